@@ -1,0 +1,35 @@
+# Every target sets up what it needs: a virtual environment in .venv, with the tested versions.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: setup demo test test-slow lint benchmark clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[train,plot,dev]"
+	touch $(STAMP)
+
+demo: setup  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
+	$(BIN)/python scripts/circle_experiment.py --output results/circle
+
+test: setup  ## the tests, without the slow statistical and soak ones
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: setup  ## the slow statistical and soak tests
+	$(BIN)/python -m pytest -m slow
+
+lint: setup  ## style, types and import rules
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+benchmark: setup  ## steps per second of every face and the cost of each part
+	$(BIN)/python scripts/benchmark.py --output results/benchmark
+
+clean:
+	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,263 @@
+"""State estimation for one vehicle: Wahba's problem and the unscented Kalman filter."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym import validation as check
+from quad_gym.kernels import single
+from quad_gym.packing import params_record
+from quad_gym.params import SensorSuite, VehicleParams
+from quad_gym.records import FLIGHT, WORK, FilterStatus
+
+_STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
+
+
+def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[np.float64]:
+    """The rotation that best turns vectors in I into the same vectors seen in B.
+
+    Minimises `sum_i a_i |v_B,i - R_BI v_I,i|^2`.
+
+    Args:
+        weights: (n,) weights a_i, none negative and not all zero.
+        v_I: (n, 3) vectors in I.
+        v_B: (n, 3) the same vectors in B.
+
+    Returns:
+        (3, 3) R_BI, a proper rotation.
+
+    Raises:
+        ValueError: If the shapes do not fit, a value is not finite, or the vectors leave the rotation open
+            (all parallel, for example).
+
+    Source: report section 4.1; F. L. Markley, J. Astronautical Sciences 36(3), 1988.
+    """
+    a = check.array("weights", weights, (None,))
+    vectors_I = check.array("v_I", v_I, (len(a), 3))
+    vectors_B = check.array("v_B", v_B, (len(a), 3))
+    if (a < 0.0).any() or not (a > 0.0).any():
+        raise ValueError(f"weights must be at least 0 and not all zero, got {a}")
+    R_BI = np.empty((3, 3))
+    uniqueness = single.wahba_of_vectors(a, vectors_I, vectors_B, R_BI)
+    if not uniqueness > 1e-10:
+        raise ValueError(
+            "v_I and v_B must determine a rotation: two directions at least must differ"
+        )
+    return R_BI
+
+
+class UnscentedKalmanFilter:
+    """The report's UKF for one vehicle: position, velocity, attitude and IMU biases.
+
+    One cycle is: `update` with what was measured at t_k, read the estimate, then `predict` to t_k+1 with the
+    IMU sample of t_k. The measurement model is that of the report's section 3.4, with antenna position,
+    baseline direction and feature directions; any of them may be missing at any time.
+
+    A cycle whose result is not finite, or whose covariance would not be positive definite, leaves the
+    estimate as it was, sets `status`, and warns.
+
+    Args:
+        sensors: The sensor suite whose geometry and noise the filter believes in.
+
+    Raises:
+        ValueError: If `sensors` is not a sensor suite.
+    """
+
+    def __init__(self, sensors: SensorSuite) -> None:
+        if not isinstance(sensors, SensorSuite):
+            raise ValueError(f"sensors must be a SensorSuite, got {type(sensors).__name__}")
+        self.sensors = sensors
+        self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
+        self._params = params_record(VehicleParams(), sensors)
+        self._params["gravity"] = sensors.estimator.gravity
+        self._flight = np.zeros(1, FLIGHT)
+        self._work = np.zeros(1, WORK)
+        self._running = False
+
+    # ---- the cycle -----------------------------------------------------------------------------------
+
+    def initialize(self, gnss_position_G: ArrayLike, gnss_baseline_G: ArrayLike) -> None:
+        """Start from a first fix: attitude by Wahba's problem with the body z axis taken as vertical.
+
+        Args:
+            gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
+            gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
+
+        Raises:
+            ValueError: If an argument has another shape, is not finite, or the baseline is zero.
+        """
+        position = check.array("gnss_position_G", gnss_position_G, (3,))
+        baseline = self._checked_baseline(gnss_baseline_G)
+        self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
+        single.ukf_initialize(self._flight, self._params)
+        self._running = True
+
+    def set_state(
+        self,
+        *,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        R_BI: ArrayLike,
+        accel_bias: ArrayLike,
+        gyro_bias: ArrayLike,
+        covariance: ArrayLike,
+    ) -> None:
+        """Start from a given estimate.
+
+        Args:
+            position, velocity: (3,) in I [m], [m/s].
+            R_BI: (3, 3) attitude, a rotation.
+            accel_bias, gyro_bias: (3,) in B [m/s^2], [rad/s].
+            covariance: (15, 15) in the order r, v, e, b_a, b_g; symmetric positive definite.
+
+        Raises:
+            ValueError: If an argument has another shape, is not finite, R_BI is no rotation, or the
+                covariance is not symmetric positive definite.
+        """
+        rotation = check.array("R_BI", R_BI, (3, 3))
+        if abs(rotation @ rotation.T - np.eye(3)).max() > 1e-9 or np.linalg.det(rotation) < 0.0:
+            raise ValueError("R_BI must be a rotation matrix")
+        P = check.array("covariance", covariance, (15, 15))
+        if not np.allclose(P, P.T, rtol=1e-9, atol=0.0):
+            raise ValueError("covariance must be symmetric")
+        try:
+            L = np.linalg.cholesky(P)
+        except np.linalg.LinAlgError:
+            raise ValueError("covariance must be positive definite") from None
+        values = (
+            check.array("position", position, (3,)),
+            check.array("velocity", velocity, (3,)),
+            rotation,
+            check.array("accel_bias", accel_bias, (3,)),
+            check.array("gyro_bias", gyro_bias, (3,)),
+        )
+        for name, value in zip(_STATE, values, strict=True):
+            self._flight[name] = value
+        self._flight["L"], self._flight["filter_status"] = L, 0
+        self._running = True
+
+    def update(
+        self,
+        gnss_position_G: ArrayLike | None = None,
+        gnss_baseline_G: ArrayLike | None = None,
+        pixels: ArrayLike | None = None,
+    ) -> None:
+        """Condition the estimate on measurements of one instant; None: not measured.
+
+        Args:
+            gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
+            gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
+            pixels: (n_features, 2) feature projections [pixels]; a row with a NaN is a feature not seen.
+
+        Raises:
+            ValueError: If an argument has another shape or is not finite; the estimate is unchanged then.
+            RuntimeError: Before `initialize` or `set_state`.
+        """
+        self._require_start()
+        f = self._flight
+        position = baseline = image = None
+        if gnss_position_G is not None:
+            position = check.array("gnss_position_G", gnss_position_G, (3,))
+        if gnss_baseline_G is not None:
+            baseline = self._checked_baseline(gnss_baseline_G)
+        if pixels is not None:
+            image = check.array("pixels", pixels, (self._features, 2), allow_nan=True)
+
+        f["position_valid"], f["baseline_valid"] = position is not None, baseline is not None
+        f["feature_valid"] = 0.0
+        if position is not None:
+            f["gnss_position"] = position
+        if baseline is not None:
+            f["gnss_baseline"] = baseline
+        if image is not None:
+            seen = np.isfinite(image).all(axis=1)
+            f["feature_valid"][0, : self._features] = seen
+            f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
+        before = self.status
+        single.ukf_update(f, self._params, self._work, self._features)
+        self._warn_of_news(before)
+
+    def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
+        """Carry the estimate over one tick.
+
+        Args:
+            gyro: (3,) angular rate measured at the start of the tick, in B [rad/s].
+            accel: (3,) specific force measured at the start of the tick, in B [m/s^2].
+
+        Raises:
+            ValueError: If an argument has another shape or is not finite; the estimate is unchanged then.
+            RuntimeError: Before `initialize` or `set_state`.
+        """
+        self._require_start()
+        rates = check.array("gyro", gyro, (3,))
+        force = check.array("accel", accel, (3,))
+        self._flight["gyro"], self._flight["accel"] = rates, force
+        before = self.status
+        single.ukf_predict(self._flight, self._params, self._work)
+        self._warn_of_news(before)
+
+    # ---- the estimate --------------------------------------------------------------------------------
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(3,) estimated position of the centre of mass in I [m]."""
+        return self._read("r_hat")
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """(3,) estimated velocity in I [m/s]."""
+        return self._read("v_hat")
+
+    @property
+    def R_BI(self) -> NDArray[np.float64]:
+        """(3, 3) estimated attitude."""
+        return self._read("R_hat")
+
+    @property
+    def accel_bias(self) -> NDArray[np.float64]:
+        """(3,) estimated accelerometer bias in B [m/s^2]."""
+        return self._read("b_a_hat")
+
+    @property
+    def gyro_bias(self) -> NDArray[np.float64]:
+        """(3,) estimated gyro bias in B [rad/s]."""
+        return self._read("b_g_hat")
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(15, 15) covariance of the errors, in the order r, v, e, b_a, b_g."""
+        L = self._read("L")
+        return L @ L.T
+
+    @property
+    def status(self) -> FilterStatus:
+        """What has gone wrong since the start; `FilterStatus(0)` when nothing has."""
+        return FilterStatus(int(self._flight["filter_status"][0]))
+
+    @property
+    def nis(self) -> tuple[float, int]:
+        """Normalised innovation squared of the last update, and how many measurements it had."""
+        return float(self._flight["nis"][0]), int(self._flight["nis_dimension"][0])
+
+    def _read(self, name: str) -> NDArray[Any]:
+        self._require_start()
+        return np.array(self._flight[name][0])
+
+    def _require_start(self) -> None:
+        if not self._running:
+            raise RuntimeError("call initialize() or set_state() before using the filter")
+
+    def _checked_baseline(self, gnss_baseline_G: ArrayLike) -> NDArray[np.float64]:
+        baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
+        if np.linalg.norm(baseline) < 1e-9:
+            raise ValueError("gnss_baseline_G must have a direction, got zeros")
+        return baseline
+
+    def _warn_of_news(self, before: FilterStatus) -> None:
+        news = self.status & ~before
+        if news:
+            warnings.warn(
+                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
+            )

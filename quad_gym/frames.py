@@ -1,0 +1,69 @@
+"""Earth frames: ECEF (G, WGS-84) and the local east-north-up frame (I)."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym import validation as check
+
+WGS84_SEMI_MAJOR_AXIS = 6378137.0
+"""[m]"""
+WGS84_FLATTENING = 1.0 / 298.257223563
+
+
+def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
+    """Geodetic latitude, longitude and height of a point.
+
+    The latitude is iterated to convergence: with N the radius of curvature in the prime vertical,
+    tan(lat) = (z + e^2 N sin(lat)) / p.
+
+    Args:
+        r_G: (3,) position in G [m], outside the Earth's core.
+
+    Returns:
+        Latitude [rad], longitude [rad], height above the ellipsoid [m].
+
+    Raises:
+        ValueError: If `r_G` is not three finite numbers, or lies within 1,000 km of the Earth's centre.
+    """
+    x, y, z = check.array("r_G", r_G, (3,))
+    if np.sqrt(x * x + y * y + z * z) < 1e6:
+        raise ValueError(f"r_G must be a place near the Earth's surface in metres, got {r_G!r}")
+    eccentricity2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING)
+    p = np.hypot(x, y)
+    lat = np.arctan2(z, p * (1.0 - eccentricity2))
+    for _ in range(50):
+        sin_lat = np.sin(lat)
+        radius = WGS84_SEMI_MAJOR_AXIS / np.sqrt(1.0 - eccentricity2 * sin_lat**2)
+        previous, lat = lat, np.arctan2(z + eccentricity2 * radius * sin_lat, p)
+        if lat == previous:
+            break
+    sin_lat, cos_lat = np.sin(lat), np.cos(lat)
+    radius = WGS84_SEMI_MAJOR_AXIS / np.sqrt(1.0 - eccentricity2 * sin_lat**2)
+    height = p * cos_lat + z * sin_lat - WGS84_SEMI_MAJOR_AXIS**2 / radius
+    return float(lat), float(np.arctan2(y, x)), float(height)
+
+
+def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
+    """The rotation R_IG from ECEF to the east-north-up frame at a point.
+
+    Its rows are the unit east, north and up vectors at the geodetic latitude and longitude of the point,
+    in G; v_I = R_IG v_G.
+
+    Args:
+        r0_G: (3,) position of the reference antenna in G [m].
+
+    Returns:
+        (3, 3) R_IG.
+
+    Raises:
+        ValueError: If `r0_G` is not three finite numbers on the Earth.
+    """
+    lat, lon, _ = ecef_to_geodetic(r0_G)
+    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )

@@ -1,0 +1,159 @@
+"""One flight: a tick, and an episode's first instant.
+
+A tick is one IMU sample: control with what is seen, predict with the sample of its start, let the true
+state and the biases evolve, then measure and update at its end.
+"""
+
+import numpy as np
+
+from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.control import act
+from quad_gym.kernels.lanes import any_of, select
+from quad_gym.kernels.linalg import (
+    add,
+    keep3,
+    keep33,
+    load3,
+    load33,
+    multiply,
+    norm,
+    scale,
+    sub,
+)
+from quad_gym.kernels.reference import evaluate_reference
+from quad_gym.kernels.rotation import euler_to_dcm, quaternion_to_dcm
+from quad_gym.kernels.sensors import (
+    DRAW_NOISY,
+    drift_biases,
+    measure_features,
+    measure_gnss,
+    measure_imu,
+    six_normals,
+    stream_of,
+)
+from quad_gym.kernels.task import draw_reference, draw_start
+from quad_gym.kernels.ukf import initialize, predict
+from quad_gym.kernels.ukf_update import update
+from quad_gym.kernels.vehicle import integrate, load4
+from quad_gym.records import Control, Source
+
+_ONE = np.uint64(1)
+
+
+@inlined
+def _look(flight, model, settings, mask):
+    """Set what the controller sees from its source, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
+    if settings.source == Source.ESTIMATE or settings.source == Source.SENSORS:
+        r, v, R_BI = load3(flight.r_hat), load3(flight.v_hat), load33(flight.R_hat)
+        w_B = load3(flight.gyro)
+        if settings.source == Source.ESTIMATE:
+            w_B = sub(w_B, load3(flight.b_g_hat))
+    elif settings.source == Source.NOISY:
+        stream = stream_of(flight)
+        s = load4(model.noisy_sigma)
+        n_r, n_v = six_normals(stream, DRAW_NOISY)
+        n_e, n_w = six_normals(stream, DRAW_NOISY + 3)
+        r, v = add(r, scale(s[0], n_r)), add(v, scale(s[1], n_v))
+        R_BI, w_B = multiply(euler_to_dcm(scale(s[2], n_e)), R_BI), add(w_B, scale(s[3], n_w))
+    keep3(flight.r_seen, mask, r)
+    keep3(flight.v_seen, mask, v)
+    keep33(flight.R_seen, mask, R_BI)
+    keep3(flight.w_seen, mask, w_B)
+    error = norm(sub(load3(flight.r_seen), load3(flight.r)))
+    flight.estimation_error = select(mask, error, flight.estimation_error)
+
+
+@kernel
+def sense(flight, world, model, settings, work, mask, starting):
+    """Measure at the present instant, update the filter and look, where `mask`.
+
+    Args:
+        flight: Record.
+        world: Parameters as they are.
+        model: Parameters as filter and controller believe them.
+        settings: What the batch does.
+        work: Workspace.
+        mask: Which lanes.
+        starting: Whether this is the first instant of their episode.
+    """
+    if settings.run_filter:
+        measure_imu(flight, world, mask)
+        period = 1.0 * settings.gnss_ticks
+        due = mask & (flight.gnss_wait <= 0.0)
+        if any_of(due):
+            measure_gnss(flight, world, due)
+        flight.position_valid = select(due, 1.0, 0.0)
+        flight.baseline_valid = select(due, 1.0, 0.0)
+        wait = select(due, period, flight.gnss_wait) - 1.0
+        flight.gnss_wait = select(mask, wait, flight.gnss_wait)
+        flight.position_fresh = select(due, 1.0, flight.position_fresh)
+        flight.baseline_fresh = select(due, 1.0, flight.baseline_fresh)
+
+        if settings.camera_ticks > 0:
+            period = 1.0 * settings.camera_ticks
+            due = mask & (flight.camera_wait <= 0.0)
+            if any_of(due):
+                measure_features(flight, world, settings.feature_count, due)
+            else:
+                for i in range(settings.feature_count):
+                    flight.feature_valid[i] = 0.0
+            wait = select(due, period, flight.camera_wait) - 1.0
+            flight.camera_wait = select(mask, wait, flight.camera_wait)
+            for i in range(settings.feature_count):
+                seen = flight.feature_valid[i] > 0.0
+                flight.feature_fresh[i] = select(seen, 1.0, flight.feature_fresh[i])
+
+        if starting:
+            initialize(flight, model, mask)
+        update(flight, model, work, settings.feature_count, mask)
+    _look(flight, model, settings, mask)
+
+
+@kernel
+def tick(flight, world, model, settings, work):
+    """Fly one tick."""
+    nothing = load3(flight.disturbance)
+    reference = (nothing, nothing, nothing, nothing)
+    if settings.control == Control.PD:
+        reference = evaluate_reference(flight, flight.tick * model.dt)
+    act(flight, model, settings.control, reference)
+    flight.instant = flight.instant + _ONE
+    if settings.run_filter:
+        predict(flight, model, work)
+        drift_biases(flight, world)
+    integrate(flight, world, settings.substeps)
+    flight.tick = flight.tick + 1.0
+    sense(flight, world, model, settings, work, flight.tick >= 0.0, False)
+
+
+@kernel
+def begin_episode(flight, world, model, settings, work, mask):
+    """Begin a new episode, where `mask`: reference, true state, first measurements, filter."""
+    flight.instant = select(mask, flight.instant + _ONE, flight.instant)
+    flight.tick = select(mask, 0.0, flight.tick)
+    flight.gnss_wait = select(mask, 0.0, flight.gnss_wait)
+    flight.camera_wait = select(mask, 0.0, flight.camera_wait)
+    flight.position_fresh = select(mask, 0.0, flight.position_fresh)
+    flight.baseline_fresh = select(mask, 0.0, flight.baseline_fresh)
+    for i in range(settings.feature_count):
+        flight.feature_fresh[i] = select(mask, 0.0, flight.feature_fresh[i])
+    stream = stream_of(flight)
+    draw_reference(flight, settings, stream, mask)
+    draw_start(flight, world, model, settings, stream, mask)
+    sense(flight, world, model, settings, work, mask, True)
+
+    flight.step = select(mask, 0.0, flight.step)
+    flight.episode = select(mask, flight.episode + 1.0, flight.episode)
+    flight.gate_next = select(mask, 0.0, flight.gate_next)
+    flight.needs_reset = select(mask, 0.0, flight.needs_reset)
+    flight.reward = select(mask, 0.0, flight.reward)
+    flight.terminated = select(mask, 0.0, flight.terminated)
+    flight.truncated = select(mask, 0.0, flight.truncated)
+    flight.ending = select(mask, 0.0, flight.ending)
+    flight.episode_return = select(mask, 0.0, flight.episode_return)
+    flight.episode_error = select(mask, 0.0, flight.episode_error)
+    r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick)
+    error = norm(sub(r_ref, load3(flight.r)))
+    flight.position_error = select(mask, error, flight.position_error)

@@ -1,0 +1,130 @@
+"""What the sensors measure at the present instant: IMU, dual-antenna GNSS, camera.
+
+Every draw has a fixed number within its instant, so that a measurement does not depend on which others
+are taken. The noise-free parts are functions of their own, for the friendly classes and the tests.
+"""
+
+import math
+
+from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.lanes import select
+from quad_gym.kernels.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    dot,
+    keep3,
+    load3,
+    load33,
+    norm,
+    scale,
+    sub,
+)
+from quad_gym.kernels.random import normal_pair
+from quad_gym.kernels.rotation import quaternion_to_dcm
+from quad_gym.kernels.vehicle import accelerations, imu_point_acceleration, load4
+
+# numbers of the draws (of two normals each) within an instant
+DRAW_BIAS, DRAW_IMU, DRAW_GNSS, DRAW_NOISY, DRAW_FEATURE, DRAW_RESET = 0, 3, 6, 9, 16, 64
+
+
+@inlined
+def stream_of(flight):
+    """The random stream of a flight at its present instant."""
+    return (flight.key[0], flight.key[1], flight.instant)
+
+
+@inlined
+def six_normals(stream, draw):
+    """Two vectors of independent standard normals, from three draws."""
+    a, b = normal_pair(stream, draw)
+    c, d = normal_pair(stream, draw + 1)
+    e, f = normal_pair(stream, draw + 2)
+    return (a, b, c), (d, e, f)
+
+
+@kernel
+def drift_biases(flight, p):
+    """Step the Gauss-Markov biases by one tick: b+ = alpha b + v_2 (report equations 6 and 7)."""
+    n_a, n_g = six_normals(stream_of(flight), DRAW_BIAS)
+    for i in range(3):
+        flight.b_a[i] = p.accel_bias_decay * flight.b_a[i] + p.accel_bias_drive * n_a[i]
+        flight.b_g[i] = p.gyro_bias_decay * flight.b_g[i] + p.gyro_bias_drive * n_g[i]
+
+
+@inlined
+def specific_force(flight, p, R_BI):
+    """f_B = R (a_I + g e3) of the accelerometer's place, without bias and noise (report equation 4)."""
+    w_B = load3(flight.w)
+    a_I, dw_B = accelerations(
+        R_BI, load3(flight.v), w_B, load4(flight.rotor_speeds), load3(flight.disturbance), p
+    )
+    a_I = imu_point_acceleration(R_BI, a_I, w_B, dw_B, load3(p.imu_lever_arm))
+    return apply(R_BI, (a_I[0], a_I[1], a_I[2] + p.gravity))
+
+
+@kernel
+def measure_imu(flight, p, mask):
+    """Sample accelerometer and gyro, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    n_a, n_g = six_normals(stream_of(flight), DRAW_IMU)
+    f_B = add(specific_force(flight, p, R_BI), load3(flight.b_a))
+    w_B = add(load3(flight.w), load3(flight.b_g))
+    keep3(flight.accel, mask, add(f_B, scale(p.accel_sigma, n_a)))
+    keep3(flight.gyro, mask, add(w_B, scale(p.gyro_sigma, n_g)))
+
+
+@inlined
+def noisy_baseline(r_b, normals, sigma_b, floor, length):
+    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, then the known length.
+
+    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section 3.1).
+    """
+    size = norm(r_b)
+    u = scale(1.0 / size, r_b)
+    b = math.sqrt(floor)
+    a = math.sqrt((size * sigma_b) * (size * sigma_b) + floor)
+    along = dot(u, normals)
+    noisy = add(add(r_b, scale(a, normals)), scale((b - a) * along, u))
+    return scale(length / norm(noisy), noisy)
+
+
+@kernel
+def measure_gnss(flight, p, mask):
+    """Measure antenna position and baseline in G, where `mask`."""
+    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+    n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
+    s = load3(p.gnss_sigma)
+    antenna_I = add(load3(flight.r), apply_transposed(R_BI, load3(p.antenna)))
+    noise_I = (s[0] * n_p[0], s[1] * n_p[1], s[2] * n_p[2])
+    keep3(flight.gnss_position, mask, apply_transposed(R_IG, add(antenna_I, noise_I)))
+    baseline_G = apply_transposed(R_IG, apply_transposed(R_BI, load3(p.baseline)))
+    measured = noisy_baseline(
+        baseline_G, n_b, p.baseline_sigma, p.direction_floor, p.baseline_length
+    )
+    keep3(flight.gnss_baseline, mask, measured)
+
+
+@inlined
+def project(X_I, r_I, R_BI, p):
+    """Pixel of a point, and whether it is in front of the camera and inside the image."""
+    v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))
+    in_front = v_C[2] > 1e-9
+    per_depth = p.focal_length / select(in_front, v_C[2], 1.0)
+    x, y = per_depth * v_C[0], per_depth * v_C[1]
+    seen = in_front & (abs(x) <= p.half_image[0]) & (abs(y) <= p.half_image[1])
+    return x, y, seen
+
+
+@kernel
+def measure_features(flight, p, feature_count, mask):
+    """Project the features that the camera sees, where `mask`; elsewhere none is valid now."""
+    stream = stream_of(flight)
+    R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
+    for i in range(feature_count):
+        x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
+        n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
+        seen = seen & mask
+        flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
+        flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
+        flight.feature_valid[i] = select(seen, 1.0, 0.0)

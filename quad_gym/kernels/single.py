@@ -1,0 +1,101 @@
+"""Entries for one flight: the scalar instances behind the friendly classes."""
+
+from quad_gym.kernels.compilation import entry
+from quad_gym.kernels.linalg import add_outer, load3, load33, scale, store3, store33
+from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
+from quad_gym.kernels.sensors import drift_biases, measure_features, measure_gnss, measure_imu
+from quad_gym.kernels.ukf import initialize, predict
+from quad_gym.kernels.ukf_update import update
+from quad_gym.kernels.vehicle import accelerations, integrate, load4, store4
+from quad_gym.kernels.wahba import wahba
+
+
+@entry
+def ukf_initialize(flights, params):
+    """Start the filter of flights[0] from its first fix."""
+    initialize(flights[0], params[0], True)
+
+
+@entry
+def ukf_update(flights, params, work, feature_count):
+    """Condition the filter of flights[0] on its valid measurements."""
+    update(flights[0], params[0], work[0], feature_count, True)
+
+
+@entry
+def ukf_predict(flights, params, work):
+    """Carry the filter of flights[0] over one tick."""
+    predict(flights[0], params[0], work[0])
+
+
+@entry
+def sense_imu(flights, params):
+    """Sample the IMU of flights[0]."""
+    measure_imu(flights[0], params[0], True)
+
+
+@entry
+def sense_gnss(flights, params):
+    """Measure flights[0] by GNSS."""
+    measure_gnss(flights[0], params[0], True)
+
+
+@entry
+def sense_features(flights, params, feature_count):
+    """Measure the features that the camera of flights[0] sees."""
+    measure_features(flights[0], params[0], feature_count, True)
+
+
+@entry
+def step_biases(flights, params):
+    """Step the IMU biases of flights[0] by one tick."""
+    drift_biases(flights[0], params[0])
+
+
+@entry
+def integrate_flight(flights, params, substeps):
+    """Carry the true state of flights[0] over one tick."""
+    integrate(flights[0], params[0], substeps)
+
+
+@entry
+def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
+    """Write the acceleration in I and the angular acceleration in B."""
+    a, dw = accelerations(
+        load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds), load3(d_I), params[0]
+    )
+    store3(a_I, a)
+    store3(dw_B, dw)
+
+
+@entry
+def wahba_of_vectors(weights, v_I, v_B, R_BI):
+    """Write the solution of Wahba's problem for (n, 3) vectors; return its uniqueness."""
+    zeros = (0.0, 0.0, 0.0)
+    profile = (zeros, zeros, zeros)
+    for i in range(len(weights)):
+        profile = add_outer(profile, scale(weights[i], load3(v_B[i])), load3(v_I[i]))
+    rotation, uniqueness = wahba(profile)
+    store33(R_BI, rotation)
+    return uniqueness
+
+
+@entry
+def dcms_of_eulers(e, R):
+    """Write the rotation matrices of (n, 3) Euler angles."""
+    for i in range(len(e)):
+        store33(R[i], euler_to_dcm(load3(e[i])))
+
+
+@entry
+def dcms_of_quaternions(q, R_BI):
+    """Write the rotation matrices of (n, 4) quaternions."""
+    for i in range(len(q)):
+        store33(R_BI[i], quaternion_to_dcm(load4(q[i])))
+
+
+@entry
+def quaternions_of_dcms(R_BI, q):
+    """Write the quaternions of (n, 3, 3) rotation matrices."""
+    for i in range(len(q)):
+        store4(q[i], dcm_to_quaternion(load33(R_BI[i])))

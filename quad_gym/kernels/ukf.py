@@ -1,0 +1,247 @@
+"""The unscented Kalman filter of the report, with its structure used and its result unchanged.
+
+State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The filter
+stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are those of the
+augmented filter (27 columns in the prediction, 15 + n_z in the update), but
+
+* the augmented factor is block diagonal, so that noise which enters linearly contributes in closed form,
+  and so do the columns for states on which a model does not depend: 9 pairs of points remain;
+* a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and its half-sum less the centre s,
+  for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the moments are
+      mean = f(x0) + mu,  mu = sum s / c^2
+      cov  = sum (a a^T + s s^T) / c^2 + (beta - alpha^2) mu mu^T + noise
+  in which nothing cancels, unlike in the usual weights near -1e6;
+* the update never forms P_zz. With A and E the columns a / c and s / c of the measurement, and
+  Rz = E E^T + (beta - alpha^2) mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion
+  lemma gives  P+ = L (I + C C^T)^-1 L^T  with  C = A^T Rz^-T/2  over the nine columns that matter.
+  The new factor is L times the factor of that inverse, lower triangular again, and stays accurate
+  when a measurement is 10^8 times as good as the prediction.
+
+Sources: report section 3.4; S. J. Julier and J. K. Uhlmann, Proc. IEEE 92(3), 2004.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.elementary import is_finite
+from quad_gym.kernels.lanes import select
+from quad_gym.kernels.linalg import (
+    add,
+    add33,
+    add_outer,
+    add_to_diagonal,
+    apply,
+    apply_transposed,
+    cholesky,
+    keep3,
+    keep33,
+    load3,
+    load33,
+    load_column3,
+    multiply,
+    outer,
+    scale,
+    scale33,
+    store_block,
+    sub,
+    sum_of_outers,
+    unit_or,
+)
+from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
+from quad_gym.kernels.wahba import wahba
+from quad_gym.records import FilterStatus
+
+R, V, E, BA, BG = 0, 3, 6, 9, 12
+"""First rows of position, velocity, attitude error, accelerometer and gyro bias in the state."""
+_PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
+
+
+@inlined
+def _euler_rate_parts(parts, w_B, dg):
+    """The parts odd and even in the sigma offset of S(e) (w_B - dg), the even one less w_B.
+
+    S(e) turns body rates into rates of the error Euler angles; e and dg change sign together.
+    """
+    s_phi, m_phi, s_th, m_th = parts
+    c_phi, c_th = 1.0 + m_phi, 1.0 + m_th
+    t_phi = s_phi / c_phi
+    odd = (
+        s_th * w_B[2] - c_th * dg[0],
+        -dg[1] - t_phi * (s_th * dg[0] + c_th * w_B[2]),
+        (-s_th * w_B[0] - c_th * dg[2]) / c_phi,
+    )
+    even = (
+        m_th * w_B[0] - s_th * dg[2],
+        t_phi * (s_th * w_B[0] + c_th * dg[2]),
+        (s_th * dg[0] + (m_th - m_phi) * w_B[2]) / c_phi,
+    )
+    return odd, even
+
+
+@inlined
+def _propagate_sigma_points(flight, p, work, f_B, w_B):
+    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's, per row."""
+    L, F, S = flight.L, work.F, work.S
+    R_BI = load33(flight.R_hat)
+    dt = p.dt
+    half_dt2 = 0.5 * dt * dt
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 27.0)
+    inverse_c = 1.0 / c
+    zero = 0.0 * c
+    mean_a, mean_e = (zero, zero, zero), (zero, zero, zero)
+
+    for j in range(9):
+        d = scale(c, load_column3(L, E, j))
+        df, dg = scale(c, load_column3(L, BA, j)), scale(c, load_column3(L, BG, j))
+        even, odd, parts = split_rotation(d)
+        # a_I = R^T R(e)^T (f - b_a) - g: its part odd in the offset, and its even part less the centre
+        odd_B = sub(sub(apply_transposed(odd, f_B), df), apply_transposed(even, df))
+        even_B = sub(apply_transposed(even, f_B), apply_transposed(odd, df))
+        a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
+        a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
+        rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
+
+        v_j = load_column3(L, V, j)
+        r_j = add(load_column3(L, R, j), scale(dt, v_j))
+        e_even = scale(dt * inverse_c, rate_even)
+        for i in range(3):
+            F[R + i, j] = r_j[i] + half_dt2 * a_odd[i]
+            F[V + i, j] = v_j[i] + dt * a_odd[i]
+            F[E + i, j] = inverse_c * (d[i] + dt * rate_odd[i])
+            S[R + i, j] = half_dt2 * a_even[i]
+            S[V + i, j] = dt * a_even[i]
+            S[E + i, j] = e_even[i]
+        mean_a = add(mean_a, a_even)
+        mean_e = add(mean_e, e_even)
+
+    for j in range(9, 15):  # offsets of the biases alone: linear
+        a_odd = apply_transposed(R_BI, scale(-1.0, load_column3(L, BA, j)))
+        for i in range(3):
+            F[R + i, j] = half_dt2 * a_odd[i]
+            F[V + i, j] = dt * a_odd[i]
+            F[E + i, j] = -dt * L[BG + i, j]
+
+    mean_a = scale(inverse_c, mean_a)
+    return scale(half_dt2, mean_a), scale(dt, mean_a), scale(inverse_c, mean_e)
+
+
+@inlined
+def _sum_moments(flight, p, work, mean_r, mean_v, mean_e):
+    """Fill the lower triangle of work.P from the propagated pairs and the process noise."""
+    L, F, S, P = flight.L, work.F, work.S, work.P
+    dt = p.dt
+    half_dt2 = 0.5 * dt * dt
+    decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
+    accel_variance = p.accel_sigma * p.accel_sigma
+    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
+
+    # rows and columns r, v, e: (i, j, their mean offsets)
+    for i in range(0, 9, 3):
+        mean_i = mean_r if i == 0 else (mean_v if i == 3 else mean_e)
+        for j in range(0, i + 3, 3):
+            mean_j = mean_r if j == 0 else (mean_v if j == 3 else mean_e)
+            block = add33(sum_of_outers(F, i, F, j, 15), sum_of_outers(S, i, S, j, 9))
+            store_block(P, i, j, add_outer(block, scale(excess, mean_i), mean_j))
+    for i in range(3):
+        P[R + i, R + i] += half_dt2 * half_dt2 * accel_variance
+        P[V + i, R + i] += half_dt2 * dt * accel_variance
+        P[V + i, V + i] += dt * dt * accel_variance
+        P[E + i, E + i] += (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
+
+    # the biases are linear: their rows of the propagated columns are those of L times the decay
+    for j in range(0, 9, 3):
+        store_block(P, BA, j, scale33(decay_a, sum_of_outers(L, BA, F, j, 12)))
+        store_block(P, BG, j, scale33(decay_g, sum_of_outers(L, BG, F, j, 15)))
+    aa, ga, gg = (
+        sum_of_outers(L, BA, L, BA, 12),
+        sum_of_outers(L, BG, L, BA, 12),
+        sum_of_outers(L, BG, L, BG, 15),
+    )
+    drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
+    store_block(P, BA, BA, add_to_diagonal(scale33(decay_a * decay_a, aa), drive_a * drive_a))
+    store_block(P, BG, BA, scale33(decay_g * decay_a, ga))
+    store_block(P, BG, BG, add_to_diagonal(scale33(decay_g * decay_g, gg), drive_g * drive_g))
+
+
+@kernel
+def predict(flight, p, work):
+    """Carry the estimate over one tick with the IMU sample at its start.
+
+    `a = R^T (f_meas - b_a - v_a) - g e3`, `r+ = r + v dt + a dt^2/2`, `v+ = v + a dt`,
+    `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`.
+
+    A lane whose predicted covariance is not positive definite keeps its state and sets PREDICTION_FAILED.
+
+    Args:
+        flight: Record; reads gyro and accel, changes the estimate.
+        p: Parameters as the filter believes them.
+        work: Workspace.
+    """
+    dt = p.dt
+    w_B = sub(load3(flight.gyro), load3(flight.b_g_hat))
+    f_B = sub(load3(flight.accel), load3(flight.b_a_hat))
+    R_BI = load33(flight.R_hat)
+    mean_r, mean_v, mean_e = _propagate_sigma_points(flight, p, work, f_B, w_B)
+    _sum_moments(flight, p, work, mean_r, mean_v, mean_e)
+    ok = cholesky(work.P, 15, work.inverse_diagonal) > 0.0
+
+    a_I = apply_transposed(R_BI, f_B)
+    a_I = (a_I[0], a_I[1], a_I[2] - p.gravity)
+    r, v = load3(flight.r_hat), load3(flight.v_hat)
+    r_pred = add(add(add(r, scale(dt, v)), scale(0.5 * dt * dt, a_I)), mean_r)
+    v_pred = add(add(v, scale(dt, a_I)), mean_v)
+    R_pred = multiply(euler_to_dcm(add(scale(dt, w_B), mean_e)), R_BI)
+    ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
+
+    keep3(flight.r_hat, ok, r_pred)
+    keep3(flight.v_hat, ok, v_pred)
+    keep33(flight.R_hat, ok, R_pred)
+    keep3(flight.b_a_hat, ok, scale(p.accel_bias_decay, load3(flight.b_a_hat)))
+    keep3(flight.b_g_hat, ok, scale(p.gyro_bias_decay, load3(flight.b_g_hat)))
+    for i in range(15):
+        for j in range(i + 1):
+            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    flight.filter_status = select(
+        ok, flight.filter_status, flight.filter_status | _PREDICTION_FAILED
+    )
+
+
+@kernel
+def initialize(flight, p, mask):
+    """Start the filter from the first fix, where `mask`.
+
+    Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical, with equal
+    weights; position from the antenna; velocity and biases zero.
+
+    Args:
+        flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
+        p: Parameters as the filter believes them.
+        mask: Which lanes.
+    """
+    R_IG = load33(p.R_IG)
+    baseline_I = unit_or(apply(R_IG, load3(flight.gnss_baseline)), (1.0, 0.0, 0.0))
+    baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
+    profile = outer(baseline_B, baseline_I)
+    profile = (profile[0], profile[1], (profile[2][0], profile[2][1], profile[2][2] + 1.0))
+    R_BI, _ = wahba(profile)
+    antenna_I = apply(R_IG, load3(flight.gnss_position))
+    keep33(flight.R_hat, mask, R_BI)
+    keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
+    keep3(flight.v_hat, mask, (0.0, 0.0, 0.0))
+    keep3(flight.b_a_hat, mask, (0.0, 0.0, 0.0))
+    keep3(flight.b_g_hat, mask, (0.0, 0.0, 0.0))
+    flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
+
+    L = flight.L
+    for i in range(15):
+        for j in range(i + 1):
+            L[i, j] = select(mask, 0.0, L[i, j])
+    inflation = math.sqrt(p.initial_scale)
+    for i in range(3):
+        L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
+        L[V + i, V + i] = select(mask, math.sqrt(p.initial_velocity_variance), L[V + i, V + i])
+        L[E + i, E + i] = select(mask, inflation * p.baseline_sigma, L[E + i, E + i])
+        L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
+        L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])

@@ -1,0 +1,318 @@
+"""The filter's measurement update: antenna position, baseline direction and feature directions at once.
+
+See `ukf.py` for the form of the unscented transform and of the update. The stacked measurement is made of
+triples, all in I or B: r + R^T l_p, unit(R^T l_b), and for each feature unit(R (X - r) - l_c), for a
+direction in the camera frame differs from one in B by a fixed rotation only. A triple that a lane lacks
+is masked: its deviations and innovation are zero and its noise is one, which gives exactly the update
+without it. Triples that every lane lacks are left out.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.elementary import is_finite
+from quad_gym.kernels.lanes import any_of, logical_not, select
+from quad_gym.kernels.linalg import (
+    add,
+    add_outer,
+    add_to_diagonal,
+    apply,
+    apply_transposed,
+    cholesky,
+    dot,
+    keep3,
+    keep33,
+    load3,
+    load33,
+    load_block,
+    load_column3,
+    multiply,
+    norm,
+    scale,
+    select3,
+    solve_left_vector,
+    solve_right,
+    store3,
+    store_block,
+    sub,
+    sum_of_outers,
+    sum_of_outers_of_rows,
+)
+from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
+from quad_gym.kernels.ukf import BA, BG, E, R, V
+from quad_gym.records import FilterStatus
+
+_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
+
+
+@inlined
+def _set_triple(row, k, has, values):
+    """Write three numbers of the stacked measurement, zero where a lane lacks it."""
+    for i in range(3):
+        row[k + i] = select(has, values[i], 0.0)
+
+
+@inlined
+def _set_noise(Rz, k, has, block):
+    """Write a diagonal block of the measurement noise, the identity where a lane lacks it."""
+    for i in range(3):
+        for j in range(3):
+            Rz[k + i, k + j] = select(has, block[i][j], 1.0 if i == j else 0.0)
+
+
+@inlined
+def _direction_noise(direction, variance, floor):
+    """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 but for the floor."""
+    negative = scale(-variance, direction)
+    zero = 0.0 * variance
+    empty = ((zero, zero, zero), (zero, zero, zero), (zero, zero, zero))
+    return add_to_diagonal(add_outer(empty, negative, direction), variance + floor)
+
+
+@inlined
+def _has_feature(flight, k):
+    return flight.feature_valid[k] > 0.0
+
+
+@inlined
+def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
+    """Fill work.h (centre), work.z (measured) and the diagonal blocks of work.Rz; return n_z of the block."""
+    h, z, Rz = work.h, work.z, work.Rz
+    R_IG, R_BI, R_CB = load33(p.R_IG), load33(flight.R_hat), load33(p.R_CB)
+    r = load3(flight.r_hat)
+    k = 0
+    if use_position:
+        has = flight.position_valid > 0.0
+        _set_triple(h, k, has, add(r, apply_transposed(R_BI, load3(p.antenna))))
+        _set_triple(z, k, has, apply(R_IG, load3(flight.gnss_position)))
+        s = load3(p.gnss_sigma)
+        zero = 0.0 * s[0]
+        noise = ((s[0] * s[0], zero, zero), (zero, s[1] * s[1], zero), (zero, zero, s[2] * s[2]))
+        _set_noise(Rz, k, has, noise)
+        k += 3
+    if use_baseline:
+        has = flight.baseline_valid > 0.0
+        u_I = apply_transposed(R_BI, scale(1.0 / p.baseline_length, load3(p.baseline)))
+        _set_triple(h, k, has, u_I)
+        measured = apply(R_IG, load3(flight.gnss_baseline))
+        _set_triple(z, k, has, scale(1.0 / norm(measured), measured))
+        variance = p.baseline_sigma * p.baseline_sigma
+        _set_noise(Rz, k, has, _direction_noise(u_I, variance, p.direction_floor))
+        k += 3
+    for i in range(feature_count):
+        has = _has_feature(flight, i)
+        if any_of(has):
+            X_B = apply(R_BI, sub(load3(p.features[i]), r))
+            to_feature = sub(X_B, load3(p.camera))
+            store3(work.X_B[i], X_B)
+            work.inverse_distance[i] = 1.0 / norm(to_feature)
+            _set_triple(h, k, has, scale(work.inverse_distance[i], to_feature))
+            pixel = p.pixel_size
+            ray_C = (
+                pixel * flight.pixels[i, 0],
+                pixel * flight.pixels[i, 1],
+                pixel * p.focal_length,
+            )
+            length = norm(ray_C)
+            u_B = apply_transposed(R_CB, scale(1.0 / length, ray_C))
+            _set_triple(z, k, has, u_B)
+            sigma = p.pixel_sigma * pixel / length
+            predicted = scale(work.inverse_distance[i], to_feature)
+            u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
+            _set_noise(Rz, k, has, _direction_noise(u_B, sigma * sigma, p.direction_floor))
+            k += 3
+    return k
+
+
+@inlined
+def _inverse_root_minus_one(d):
+    """(1 + d)^(-1/2) - 1 by its binomial series, exact to float64 for |d| < 0.01."""
+    return d * (
+        -1.0 / 2.0
+        + d
+        * (
+            3.0 / 8.0
+            + d
+            * (
+                -5.0 / 16.0
+                + d
+                * (35.0 / 128.0 + d * (-63.0 / 256.0 + d * (231.0 / 1024.0 - d * (429.0 / 2048.0))))
+            )
+        )
+    )
+
+
+@inlined
+def _shrinkage(d):
+    """(1 + d)^(-1/2) - 1 for d > -1."""
+    value = _inverse_root_minus_one(d)
+    if any_of(abs(d) >= 0.01):
+        root = math.sqrt(1.0 + d)
+        value = select(abs(d) < 0.01, value, -d / (root * (1.0 + root)))
+    return value
+
+
+@inlined
+def _direction_pair(v, inverse_norm, v_even, v_odd):
+    """Half-difference, and half-sum less unit(v), of unit(v + v_even + v_odd) and unit(v + v_even - v_odd).
+
+    |v + v_even +- v_odd|^2 = |v|^2 (1 + d), and the small d gives the new lengths without cancellation.
+    """
+    centre = add(v, v_even)
+    inverse_square = inverse_norm * inverse_norm
+    d_even = inverse_square * (dot(v_even, add(v, centre)) + dot(v_odd, v_odd))
+    d_odd = inverse_square * (2.0 * dot(centre, v_odd))
+    plus, minus = _shrinkage(d_even + d_odd), _shrinkage(d_even - d_odd)
+    both, gap = 0.5 * (plus + minus), 0.5 * (plus - minus)
+    difference = add(add(v_odd, scale(both, v_odd)), scale(gap, centre))
+    half_sum = add(add(v_even, scale(both, centre)), scale(gap, v_odd))
+    return scale(inverse_norm, difference), scale(inverse_norm, half_sum)
+
+
+@inlined
+def _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c):
+    """Fill work.A and work.E with the measured pairs; column j of L is their row 8 - j."""
+    L = flight.L
+    R_BI = load33(flight.R_hat)
+    camera = load3(p.camera)
+    antenna, unit_baseline = load3(p.antenna), scale(1.0 / p.baseline_length, load3(p.baseline))
+    inverse_c = 1.0 / c
+    for j in range(9):
+        A, S = work.A[8 - j], work.E[8 - j]
+        dr = load_column3(L, R, j)
+        even, odd, _ = split_rotation(scale(c, load_column3(L, E, j)))
+        k = 0
+        if use_position:
+            has = flight.position_valid > 0.0
+            lever_odd = scale(inverse_c, apply_transposed(odd, antenna))
+            lever_even = scale(inverse_c, apply_transposed(even, antenna))
+            _set_triple(A, k, has, add(dr, apply_transposed(R_BI, lever_odd)))
+            _set_triple(S, k, has, apply_transposed(R_BI, lever_even))
+            k += 3
+        if use_baseline:
+            has = flight.baseline_valid > 0.0
+            baseline_odd = scale(inverse_c, apply_transposed(odd, unit_baseline))
+            baseline_even = scale(inverse_c, apply_transposed(even, unit_baseline))
+            _set_triple(A, k, has, apply_transposed(R_BI, baseline_odd))
+            _set_triple(S, k, has, apply_transposed(R_BI, baseline_even))
+            k += 3
+        dr_B = apply(R_BI, scale(c, dr))
+        for i in range(feature_count):
+            has = _has_feature(flight, i)
+            if any_of(has):
+                X_B = load3(work.X_B[i])
+                # (I + even +- odd) (X_B -+ dr_B) - l_c
+                v_odd = sub(sub(apply(odd, X_B), dr_B), apply(even, dr_B))
+                v_even = sub(apply(even, X_B), apply(odd, dr_B))
+                v = sub(X_B, camera)
+                a, s = _direction_pair(v, work.inverse_distance[i], v_even, v_odd)
+                _set_triple(A, k, has, scale(inverse_c, a))
+                _set_triple(S, k, has, scale(inverse_c, s))
+                k += 3
+
+
+@inlined
+def _sum_noise(p, work, n, c):
+    """Turn work.z into the innovation and add the even parts' share to work.Rz."""
+    S, mu = work.E, work.mu
+    for k in range(n):
+        total = S[0, k]
+        for j in range(1, 9):
+            total = total + S[j, k]
+        mu[k] = total / c
+        work.z[k] = work.z[k] - work.h[k] - mu[k]
+    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
+    for i in range(0, n, 3):
+        mu_i = scale(excess, (mu[i], mu[i + 1], mu[i + 2]))
+        for j in range(0, i + 3, 3):
+            block = sum_of_outers_of_rows(S, S, i, j, 9)
+            block = add_outer(block, mu_i, (mu[j], mu[j + 1], mu[j + 2]))
+            if i == j:
+                noise = load_block(work.Rz, i, i)
+                block = (add(block[0], noise[0]), add(block[1], noise[1]), add(block[2], noise[2]))
+            store_block(work.Rz, i, j, block)
+
+
+@kernel
+def update(flight, p, work, feature_count, mask):
+    """Condition the estimate on the valid measurements of the present instant, where `mask`.
+
+    A lane whose result is not finite keeps its state bit for bit and sets UPDATE_FAILED.
+
+    Args:
+        flight: Record; reads the measurements and their validity, changes the estimate.
+        p: Parameters as the filter believes them.
+        work: Workspace.
+        feature_count: Features in use.
+        mask: Which lanes.
+    """
+    use_position = any_of(flight.position_valid > 0.0)
+    use_baseline = any_of(flight.baseline_valid > 0.0)
+    n = _compare_centre(flight, p, work, feature_count, use_position, use_baseline)
+    if n == 0:
+        return
+    measured = 3.0 * (flight.position_valid + flight.baseline_valid)
+    for i in range(feature_count):
+        measured = measured + 3.0 * flight.feature_valid[i]
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 15.0 + measured)
+    _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c)
+    _sum_noise(p, work, n, c)
+
+    # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
+    A, z, N, t, L9 = work.A, work.z, work.N, work.t, work.L9
+    pivot = cholesky(work.Rz, n, work.inverse_diagonal)
+    solve_right(A, 9, work.Rz, n, work.inverse_diagonal)
+    solve_left_vector(work.Rz, z, n, work.inverse_diagonal)
+    nis = z[0] * z[0]
+    for k in range(1, n):
+        nis = nis + z[k] * z[k]
+
+    # N = I + C C^T = K K^T, t = K^-1 C y
+    for j in range(9):
+        total = A[j, 0] * z[0]
+        for k in range(1, n):
+            total = total + A[j, k] * z[k]
+        t[j] = total
+    for i in range(0, 9, 3):
+        for j in range(0, i + 3, 3):
+            block = sum_of_outers(A, i, A, j, n)
+            store_block(N, i, j, add_to_diagonal(block, 1.0) if i == j else block)
+    cholesky(N, 9, work.inverse_diagonal)
+    solve_left_vector(N, t, 9, work.inverse_diagonal)
+    for j in range(9):
+        nis = nis - t[j] * t[j]
+
+    # L9 K^-T: with the columns last first it is the updated factor's, last first again
+    L = flight.L
+    for i in range(15):
+        for j in range(9):
+            L9[i, 8 - j] = L[i, j]
+    solve_right(L9, 15, N, 9, work.inverse_diagonal)
+
+    dx = work.h  # no longer needed
+    total = 0.0 * nis
+    for i in range(15):
+        shift = L9[i, 0] * t[0]
+        for j in range(1, 9):
+            shift = shift + L9[i, j] * t[j]
+        dx[i] = shift
+        total = total + shift
+    wanted = mask & (measured > 0.0)
+    ok = wanted & (pivot > 0.0) & is_finite(total)
+    keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))
+    keep3(flight.v_hat, ok, add(load3(flight.v_hat), (dx[V], dx[V + 1], dx[V + 2])))
+    R_BI = multiply(euler_to_dcm((dx[E], dx[E + 1], dx[E + 2])), load33(flight.R_hat))
+    keep33(flight.R_hat, ok, R_BI)
+    keep3(flight.b_a_hat, ok, add(load3(flight.b_a_hat), (dx[BA], dx[BA + 1], dx[BA + 2])))
+    keep3(flight.b_g_hat, ok, add(load3(flight.b_g_hat), (dx[BG], dx[BG + 1], dx[BG + 2])))
+    for i in range(15):
+        for j in range(min(i + 1, 9)):
+            L[i, j] = select(ok, L9[i, 8 - j], L[i, j])
+    flight.nis = select(ok, nis, flight.nis)
+    flight.nis_dimension = select(ok, measured, flight.nis_dimension)
+    failed = wanted & logical_not(ok)
+    flight.filter_status = select(
+        failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
+    )

@@ -1,0 +1,162 @@
+"""Sensors of one vehicle: each turns a true state into one measurement, with its own random stream."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym import validation as check
+from quad_gym.kernels import single
+from quad_gym.packing import params_record
+from quad_gym.params import (
+    CameraParams,
+    GnssParams,
+    ImuParams,
+    SensorSuite,
+    VehicleParams,
+)
+from quad_gym.records import FLIGHT
+from quad_gym.rotations import dcm_to_quaternion
+from quad_gym.vehicle import State, checked_state
+
+
+class _Sensor:
+    """A scalar flight record that is set to a true state and measured."""
+
+    def __init__(
+        self, suite: SensorSuite, rng: np.random.Generator, vehicle: VehicleParams | None = None
+    ) -> None:
+        if not isinstance(rng, np.random.Generator):
+            raise ValueError(f"rng must be a numpy.random.Generator, got {type(rng).__name__}")
+        self._params = params_record(VehicleParams() if vehicle is None else vehicle, suite)
+        self._flight = np.zeros(1, FLIGHT)
+        self._flight["key"] = rng.integers(0, 2**64, size=2, dtype=np.uint64)
+
+    def _place(self, position: ArrayLike, R_BI: ArrayLike) -> None:
+        place = check.array("position", position, (3,))
+        attitude = check.array("R_BI", R_BI, (3, 3))
+        self._flight["r"], self._flight["q"] = place, dcm_to_quaternion(attitude)
+        self._flight["instant"] += 1
+
+
+class GnssReceiver(_Sensor):
+    """Two GNSS antennas: noisy position of the primary one and noisy baseline of exact length.
+
+    Args:
+        params: Geometry and noise.
+        rng: Seeds the sensor's random stream.
+
+    Source: report sections 2.1 and 3.1.
+    """
+
+    def __init__(self, params: GnssParams, rng: np.random.Generator) -> None:
+        imu = ImuParams(rate=params.rate)
+        super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
+
+    def measure(
+        self, position: ArrayLike, R_BI: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """One measurement.
+
+        Args:
+            position: (3,) true position of the centre of mass in I [m].
+            R_BI: (3, 3) true attitude.
+
+        Returns:
+            (3,) primary antenna relative to the reference antenna and (3,) baseline, both in G [m].
+
+        Raises:
+            ValueError: If an argument has another shape or is not finite.
+        """
+        self._place(position, R_BI)
+        single.sense_gnss(self._flight, self._params)
+        return self._flight["gnss_position"][0].copy(), self._flight["gnss_baseline"][0].copy()
+
+
+class Camera(_Sensor):
+    """A pinhole camera that projects known features with pixel noise.
+
+    Args:
+        params: Geometry, noise and features.
+        rng: Seeds the sensor's random stream.
+
+    Source: report sections 2.2 and 3.2.
+    """
+
+    def __init__(self, params: CameraParams, rng: np.random.Generator) -> None:
+        imu, gnss = ImuParams(rate=params.rate), GnssParams(rate=params.rate)
+        super().__init__(SensorSuite(imu=imu, gnss=gnss, camera=params), rng)
+        self._features = len(params.features_I)
+
+    def measure(self, position: ArrayLike, R_BI: ArrayLike) -> NDArray[np.float64]:
+        """One image.
+
+        Args:
+            position: (3,) true position of the centre of mass in I [m].
+            R_BI: (3, 3) true attitude.
+
+        Returns:
+            (n_features, 2) pixels from the image's centre; NaN for a feature that is behind the camera or
+            whose noiseless projection lies outside the image.
+
+        Raises:
+            ValueError: If an argument has another shape or is not finite.
+        """
+        self._place(position, R_BI)
+        single.sense_features(self._flight, self._params, self._features)
+        seen = self._flight["feature_valid"][0, : self._features] > 0.0
+        return np.where(seen[:, np.newaxis], self._flight["pixels"][0, : self._features], np.nan)
+
+
+class Imu(_Sensor):
+    """Accelerometer and gyro with white noise and Gauss-Markov biases, which drift between samples.
+
+    Args:
+        params: Lever arm, noise and biases.
+        rng: Seeds the sensor's random stream.
+        vehicle: The vehicle whose forces the accelerometer feels.
+
+    Source: report sections 2.3 and 3.3.
+    """
+
+    def __init__(
+        self, params: ImuParams, rng: np.random.Generator, vehicle: VehicleParams | None = None
+    ) -> None:
+        gnss = GnssParams(rate=params.rate)
+        super().__init__(SensorSuite(imu=params, gnss=gnss, camera=None), rng, vehicle)
+        self._flight["b_a"] = rng.normal(0.0, params.accel_bias_sigma, 3)
+        self._flight["b_g"] = rng.normal(0.0, params.gyro_bias_sigma, 3)
+
+    @property
+    def accel_bias(self) -> NDArray[np.float64]:
+        """(3,) true accelerometer bias now [m/s^2]."""
+        return self._flight["b_a"][0].copy()
+
+    @property
+    def gyro_bias(self) -> NDArray[np.float64]:
+        """(3,) true gyro bias now [rad/s]."""
+        return self._flight["b_g"][0].copy()
+
+    def measure(
+        self, state: State, disturbance_I: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """One sample; the biases drift by one tick after it.
+
+        Args:
+            state: The true state, see `quad_gym.vehicle.STATE_SHAPES`.
+            disturbance_I: (3,) external force in I [N].
+
+        Returns:
+            (3,) angular rate in B [rad/s] and (3,) specific force in B [m/s^2].
+
+        Raises:
+            ValueError: If the state is incomplete, has other shapes or is not finite.
+        """
+        s = checked_state(state)
+        force = check.array("disturbance_I", disturbance_I, (3,))
+        self._place(s["position"], s["R_BI"])
+        f = self._flight
+        f["v"], f["w"], f["rotor_speeds"] = s["velocity"], s["body_rates"], s["rotor_speeds"]
+        f["disturbance"] = force
+        single.sense_imu(f, self._params)
+        gyro, accel = f["gyro"][0].copy(), f["accel"][0].copy()
+        single.step_biases(f, self._params)
+        return gyro, accel

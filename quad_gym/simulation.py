@@ -1,0 +1,272 @@
+"""`FlightBatch`: many flights of one configuration, flown together."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym import validation as check
+from quad_gym.kernels.batch import fly
+from quad_gym.packing import params_block, params_record, settings_record
+from quad_gym.params import (
+    ActionParams,
+    Clocks,
+    PDGains,
+    SensorSuite,
+    TaskParams,
+    VehicleParams,
+    pd_gains,
+    sensor_suite,
+    vehicle_params,
+)
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    RESULTS,
+    WIDTH,
+    WORK_BLOCK,
+    Autoreset,
+    Command,
+    Control,
+    Layout,
+    Source,
+    aligned_zeros,
+    field_of_flights,
+)
+from quad_gym.threads import resolve_threads, run_ranges
+
+_NO_BOUNDS = np.zeros(0)
+
+
+def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
+    """Draw the key of a flight's random stream, (2,) words."""
+    return rng.integers(0, 2**64, size=2, dtype=np.uint64, endpoint=False)
+
+
+def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
+    """Keys for flights seeded one by one as Gymnasium seeds environments; None takes fresh entropy."""
+    return np.array([stream_key(np.random.Generator(np.random.PCG64(seed))) for seed in seeds])
+
+
+class FlightBatch:
+    """N flights of one configuration, advanced together by compiled kernels.
+
+    A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does depends
+    on its seed and its actions alone, not on the batch's size, its order or the number of threads.
+
+    Args:
+        count: Number of flights.
+        vehicle: The vehicle, or the name of a preset.
+        sensors: The sensor suite, or the name of a preset.
+        gains: Gains of `Control.PD`, or the name of a preset.
+        actions: Scaling of actions and bandwidths of the inner loops.
+        task: Reference, start and endings.
+        source: What the controller sees.
+        control: What an action means; `Control.PD` flies by itself.
+        control_rate: Actions per second, a whole division of the IMU rate [Hz].
+        substeps: Runge-Kutta steps in a tick.
+        layout: What an observation holds.
+        include_covariance: Whether an observation holds the filter's standard deviations.
+        privileged: Whether an observation ends with the truth.
+        bounds: (low, high) of the observation, each (n,); None: the batch observes nothing.
+        autoreset: When a flight whose episode is over begins the next one.
+        run_filter: Whether sensors and filter run; None: where something needs them.
+        threads: Threads to use; None: as many as there are cores.
+        true_vehicle: The vehicle as it is, where it differs from the nominal one that the controller knows.
+        true_sensors: The sensors as they are, where they differ from what the filter believes.
+
+    Raises:
+        ValueError: If an argument makes no sense; nothing is allocated then.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        vehicle: VehicleParams | str = "lab",
+        sensors: SensorSuite | str = "lab",
+        gains: PDGains | str = "lab",
+        actions: ActionParams | None = None,
+        task: TaskParams | None = None,
+        source: Source = Source.ESTIMATE,
+        control: Control = Control.PD,
+        control_rate: float | None = None,
+        substeps: int = 1,
+        layout: Layout = Layout.RELATIVE,
+        include_covariance: bool = False,
+        privileged: bool = False,
+        bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+        autoreset: Autoreset = Autoreset.DISABLED,
+        run_filter: bool | None = None,
+        threads: int | None = None,
+        true_vehicle: VehicleParams | None = None,
+        true_sensors: SensorSuite | None = None,
+    ) -> None:
+        self.count = check.whole("count", count)
+        self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
+        self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
+        self.gains = pd_gains(gains) if isinstance(gains, str) else gains
+        self.actions = ActionParams() if actions is None else actions
+        self.task = TaskParams() if task is None else task
+        self.source, self.control = Source(source), Control(control)
+        rate = self.sensors.imu.rate if control_rate is None else control_rate
+        self.clocks = Clocks.of(self.sensors, rate, substeps)
+        self.threads = resolve_threads(threads)
+        true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
+        true_sensors = self.sensors if true_sensors is None else true_sensors
+        if true_sensors.imu.rate != self.sensors.imu.rate:
+            raise ValueError("true_sensors must have the IMU rate of sensors, as it is the tick")
+        if run_filter is None:
+            run_filter = include_covariance or self.source in (Source.ESTIMATE, Source.SENSORS)
+
+        model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
+        world = params_record(true_vehicle, true_sensors, self.gains, self.actions)
+        self._model, self._world = params_block(model), params_block(world)
+        self._settings = settings_record(
+            self.task,
+            self.clocks,
+            self.sensors,
+            source=self.source,
+            control=self.control,
+            layout=Layout(layout),
+            include_covariance=include_covariance,
+            privileged=privileged,
+            autoreset=Autoreset(autoreset),
+            run_filter=run_filter,
+        )
+        self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
+        self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
+        self._blocks["idle"].reshape(-1)[self.count :] = 1.0
+        self._blocks["needs_reset"] = 1.0
+        self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
+        self._actions = np.zeros((self.count, 4))
+        self._resets = np.zeros(self.count, np.uint8)
+        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
+        self.results = np.zeros((self.count, len(RESULTS)))
+
+    # ---- flying --------------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seeds: Sequence[int | None] | None = None,
+        keys: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+    ) -> NDArray[np.float32]:
+        """Begin new episodes.
+
+        Args:
+            seeds: One per flight, seeding it as Gymnasium seeds an environment; None in it: fresh entropy.
+            keys: (count, 2) keys of the random streams, instead of seeds. Without either, streams go on.
+            mask: (count,) bool: which flights; None: all.
+
+        Returns:
+            (count, n_observation) float32 observations of the present instant, of all flights.
+
+        Raises:
+            ValueError: If the arguments do not fit the number of flights; nothing has changed then.
+        """
+        chosen = self._checked_mask(mask)
+        if seeds is not None:
+            if len(seeds) != self.count:
+                raise ValueError(f"seeds must hold {self.count} seeds, got {len(seeds)}")
+            keys = stream_keys(seeds)
+        if keys is not None:
+            words = np.asarray(keys, np.uint64)
+            if words.shape != (self.count, 2):
+                raise ValueError(f"keys must have shape ({self.count}, 2), got {words.shape}")
+            for flight in np.flatnonzero(chosen):
+                block, lane = divmod(int(flight), WIDTH)
+                self._blocks["key"][block, :, lane] = words[flight]
+                self._blocks["instant"][block, lane] = 0
+                self._blocks["episode"][block, lane] = 0.0
+        self._resets[:] = chosen
+        return self._run(Command.RESET)
+
+    def step(self, actions: NDArray[Any] | None = None) -> NDArray[np.float32]:
+        """Fly one control period.
+
+        Args:
+            actions: (count, 4) in [-1, 1], already checked; None keeps the present ones.
+
+        Returns:
+            (count, n_observation) float32 observations; `results` holds the rest.
+        """
+        if actions is not None:
+            self._actions[:] = actions
+        return self._run(Command.STEP)
+
+    def _run(self, command: Command) -> NDArray[np.float32]:
+        observations = np.zeros((self.count, self._low.size), np.float32)
+
+        def part(number: int, first: int, last: int) -> None:
+            fly(
+                self._blocks,
+                first,
+                last,
+                int(command),
+                self._resets,
+                self._world,
+                self._model,
+                self._settings,
+                self._work[number],
+                self._actions,
+                self._low,
+                self._high,
+                observations,
+                self.final_observations,
+                self.results,
+            )
+
+        run_ranges(part, len(self._blocks), self.threads)
+        return observations
+
+    # ---- reading -------------------------------------------------------------------------------------
+
+    def read(self, name: str) -> NDArray[Any]:
+        """One field of all flights, such as "r" or "b_a_hat", as a new array (count, ...).
+
+        Raises:
+            ValueError: If there is no such field; see `records.FLIGHT_FIELDS`.
+        """
+        if name not in (FLIGHT_BLOCK.names or ()):
+            raise ValueError(f"name must be a field of a flight, got {name!r}")
+        return field_of_flights(self._blocks, name, self.count)
+
+    def result(self, name: str) -> NDArray[np.float64]:
+        """One column of `RESULTS` of the last step, as a new array (count,)."""
+        return self.results[:, RESULTS.index(name)].copy()
+
+    def covariance(self) -> NDArray[np.float64]:
+        """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
+        factor = self.read("L")
+        return factor @ factor.transpose(0, 2, 1)
+
+    # ---- keeping -------------------------------------------------------------------------------------
+
+    def snapshot(self) -> NDArray[Any]:
+        """A copy of all flights; `restore` brings them back to this instant bit for bit."""
+        return self._blocks.copy()
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Bring all flights back to a snapshot of this batch, or of one of the same size.
+
+        Raises:
+            ValueError: If the snapshot is of another size or kind.
+        """
+        if snapshot.dtype != FLIGHT_BLOCK or snapshot.shape != self._blocks.shape:
+            raise ValueError(
+                f"snapshot must be that of a batch of {len(self._blocks)} blocks, got shape "
+                f"{getattr(snapshot, 'shape', None)}"
+            )
+        self._blocks[:] = snapshot
+
+    def _checked_mask(self, mask: ArrayLike | None) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self.count, bool)
+        chosen = np.asarray(mask)
+        if chosen.shape != (self.count,) or chosen.dtype != bool:
+            raise ValueError(
+                f"mask must be {self.count} booleans, got shape {chosen.shape} of {chosen.dtype}"
+            )
+        return chosen

@@ -1,0 +1,80 @@
+"""The one place that knows of threads: shares a range of blocks among the cores.
+
+Kernels release the GIL, so plain threads run them side by side. A pool belongs to the process that made it:
+after a fork the child makes its own, and a batch that is pickled or copied takes none along.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from quad_gym import validation as check
+
+MIN_BLOCKS_PER_THREAD = 4
+"""Fewer blocks than this are not worth a hand-over to another thread (some 20 us)."""
+
+_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+
+
+def available_cores() -> int:
+    """The cores that this process may use, by its affinity and NUMBA_NUM_THREADS."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    quota = _cgroup_cores()
+    if quota is not None:
+        cores = min(cores, quota)
+    limit = os.environ.get("NUMBA_NUM_THREADS", "")
+    return max(1, min(cores, int(limit))) if limit.isdigit() and int(limit) > 0 else cores
+
+
+def _cgroup_cores() -> int | None:
+    """The whole cores that a container's quota allows, if there is one."""
+    try:
+        with open("/sys/fs/cgroup/cpu.max", encoding="ascii") as file:
+            quota, period = file.read().split()
+        return None if quota == "max" else max(1, int(quota) // int(period))
+    except (OSError, ValueError):
+        return None
+
+
+def resolve_threads(threads: int | None) -> int:
+    """`threads` checked, or the available cores where it is None.
+
+    Raises:
+        ValueError: If `threads` is not a whole number of at least 1.
+    """
+    return available_cores() if threads is None else check.whole("threads", threads)
+
+
+def _pool(workers: int) -> ThreadPoolExecutor:
+    key = (os.getpid(), workers)
+    if key not in _pools:
+        _pools[key] = ThreadPoolExecutor(workers, thread_name_prefix="quad_gym")
+    return _pools[key]
+
+
+def run_ranges(work: Callable[[int, int, int], None], blocks: int, threads: int) -> None:
+    """Call `work(part, first, last)` on ranges that together cover `blocks` blocks.
+
+    The first part runs in the calling thread. What the parts compute does not depend on how they are cut.
+
+    Args:
+        work: Called once per part, with the part's number and its range of blocks without the end.
+        blocks: How many blocks there are.
+        threads: The most parts to cut.
+    """
+    parts = max(1, min(threads, blocks // MIN_BLOCKS_PER_THREAD))
+    if parts == 1:
+        work(0, 0, blocks)
+        return
+    cuts = [blocks * part // parts for part in range(parts + 1)]
+    pool = _pool(threads - 1)
+    others: list[Future[None]] = [
+        pool.submit(work, part, cuts[part], cuts[part + 1]) for part in range(1, parts)
+    ]
+    try:
+        work(0, cuts[0], cuts[1])
+    finally:
+        for other in others:
+            other.result()

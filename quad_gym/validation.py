@@ -1,0 +1,83 @@
+"""Checks of what users pass in: each raises a ValueError that names the argument and says what came."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def number(name: str, value: Any, *, least: float = -math.inf, open_end: bool = False) -> float:
+    """`value` as a finite float that is at least `least` (above it, with `open_end`)."""
+    try:
+        result = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a number, got {value!r}") from None
+    if not math.isfinite(result):
+        raise ValueError(f"{name} must be finite, got {value!r}")
+    if result < least or (open_end and result == least):
+        relation = "greater than" if open_end else "at least"
+        raise ValueError(f"{name} must be {relation} {least:g}, got {value!r}")
+    return result
+
+
+def positive(name: str, value: Any) -> float:
+    """`value` as a finite float above zero."""
+    return number(name, value, least=0.0, open_end=True)
+
+
+def whole(name: str, value: Any, *, least: int = 1) -> int:
+    """`value` as an int that is at least `least`."""
+    if isinstance(value, bool) or int(number(name, value)) != value:
+        raise ValueError(f"{name} must be a whole number, got {value!r}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    return int(value)
+
+
+def choice(name: str, value: Any, choices: Sequence[str]) -> str:
+    """`value`, if it is one of `choices`."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+    return str(value)
+
+
+def array(
+    name: str, value: ArrayLike, shape: tuple[int | None, ...], *, allow_nan: bool = False
+) -> NDArray[np.float64]:
+    """`value` as a new float64 array of `shape` (None: any length), finite unless NaN is allowed."""
+    try:
+        result = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be an array of numbers, got {value!r}") from None
+    fits = result.ndim == len(shape) and all(
+        want is None or have == want for have, want in zip(result.shape, shape, strict=False)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+        raise ValueError(f"{name} must have shape {wanted}, got {result.shape}")
+    bad = np.isinf(result) if allow_nan else ~np.isfinite(result)
+    if bad.any():
+        raise ValueError(f"{name} must be finite, got {result[bad].flat[0]} among its values")
+    return result
+
+
+def vector(name: str, value: Any, length: int) -> tuple[float, ...]:
+    """`value` as a tuple of `length` finite floats."""
+    return tuple(array(name, value, (length,)).tolist())
+
+
+def matrix(name: str, value: Any, rows: int | None, columns: int) -> tuple[tuple[float, ...], ...]:
+    """`value` as a tuple of rows of finite floats."""
+    return tuple(tuple(row) for row in array(name, value, (rows, columns)).tolist())
+
+
+def ticks(name: str, rate: float, tick_rate: float) -> int:
+    """How many ticks lie between two events at `rate` [Hz]; they must be a whole number."""
+    ratio = tick_rate / positive(name, rate)
+    if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-9 * ratio:
+        raise ValueError(
+            f"{name} must divide the IMU rate of {tick_rate:g} Hz into whole ticks, got {rate:g} Hz"
+        )
+    return round(ratio)

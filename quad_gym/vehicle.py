@@ -1,0 +1,83 @@
+"""The quadrotor's equations of motion, for one state."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym import validation as check
+from quad_gym.kernels import single
+from quad_gym.packing import params_record
+from quad_gym.params import SensorSuite, VehicleParams
+
+State = Mapping[str, ArrayLike]
+STATE_SHAPES: dict[str, tuple[int, ...]] = {
+    "position": (3,),
+    "velocity": (3,),
+    "R_BI": (3, 3),
+    "body_rates": (3,),
+    "rotor_speeds": (4,),
+}
+"""Keys of a state and their shapes: [m] in I, [m/s] in I, body from inertial, [rad/s] in B, [rad/s]."""
+
+
+def checked_state(state: State) -> dict[str, NDArray[np.float64]]:
+    """A copy of a state as float64 arrays.
+
+    Raises:
+        ValueError: If a key is missing or unknown, or a value has another shape or is not finite.
+    """
+    if set(state) != set(STATE_SHAPES):
+        raise ValueError(f"state must have the keys {sorted(STATE_SHAPES)}, got {sorted(state)}")
+    return {
+        name: check.array(f"state[{name!r}]", state[name], shape)
+        for name, shape in STATE_SHAPES.items()
+    }
+
+
+def state_derivative(
+    state: State, voltages: ArrayLike, disturbance_I: ArrayLike, params: VehicleParams
+) -> dict[str, NDArray[np.float64]]:
+    """The time derivative of a quadrotor's state.
+
+    `dr/dt = v`, `m dv/dt = -m g e3 + z_I sum(F_i) + d - 0.5 Cd Ad rho |z_I . v| v`,
+    `dR_BI/dt = -[w x] R_BI`, `J dw/dt = N - w x J w`, `dW_i/dt = (cm ea_i - W_i) / taum`, with
+    `F_i = kF W_i^2` and `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`.
+
+    Args:
+        state: position (3,) [m] and velocity (3,) [m/s] in I, R_BI (3, 3), body_rates (3,) [rad/s] in B,
+            rotor_speeds (4,) [rad/s].
+        voltages: (4,) motor voltages [V], between 0 and the vehicle's largest.
+        disturbance_I: (3,) external force in I [N].
+        params: The vehicle.
+
+    Returns:
+        The derivative under the same keys, per second.
+
+    Raises:
+        ValueError: If an argument has another shape, is not finite, or a voltage is out of range.
+    """
+    s = checked_state(state)
+    ea = check.array("voltages", voltages, (4,))
+    d_I = check.array("disturbance_I", disturbance_I, (3,))
+    if (ea < 0.0).any() or (ea > params.max_voltage).any():
+        raise ValueError(f"voltages must be within [0, {params.max_voltage:g}] V, got {ea}")
+    a_I, dw_B = np.empty(3), np.empty(3)
+    single.body_accelerations(
+        s["R_BI"],
+        s["velocity"],
+        s["body_rates"],
+        s["rotor_speeds"],
+        d_I,
+        params_record(params, SensorSuite()),
+        a_I,
+        dw_B,
+    )
+    lag = params.motor_speed_per_volt * ea - s["rotor_speeds"]
+    return {
+        "position": s["velocity"],
+        "velocity": a_I,
+        "R_BI": -np.cross(s["body_rates"], s["R_BI"], axisb=0, axisc=0),
+        "body_rates": dw_B,
+        "rotor_speeds": lag / params.motor_time_constant,
+    }
