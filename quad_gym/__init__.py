@@ -1,5 +1,12 @@
-"""Gymnasium environments for quadrotor control on estimated state."""
+"""Gymnasium environments for quadrotor control on estimated state.
 
+Importing the package registers its environments with Gymnasium. The kernels are imported, and compiled or
+loaded from their cache, when the first environment is made.
+"""
+
+from typing import Any
+
+from quad_gym.envs import IDS, make_sb3_vec_env, register_all
 from quad_gym.params import (
     ActionParams,
     CameraParams,
@@ -19,7 +26,28 @@ from quad_gym.params import (
 
 __version__ = "0.1.0"
 
+register_all()
+
+
+def __getattr__(name: str) -> Any:
+    """What needs the kernels is imported on first use, so that the package imports fast."""
+    if name in _LAZY:
+        import importlib
+
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'quad_gym' has no attribute {name!r}")
+
+
+_LAZY = {
+    "FlightBatch": "quad_gym.simulation",
+    "QuadEnv": "quad_gym.envs.single",
+    "QuadVectorEnv": "quad_gym.envs.vector",
+    "UnscentedKalmanFilter": "quad_gym.estimation",
+    "observation_layout": "quad_gym.envs.spaces",
+}
+
 __all__ = [
+    "IDS",
     "ActionParams",
     "CameraParams",
     "Clocks",
@@ -32,6 +60,7 @@ __all__ = [
     "TaskParams",
     "VehicleParams",
     "__version__",
+    "make_sb3_vec_env",
     "pd_gains",
     "sensor_suite",
     "vehicle_params",

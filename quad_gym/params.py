@@ -543,8 +543,10 @@ _SUITES = {"lab": SensorSuite()}
 _VEHICLES = {"lab": VehicleParams()}
 _GAINS = {
     "lab": PDGains(),
+    # by random search for the smallest mean error over Hover, Circle, Lemniscate and RandomTrajectory, each
+    # relative to that of the laboratory's gains, flown on the estimate at 50 Hz with collective thrust and rates
     "tuned": PDGains(
-        position=10.0, velocity=5.0, attitude=(1.0, 0.95, 0.21), body_rates=(0.25, 0.25, 0.12)
+        position=10.6, velocity=3.44, attitude=(1.29, 1.29, 0.138), body_rates=(0.25, 0.25, 0.12)
     ),
 }
 
@@ -560,5 +562,5 @@ def vehicle_params(name: str) -> VehicleParams:
 
 
 def pd_gains(name: str) -> PDGains:
-    """PD gains by name: "lab", the report's, or "tuned", for the smallest mean error on the circle."""
+    """PD gains by name: "lab", the report's, or "tuned", for small errors on all tracking tasks."""
     return _GAINS[check.choice("gains", name, tuple(_GAINS))]

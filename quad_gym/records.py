@@ -175,6 +175,7 @@ FLIGHT_FIELDS = (
     Field("gate_count", (), "-", "gates of this course"),
     Field("gate_next", (), "-", "gates passed so far"),
     # the task
+    Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
     Field("action", (4,), "-", "the present action, in [-1, 1]"),
     Field("last_action", (4,), "-", "the action before it"),
     Field("idle", (), "0 or 1", "a lane that only pads the last block"),

@@ -138,6 +138,7 @@ class FlightBatch:
         self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
         self._blocks["idle"].reshape(-1)[self.count :] = 1.0
         self._blocks["needs_reset"] = 1.0
+        self._blocks["start_given"] = np.nan
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._actions = np.zeros((self.count, 4))
         self._resets = np.zeros(self.count, np.uint8)
@@ -152,6 +153,9 @@ class FlightBatch:
         seeds: Sequence[int | None] | None = None,
         keys: ArrayLike | None = None,
         mask: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        velocity: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
     ) -> NDArray[np.float32]:
         """Begin new episodes.
 
@@ -159,6 +163,8 @@ class FlightBatch:
             seeds: One per flight, seeding it as Gymnasium seeds an environment; None in it: fresh entropy.
             keys: (count, 2) keys of the random streams, instead of seeds. Without either, streams go on.
             mask: (count,) bool: which flights; None: all.
+            position, velocity: (3,) or (count, 3) in I, to start with instead of drawn ones [m], [m/s].
+            yaw: Scalar or (count,), likewise [rad].
 
         Returns:
             (count, n_observation) float32 observations of the present instant, of all flights.
@@ -167,6 +173,7 @@ class FlightBatch:
             ValueError: If the arguments do not fit the number of flights; nothing has changed then.
         """
         chosen = self._checked_mask(mask)
+        given = self._checked_start(position, velocity, yaw)
         if seeds is not None:
             if len(seeds) != self.count:
                 raise ValueError(f"seeds must hold {self.count} seeds, got {len(seeds)}")
@@ -181,7 +188,14 @@ class FlightBatch:
                 self._blocks["instant"][block, lane] = 0
                 self._blocks["episode"][block, lane] = 0.0
         self._resets[:] = chosen
-        return self._run(Command.RESET)
+        if given is None:
+            return self._run(Command.RESET)
+        lanes = np.full((len(self._blocks) * WIDTH, 7), np.nan)
+        lanes[: self.count] = given
+        self._blocks["start_given"] = lanes.reshape(-1, WIDTH, 7).transpose(0, 2, 1)
+        observations = self._run(Command.RESET)
+        self._blocks["start_given"] = np.nan
+        return observations
 
     def step(self, actions: NDArray[Any] | None = None) -> NDArray[np.float32]:
         """Fly one control period.
@@ -220,6 +234,15 @@ class FlightBatch:
 
         run_ranges(part, len(self._blocks), self.threads)
         return observations
+
+    def limit(self, max_steps: int) -> None:
+        """Truncate episodes after this many steps; 0: never."""
+        self._settings["max_steps"] = check.whole("max_steps", max_steps, least=0)
+
+    @property
+    def max_steps(self) -> int:
+        """Steps after which an episode is truncated; 0: never."""
+        return int(self._settings["max_steps"][0])
 
     # ---- reading -------------------------------------------------------------------------------------
 
@@ -260,6 +283,32 @@ class FlightBatch:
                 f"{getattr(snapshot, 'shape', None)}"
             )
         self._blocks[:] = snapshot
+
+    def _checked_start(
+        self, position: ArrayLike | None, velocity: ArrayLike | None, yaw: ArrayLike | None
+    ) -> NDArray[np.float64] | None:
+        """(count, 7) start values, NaN where they are to be drawn; None if all are."""
+        if position is None and velocity is None and yaw is None:
+            return None
+        given = np.full((self.count, 7), np.nan)
+        for name, value, columns in (
+            ("position", position, slice(0, 3)),
+            ("velocity", velocity, slice(3, 6)),
+            ("yaw", yaw, slice(6, 7)),
+        ):
+            if value is None:
+                continue
+            width = columns.stop - columns.start
+            numbers = np.asarray(value, np.float64)
+            if name == "yaw":
+                numbers = numbers[..., np.newaxis]
+            if numbers.shape not in ((width,), (self.count, width)):
+                shapes = "a number or (n,)" if name == "yaw" else "(3,) or (n, 3)"
+                raise ValueError(f"{name} must have shape {shapes}, got {np.shape(value)}")
+            if not np.isfinite(numbers).all():
+                raise ValueError(f"{name} must be finite, got {value!r}")
+            given[:, columns] = numbers
+        return given
 
     def _checked_mask(self, mask: ArrayLike | None) -> NDArray[np.bool_]:
         if mask is None:

@@ -1,6 +1,5 @@
 """The judge of a step: errors, reward and endings, from the true state alone."""
 
-
 from quad_gym.kernels.compilation import inlined, kernel
 from quad_gym.kernels.elementary import exp, is_finite
 from quad_gym.kernels.lanes import logical_not, select

@@ -127,6 +127,12 @@ def draw_reference(flight, settings, stream, mask):
         _draw_gates(flight, settings, stream, mask)
 
 
+@inlined
+def _given_or(given, drawn):
+    """A start value that the caller gave, or the drawn one where it is NaN."""
+    return select(given == given, given, drawn)
+
+
 @kernel
 def draw_start(flight, p, model, settings, stream, mask):
     """Set the true state at the start of an episode, where `mask`."""
@@ -155,6 +161,10 @@ def draw_start(flight, p, model, settings, stream, mask):
         roll, pitch = START_TILT_SIGMA * n_roll, START_TILT_SIGMA * n_pitch
         yaw = yaw + START_YAW_SIGMA * n_yaw
         rotor_speed = model.motor_gain * model.hover_voltage
+    given = flight.start_given
+    x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
+    v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
+    yaw = _given_or(given[6], yaw)
     keep3(flight.r, mask, (x, y, z))
     keep3(flight.v, mask, v_I)
     keep3(flight.w, mask, (zero, zero, zero))

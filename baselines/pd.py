@@ -1,0 +1,219 @@
+"""The report's PD controller, as a policy that computes its action from the observation alone."""
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import PDGains, pd_gains
+
+Array = NDArray[np.float64]
+
+
+class _Seen(NamedTuple):
+    """What the controller needs of an observation, all (n, 3) in the body frame."""
+
+    position_error: Array
+    velocity_error: Array
+    up: Array
+    heading: Array
+    body_rates: Array
+    reference_acceleration: Array
+    velocity: Array | None
+    """None where the observation does not hold it"""
+
+
+class PDPolicy:
+    """Proportional-derivative control of position and attitude (report section 4.2).
+
+    `F = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F/|F|`, thrust `F . z`; with `b = unit(z* x x*)` and
+    `R_E = [b x z*, b, z*]^T` in body axes, e its antisymmetric part, `N = K e - Kd w + w x J w`. How the
+    thrust and the torque become an action depends on the environment's `action`:
+
+    | `action` | what is commanded |
+    |---|---|
+    | "motor" | the voltages of the allocation, with the largest alpha that saturates no rotor |
+    | "wrench" | thrust and torque N |
+    | "ctbr" | thrust and the body rates (K/Kd) e at which N would be zero but for w x J w |
+    | "attitude" | thrust, roll and pitch of z*, yaw rate (K/Kd) e |
+    | "velocity" | the velocity whose error the inner loop turns into F (`layout="absolute"` only) |
+
+    Args:
+        env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be "estimate",
+            "truth" or "noisy".
+        gains: "lab" (the report's), "tuned", or `PDGains`.
+        max_position_error: Position errors are shortened to this length [m]; None: 1 m on `Waypoints`, which
+            are far apart, and unlimited elsewhere.
+
+    Raises:
+        ValueError: If the environment's observation or action does not admit the controller.
+    """
+
+    def __init__(
+        self, env: Any, gains: PDGains | str = "tuned", max_position_error: float | None = None
+    ) -> None:
+        flights = getattr(getattr(env, "unwrapped", env), "flights", None)
+        if flights is None:
+            raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
+        if flights.observation == "sensors":
+            raise ValueError(
+                'env must observe a state: observation="sensors" does not admit PD control'
+            )
+        if flights.action == "velocity" and flights.layout != "absolute":
+            raise ValueError(
+                'env must have layout="absolute" for action="velocity": the relative layout holds no velocity'
+            )
+        self.gains = pd_gains(gains) if isinstance(gains, str) else gains
+        if flights.action in ("motor", "wrench"):
+            self._warn_if_too_slow(flights.control_rate, flights.batch.vehicle.inertia)
+        self._vehicle = flights.batch.vehicle
+        self._scales = flights.batch.actions
+        self._action, self._absolute = flights.action, flights.layout == "absolute"
+        self._slices = {field.name: field.slice for field in flights.table}
+        on_course = flights.task.kind == "waypoints"
+        self._reach = (
+            (1.0 if on_course else np.inf) if max_position_error is None else max_position_error
+        )
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], None]:
+        """The action for an observation, with the signature of Stable-Baselines3.
+
+        Args:
+            observation: (n_observation,) or (n, n_observation), or the Dict with "policy".
+            state, episode_start, deterministic: Not used; the controller has no memory and no noise.
+
+        Returns:
+            (4,) or (n, 4) action in [-1, 1], and None.
+        """
+        flat = observation["policy"] if isinstance(observation, dict) else observation
+        rows = np.atleast_2d(np.asarray(flat, np.float64))
+        action = self._act(self._read(rows))
+        clipped = np.clip(action, -1.0, 1.0).astype(np.float32)
+        return (clipped if np.ndim(flat) == 2 else clipped[0]), None
+
+    def _warn_if_too_slow(self, control_rate: float, inertia: Any) -> None:
+        """The sampled rate loop w+ = (1 - Kd/(J f)) w is unstable beyond Kd/(J f) = 2."""
+        gain = float(np.max(np.array(self.gains.body_rates) / np.diag(inertia))) / control_rate
+        if gain > 1.0:
+            warnings.warn(
+                f"PD control of torques needs a control rate of {gain * control_rate:.0f} Hz with these "
+                f"gains, this environment has {control_rate:g} Hz: expect it to shake or crash",
+                UserWarning,
+                stacklevel=3,
+            )
+
+    # ---- from observation to force and torque ----------------------------------------------------------
+
+    def _read(self, rows: Array) -> _Seen:
+        part = {name: rows[:, where] for name, where in self._slices.items()}
+        if not self._absolute:
+            return _Seen(*(part[name] for name in _Seen._fields[:-1]), velocity=None)
+        R_BI = part["R_BI"].reshape(-1, 3, 3)
+
+        def in_body(v_I: Array) -> Array:
+            return np.einsum("nij,nj->ni", R_BI, v_I)
+
+        return _Seen(
+            position_error=in_body(part["reference_position"] - part["position"]),
+            velocity_error=in_body(part["reference_velocity"] - part["velocity"]),
+            up=R_BI[:, :, 2],
+            heading=in_body(part["reference_heading"]),
+            body_rates=part["body_rates"],
+            reference_acceleration=in_body(part["reference_acceleration"]),
+            velocity=in_body(part["velocity"]),
+        )
+
+    def _force(self, seen: _Seen) -> Array:
+        """(n, 3) wanted force F in B [N]."""
+        g, vehicle = self.gains, self._vehicle
+        distance = np.linalg.norm(seen.position_error, axis=1, keepdims=True)
+        error = seen.position_error * np.minimum(1.0, self._reach / np.maximum(distance, 1e-9))
+        return (
+            g.position * error
+            + g.velocity * seen.velocity_error
+            + vehicle.mass * (vehicle.gravity * seen.up + seen.reference_acceleration)
+        )
+
+    @staticmethod
+    def _attitude_error(z_wanted: Array, heading: Array) -> Array:
+        """(n, 3) antisymmetric part of R_E, twice the rotation vector for small errors [-]."""
+        b = np.cross(z_wanted, heading)
+        b /= np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-9)
+        a = np.cross(b, z_wanted)
+        return np.stack(
+            [b[:, 2] - z_wanted[:, 1], z_wanted[:, 0] - a[:, 2], a[:, 1] - b[:, 0]], axis=1
+        )
+
+    # ---- from force and torque to action ---------------------------------------------------------------
+
+    def _act(self, seen: _Seen) -> Array:
+        vehicle, g = self._vehicle, self.gains
+        weight = vehicle.mass * vehicle.gravity
+        F = self._force(seen)
+        z_wanted = F / np.maximum(np.linalg.norm(F, axis=1, keepdims=True), 1e-9)
+        e = self._attitude_error(z_wanted, seen.heading)
+        thrust = F[:, 2]
+        rates = np.array(g.attitude) / np.maximum(g.body_rates, 1e-9) * e
+        collective = (thrust / weight - 1.0)[:, np.newaxis]
+
+        if self._action == "ctbr":
+            return np.hstack([collective, rates / self._scales.rate_scale])
+        if self._action == "attitude":
+            return np.hstack([collective, self._tilt(z_wanted, seen.up), self._yaw(rates)])
+        if self._action == "velocity":
+            return np.hstack([self._velocity(F, seen), self._yaw(rates)])
+        w = seen.body_rates
+        gyroscopic = np.cross(w, w @ np.array(vehicle.inertia).T)
+        torque = np.array(g.attitude) * e - np.array(g.body_rates) * w + gyroscopic
+        if self._action == "wrench":
+            return np.hstack([collective, torque / vehicle.hover_torques])
+        return self._voltages(thrust, torque) / vehicle.hover_voltage - 1.0
+
+    def _yaw(self, rates: Array) -> Array:
+        return rates[:, 2:] / self._scales.rate_scale[2]
+
+    @staticmethod
+    def _level_axes(up: Array) -> tuple[Array, Array]:
+        """Ahead and left, level, in B."""
+        ahead = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+        return ahead, np.cross(up, ahead)
+
+    def _tilt(self, z_wanted: Array, up: Array) -> Array:
+        """(n, 2) roll and pitch of the wanted thrust axis, scaled."""
+        ahead, left = self._level_axes(up)
+        x, y = (z_wanted * ahead).sum(axis=1), (z_wanted * left).sum(axis=1)
+        z = (z_wanted * up).sum(axis=1)
+        roll, pitch = np.arctan2(-y, z), np.arcsin(np.clip(x, -1.0, 1.0))
+        return np.stack([roll, pitch], axis=1) / self._scales.tilt_scale
+
+    def _velocity(self, F: Array, seen: _Seen) -> Array:
+        """(n, 3) level velocity whose error times m k_v is F less the weight, scaled."""
+        vehicle = self._vehicle
+        if seen.velocity is None:
+            raise ValueError('action="velocity" needs layout="absolute"')
+        wanted = seen.velocity + (F - vehicle.mass * vehicle.gravity * seen.up) / (
+            vehicle.mass * self._scales.velocity_bandwidth
+        )
+        ahead, left = self._level_axes(seen.up)
+        level = [(wanted * axis).sum(axis=1) for axis in (ahead, left, seen.up)]
+        return np.stack(level, axis=1) / self._scales.velocity_scale
+
+    def _voltages(self, thrust: Array, torque: Array) -> Array:
+        """(n, 4) motor voltages by the laboratory's allocation."""
+        vehicle = self._vehicle
+        limit = vehicle.max_rotor_force
+        allocation = np.linalg.inv(vehicle.effectiveness)
+        base = np.minimum(thrust, 3.6 * limit)[:, np.newaxis] * allocation[:, 0]
+        turn = torque @ allocation[:, 1:].T
+        room = (limit - base) / np.where(turn > 0.0, turn, np.inf)
+        alpha = np.where(turn > 0.0, room, 1.0).min(axis=1, keepdims=True).clip(0.0, 1.0)
+        forces = np.maximum(base + alpha * turn, 0.0)
+        return np.sqrt(forces / vehicle.thrust_coefficient) / vehicle.motor_speed_per_volt

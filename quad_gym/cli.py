@@ -1,0 +1,158 @@
+"""Command lines of scripts: a frozen dataclass of options becomes an argument parser.
+
+A script declares its options once, with their types, defaults and help texts::
+
+    @dataclass(frozen=True)
+    class Args:
+        seeds: int = option(1000, "number of flights")
+        camera: bool = option(True, "measure with the camera")
+
+    args = parse(Args, description=__doc__)
+
+Wrong options end the program with one line on stderr and exit code 2, as is the custom on Unix.
+"""
+
+import argparse
+import dataclasses
+import sys
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn, TypeVar
+
+USAGE_ERROR = 2
+"""Exit code of a program that was called in a way that makes no sense."""
+
+_Args = TypeVar("_Args")
+
+
+def option(default: Any, text: str, *, group: str | None = None) -> Any:
+    """A field of a dataclass that is an option of the command line.
+
+    Args:
+        default: Value where the option is not given; None: the help text says what happens then.
+        text: What the option does, with its unit.
+        group: Heading in the help above this option and those after it.
+    """
+    return dataclasses.field(default=default, metadata={"text": text, "group": group})
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE_ERROR, f"{self.prog}: error: {message} (--help lists the options)\n")
+
+
+def parser_of(
+    kind: type[Any], *, description: str | None = None, program: str | None = None
+) -> argparse.ArgumentParser:
+    """An argument parser with one option for every field of a dataclass.
+
+    Types may be int, float, str, bool (an option and its `--no-` twin), a path, a Literal (a
+    choice), a tuple of fixed length, or one of these or None.
+    """
+    parser = _Parser(
+        prog=program,
+        description=description,
+        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(
+            prog, max_help_position=30, width=100
+        ),
+        allow_abbrev=False,
+    )
+    hints = typing.get_type_hints(kind)
+    group: Any = parser
+    for field in dataclasses.fields(kind):
+        if field.metadata.get("group"):
+            group = parser.add_argument_group(field.metadata["group"])
+        group.add_argument(
+            "--" + field.name.replace("_", "-"),
+            default=field.default,
+            help=_help_of(field),
+            **_how_to_parse(hints[field.name]),
+        )
+    return parser
+
+
+def parse(
+    kind: type[_Args],
+    argv: Sequence[str] | None = None,
+    *,
+    description: str | None = None,
+    program: str | None = None,
+) -> _Args:
+    """Options from the command line as an instance of a dataclass.
+
+    A ValueError of the dataclass's own checks ends the program as a wrong option does.
+
+    Args:
+        kind: Dataclass whose fields were made by `option`.
+        argv: Arguments without the program's name; None: those of the process.
+        description: Text above the options in the help.
+        program: Name of the program in its messages; None: that of the process.
+    """
+    parser = parser_of(kind, description=description, program=program)
+    values = vars(parser.parse_args(argv))
+    try:
+        return kind(**values)
+    except ValueError as error:
+        parser.error(str(error))
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Turn what is raised while options are checked into one line on stderr and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(USAGE_ERROR) from None
+
+
+def _help_of(field: "dataclasses.Field[Any]") -> str:
+    text = str(field.metadata.get("text", "")).replace("%", "%%")
+    if field.default is None or field.default is dataclasses.MISSING:
+        return text
+    default = field.default
+    if isinstance(default, bool):
+        default = "--" + ("" if default else "no-") + field.name.replace("_", "-")
+    elif isinstance(default, tuple):
+        default = " ".join(str(value) for value in default)
+    return f"{text} (default: {default})"
+
+
+_PLACEHOLDERS = {int: "N", float: "X", str: "NAME"}
+
+
+def _how_to_parse(hint: Any) -> dict[str, Any]:
+    """Keywords of `add_argument` for a type."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        (hint,) = (part for part in typing.get_args(hint) if part is not type(None))
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if hint is bool:
+        return {"action": argparse.BooleanOptionalAction}
+    if origin is typing.Literal:
+        return {"choices": parts, "type": type(parts[0])}
+    if origin is tuple:
+        placeholder = _PLACEHOLDERS.get(parts[0], "PATH")
+        return {
+            "nargs": len(parts),
+            "type": parts[0],
+            "metavar": placeholder,
+            "action": _Tuple,
+        }
+    return {"type": hint, "metavar": _PLACEHOLDERS.get(hint, "PATH")}
+
+
+class _Tuple(argparse.Action):
+    """Keeps several values as a tuple, as frozen dataclasses like them."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        setattr(namespace, self.dest, tuple(values))

@@ -1,0 +1,176 @@
+"""`QuadVecEnv`: many flights as a Stable-Baselines3 vector environment."""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from quad_gym.envs.configuration import ENDINGS, checked_actions, start_options
+from quad_gym.envs.configuration import Flights
+from quad_gym.envs.single import keys_of
+from quad_gym.envs.spaces import action_space
+from quad_gym.records import RESULTS, Autoreset
+
+_COLUMN = {name: column for column, name in enumerate(RESULTS)}
+
+
+class QuadVecEnv(VecEnv):
+    """N flights for Stable-Baselines3, with the `Monitor`'s episode records built in.
+
+    An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with the return
+    "r", the length "l", the time "t" since construction [s] and the mean true position error "e" [m].
+
+    Args:
+        num_envs: Number of flights.
+        task: The kind of task.
+        threads: Threads to use; None: as many as there are cores.
+        keywords: Those of `QuadEnv`.
+
+    Raises:
+        ValueError: If a keyword is unknown or makes no sense.
+    """
+
+    def __init__(
+        self, num_envs: int, task: str, *, threads: int | None = None, **keywords: Any
+    ) -> None:
+        self.flights = Flights(task, num_envs, Autoreset.SAME_STEP, threads=threads, **keywords)
+        self.render_mode = None
+        self.metadata: dict[str, Any] = {"render_modes": []}
+        self.spec: Any = None
+        self._began = time.monotonic()
+        self._seeded = False
+        self._pending: np.ndarray | None = None
+        super().__init__(num_envs, self.flights.space, action_space())
+
+    def reset(self) -> Any:
+        """Begin an episode in every flight, with the seeds and options set before."""
+        seeds = list(self._seeds)
+        batch = self.flights.batch
+        start = self._start_values()
+        if not self._seeded or any(seed is not None for seed in seeds):
+            chosen = np.array([not self._seeded or seed is not None for seed in seeds])
+            observations = batch.reset(keys=keys_of(seeds), mask=chosen, **start)
+            if not chosen.all():
+                observations = batch.reset(mask=~chosen, **start)
+            self._seeded = True
+        else:
+            observations = batch.reset(**start)
+        self.reset_infos = self._infos_of_start()
+        self._reset_seeds()
+        self._reset_options()
+        return self.flights.split(observations)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions of the coming step, (n, 4) in [-1, 1]; beyond is clipped."""
+        self._pending = checked_actions(actions, (self.num_envs, 4))
+
+    def step_wait(self) -> Any:
+        """Fly the step; return observations, rewards, dones and one `info` per flight."""
+        if self._pending is None:
+            raise RuntimeError("call step_async() before step_wait()")
+        batch = self.flights.batch
+        observations = batch.step(self._pending)
+        self._pending = None
+        results = batch.results
+        done = (results[:, 1] + results[:, 2]) > 0.0
+        infos: list[dict[str, Any]] = [
+            {
+                "position_error": position,
+                "estimation_error": estimation,
+                "TimeLimit.truncated": False,
+            }
+            for position, estimation in results[:, 4:6].tolist()
+        ]
+        for i in np.flatnonzero(done):
+            infos[i] |= self._episode_end(i, results[i])
+        rewards = results[:, 0].astype(np.float32)
+        return self.flights.split(observations), rewards, done, infos
+
+    def _episode_end(self, i: int, row: np.ndarray) -> dict[str, Any]:
+        """What the last `info` of an episode adds."""
+        final = self.flights.batch.final_observations[i].copy()
+        steps = int(row[_COLUMN["episode_steps"]])
+        return {
+            "terminal_observation": self.flights.split(final),
+            "TimeLimit.truncated": bool(row[2] > 0.0),
+            "ending": ENDINGS[int(row[3])],
+            "filter_status": int(row[6]),
+            "gates_passed": int(row[_COLUMN["gates_passed"]]),
+            "episode": {
+                "r": float(row[_COLUMN["episode_return"]]),
+                "l": steps,
+                "t": round(time.monotonic() - self._began, 6),
+                "e": float(row[_COLUMN["episode_error_sum"]]) / steps,
+            },
+        }
+
+    def close(self) -> None:
+        """Nothing is held open; closing twice is fine."""
+
+    # ---- the rest of the interface -------------------------------------------------------------------
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of this environment, once per index: the flights share it."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute; as the flights share it, only for all of them.
+
+        Raises:
+            ValueError: If `indices` leaves flights out, or there is no such attribute.
+        """
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError("indices must be None: the flights share their attributes")
+        if not hasattr(self, attr_name):
+            raise ValueError(
+                f"attr_name must be an attribute of the environment, got {attr_name!r}"
+            )
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Call a method of this environment once, and return its result once per index."""
+        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(
+        self,
+        wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]],
+        indices: VecEnvIndices = None,
+    ) -> list[bool]:
+        """No flight is wrapped; but the records of a `Monitor` are there."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """No flight renders."""
+        return [None for _ in range(self.num_envs)]
+
+    def _start_values(self) -> dict[str, Any]:
+        """The options of all flights as start values."""
+        chosen = [start_options(options) for options in self._options]
+        names = {name for options in chosen for name in options}
+        if not names:
+            return {}
+        if any(set(options) != names for options in chosen):
+            raise ValueError("options must hold the same names for every environment")
+        return {name: np.array([options[name] for options in chosen]) for name in names}
+
+    def _infos_of_start(self) -> list[dict[str, Any]]:
+        batch = self.flights.batch
+        errors: Iterable[tuple[float, float]] = zip(
+            batch.read("position_error").tolist(),
+            batch.read("estimation_error").tolist(),
+            strict=True,
+        )
+        return [{"position_error": p, "estimation_error": e} for p, e in errors]

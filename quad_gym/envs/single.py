@@ -1,0 +1,228 @@
+"""`QuadEnv`: one flight as a Gymnasium environment."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+
+from quad_gym.envs.configuration import ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.spaces import action_space
+from quad_gym.records import RESULTS, Autoreset
+from quad_gym.simulation import stream_key
+
+_COLUMN = {name: column for column, name in enumerate(RESULTS)}
+
+
+class QuadEnv(gymnasium.Env[Any, np.ndarray]):
+    """A quadrotor that is controlled on estimated state.
+
+    ## Description
+    A quadrotor (0.78 kg, four rotors with a lag of 0.05 s) flies a reference. GNSS, camera and IMU measure it
+    200 times a second, an unscented Kalman filter fuses them, and the controller sees what `observation`
+    says: by default the filter's estimate. The reward, the endings and `info` use the true state.
+
+    | id | reference | start | time limit |
+    |---|---|---|---|
+    | `QuadGym/Hover-v0` | a point 4 m from the origin, 1 m high, looking at the origin | hovering near it | 10 s |
+    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the centre | at rest on the ground below it, rotors stopped | 10 s |
+    | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
+    | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
+    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin | hovering near the origin | 20 s |
+
+    ## Observation space
+    A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and `layout="relative"`:
+
+    | slice | name | meaning | unit | frame |
+    |---|---|---|---|---|
+    | 0:3 | position_error | reference less position | m | B |
+    | 3:6 | velocity_error | reference less velocity | m/s | B |
+    | 6:9 | up | the vertical | - | B |
+    | 9:12 | heading | the horizontal direction that body x is to point in | - | B |
+    | 12:15 | body_rates | angular rate | rad/s | B |
+    | 15:18 | reference_acceleration | | m/s^2 | B |
+    | 18:21 | preview_1 | reference in 0.2 s (next gate) less the present one | m | B |
+    | 21:24 | preview_2 | reference in 0.4 s (the gate after) less the present one | m | B |
+    | 24:28 | last_action | | - | - |
+
+    The body frame is the one that the controller's source believes in. `layout="absolute"` gives position,
+    velocity, rotation matrix, biases and reference in the inertial frame; `observation="sensors"` gives the
+    raw measurements of the step with flags (a measurement that was not taken is zero, its flag too), and has
+    that layout only. `quad_gym.observation_layout(...)` returns any of these tables, with bounds;
+    observations are held within them.
+
+    ## Action space
+    `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal vehicle. The inner loops
+    run at every tick (200 Hz) on what the controller sees, its gyro included.
+
+    | `action` | a[0] | a[1], a[2], a[3] |
+    |---|---|---|
+    | `"ctbr"` (default) | thrust m g (1 + a) | body rates 6, 6, 3 rad/s |
+    | `"motor"` | each: voltage = hover voltage (1 + a), at most 12 V | |
+    | `"wrench"` | thrust m g (1 + a) | torque 1.6, 1.6, 0.19 N m |
+    | `"attitude"` | thrust m g (1 + a) | roll, pitch 45 deg, yaw rate 3 rad/s |
+    | `"velocity"` | velocity ahead 5 m/s | to the left, up 5 m/s; yaw rate 3 rad/s |
+
+    ## Reward
+    Per second of flight, with the position error e [m], the alignment h of body x with the wanted heading
+    (1: aligned), the change of the action da and the body rates w:
+
+        exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
+
+    times the control period. At most 1.6 a second; a circle flown perfectly returns 16. `Waypoints` gives 1 a
+    metre of progress toward the next gate and 1 a gate instead of the two exponentials.
+
+    ## Episode end
+    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by more than 100 degrees, below
+    -0.5 m, or through the last gate. Truncated: at the time limit, or when the filter has failed
+    (`info["filter_status"]`). `info["ending"]` says which.
+
+    ## Start
+    "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped, level, looking
+    as wanted. "hover": hovering at rest, with standard deviations of 0.3 m, 0.2 rad in yaw, 0.03 rad in tilt.
+    The filter starts from its first fix in either. `reset(options={"position": (3,), "velocity": (3,), "yaw":
+    rad})` sets any of these for one episode.
+
+    ## Info
+    `position_error` and `estimation_error` [m], both against the true position; `ending`; `filter_status`,
+    0 while all is well; `gates_passed`.
+
+    ## Arguments
+    Args:
+        task: The kind of task; `gymnasium.make` fills it in from the id.
+        observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the converged
+            filter's errors), or "sensors".
+        action: "ctbr", "motor", "wrench", "attitude" or "velocity".
+        layout: "relative" or "absolute".
+        include_covariance: Append the square roots of the diagonal of the filter's covariance.
+        privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
+        sensors, vehicle: Presets by name, or parameter objects.
+        actions: Scales of the actions and bandwidths of the inner loops.
+        camera: Whether there is a camera.
+        feature_noise_across: "predicted" or "measured", see `quad_gym.FilterParams`. None: as a given
+            `SensorSuite` has it; for a suite by name "predicted", as the report's own "measured" makes some 6
+            circles in 1,000 crash in their first second.
+        control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
+        imu_rate, gnss_rate, camera_rate: Rates in place of the suite's [Hz].
+        substeps: Runge-Kutta steps in a tick.
+        max_episode_steps: Time limit in steps, in place of `duration`.
+        true_vehicle, true_sensors: What really flies, where controller and filter believe something else.
+        radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt, max_speed,
+            max_acceleration, gate_count, gate_radius, preview: The task; see `quad_gym.TaskParams`.
+
+    ## Version history
+    - v0: first version.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's attribute
+
+    def __init__(self, task: str = "circle", **keywords: Any) -> None:
+        self.render_mode = keywords.pop("render_mode", None)
+        if self.render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {self.render_mode!r}")
+        self.flights = Flights(task, 1, Autoreset.DISABLED, threads=1, **keywords)
+        self._limited = keywords.get("max_episode_steps") is not None
+        self.observation_space = self.flights.space
+        self.action_space = action_space()
+        self._seeded = self._over = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: Seeds the flight's random stream; None goes on with the present one.
+            options: "position", "velocity" (3,) and "yaw" to start with, any of them.
+
+        Returns:
+            The observation and `info`.
+
+        Raises:
+            ValueError: If an option is unknown or makes no sense.
+        """
+        start = start_options(options)
+        super().reset(seed=seed)
+        self._honour_spec()
+        batch = self.flights.batch
+        if seed is not None or not self._seeded:
+            keys = stream_key(self.np_random)[np.newaxis]
+            observations = batch.reset(keys=keys, **start)
+            self._seeded = True
+        else:
+            observations = batch.reset(**start)
+        self._over = False
+        return self.flights.split(observations[0]), {
+            "position_error": float(batch.read("position_error")[0]),
+            "estimation_error": float(batch.read("estimation_error")[0]),
+            "ending": ENDINGS[0],
+            "filter_status": int(batch.read("filter_status")[0]),
+            "gates_passed": 0,
+        }
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Fly one control period.
+
+        Args:
+            action: (4,) in [-1, 1]; beyond is clipped.
+
+        Returns:
+            Observation, reward, terminated, truncated, `info`.
+
+        Raises:
+            ValueError: If the action has another shape or is not finite; nothing has been flown then.
+            gymnasium.error.ResetNeeded: If the episode is over.
+        """
+        numbers = checked_actions(action, (4,))
+        if self._over or not self._seeded:
+            raise gymnasium.error.ResetNeeded(
+                "call reset() before step(): there is no episode to fly"
+            )
+        batch = self.flights.batch
+        observations = batch.step(numbers)
+        row = batch.results[0].tolist()
+        terminated, truncated = row[1] > 0.0, row[2] > 0.0
+        self._over = terminated or truncated
+        return (
+            self.flights.split(observations[0]),
+            row[0],
+            terminated,
+            truncated,
+            {
+                "position_error": row[4],
+                "estimation_error": row[5],
+                "ending": ENDINGS[int(row[3])],
+                "filter_status": int(row[6]),
+                "gates_passed": int(row[10]),
+            },
+        )
+
+    def close(self) -> None:
+        """Nothing is held open; closing twice is fine."""
+
+    def _honour_spec(self) -> None:
+        """A limit that was given to `gymnasium.make` replaces the task's duration."""
+        steps = getattr(self.spec, "max_episode_steps", None)
+        if steps is not None and not self._limited:
+            self.flights.limit(steps)
+            self._limited = True
+
+
+def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
+    """One seed per flight: seed + i for a number, the list itself for a list.
+
+    Raises:
+        ValueError: If a list has another length.
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, (int, np.integer)):
+        return [int(seed) + i for i in range(count)]
+    if len(seed) != count:
+        raise ValueError(f"seed must be a number or {count} numbers, got {len(seed)} of them")
+    return [None if s is None else int(s) for s in seed]
+
+
+def keys_of(seeds: list[int | None]) -> np.ndarray:
+    """Keys of the random streams, drawn as `reset(seed=...)` of single environments would draw them."""
+    return np.array([stream_key(seeding.np_random(seed)[0]) for seed in seeds])

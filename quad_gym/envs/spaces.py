@@ -1,0 +1,194 @@
+"""Observation and action spaces, and the table of what an observation holds.
+
+`observation_layout` is the one description of an observation; the kernel `observe` writes in this order.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from quad_gym import validation as check
+from quad_gym.records import Control, Layout, Source
+
+OBSERVATIONS = {
+    "estimate": Source.ESTIMATE,
+    "truth": Source.TRUTH,
+    "noisy": Source.NOISY,
+    "sensors": Source.SENSORS,
+}
+"""Values of the keyword `observation`."""
+
+ACTIONS = {
+    "ctbr": Control.CTBR,
+    "motor": Control.MOTOR,
+    "wrench": Control.WRENCH,
+    "attitude": Control.ATTITUDE,
+    "velocity": Control.VELOCITY,
+}
+"""Values of the keyword `action`."""
+
+LAYOUTS = {"relative": Layout.RELATIVE, "absolute": Layout.ABSOLUTE}
+"""Values of the keyword `layout`."""
+
+STATE_NAMES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+"""The blocks of the estimated state, three numbers each."""
+
+
+class ObservationField(NamedTuple):
+    """One named part of an observation."""
+
+    name: str
+    slice: slice
+    """where it lies in the (flat) observation"""
+    unit: str
+    frame: str
+    """I: inertial, B: body, "-": none"""
+    low: float
+    high: float
+    """bounds that observations are held within"""
+
+
+_RELATIVE = (
+    ("position_error", 3, "m", "B", 100.0),
+    ("velocity_error", 3, "m/s", "B", 100.0),
+    ("up", 3, "-", "B", 1.0),
+    ("heading", 3, "-", "B", 1.0),
+    ("body_rates", 3, "rad/s", "B", 200.0),
+    ("reference_acceleration", 3, "m/s^2", "B", 100.0),
+    ("preview_1", 3, "m", "B", 100.0),
+    ("preview_2", 3, "m", "B", 100.0),
+)
+_REFERENCE = (
+    ("reference_position", 3, "m", "I", 1000.0),
+    ("reference_velocity", 3, "m/s", "I", 100.0),
+    ("reference_acceleration", 3, "m/s^2", "I", 100.0),
+    ("reference_heading", 3, "-", "I", 1.0),
+    ("preview_1", 3, "m", "I", 1000.0),
+    ("preview_2", 3, "m", "I", 1000.0),
+)
+_ABSOLUTE = (
+    ("position", 3, "m", "I", 1000.0),
+    ("velocity", 3, "m/s", "I", 200.0),
+    ("R_BI", 9, "-", "I to B", 1.0),
+    ("accel_bias", 3, "m/s^2", "B", 100.0),
+    ("gyro_bias", 3, "rad/s", "B", 10.0),
+    ("body_rates", 3, "rad/s", "B", 200.0),
+    *_REFERENCE,
+)
+_PRIVILEGED = (
+    ("true_position_error", 3, "m", "B", 100.0),
+    ("true_velocity_error", 3, "m/s", "B", 100.0),
+    ("true_up", 3, "-", "B", 1.0),
+    ("true_heading", 3, "-", "B", 1.0),
+    ("true_body_rates", 3, "rad/s", "B", 200.0),
+    ("true_accel_bias", 3, "m/s^2", "B", 100.0),
+    ("true_gyro_bias", 3, "rad/s", "B", 10.0),
+    ("rotor_speeds", 4, "of hover", "-", 20.0),
+)
+_LAST_ACTION = ("last_action", 4, "-", "-", 1.0)
+_FLAG = 0.0
+"""A bound of zero marks a flag, in [0, 1]."""
+
+
+def _sensor_fields(feature_count: int) -> tuple[tuple[str, int, str, str, float], ...]:
+    fields = [
+        ("gyro", 3, "rad/s", "B", 200.0),
+        ("accel", 3, "m/s^2", "B", 1000.0),
+        ("gnss_position", 3, "m", "I", 1000.0),
+        ("gnss_position_valid", 1, "0 or 1", "-", _FLAG),
+        ("gnss_baseline", 3, "-", "I", 1.0),
+        ("gnss_baseline_valid", 1, "0 or 1", "-", _FLAG),
+    ]
+    for k in range(1, feature_count + 1):
+        fields.append((f"feature_{k}", 2, "half images", "C", 2.0))
+        fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
+    return (*fields, *_REFERENCE)
+
+
+def _table(
+    parts: tuple[tuple[str, int, str, str, float], ...], first: int
+) -> list[ObservationField]:
+    table = []
+    for name, size, unit, frame, bound in parts:
+        low, high = (0.0, 1.0) if bound == _FLAG else (-bound, bound)
+        table.append(ObservationField(name, slice(first, first + size), unit, frame, low, high))
+        first += size
+    return table
+
+
+def observation_layout(
+    observation: str = "estimate",
+    layout: str = "relative",
+    *,
+    include_covariance: bool = False,
+    privileged: bool = False,
+    feature_count: int = 2,
+) -> tuple[ObservationField, ...]:
+    """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
+
+    Args:
+        observation: The environment's `observation`; "sensors" has a layout of its own.
+        layout: The environment's `layout`.
+        include_covariance: Whether the filter's 15 standard deviations follow.
+        privileged: Whether the truth ends the table; its slices go on counting, though the environment
+            returns that part under a key of its own.
+        feature_count: Features of the camera, for "sensors".
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: If `observation` or `layout` is unknown.
+    """
+    check.choice("observation", observation, tuple(OBSERVATIONS))
+    check.choice("layout", layout, tuple(LAYOUTS))
+    parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
+    if observation == "sensors":
+        parts = _sensor_fields(feature_count)
+    parts = (*parts, _LAST_ACTION)
+    if include_covariance:
+        units = ("m", "m/s", "rad", "m/s^2", "rad/s")
+        frames = ("I", "I", "B", "B", "B")
+        parts += tuple(
+            (f"{name}_sigma", 3, unit, frame, 1000.0)
+            for name, unit, frame in zip(STATE_NAMES, units, frames, strict=True)
+        )
+    if privileged:
+        parts += _PRIVILEGED
+    return tuple(_table(parts, 0))
+
+
+def layout_bounds(
+    table: tuple[ObservationField, ...],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(low, high) of every number of an observation, (n,) each."""
+    low, high = np.empty(table[-1].slice.stop), np.empty(table[-1].slice.stop)
+    for field in table:
+        low[field.slice], high[field.slice] = field.low, field.high
+    return low, high
+
+
+def observation_space(table: tuple[ObservationField, ...]) -> spaces.Box | spaces.Dict:
+    """The space of a table: a Box, or a Dict of two where it has a privileged part."""
+    low, high = (bound.astype(np.float32) for bound in layout_bounds(table))
+    split = policy_size(table)
+    policy = spaces.Box(low[:split], high[:split], dtype=np.float32)
+    if split == len(low):
+        return policy
+    truth = spaces.Box(low[split:], high[split:], dtype=np.float32)
+    return spaces.Dict({"policy": policy, "privileged": truth})
+
+
+def policy_size(table: tuple[ObservationField, ...]) -> int:
+    """How many numbers of an observation are for the policy; the rest is privileged."""
+    return next(
+        (field.slice.start for field in table if field.name == _PRIVILEGED[0][0]),
+        table[-1].slice.stop,
+    )
+
+
+def action_space() -> spaces.Box:
+    """Four numbers in [-1, 1]."""
+    return spaces.Box(-1.0, 1.0, (4,), np.float32)

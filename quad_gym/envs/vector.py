@@ -1,0 +1,226 @@
+"""`QuadVectorEnv`: many flights as a Gymnasium vector environment."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from quad_gym.envs.configuration import ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.single import keys_of, seeds_of
+from quad_gym.envs.spaces import action_space
+from quad_gym.records import RESULTS, Autoreset
+
+_MODES = {
+    AutoresetMode.NEXT_STEP: Autoreset.NEXT_STEP,
+    AutoresetMode.SAME_STEP: Autoreset.SAME_STEP,
+    AutoresetMode.DISABLED: Autoreset.DISABLED,
+}
+_ENDING_NAMES = np.array(ENDINGS, dtype=object)
+_COLUMN = {name: column for column, name in enumerate(RESULTS)}
+
+
+class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
+    """N flights in one compiled call; flight i seeded with seed + i flies what a `QuadEnv` so seeded flies.
+
+    Observations, actions, rewards, endings and keywords are those of `QuadEnv`. `info` holds arrays (n,) of
+    the same names, each with its mask `_name`.
+
+    Args:
+        num_envs: Number of flights.
+        task: The kind of task; `gymnasium.make_vec` fills it in from the id.
+        autoreset_mode: "NextStep" (default), "SameStep" or "Disabled", or the enum.
+        threads: Threads to use; None: as many as there are cores.
+        keywords: Those of `QuadEnv`.
+
+    Raises:
+        ValueError: If a keyword is unknown or makes no sense.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: str = "circle",
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        threads: int | None = None,
+        **keywords: Any,
+    ) -> None:
+        self.render_mode = keywords.pop("render_mode", None)
+        if self.render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {self.render_mode!r}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        mode = _MODES[self.autoreset_mode]
+        self.flights = Flights(task, num_envs, mode, threads=threads, **keywords)
+        self.num_envs = self.flights.batch.count
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = self.flights.space
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._seeded = False
+        self._over = np.zeros(self.num_envs, bool)
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes.
+
+        Args:
+            seed: A number s seeds flight i with s + i; a list has one per flight; None goes on.
+            options: "reset_mask" (n,) bool: which flights; "position", "velocity" (3,) or (n, 3) and "yaw" to
+                start with.
+
+        Returns:
+            Observations of all flights, and `info` of those that were reset.
+
+        Raises:
+            ValueError: If an option is unknown or makes no sense, or the seeds do not fit.
+            TypeError: If `reset_mask` is no array of booleans.
+        """
+        options = dict(options or {})
+        mask = self._checked_mask(options.pop("reset_mask", None))
+        start = start_options(options)
+        seeds = seeds_of(seed, self.num_envs)
+        if isinstance(seed, (int, np.integer)):
+            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(int(seed))
+        batch = self.flights.batch
+        if not self._seeded:
+            observations = batch.reset(keys=keys_of(seeds), **start)
+            self._seeded = True
+        else:
+            chosen = mask & np.array([s is not None for s in seeds])
+            goes_on = mask & ~chosen
+            if chosen.any():
+                filled = [s if chosen[i] else 0 for i, s in enumerate(seeds)]
+                observations = batch.reset(keys=keys_of(filled), mask=chosen, **start)
+            if goes_on.any():
+                observations = batch.reset(mask=goes_on, **start)
+        self._over[mask] = False
+        infos: dict[str, Any] = {
+            "position_error": batch.read("position_error"),
+            "estimation_error": batch.read("estimation_error"),
+            "ending": np.full(self.num_envs, ENDINGS[0], object),
+            "filter_status": batch.read("filter_status").astype(np.int64),
+            "gates_passed": np.zeros(self.num_envs, np.int64),
+        }
+        return self.flights.split(observations), _masked(infos, mask)
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Fly one control period.
+
+        Args:
+            actions: (n, 4) in [-1, 1]; beyond is clipped.
+
+        Returns:
+            Observations, rewards, terminated, truncated, `info`: new arrays.
+
+        Raises:
+            ValueError: If the actions have another shape or are not finite; nothing has been flown then.
+            gymnasium.error.ResetNeeded: Before the first reset, or with autoreset disabled if an episode is
+                over.
+        """
+        numbers = checked_actions(actions, (self.num_envs, 4))
+        if not self._seeded:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        disabled = self.autoreset_mode == AutoresetMode.DISABLED
+        if disabled and self._over.any():
+            raise gymnasium.error.ResetNeeded(
+                f"reset environment {int(np.flatnonzero(self._over)[0])} before step(): its episode is over"
+            )
+        batch = self.flights.batch
+        began = self._over if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
+        observations = batch.step(numbers)
+        terminated, truncated = batch.result("terminated") > 0.0, batch.result("truncated") > 0.0
+        self._over = terminated | truncated
+        everyone = np.ones(self.num_envs, bool)
+        infos = _masked(self._step_infos(began), everyone)
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
+            infos = self._with_finals(infos)
+        return (
+            self.flights.split(observations),
+            batch.result("reward"),
+            terminated,
+            truncated,
+            infos,
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing is held open; closing twice is fine."""
+
+    def _step_infos(self, began: NDArray[np.bool_] | None) -> dict[str, Any]:
+        """What the judge says of the step; of the new episode where one began in its stead."""
+        batch = self.flights.batch
+        infos: dict[str, Any] = {
+            "position_error": batch.result("position_error"),
+            "estimation_error": batch.result("estimation_error"),
+            "ending": _ENDING_NAMES[batch.result("ending").astype(np.intp)],
+            "filter_status": batch.result("filter_status").astype(np.int64),
+            "gates_passed": batch.result("gates_passed").astype(np.int64),
+        }
+        if began is not None and began.any():
+            self._replace_by_start(infos, began)
+        return infos
+
+    def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.bool_]) -> None:
+        batch = self.flights.batch
+        for name in ("position_error", "estimation_error", "filter_status"):
+            infos[name][began] = batch.read(name)[began]
+        infos["ending"][began] = ENDINGS[0]
+        infos["gates_passed"][began] = 0
+
+    def _with_finals(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Move what ended into `final_obs` and `final_info`, and describe the new episodes instead."""
+        over = self._over.copy()
+        finals = self.flights.batch.final_observations
+        final_obs = np.full(self.num_envs, None, object)
+        for i in np.flatnonzero(over):
+            final_obs[i] = self.flights.split(finals[i].copy())
+        final_info = {
+            name: np.where(over, values, _blank(values))
+            for name, values in infos.items()
+            if not name.startswith("_")
+        }
+        self._replace_by_start(infos, over)
+        infos |= {
+            "final_obs": final_obs,
+            "_final_obs": over,
+            "final_info": _masked(final_info, over),
+            "_final_info": over.copy(),
+        }
+        return infos
+
+    def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+            raise TypeError(
+                "options['reset_mask'] must be an array of booleans, got "
+                f"{getattr(mask, 'dtype', type(mask).__name__)}"
+            )
+        if mask.shape != (self.num_envs,):
+            raise ValueError(
+                f"options['reset_mask'] must have shape ({self.num_envs},), got {mask.shape}"
+            )
+        if not mask.any():
+            raise ValueError("options['reset_mask'] must choose at least one environment")
+        return mask
+
+
+def _blank(values: NDArray[Any]) -> Any:
+    return None if values.dtype == object else values.dtype.type(0)
+
+
+def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Every array beside the mask of the environments that it speaks of."""
+    masked = dict(infos)
+    for name in infos:
+        masked[f"_{name}"] = mask.copy()
+    return masked

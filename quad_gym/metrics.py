@@ -1,0 +1,275 @@
+"""How well flights followed their reference, and how honest their filters were.
+
+Errors of flights are arrays whose last axis is time; numbers over seeds are arrays with one entry
+a flight. The filter's error has 15 coordinates in the order of its covariance: position, velocity,
+attitude (the 3-1-2 Euler angles e with R_BI = R(e) R_hat), accelerometer bias, gyro bias; each is
+truth minus estimate.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.rotations import dcm_to_euler
+
+STATE_DIMENSION = 15
+"""Coordinates of the filter's error."""
+
+Floats = NDArray[np.float64]
+
+
+class Interval(NamedTuple):
+    """A range with a confidence or probability attached to it."""
+
+    low: float
+    high: float
+
+    def holds(self, value: float) -> bool:
+        """Whether a value lies in the range, its ends included."""
+        return self.low <= value <= self.high
+
+
+@dataclass(frozen=True)
+class TrackingSummary:
+    """Mean errors of flights."""
+
+    mean: Floats
+    """(...,) mean over the flight [unit of the error]"""
+    last_half: Floats
+    """(...,) mean over its last half, where the start is forgotten [unit of the error]"""
+
+
+def tracking_summary(errors: ArrayLike) -> TrackingSummary:
+    """Mean error of each flight, over all of it and over its last half.
+
+    Args:
+        errors: (..., n) error at n instants that are equally far apart, such as metres.
+
+    Returns:
+        Means, (...,) each. The last half of an odd number of instants has the middle one.
+
+    Raises:
+        ValueError: If there are no instants.
+    """
+    values = np.asarray(errors, np.float64)
+    if values.ndim == 0 or values.shape[-1] == 0:
+        raise ValueError(f"errors must have shape (..., n) with n >= 1, got {values.shape}")
+    half = values[..., values.shape[-1] // 2 :]
+    return TrackingSummary(mean=values.mean(axis=-1), last_half=half.mean(axis=-1))
+
+
+class RunningSummary:
+    """A `TrackingSummary` that is built up instant by instant and keeps nothing but sums.
+
+    Args:
+        flights: Number of flights.
+        instants: Number of instants that a whole flight has.
+    """
+
+    def __init__(self, flights: int, instants: int) -> None:
+        self._half = instants // 2
+        self._instant = 0
+        self._sums, self._counts = np.zeros((2, flights)), np.zeros((2, flights))
+
+    def add(self, error: ArrayLike, counts: ArrayLike = True) -> None:
+        """Take in the next instant.
+
+        Args:
+            error: (flights,) errors.
+            counts: (flights,) whether each of them counts; those of flights that have ended do not.
+        """
+        counted = np.broadcast_to(np.asarray(counts, bool), self._sums[0].shape)
+        value = np.where(counted, np.asarray(error, np.float64), 0.0)
+        parts = slice(0, 2 if self._instant >= self._half else 1)
+        self._sums[parts] += value
+        self._counts[parts] += counted
+        self._instant += 1
+
+    def result(self) -> TrackingSummary:
+        """Means so far, (flights,) each; NaN where nothing counted."""
+        means = np.full(self._sums.shape, np.nan)
+        np.divide(self._sums, self._counts, out=means, where=self._counts > 0)
+        return TrackingSummary(mean=means[0], last_half=means[1])
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How a number is distributed over seeds; all NaN where there are no seeds."""
+
+    count: int
+    """seeds"""
+    mean: float
+    sd: float
+    """standard deviation with n - 1; NaN for a single seed"""
+    median: float
+    low: float
+    """5th percentile"""
+    high: float
+    """95th percentile"""
+    largest: float
+
+
+def spread(values: ArrayLike) -> Spread:
+    """Mean, standard deviation and percentiles of one number per seed.
+
+    Args:
+        values: (n,) one number a seed; n may be 0.
+    """
+    x = np.asarray(values, np.float64).reshape(-1)
+    if x.size == 0:
+        return Spread(0, *[float("nan")] * 6)
+    # subtracting one of them first makes the spread of equal numbers exactly zero
+    sd = float((x - x[0]).std(ddof=1)) if x.size > 1 else float("nan")
+    low, median, high = (float(p) for p in np.percentile(x, (5.0, 50.0, 95.0)))
+    mean = float(x[0] + (x - x[0]).mean())
+    return Spread(x.size, mean, sd, median, low, high, float(x.max()))
+
+
+def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats:
+    """The filter's error in the coordinates of its covariance.
+
+    Args:
+        truth: "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI" (..., 3, 3);
+            position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
+        estimate: Likewise, by the filter.
+
+    Returns:
+        (..., 15) truth minus estimate, the attitude as Euler angles e [rad] with R_BI = R(e) R_hat.
+
+    Raises:
+        KeyError: If a quantity is missing.
+    """
+
+    def difference(name: str) -> Floats:
+        return np.asarray(truth[name], np.float64) - np.asarray(estimate[name], np.float64)
+
+    R_hat = np.asarray(estimate["R_BI"], np.float64)
+    e = dcm_to_euler(np.asarray(truth["R_BI"], np.float64) @ np.swapaxes(R_hat, -1, -2))
+    parts = (difference("position"), difference("velocity"), e)
+    return np.concatenate([*parts, difference("accel_bias"), difference("gyro_bias")], axis=-1)
+
+
+def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
+    """Normalised estimation error squared, e^T P^-1 e; about n on average for an honest filter.
+
+    Args:
+        errors: (..., n) errors of the estimate.
+        covariances: (..., n, n) covariances that the filter claims, in the same coordinates.
+
+    Returns:
+        (...,) without unit; chi-square distributed with n degrees of freedom if the filter is
+        consistent.
+
+    Raises:
+        ValueError: If the shapes do not fit or a covariance is singular.
+
+    Source: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
+    Navigation, 2001, section 5.4.
+    """
+    e, P = np.asarray(errors, np.float64), np.asarray(covariances, np.float64)
+    if e.ndim < 1 or P.shape[-2:] != (e.shape[-1], e.shape[-1]):
+        raise ValueError(
+            "covariances must have shape (..., n, n) for errors of shape (..., n), "
+            f"got {P.shape} and {e.shape}"
+        )
+    try:
+        weighted = np.linalg.solve(P, e[..., np.newaxis])[..., 0]
+    except np.linalg.LinAlgError:
+        raise ValueError("covariances must not be singular") from None
+    return np.asarray((e * weighted).sum(axis=-1))
+
+
+def chi_square_band(dimension: int, count: int = 1, probability: float = 0.95) -> Interval:
+    """Where the mean of `count` independent NEES values lies if the filter is consistent.
+
+    Args:
+        dimension: Degrees of freedom of one value, 15 for the whole state.
+        count: How many independent values the mean is of.
+        probability: Of the mean to lie in the band; what is left is split evenly.
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+    _require_probability(probability)
+    if dimension < 1 or count < 1:
+        raise ValueError(f"dimension and count must be at least 1, got {dimension} and {count}")
+    from scipy.stats import chi2
+
+    tail = (1.0 - probability) / 2
+    low, high = chi2.ppf((tail, 1.0 - tail), dimension * count) / count
+    return Interval(float(low), float(high))
+
+
+def bootstrap_interval(values: ArrayLike, *, probability: float = 0.95, seed: int = 0) -> Interval:
+    """Bootstrap confidence interval of a mean, for samples of any distribution.
+
+    Bias-corrected and accelerated up to 5,000 values; beyond, where that costs too much and a mean
+    is as good as normal, by percentiles.
+
+    Args:
+        values: (n,) independent numbers, at least two; for a paired comparison, their differences.
+        probability: Confidence.
+        seed: Of the resampling, so that the interval can be reproduced.
+
+    Raises:
+        ValueError: If there are fewer than two values or one is not finite.
+    """
+    _require_probability(probability)
+    x = np.asarray(values, np.float64).reshape(-1)
+    if x.size < 2 or not np.isfinite(x).all():
+        raise ValueError(f"values must be at least two finite numbers, got {x.size}")
+    if np.ptp(x) == 0.0:
+        return Interval(float(x[0]), float(x[0]))
+    from scipy.stats import bootstrap
+
+    found = bootstrap(
+        (x,),
+        np.mean,
+        confidence_level=probability,
+        method="BCa" if x.size <= 5000 else "percentile",
+        n_resamples=4999,
+        batch=max(1, 1_000_000 // x.size),
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return Interval(float(found.low), float(found.high))
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """How a number differs between two cases that met the same seeds."""
+
+    spread: Spread
+    """of first less second, seed by seed"""
+    interval: Interval | None
+    """bootstrap 95 % interval of the mean difference; None for fewer than two seeds"""
+
+    @property
+    def significant(self) -> bool:
+        """Whether the interval excludes no difference at all."""
+        return self.interval is not None and not self.interval.holds(0.0)
+
+
+def paired_difference(first: ArrayLike, second: ArrayLike) -> PairedDifference:
+    """Compare two cases seed by seed, so that what a seed does to both drops out.
+
+    Args:
+        first: (n,) one number a seed; a seed with a NaN is left out.
+        second: (n,) likewise, of the same seeds.
+
+    Raises:
+        ValueError: If the shapes differ.
+    """
+    a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    if a.shape != b.shape or a.ndim != 1:
+        raise ValueError(f"first and second must have shape (n,), got {a.shape} and {b.shape}")
+    differences = (a - b)[np.isfinite(a - b)]
+    interval = bootstrap_interval(differences) if differences.size > 1 else None
+    return PairedDifference(spread=spread(differences), interval=interval)
+
+
+def _require_probability(probability: float) -> None:
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"probability must be between 0 and 1, got {probability}")

@@ -1,0 +1,372 @@
+"""Figures of flights: path from above, height, and error over time.
+
+Every `draw_*` puts one picture on a matplotlib Axes, so pictures can be combined; every `*_figure`
+makes a figure of one. Figures are made without pyplot: no window opens, nothing needs to be closed,
+and a server without a display will do. Colours are those of Okabe and Ito, which people with a
+colour vision deficiency can tell apart.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
+"""Flown; heading; further curves."""
+INK, GREY, PALE = "#222222", "#767676", "#DDDDDD"
+"""Text and the reference; axes; grid."""
+
+_STYLE = {
+    "font.size": 9.0,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "text.color": INK,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 9.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": PALE,
+    "grid.linewidth": 0.6,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 1.8,
+    "lines.linewidth": 1.6,
+    "lines.solid_capstyle": "round",
+    "figure.dpi": 100.0,
+    "savefig.dpi": 200.0,
+    "svg.hashsalt": "quad_gym",
+}
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """One flight, instant by instant."""
+
+    time: Floats
+    """(n,) since the start [s]"""
+    position: Floats
+    """(n, 3) true position of the centre of mass in I [m]"""
+    heading: Floats
+    """(n, 2) horizontal components of the body x axis in I [-]"""
+    reference: Floats
+    """(n, 3) position of the reference in I [m]"""
+    error: Floats
+    """(n,) distance of the true position from the reference [m]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """A range of an error over many flights, instant by instant."""
+
+    low: Floats
+    """(n,) [m]"""
+    high: Floats
+    """(n,) [m]"""
+    label: str
+    """what the range is, for the legend"""
+
+
+def require_matplotlib() -> None:
+    """Check that figures can be made.
+
+    Raises:
+        ImportError: If matplotlib is missing; the message says how to install it.
+    """
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        raise ImportError(
+            'Figures need matplotlib, which is not installed: pip install "quad-gym[plot]"'
+        ) from None
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Use the house style for what is drawn and saved inside."""
+    require_matplotlib()
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE):
+        yield
+
+
+def heading_ticks(
+    time: ArrayLike, position: ArrayLike, heading: ArrayLike, *, every: float, length: float
+) -> Floats:
+    """Short lines from the path in the direction of the body x axis, seen from above.
+
+    Args:
+        time: (n,) increasing [s].
+        position: (n, 2) or (n, 3) in I [m]; only x and y count.
+        heading: (n, 2) horizontal components of the body x axis; its length does not matter.
+        every: Time between ticks [s]; the first stands at the start.
+        length: Of a tick [m].
+
+    Returns:
+        (m, 2, 2) first and second end of each tick, in x and y of I [m].
+    """
+    t, here = np.asarray(time, np.float64), np.asarray(position, np.float64)[:, :2]
+    direction = np.asarray(heading, np.float64)
+    # half an instant's grace, so that rounding of times loses no tick
+    grace = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
+    wanted = np.arange(t[0], t[-1] + grace, every)
+    chosen = np.minimum(np.searchsorted(t, wanted - grace), t.size - 1)
+    unit = direction[chosen] / np.linalg.norm(direction[chosen], axis=1, keepdims=True)
+    return np.stack([here[chosen], here[chosen] + length * unit], axis=1)
+
+
+def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5) -> None:
+    """The flight from above, with the heading as ticks; both axes have one scale.
+
+    Args:
+        axes: matplotlib Axes.
+        trace: The flight.
+        tick_every: Time between heading ticks [s].
+    """
+    from matplotlib.collections import LineCollection
+
+    both = np.concatenate([trace.position, trace.reference])[:, :2]
+    low, high = both.min(axis=0), both.max(axis=0)
+    extent = float(max(high - low))
+    ticks = heading_ticks(
+        trace.time, trace.position, trace.heading, every=tick_every, length=0.075 * extent
+    )
+    axes.plot(*trace.reference[:, :2].T, color=INK, linestyle=(0, (4, 3)), linewidth=1.0)
+    axes.add_collection(LineCollection(list(ticks), colors=VERMILLION, linewidths=1.3))
+    axes.plot(*trace.position[:, :2].T, color=BLUE)
+    start = trace.position[0, :2]
+    axes.plot(*start, "o", color=BLUE, markerfacecolor="white", markersize=7, markeredgewidth=1.6)
+    margin = 0.09 * extent
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, east [m]")
+    axes.set_ylabel("y, north [m]")
+    axes.legend(
+        handles=[
+            _line("flown", BLUE),
+            _line("reference", INK, dashed=True),
+            _line(f"body x axis every {tick_every:g} s", VERMILLION, width=1.3),
+            _marker("start"),
+        ],
+        loc="center",
+    )
+
+
+def draw_height(axes: Any, trace: Trace) -> None:
+    """Height over time, with the reference.
+
+    Args:
+        axes: matplotlib Axes.
+        trace: The flight.
+    """
+    axes.plot(trace.time, trace.reference[:, 2], color=INK, linestyle=(0, (4, 3)), linewidth=1.0)
+    axes.plot(trace.time, trace.position[:, 2], color=BLUE)
+    _mark_start(axes, trace.time[0], trace.position[0, 2])
+    axes.set_xlim(trace.time[0] - 0.01 * np.ptp(trace.time), trace.time[-1])
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("height z [m]")
+    axes.legend(
+        handles=[_line("flown", BLUE), _line("reference", INK, dashed=True), _marker("start")],
+        loc="lower right",
+    )
+
+
+def draw_error(
+    axes: Any,
+    trace: Trace,
+    band: Band | None = None,
+    *,
+    label: str = "one flight",
+    limits: tuple[float, float] | None = None,
+) -> None:
+    """Distance from the reference over time, on a logarithmic scale.
+
+    Args:
+        axes: matplotlib Axes.
+        trace: The flight.
+        band: Range over many flights, drawn behind it.
+        label: Name of the flight in the legend.
+        limits: Lowest and highest error shown [m], to compare figures; None: as it comes.
+    """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    handles = [_line(label, BLUE, width=1.1)]
+    if band is not None:
+        # a line of its own, or a band without width would not be seen
+        axes.fill_between(trace.time, band.low, band.high, color=ORANGE, alpha=0.45, linewidth=1.2)
+        handles.append(_patch(band.label, ORANGE))
+    axes.plot(trace.time, trace.error, color=BLUE, linewidth=1.1)
+    axes.set_yscale("log")
+    axes.set_xlim(trace.time[0], trace.time[-1])
+    axes.set_ylim(limits or error_limits([trace], [band] if band else []))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="minor", axis="y", linewidth=0.3)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("position error [m]")
+    axes.legend(handles=handles, loc="upper right")
+
+
+def error_limits(traces: list[Trace], bands: list[Band]) -> tuple[float, float]:
+    """Limits of a logarithmic error axis that suit several figures [m].
+
+    A flight may pass through its reference; its lowest percent does not stretch the axis.
+    """
+    curves = [trace.error for trace in traces] + [band.low for band in bands]
+    low = min(float(np.nanpercentile(curve, 1.0)) for curve in curves)
+    tops = [trace.error for trace in traces] + [band.high for band in bands]
+    high = max(float(np.nanmax(curve)) for curve in tops)
+    return 0.8 * max(low, 1e-4 * high), 1.5 * high
+
+
+def path_figure(trace: Trace, title: str = "") -> Any:
+    """A figure of `draw_path`, as a matplotlib Figure."""
+    return _one_picture((5.0, 5.0), title, lambda axes: draw_path(axes, trace))
+
+
+def height_figure(trace: Trace, title: str = "") -> Any:
+    """A figure of `draw_height`, as a matplotlib Figure."""
+    return _one_picture((6.0, 3.4), title, lambda axes: draw_height(axes, trace))
+
+
+def error_figure(
+    trace: Trace,
+    band: Band | None = None,
+    title: str = "",
+    *,
+    label: str = "one flight",
+    limits: tuple[float, float] | None = None,
+) -> Any:
+    """A figure of `draw_error`, as a matplotlib Figure."""
+    return _one_picture(
+        (6.0, 3.4), title, lambda axes: draw_error(axes, trace, band, label=label, limits=limits)
+    )
+
+
+def overview_figure(
+    trace: Trace,
+    errors: dict[str, tuple[Trace, Band | None]],
+    *,
+    title: str = "",
+    label: str = "one flight",
+) -> Any:
+    """One flight at a glance: its path, its height, and errors over time on one scale.
+
+    Args:
+        trace: The flight whose path and height are drawn.
+        errors: Flight and band of each picture of errors, by its title.
+        title: Of the path.
+        label: Name of a flight in the legends.
+
+    Returns:
+        matplotlib Figure.
+    """
+    pairs = list(errors.values())
+    limits = error_limits([one for one, _ in pairs], [band for _, band in pairs if band])
+    with house_style():
+        from matplotlib.figure import Figure
+
+        rows = 1 + len(errors)
+        figure = Figure(figsize=(9.6, 1.0 + 1.9 * rows), layout="constrained")
+        grid = figure.add_gridspec(rows, 2, width_ratios=(1.25, 1.0))
+        axes = figure.add_subplot(grid[:, 0])
+        draw_path(axes, trace)
+        axes.set_title(title)
+        axes = figure.add_subplot(grid[0, 1])
+        draw_height(axes, trace)
+        axes.set_title("Height")
+        for row, (name, (one, band)) in enumerate(errors.items(), start=1):
+            axes = figure.add_subplot(grid[row, 1])
+            draw_error(axes, one, band, label=label, limits=limits)
+            axes.set_title(name)
+    return figure
+
+
+def save_figure(figure: Any, stem: Path | str) -> list[Path]:
+    """Write a figure as PNG and SVG; the same figure gives the same bytes.
+
+    Args:
+        figure: matplotlib Figure.
+        stem: Path without the ending.
+
+    Returns:
+        The two files.
+    """
+    files = [Path(f"{stem}.{ending}") for ending in ("png", "svg")]
+    with house_style():
+        for file in files:
+            metadata = {"Date": None} if file.suffix == ".svg" else {"Software": None}
+            figure.savefig(file, metadata=metadata)
+    return files
+
+
+def _one_picture(size: tuple[float, float], title: str, draw: Callable[[Any], None]) -> Any:
+    with house_style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.add_subplot()
+        draw(axes)
+        axes.set_title(title)
+    return figure
+
+
+def _mark_start(axes: Any, x: float, y: float) -> None:
+    axes.plot(
+        x,
+        y,
+        "o",
+        color=BLUE,
+        markerfacecolor="white",
+        markersize=7,
+        markeredgewidth=1.6,
+        clip_on=False,
+        zorder=5,
+    )
+
+
+def _line(label: str, color: str, *, dashed: bool = False, width: float = 1.6) -> Any:
+    from matplotlib.lines import Line2D
+
+    style: Any = (0, (4, 3)) if dashed else "-"
+    width = 1.0 if dashed else width
+    return Line2D([], [], color=color, linestyle=style, linewidth=width, label=label)
+
+
+def _marker(label: str) -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D(
+        [],
+        [],
+        color=BLUE,
+        marker="o",
+        linestyle="none",
+        markerfacecolor="white",
+        markersize=7,
+        markeredgewidth=1.6,
+        label=label,
+    )
+
+
+def _patch(label: str, color: str) -> Any:
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=color, alpha=0.45, label=label)
