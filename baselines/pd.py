@@ -24,12 +24,15 @@ class _Seen(NamedTuple):
     """None where the observation does not hold it"""
 
 
+_RELATIVE_FIELDS = _Seen._fields[:-1]
+
+
 class PDPolicy:
     """Proportional-derivative control of position and attitude (report section 4.2).
 
-    `F = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F/|F|`, thrust `F . z`; with `b = unit(z* x x*)` and
-    `R_E = [b x z*, b, z*]^T` in body axes, e its antisymmetric part, `N = K e - Kd w + w x J w`. How the
-    thrust and the torque become an action depends on the environment's `action`:
+    `F = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F/|F|`, thrust `F . z`; with `b = unit(z*
+    x x*)` and `R_E = [b x z*, b, z*]^T` in body axes, e its antisymmetric part, `N = K e - Kd w + w
+    x J w`. How the thrust and the torque become an action depends on the environment's `action`:
 
     | `action` | what is commanded |
     |---|---|
@@ -40,11 +43,11 @@ class PDPolicy:
     | "velocity" | the velocity whose error the inner loop turns into F (`layout="absolute"` only) |
 
     Args:
-        env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be "estimate",
-            "truth" or "noisy".
+        env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be
+            "estimate", "truth" or "noisy".
         gains: "lab" (the report's), "tuned", or `PDGains`.
-        max_position_error: Position errors are shortened to this length [m]; None: 1 m on `Waypoints`, which
-            are far apart, and unlimited elsewhere.
+        max_position_error: Position errors are shortened to this length [m]; None: 1 m on
+            `Waypoints`, which are far apart, and unlimited elsewhere.
 
     Raises:
         ValueError: If the environment's observation or action does not admit the controller.
@@ -57,12 +60,11 @@ class PDPolicy:
         if flights is None:
             raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
         if flights.observation == "sensors":
-            raise ValueError(
-                'env must observe a state: observation="sensors" does not admit PD control'
-            )
+            raise ValueError('env must observe a state: observation="sensors" holds none')
         if flights.action == "velocity" and flights.layout != "absolute":
             raise ValueError(
-                'env must have layout="absolute" for action="velocity": the relative layout holds no velocity'
+                'env must have layout="absolute" for action="velocity", as the relative layout '
+                "holds no velocity"
             )
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
         if flights.action in ("motor", "wrench"):
@@ -87,7 +89,9 @@ class PDPolicy:
 
         Args:
             observation: (n_observation,) or (n, n_observation), or the Dict with "policy".
-            state, episode_start, deterministic: Not used; the controller has no memory and no noise.
+            state: Not used; the controller has no memory.
+            episode_start: Not used.
+            deterministic: Not used; the controller is.
 
         Returns:
             (4,) or (n, 4) action in [-1, 1], and None.
@@ -103,18 +107,18 @@ class PDPolicy:
         gain = float(np.max(np.array(self.gains.body_rates) / np.diag(inertia))) / control_rate
         if gain > 1.0:
             warnings.warn(
-                f"PD control of torques needs a control rate of {gain * control_rate:.0f} Hz with these "
-                f"gains, this environment has {control_rate:g} Hz: expect it to shake or crash",
+                f"PD control of torques needs {gain * control_rate:.0f} Hz with these gains, this "
+                f"environment is controlled at {control_rate:g} Hz: expect it to shake or crash",
                 UserWarning,
                 stacklevel=3,
             )
 
-    # ---- from observation to force and torque ----------------------------------------------------------
+    # ---- from observation to force and torque -------------------------------------------------
 
     def _read(self, rows: Array) -> _Seen:
         part = {name: rows[:, where] for name, where in self._slices.items()}
         if not self._absolute:
-            return _Seen(*(part[name] for name in _Seen._fields[:-1]), velocity=None)
+            return _Seen(**{name: part[name] for name in _RELATIVE_FIELDS}, velocity=None)
         R_BI = part["R_BI"].reshape(-1, 3, 3)
 
         def in_body(v_I: Array) -> Array:
@@ -151,7 +155,7 @@ class PDPolicy:
             [b[:, 2] - z_wanted[:, 1], z_wanted[:, 0] - a[:, 2], a[:, 1] - b[:, 0]], axis=1
         )
 
-    # ---- from force and torque to action ---------------------------------------------------------------
+    # ---- from force and torque to action ------------------------------------------------------
 
     def _act(self, seen: _Seen) -> Array:
         vehicle, g = self._vehicle, self.gains

@@ -1,7 +1,7 @@
 """Gymnasium environments for quadrotor control on estimated state.
 
-Importing the package registers its environments with Gymnasium. The kernels are imported, and compiled or
-loaded from their cache, when the first environment is made.
+Importing the package registers its environments with Gymnasium. The kernels are imported, and
+compiled or loaded from their cache, when the first environment is made.
 """
 
 from typing import Any

@@ -29,8 +29,8 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
         (3, 3) R_BI, a proper rotation.
 
     Raises:
-        ValueError: If the shapes do not fit, a value is not finite, or the vectors leave the rotation open
-            (all parallel, for example).
+        ValueError: If the shapes do not fit, a value is not finite, or the vectors leave the
+            rotation open (all parallel, for example).
 
     Source: report section 4.1; F. L. Markley, J. Astronautical Sciences 36(3), 1988.
     """
@@ -51,12 +51,13 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
 class UnscentedKalmanFilter:
     """The report's UKF for one vehicle: position, velocity, attitude and IMU biases.
 
-    One cycle is: `update` with what was measured at t_k, read the estimate, then `predict` to t_k+1 with the
-    IMU sample of t_k. The measurement model is that of the report's section 3.4, with antenna position,
-    baseline direction and feature directions; any of them may be missing at any time.
+    One cycle is: `update` with what was measured at t_k, read the estimate, then `predict` to t_k+1
+        with the
+    IMU sample of t_k. The measurement model is that of the report's section 3.4, with antenna
+    position, baseline direction and feature directions; any of them may be missing at any time.
 
-    A cycle whose result is not finite, or whose covariance would not be positive definite, leaves the
-    estimate as it was, sets `status`, and warns.
+    A cycle whose result is not finite, or whose covariance would not be positive definite, leaves
+    the estimate as it was, sets `status`, and warns.
 
     Args:
         sensors: The sensor suite whose geometry and noise the filter believes in.
@@ -76,10 +77,10 @@ class UnscentedKalmanFilter:
         self._work = np.zeros(1, WORK)
         self._running = False
 
-    # ---- the cycle -----------------------------------------------------------------------------------
+    # ---- the cycle ----------------------------------------------------------------------------
 
     def initialize(self, gnss_position_G: ArrayLike, gnss_baseline_G: ArrayLike) -> None:
-        """Start from a first fix: attitude by Wahba's problem with the body z axis taken as vertical.
+        """Start from a first fix: attitude by Wahba's problem, the body z axis taken as vertical.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
@@ -107,9 +108,11 @@ class UnscentedKalmanFilter:
         """Start from a given estimate.
 
         Args:
-            position, velocity: (3,) in I [m], [m/s].
+            position: (3,) in I [m].
+            velocity: (3,) in I [m/s].
             R_BI: (3, 3) attitude, a rotation.
-            accel_bias, gyro_bias: (3,) in B [m/s^2], [rad/s].
+            accel_bias: (3,) in B [m/s^2].
+            gyro_bias: (3,) in B [rad/s].
             covariance: (15, 15) in the order r, v, e, b_a, b_g; symmetric positive definite.
 
         Raises:
@@ -149,10 +152,12 @@ class UnscentedKalmanFilter:
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
-            pixels: (n_features, 2) feature projections [pixels]; a row with a NaN is a feature not seen.
+            pixels: (n_features, 2) feature projections [pixels]; a row with a NaN is a feature not
+                seen.
 
         Raises:
-            ValueError: If an argument has another shape or is not finite; the estimate is unchanged then.
+            ValueError: If an argument has another shape or is not finite; the estimate is unchanged
+                then.
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
@@ -172,7 +177,7 @@ class UnscentedKalmanFilter:
         if baseline is not None:
             f["gnss_baseline"] = baseline
         if image is not None:
-            seen = np.isfinite(image).all(axis=1)
+            seen = np.asarray(~np.isnan(image).any(axis=1))
             f["feature_valid"][0, : self._features] = seen
             f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
         before = self.status
@@ -187,7 +192,8 @@ class UnscentedKalmanFilter:
             accel: (3,) specific force measured at the start of the tick, in B [m/s^2].
 
         Raises:
-            ValueError: If an argument has another shape or is not finite; the estimate is unchanged then.
+            ValueError: If an argument has another shape or is not finite; the estimate is unchanged
+                then.
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
@@ -198,7 +204,7 @@ class UnscentedKalmanFilter:
         single.ukf_predict(self._flight, self._params, self._work)
         self._warn_of_news(before)
 
-    # ---- the estimate --------------------------------------------------------------------------------
+    # ---- the estimate -------------------------------------------------------------------------
 
     @property
     def position(self) -> NDArray[np.float64]:

@@ -35,7 +35,7 @@ class Episodes(NamedTuple):
     mean_error: NDArray[np.float64]
     """true position error, mean over the episode [m]"""
     late_error: NDArray[np.float64]
-    """true position error, mean over the second half of the time limit [m]; NaN if it ended before"""
+    """true position error, mean over the time limit's second half [m]; NaN if it ended before"""
     estimation_error: NDArray[np.float64]
     """distance of the seen from the true position, mean over the episode [m]"""
     crashed: NDArray[np.bool_]

@@ -23,7 +23,8 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
         Latitude [rad], longitude [rad], height above the ellipsoid [m].
 
     Raises:
-        ValueError: If `r_G` is not three finite numbers, or lies within 1,000 km of the Earth's centre.
+        ValueError: If `r_G` is not three finite numbers, or lies within 1,000 km of the Earth's
+            centre.
     """
     x, y, z = check.array("r_G", r_G, (3,))
     if np.sqrt(x * x + y * y + z * z) < 1e6:
@@ -46,8 +47,8 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
 def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
     """The rotation R_IG from ECEF to the east-north-up frame at a point.
 
-    Its rows are the unit east, north and up vectors at the geodetic latitude and longitude of the point,
-    in G; v_I = R_IG v_G.
+    Its rows are the unit east, north and up vectors at the geodetic latitude and longitude of the
+    point, in G; v_I = R_IG v_G.
 
     Args:
         r0_G: (3,) position of the reference antenna in G [m].

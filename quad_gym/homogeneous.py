@@ -1,7 +1,7 @@
 """Points and lines of the image plane in homogeneous coordinates (report section 2.2).
 
-A point (x, y) is any [k x, k y, k] with k not 0; a line a x + b y + c = 0 is [a, b, c]. The point where two
-lines meet is their cross product, and so is the line through two points.
+A point (x, y) is any [k x, k y, k] with k not 0; a line a x + b y + c = 0 is [a, b, c]. The point
+where two lines meet is their cross product, and so is the line through two points.
 """
 
 import numpy as np

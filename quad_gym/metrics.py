@@ -41,6 +41,15 @@ class TrackingSummary:
     last_half: Floats
     """(...,) mean over its last half, where the start is forgotten [unit of the error]"""
 
+    def spreads(self, chosen: ArrayLike = True) -> "dict[str, Spread]":
+        """How both means are distributed over flights.
+
+        Args:
+            chosen: (...,) bool, which flights count; True: all.
+        """
+        parts = {"mean": self.mean, "last_half": self.last_half}
+        return {name: spread(values[np.asarray(chosen)]) for name, values in parts.items()}
+
 
 def tracking_summary(errors: ArrayLike) -> TrackingSummary:
     """Mean error of each flight, over all of it and over its last half.
@@ -201,6 +210,24 @@ def chi_square_band(dimension: int, count: int = 1, probability: float = 0.95) -
     tail = (1.0 - probability) / 2
     low, high = chi2.ppf((tail, 1.0 - tail), dimension * count) / count
     return Interval(float(low), float(high))
+
+
+def chi_square_quantile(dimension: int, probability: float) -> float:
+    """The NEES that a consistent filter stays below with a given probability.
+
+    Args:
+        dimension: Degrees of freedom, 15 for the whole state.
+        probability: Between 0 and 1.
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+    _require_probability(probability)
+    if dimension < 1:
+        raise ValueError(f"dimension must be at least 1, got {dimension}")
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(probability, dimension))
 
 
 def bootstrap_interval(values: ArrayLike, *, probability: float = 0.95, seed: int = 0) -> Interval:

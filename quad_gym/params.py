@@ -1,7 +1,8 @@
-"""What a flight is made of: vehicle, sensors, filter, gains and clocks, with the source of every number.
+"""What a flight is made of: vehicle, sensors, filter, gains, clocks; with their sources.
 
 All classes are frozen, keyword-only and check themselves: a value that makes no sense raises a
-ValueError that names it. Everything is SI (radians too); body frame B: x forward, z up along the thrust.
+ValueError that names it. Everything is SI (radians too); body frame B: x forward, z up along the
+thrust.
 
 The laboratory's numbers come from the Aerial Robotics course (ASE 479W, The University of Texas at
 Austin) whose third laboratory report this package implements.
@@ -67,7 +68,7 @@ class VehicleParams(_Checked):
     )
     """(4, 3) rotor hubs relative to the centre of mass, in B [m]; laboratory vehicle"""
     rotor_spins: Vector = (1.0, -1.0, 1.0, -1.0)
-    """(4,) sense of rotation about the body z axis; the reaction torque is opposite; laboratory vehicle"""
+    """(4,) sense of rotation about body z, opposite to the reaction torque; laboratory vehicle"""
     thrust_coefficient: float = 6.11e-8 / 0.104719755**2
     """F = kF W^2 [N/(rad/s)^2]; laboratory vehicle, given there per rpm^2"""
     torque_coefficient: float = 1.5e-9 / 0.104719755**2
@@ -108,7 +109,8 @@ class VehicleParams(_Checked):
         smallest = np.linalg.eigvalsh(inertia)[0]
         if smallest <= 1e-9 * abs(inertia).max():
             raise ValueError(
-                f"VehicleParams.inertia must be positive definite, got a smallest eigenvalue of {smallest:g}"
+                "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
+                f"{smallest:g}"
             )
         if any(abs(spin) != 1.0 for spin in self.rotor_spins):
             raise ValueError(f"VehicleParams.rotor_spins must be +1 or -1, got {self.rotor_spins}")
@@ -145,7 +147,7 @@ class VehicleParams(_Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParams(_Checked):
-    """Accelerometer and rate gyro: white noise and Gauss-Markov biases (report equations 4, 6, 7)."""
+    """Accelerometer and gyro: white noise, Gauss-Markov biases (report equations 4, 6, 7)."""
 
     rate: float = 200.0
     """[Hz]; one sample is one tick of the simulation; report section 4"""
@@ -230,7 +232,7 @@ class CameraParams(_Checked):
     position_B: Vector = (0.1159, -0.0004, -0.0435)
     """(3,) projection centre in B [m]; laboratory vehicle"""
     attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
-    """(3,) Euler angles (roll, pitch, yaw) of R_CB, camera z along the optical axis [rad]; laboratory"""
+    """(3,) Euler angles of R_CB, camera z along the optical axis [rad]; laboratory"""
     pixel_size: float = 2e-6
     """[m]; laboratory"""
     focal_length: float = 1657.72
@@ -255,7 +257,8 @@ class CameraParams(_Checked):
         self._check(check.matrix, "features_I", rows=None, columns=3)
         if len(self.features_I) > MAX_FEATURES:
             raise ValueError(
-                f"CameraParams.features_I holds {len(self.features_I)} features, at most {MAX_FEATURES} fit"
+                f"CameraParams.features_I must hold at most {MAX_FEATURES} features, "
+                f"got {len(self.features_I)}"
             )
 
 
@@ -270,11 +273,11 @@ class FilterParams(_Checked):
     kappa: float = 0.0
     """secondary scaling; laboratory"""
     direction_variance_floor: float = 1e-8
-    """added to the diagonal of every direction's covariance, which has rank 2 [-]; report section 3.1"""
+    """added to the diagonal of a direction's covariance, of rank 2 [-]; report section 3.1"""
     feature_noise_across: str = "measured"
-    """"measured": a feature's noise covariance has rank 2 across its measured direction (report); "predicted":
-    across the predicted one, as for the baseline. The first takes the angle between the two, in the
-    first second tens of milliradians, for information along a direction that it trusts to 0.1 mrad."""
+    """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
+    across the "predicted" one, as the baseline's does. The first takes the angle between the two,
+    tens of milliradians in the first second, for information that it trusts to 0.1 mrad."""
     initial_velocity_variance: float = 1e-3
     """[m^2/s^2]; laboratory"""
     initial_scale: float = 2.0
@@ -366,7 +369,7 @@ class SensorSuite(_Checked):
         )
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
-        """A copy whose white measurement noise is `factor` times as large; the filter knows of it."""
+        """A copy whose white noise is `factor` times as large; the filter knows of it."""
         check.positive("factor", factor)
         camera = self.camera
         if camera is not None:
@@ -489,8 +492,8 @@ class TaskParams(_Checked):
     height: float = 1.0
     """of the reference [m]; report section 4.2"""
     start: str = "ground"
-    """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2); "hover":
-    hovering at rest within some decimetres of the reference"""
+    """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
+    "hover": hovering at rest within some decimetres of the reference"""
     randomize: bool = False
     """draw phase, radius, period and sense of the reference anew each episode"""
     duration: float = 10.0
@@ -498,7 +501,7 @@ class TaskParams(_Checked):
     out_of_bounds: float = 3.0
     """distance from the reference at which an episode ends [m]"""
     ground: float = -0.5
-    """height at which an episode ends [m]; below 0, as the report's flights sag while the rotors spin up"""
+    """height at which an episode ends [m]; below 0, for flights sag while the rotors spin up"""
     max_tilt: float = math.radians(100.0)
     """angle between the body z axis and the vertical at which an episode ends [rad]"""
     max_speed: float = 2.5
@@ -543,8 +546,8 @@ _SUITES = {"lab": SensorSuite()}
 _VEHICLES = {"lab": VehicleParams()}
 _GAINS = {
     "lab": PDGains(),
-    # by random search for the smallest mean error over Hover, Circle, Lemniscate and RandomTrajectory, each
-    # relative to that of the laboratory's gains, flown on the estimate at 50 Hz with collective thrust and rates
+    # by random search for small errors on Hover, Circle, Lemniscate and RandomTrajectory, each
+    # relative to that of the laboratory's gains, on the estimate at 50 Hz with thrust and rates
     "tuned": PDGains(
         position=10.6, velocity=3.44, attitude=(1.29, 1.29, 0.138), body_rates=(0.25, 0.25, 0.12)
     ),

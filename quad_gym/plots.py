@@ -41,7 +41,10 @@ _STYLE = {
     "ytick.color": GREY,
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
-    "legend.frameon": False,
+    "legend.frameon": True,
+    "legend.edgecolor": "none",
+    "legend.framealpha": 0.85,
+    "legend.fancybox": False,
     "legend.fontsize": 8.5,
     "legend.handlelength": 1.8,
     "lines.linewidth": 1.6,
@@ -49,6 +52,17 @@ _STYLE = {
     "figure.dpi": 100.0,
     "savefig.dpi": 200.0,
     "svg.hashsalt": "quad_gym",
+}
+
+_REFERENCE: dict[str, Any] = {"color": INK, "linestyle": (0, (4, 3)), "linewidth": 1.0}
+_START: dict[str, Any] = {
+    "color": BLUE,
+    "marker": "o",
+    "markersize": 7.0,
+    "markeredgewidth": 1.8,
+    "markerfacecolor": "white",
+    "linestyle": "none",
+    "zorder": 5,
 }
 
 Floats = NDArray[np.float64]
@@ -147,11 +161,10 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5) -> None:
     ticks = heading_ticks(
         trace.time, trace.position, trace.heading, every=tick_every, length=0.075 * extent
     )
-    axes.plot(*trace.reference[:, :2].T, color=INK, linestyle=(0, (4, 3)), linewidth=1.0)
     axes.add_collection(LineCollection(list(ticks), colors=VERMILLION, linewidths=1.3))
-    axes.plot(*trace.position[:, :2].T, color=BLUE)
-    start = trace.position[0, :2]
-    axes.plot(*start, "o", color=BLUE, markerfacecolor="white", markersize=7, markeredgewidth=1.6)
+    axes.plot(*trace.position[:, :2].T, color=BLUE, linewidth=2.2)
+    axes.plot(*trace.reference[:, :2].T, **_REFERENCE)
+    axes.plot(*trace.position[0, :2], **_START)
     margin = 0.09 * extent
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
@@ -160,10 +173,10 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5) -> None:
     axes.set_ylabel("y, north [m]")
     axes.legend(
         handles=[
-            _line("flown", BLUE),
-            _line("reference", INK, dashed=True),
+            _line("flown", BLUE, width=2.2),
+            _sample("reference", _REFERENCE),
             _line(f"body x axis every {tick_every:g} s", VERMILLION, width=1.3),
-            _marker("start"),
+            _sample("start", _START),
         ],
         loc="center",
     )
@@ -176,14 +189,18 @@ def draw_height(axes: Any, trace: Trace) -> None:
         axes: matplotlib Axes.
         trace: The flight.
     """
-    axes.plot(trace.time, trace.reference[:, 2], color=INK, linestyle=(0, (4, 3)), linewidth=1.0)
-    axes.plot(trace.time, trace.position[:, 2], color=BLUE)
-    _mark_start(axes, trace.time[0], trace.position[0, 2])
+    axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2)
+    axes.plot(trace.time, trace.reference[:, 2], **_REFERENCE)
+    axes.plot(trace.time[0], trace.position[0, 2], **_START, clip_on=False)
     axes.set_xlim(trace.time[0] - 0.01 * np.ptp(trace.time), trace.time[-1])
     axes.set_xlabel("time [s]")
     axes.set_ylabel("height z [m]")
     axes.legend(
-        handles=[_line("flown", BLUE), _line("reference", INK, dashed=True), _marker("start")],
+        handles=[
+            _line("flown", BLUE, width=2.2),
+            _sample("reference", _REFERENCE),
+            _sample("start", _START),
+        ],
         loc="lower right",
     )
 
@@ -209,8 +226,10 @@ def draw_error(
 
     handles = [_line(label, BLUE, width=1.1)]
     if band is not None:
-        # a line of its own, or a band without width would not be seen
-        axes.fill_between(trace.time, band.low, band.high, color=ORANGE, alpha=0.45, linewidth=1.2)
+        axes.fill_between(trace.time, band.low, band.high, color=ORANGE, alpha=0.45, linewidth=0)
+        if np.allclose(band.low, band.high, equal_nan=True):
+            # a band without width would not be seen
+            axes.plot(trace.time, band.high, color=ORANGE, alpha=0.45, linewidth=6.0)
         handles.append(_patch(band.label, ORANGE))
     axes.plot(trace.time, trace.error, color=BLUE, linewidth=1.1)
     axes.set_yscale("log")
@@ -282,10 +301,12 @@ def overview_figure(
     limits = error_limits([one for one, _ in pairs], [band for _, band in pairs if band])
     with house_style():
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         rows = 1 + len(errors)
-        figure = Figure(figsize=(9.6, 1.0 + 1.9 * rows), layout="constrained")
-        grid = figure.add_gridspec(rows, 2, width_ratios=(1.25, 1.0))
+        layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06)
+        figure = Figure(figsize=(9.6, 1.75 * rows), layout=layout)
+        grid = figure.add_gridspec(rows, 2, width_ratios=(1.15, 1.0))
         axes = figure.add_subplot(grid[:, 0])
         draw_path(axes, trace)
         axes.set_title(title)
@@ -328,42 +349,16 @@ def _one_picture(size: tuple[float, float], title: str, draw: Callable[[Any], No
     return figure
 
 
-def _mark_start(axes: Any, x: float, y: float) -> None:
-    axes.plot(
-        x,
-        y,
-        "o",
-        color=BLUE,
-        markerfacecolor="white",
-        markersize=7,
-        markeredgewidth=1.6,
-        clip_on=False,
-        zorder=5,
-    )
-
-
-def _line(label: str, color: str, *, dashed: bool = False, width: float = 1.6) -> Any:
+def _line(label: str, color: str, *, width: float) -> Any:
     from matplotlib.lines import Line2D
 
-    style: Any = (0, (4, 3)) if dashed else "-"
-    width = 1.0 if dashed else width
-    return Line2D([], [], color=color, linestyle=style, linewidth=width, label=label)
+    return Line2D([], [], color=color, linewidth=width, label=label)
 
 
-def _marker(label: str) -> Any:
+def _sample(label: str, style: dict[str, Any]) -> Any:
     from matplotlib.lines import Line2D
 
-    return Line2D(
-        [],
-        [],
-        color=BLUE,
-        marker="o",
-        linestyle="none",
-        markerfacecolor="white",
-        markersize=7,
-        markeredgewidth=1.6,
-        label=label,
-    )
+    return Line2D([], [], label=label, **style)
 
 
 def _patch(label: str, color: str) -> Any:

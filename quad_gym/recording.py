@@ -1,7 +1,7 @@
 """Fly a batch to the end and keep what tables and figures of a flight need.
 
-Nothing is kept of every instant of every flight but sums and percentiles, so that a hundred thousand
-flights fit into memory as well as ten.
+Nothing is kept of every instant of every flight but sums and percentiles, so that a hundred
+thousand flights fit into memory as well as ten.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -115,6 +115,8 @@ def record_flights(
         if estimating and samples[row] == step and flying.any():
             nees_values[row, flying] = nees_of_flights(batch, flying)
 
+    alike = bool(np.allclose(percentiles[0], percentiles[1], equal_nan=True))
+    share = "all" if alike else "5 to 95 % of"
     shown = slice(0, len(times) if flying[0] else int((times < ended_at[0]).sum()))
     return Recording(
         tracking=tracking.result(),
@@ -131,7 +133,7 @@ def record_flights(
         band=Band(
             low=percentiles[0, shown],
             high=percentiles[1, shown],
-            label=f"5 to 95 % of {count:,} flights",
+            label=f"{share} {count:,} flights" if count > 1 else "the only flight",
         ),
         nees_time=times[samples],
         nees=nees_values,

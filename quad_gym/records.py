@@ -1,8 +1,8 @@
 """The memory of flights: structured records whose fields are named, shaped, and given units here.
 
-Eight flights share a record (`block_dtype`): every field has a trailing axis of eight. The scalar form
-(`scalar_dtype`) has the same fields without it. Kernels read both by field name. As a flight is nothing
-but its record, snapshot, restore, pickling and copying are array copies.
+Eight flights share a record (`block_dtype`): every field has a trailing axis of eight. The scalar
+form (`scalar_dtype`) has the same fields without it. Kernels read both by field name. As a flight
+is nothing but its record, snapshot, restore, pickling and copying are array copies.
 """
 
 from enum import IntEnum, IntFlag

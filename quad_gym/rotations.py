@@ -1,7 +1,8 @@
 """Attitude conversions on NumPy arrays.
 
-`R_BI` turns inertial components into body components, v_B = R_BI v_I. Euler angles are 3-1-2: yaw about
-z, then roll about x, then pitch about y. Quaternions are Hamilton's (w, x, y, z), body to inertial.
+`R_BI` turns inertial components into body components, v_B = R_BI v_I. Euler angles are 3-1-2: yaw
+about z, then roll about x, then pitch about y. Quaternions are Hamilton's (w, x, y, z), body to
+inertial.
 """
 
 import numpy as np
@@ -48,8 +49,8 @@ def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
         R_BI: (..., 3, 3) rotation matrices.
 
     Returns:
-        (..., 3) roll in [-pi/2, pi/2], pitch and yaw in [-pi, pi] [rad]; at a roll of +-pi/2, where only one
-        combination of pitch and yaw is determined, the pitch is 0.
+        (..., 3) roll in [-pi/2, pi/2], pitch and yaw in [-pi, pi] [rad]; at a roll of +-pi/2, where
+        only one combination of pitch and yaw is determined, the pitch is 0.
 
     Raises:
         ValueError: If `R_BI` has another shape or is not finite.

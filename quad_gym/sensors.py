@@ -1,4 +1,4 @@
-"""Sensors of one vehicle: each turns a true state into one measurement, with its own random stream."""
+"""Sensors of one vehicle: each turns a true state into one measurement."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,8 +94,8 @@ class Camera(_Sensor):
             R_BI: (3, 3) true attitude.
 
         Returns:
-            (n_features, 2) pixels from the image's centre; NaN for a feature that is behind the camera or
-            whose noiseless projection lies outside the image.
+            (n_features, 2) pixels from the image's centre; NaN for a feature that is behind the
+            camera or whose noiseless projection lies outside the image.
 
         Raises:
             ValueError: If an argument has another shape or is not finite.

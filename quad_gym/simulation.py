@@ -44,14 +44,15 @@ def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
 
 
 def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
-    """Keys for flights seeded one by one as Gymnasium seeds environments; None takes fresh entropy."""
+    """Keys for flights seeded one by one, as Gymnasium seeds; None takes fresh entropy."""
     return np.array([stream_key(np.random.Generator(np.random.PCG64(seed))) for seed in seeds])
 
 
 class FlightBatch:
     """N flights of one configuration, advanced together by compiled kernels.
 
-    A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does depends
+    A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does
+        depends
     on its seed and its actions alone, not on the batch's size, its order or the number of threads.
 
     Args:
@@ -72,7 +73,8 @@ class FlightBatch:
         autoreset: When a flight whose episode is over begins the next one.
         run_filter: Whether sensors and filter run; None: where something needs them.
         threads: Threads to use; None: as many as there are cores.
-        true_vehicle: The vehicle as it is, where it differs from the nominal one that the controller knows.
+        true_vehicle: The vehicle as it is, where it differs from the nominal one that the
+            controller knows.
         true_sensors: The sensors as they are, where they differ from what the filter believes.
 
     Raises:
@@ -145,7 +147,7 @@ class FlightBatch:
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
         self.results = np.zeros((self.count, len(RESULTS)))
 
-    # ---- flying --------------------------------------------------------------------------------------
+    # ---- flying -------------------------------------------------------------------------------
 
     def reset(
         self,
@@ -160,10 +162,13 @@ class FlightBatch:
         """Begin new episodes.
 
         Args:
-            seeds: One per flight, seeding it as Gymnasium seeds an environment; None in it: fresh entropy.
-            keys: (count, 2) keys of the random streams, instead of seeds. Without either, streams go on.
+            seeds: One per flight, seeding it as Gymnasium seeds an environment; None in it: fresh
+                entropy.
+            keys: (count, 2) keys of the random streams, instead of seeds. Without either, streams
+                go on.
             mask: (count,) bool: which flights; None: all.
-            position, velocity: (3,) or (count, 3) in I, to start with instead of drawn ones [m], [m/s].
+            position: (3,) or (count, 3) in I, to start with instead of a drawn one [m].
+            velocity: (3,) or (count, 3) in I, likewise [m/s].
             yaw: Scalar or (count,), likewise [rad].
 
         Returns:
@@ -244,7 +249,7 @@ class FlightBatch:
         """Steps after which an episode is truncated; 0: never."""
         return int(self._settings["max_steps"][0])
 
-    # ---- reading -------------------------------------------------------------------------------------
+    # ---- reading ------------------------------------------------------------------------------
 
     def read(self, name: str) -> NDArray[Any]:
         """One field of all flights, such as "r" or "b_a_hat", as a new array (count, ...).
@@ -265,7 +270,7 @@ class FlightBatch:
         factor = self.read("L")
         return factor @ factor.transpose(0, 2, 1)
 
-    # ---- keeping -------------------------------------------------------------------------------------
+    # ---- keeping ------------------------------------------------------------------------------
 
     def snapshot(self) -> NDArray[Any]:
         """A copy of all flights; `restore` brings them back to this instant bit for bit."""

@@ -1,7 +1,8 @@
 """The one place that knows of threads: shares a range of blocks among the cores.
 
-Kernels release the GIL, so plain threads run them side by side. A pool belongs to the process that made it:
-after a fork the child makes its own, and a batch that is pickled or copied takes none along.
+Kernels release the GIL, so plain threads run them side by side. A pool belongs to the process that
+made it: after a fork the child makes its own, and a batch that is pickled or copied takes none
+along.
 """
 
 import os
@@ -57,7 +58,8 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 def run_ranges(work: Callable[[int, int, int], None], blocks: int, threads: int) -> None:
     """Call `work(part, first, last)` on ranges that together cover `blocks` blocks.
 
-    The first part runs in the calling thread. What the parts compute does not depend on how they are cut.
+    The first part runs in the calling thread. What the parts compute does not depend on how they
+    are cut.
 
     Args:
         work: Called once per part, with the part's number and its range of blocks without the end.

@@ -1,4 +1,4 @@
-"""Checks of what users pass in: each raises a ValueError that names the argument and says what came."""
+"""Checks of what users pass in: each raises a ValueError that names the argument."""
 
 import math
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def choice(name: str, value: Any, choices: Sequence[str]) -> str:
 def array(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], *, allow_nan: bool = False
 ) -> NDArray[np.float64]:
-    """`value` as a new float64 array of `shape` (None: any length), finite unless NaN is allowed."""
+    """`value` as a new float64 array of `shape` (None: any length), finite or NaN if allowed."""
     try:
         result = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -18,7 +18,7 @@ STATE_SHAPES: dict[str, tuple[int, ...]] = {
     "body_rates": (3,),
     "rotor_speeds": (4,),
 }
-"""Keys of a state and their shapes: [m] in I, [m/s] in I, body from inertial, [rad/s] in B, [rad/s]."""
+"""Keys and shapes of a state: [m] in I, [m/s] in I, attitude, [rad/s] in B, [rad/s]."""
 
 
 def checked_state(state: State) -> dict[str, NDArray[np.float64]]:
@@ -45,8 +45,8 @@ def state_derivative(
     `F_i = kF W_i^2` and `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`.
 
     Args:
-        state: position (3,) [m] and velocity (3,) [m/s] in I, R_BI (3, 3), body_rates (3,) [rad/s] in B,
-            rotor_speeds (4,) [rad/s].
+        state: position (3,) [m] and velocity (3,) [m/s] in I, R_BI (3, 3), body_rates (3,) [rad/s]
+            in B, rotor_speeds (4,) [rad/s].
         voltages: (4,) motor voltages [V], between 0 and the vehicle's largest.
         disturbance_I: (3,) external force in I [N].
         params: The vehicle.

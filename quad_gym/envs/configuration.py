@@ -156,7 +156,7 @@ class Flights:
         self.batch.limit(check.whole("max_episode_steps", max_episode_steps))
 
     def split(self, observations: NDArray[np.float32]) -> Any:
-        """Observations (..., n) as the space wants them: an array, or a Dict of policy and privileged."""
+        """Observations (..., n) as the space wants them: an array, or a Dict of parts."""
         if self._split is None:
             return observations
         return {

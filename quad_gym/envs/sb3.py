@@ -9,8 +9,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from quad_gym.envs.configuration import ENDINGS, checked_actions, start_options
-from quad_gym.envs.configuration import Flights
+from quad_gym.envs.configuration import ENDINGS, Flights, checked_actions, start_options
 from quad_gym.envs.single import keys_of
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import RESULTS, Autoreset
@@ -21,8 +20,9 @@ _COLUMN = {name: column for column, name in enumerate(RESULTS)}
 class QuadVecEnv(VecEnv):
     """N flights for Stable-Baselines3, with the `Monitor`'s episode records built in.
 
-    An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with the return
-    "r", the length "l", the time "t" since construction [s] and the mean true position error "e" [m].
+    An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with
+    the return "r", the length "l", the time "t" since construction [s] and the mean true position
+    error "e" [m].
 
     Args:
         num_envs: Number of flights.
@@ -85,7 +85,7 @@ class QuadVecEnv(VecEnv):
             }
             for position, estimation in results[:, 4:6].tolist()
         ]
-        for i in np.flatnonzero(done):
+        for i in np.flatnonzero(done).tolist():
             infos[i] |= self._episode_end(i, results[i])
         rewards = results[:, 0].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
@@ -111,7 +111,7 @@ class QuadVecEnv(VecEnv):
     def close(self) -> None:
         """Nothing is held open; closing twice is fine."""
 
-    # ---- the rest of the interface -------------------------------------------------------------------
+    # ---- the rest of the interface ------------------------------------------------------------
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """The attribute of this environment, once per index: the flights share it."""

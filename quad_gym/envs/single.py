@@ -17,10 +17,10 @@ _COLUMN = {name: column for column, name in enumerate(RESULTS)}
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     """A quadrotor that is controlled on estimated state.
 
-    ## Description
-    A quadrotor (0.78 kg, four rotors with a lag of 0.05 s) flies a reference. GNSS, camera and IMU measure it
-    200 times a second, an unscented Kalman filter fuses them, and the controller sees what `observation`
-    says: by default the filter's estimate. The reward, the endings and `info` use the true state.
+    ## Description A quadrotor (0.78 kg, four rotors with a lag of 0.05 s) flies a reference. GNSS,
+    camera and IMU measure it 200 times a second, an unscented Kalman filter fuses them, and the
+    controller sees what `observation` says: by default the filter's estimate. The reward, the
+    endings and `info` use the true state.
 
     | id | reference | start | time limit |
     |---|---|---|---|
@@ -30,8 +30,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin | hovering near the origin | 20 s |
 
-    ## Observation space
-    A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and `layout="relative"`:
+    ## Observation space A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"`
+    and `layout="relative"`:
 
     | slice | name | meaning | unit | frame |
     |---|---|---|---|---|
@@ -45,15 +45,16 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | 21:24 | preview_2 | reference in 0.4 s (the gate after) less the present one | m | B |
     | 24:28 | last_action | | - | - |
 
-    The body frame is the one that the controller's source believes in. `layout="absolute"` gives position,
-    velocity, rotation matrix, biases and reference in the inertial frame; `observation="sensors"` gives the
-    raw measurements of the step with flags (a measurement that was not taken is zero, its flag too), and has
-    that layout only. `quad_gym.observation_layout(...)` returns any of these tables, with bounds;
-    observations are held within them.
+    The body frame is the one that the controller's source believes in. `layout="absolute"` gives
+    position, velocity, rotation matrix, biases and reference in the inertial frame;
+    `observation="sensors"` gives the raw measurements of the step with flags (a measurement that
+    was not taken is zero, its flag too), and has that layout only.
+    `quad_gym.observation_layout(...)` returns any of these tables, with bounds; observations are
+    held within them.
 
-    ## Action space
-    `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal vehicle. The inner loops
-    run at every tick (200 Hz) on what the controller sees, its gyro included.
+    ## Action space `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal
+    vehicle. The inner loops run at every tick (200 Hz) on what the controller sees, its gyro
+    included.
 
     | `action` | a[0] | a[1], a[2], a[3] |
     |---|---|---|
@@ -63,35 +64,32 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `"attitude"` | thrust m g (1 + a) | roll, pitch 45 deg, yaw rate 3 rad/s |
     | `"velocity"` | velocity ahead 5 m/s | to the left, up 5 m/s; yaw rate 3 rad/s |
 
-    ## Reward
-    Per second of flight, with the position error e [m], the alignment h of body x with the wanted heading
-    (1: aligned), the change of the action da and the body rates w:
+    ## Reward Per second of flight, with the position error e [m], the alignment h of body x with
+    the wanted heading (1: aligned), the change of the action da and the body rates w:
 
         exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
 
-    times the control period. At most 1.6 a second; a circle flown perfectly returns 16. `Waypoints` gives 1 a
-    metre of progress toward the next gate and 1 a gate instead of the two exponentials.
+    times the control period. At most 1.6 a second; a circle flown perfectly returns 16. `Waypoints`
+    gives 1 a metre of progress toward the next gate and 1 a gate instead of the two exponentials.
 
-    ## Episode end
-    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by more than 100 degrees, below
-    -0.5 m, or through the last gate. Truncated: at the time limit, or when the filter has failed
-    (`info["filter_status"]`). `info["ending"]` says which.
+    ## Episode end Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by
+    more than 100 degrees, below -0.5 m, or through the last gate. Truncated: at the time limit, or
+    when the filter has failed (`info["filter_status"]`). `info["ending"]` says which.
 
-    ## Start
-    "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped, level, looking
-    as wanted. "hover": hovering at rest, with standard deviations of 0.3 m, 0.2 rad in yaw, 0.03 rad in tilt.
-    The filter starts from its first fix in either. `reset(options={"position": (3,), "velocity": (3,), "yaw":
-    rad})` sets any of these for one episode.
+    ## Start "ground" (the report's): at rest at height 0 below the start of the reference, rotors
+    stopped, level, looking as wanted. "hover": hovering at rest, with standard deviations of 0.3 m,
+    0.2 rad in yaw, 0.03 rad in tilt. The filter starts from its first fix in either.
+    `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these for one
+    episode.
 
-    ## Info
-    `position_error` and `estimation_error` [m], both against the true position; `ending`; `filter_status`,
-    0 while all is well; `gates_passed`.
+    ## Info `position_error` and `estimation_error` [m], both against the true position; `ending`;
+    `filter_status`, 0 while all is well; `gates_passed`.
 
     ## Arguments
     Args:
         task: The kind of task; `gymnasium.make` fills it in from the id.
-        observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the converged
-            filter's errors), or "sensors".
+        observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the
+            converged filter's errors), or "sensors".
         action: "ctbr", "motor", "wrench", "attitude" or "velocity".
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
@@ -99,16 +97,18 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         sensors, vehicle: Presets by name, or parameter objects.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
-        feature_noise_across: "predicted" or "measured", see `quad_gym.FilterParams`. None: as a given
-            `SensorSuite` has it; for a suite by name "predicted", as the report's own "measured" makes some 6
-            circles in 1,000 crash in their first second.
+        feature_noise_across: "predicted" or "measured", see `quad_gym.FilterParams`. None: as a
+            given `SensorSuite` has it; for a suite by name "predicted", as the report's own
+            "measured" makes some 6 circles in 1,000 crash in their first second.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
         imu_rate, gnss_rate, camera_rate: Rates in place of the suite's [Hz].
         substeps: Runge-Kutta steps in a tick.
         max_episode_steps: Time limit in steps, in place of `duration`.
-        true_vehicle, true_sensors: What really flies, where controller and filter believe something else.
-        radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt, max_speed,
-            max_acceleration, gate_count, gate_radius, preview: The task; see `quad_gym.TaskParams`.
+        true_vehicle, true_sensors: What really flies, where controller and filter believe something
+            else.
+        radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
+            max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
+            `quad_gym.TaskParams`.
 
     ## Version history
     - v0: first version.
@@ -170,7 +170,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             Observation, reward, terminated, truncated, `info`.
 
         Raises:
-            ValueError: If the action has another shape or is not finite; nothing has been flown then.
+            ValueError: If the action has another shape or is not finite; nothing has been flown
+                then.
             gymnasium.error.ResetNeeded: If the episode is over.
         """
         numbers = checked_actions(action, (4,))
@@ -224,5 +225,5 @@ def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None
 
 
 def keys_of(seeds: list[int | None]) -> np.ndarray:
-    """Keys of the random streams, drawn as `reset(seed=...)` of single environments would draw them."""
+    """Keys of the random streams, as `reset(seed=...)` of single environments draws them."""
     return np.array([stream_key(seeding.np_random(seed)[0]) for seed in seeds])

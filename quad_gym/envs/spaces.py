@@ -1,6 +1,7 @@
 """Observation and action spaces, and the table of what an observation holds.
 
-`observation_layout` is the one description of an observation; the kernel `observe` writes in this order.
+`observation_layout` is the one description of an observation; the kernel `observe` writes in this
+order.
 """
 
 from typing import NamedTuple
@@ -32,6 +33,9 @@ ACTIONS = {
 LAYOUTS = {"relative": Layout.RELATIVE, "absolute": Layout.ABSOLUTE}
 """Values of the keyword `layout`."""
 
+Part = tuple[str, int, str, str, float]
+"""Name, size, unit, frame and bound of one part of an observation."""
+
 STATE_NAMES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 """The blocks of the estimated state, three numbers each."""
 
@@ -50,7 +54,7 @@ class ObservationField(NamedTuple):
     """bounds that observations are held within"""
 
 
-_RELATIVE = (
+_RELATIVE: tuple[Part, ...] = (
     ("position_error", 3, "m", "B", 100.0),
     ("velocity_error", 3, "m/s", "B", 100.0),
     ("up", 3, "-", "B", 1.0),
@@ -60,7 +64,7 @@ _RELATIVE = (
     ("preview_1", 3, "m", "B", 100.0),
     ("preview_2", 3, "m", "B", 100.0),
 )
-_REFERENCE = (
+_REFERENCE: tuple[Part, ...] = (
     ("reference_position", 3, "m", "I", 1000.0),
     ("reference_velocity", 3, "m/s", "I", 100.0),
     ("reference_acceleration", 3, "m/s^2", "I", 100.0),
@@ -68,7 +72,7 @@ _REFERENCE = (
     ("preview_1", 3, "m", "I", 1000.0),
     ("preview_2", 3, "m", "I", 1000.0),
 )
-_ABSOLUTE = (
+_ABSOLUTE: tuple[Part, ...] = (
     ("position", 3, "m", "I", 1000.0),
     ("velocity", 3, "m/s", "I", 200.0),
     ("R_BI", 9, "-", "I to B", 1.0),
@@ -77,7 +81,7 @@ _ABSOLUTE = (
     ("body_rates", 3, "rad/s", "B", 200.0),
     *_REFERENCE,
 )
-_PRIVILEGED = (
+_PRIVILEGED: tuple[Part, ...] = (
     ("true_position_error", 3, "m", "B", 100.0),
     ("true_velocity_error", 3, "m/s", "B", 100.0),
     ("true_up", 3, "-", "B", 1.0),
@@ -87,12 +91,12 @@ _PRIVILEGED = (
     ("true_gyro_bias", 3, "rad/s", "B", 10.0),
     ("rotor_speeds", 4, "of hover", "-", 20.0),
 )
-_LAST_ACTION = ("last_action", 4, "-", "-", 1.0)
+_LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
 _FLAG = 0.0
 """A bound of zero marks a flag, in [0, 1]."""
 
 
-def _sensor_fields(feature_count: int) -> tuple[tuple[str, int, str, str, float], ...]:
+def _sensor_fields(feature_count: int) -> tuple[Part, ...]:
     fields = [
         ("gyro", 3, "rad/s", "B", 200.0),
         ("accel", 3, "m/s^2", "B", 1000.0),
@@ -107,9 +111,7 @@ def _sensor_fields(feature_count: int) -> tuple[tuple[str, int, str, str, float]
     return (*fields, *_REFERENCE)
 
 
-def _table(
-    parts: tuple[tuple[str, int, str, str, float], ...], first: int
-) -> list[ObservationField]:
+def _table(parts: tuple[Part, ...], first: int) -> list[ObservationField]:
     table = []
     for name, size, unit, frame, bound in parts:
         low, high = (0.0, 1.0) if bound == _FLAG else (-bound, bound)
@@ -132,8 +134,8 @@ def observation_layout(
         observation: The environment's `observation`; "sensors" has a layout of its own.
         layout: The environment's `layout`.
         include_covariance: Whether the filter's 15 standard deviations follow.
-        privileged: Whether the truth ends the table; its slices go on counting, though the environment
-            returns that part under a key of its own.
+        privileged: Whether the truth ends the table; its slices go on counting, though the
+            environment returns that part under a key of its own.
         feature_count: Features of the camera, for "sensors".
 
     Returns:
@@ -183,10 +185,10 @@ def observation_space(table: tuple[ObservationField, ...]) -> spaces.Box | space
 
 def policy_size(table: tuple[ObservationField, ...]) -> int:
     """How many numbers of an observation are for the policy; the rest is privileged."""
-    return next(
-        (field.slice.start for field in table if field.name == _PRIVILEGED[0][0]),
-        table[-1].slice.stop,
-    )
+    for field in table:
+        if field.name == _PRIVILEGED[0][0]:
+            return int(field.slice.start)
+    return int(table[-1].slice.stop)
 
 
 def action_space() -> spaces.Box:

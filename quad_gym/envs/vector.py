@@ -23,10 +23,10 @@ _COLUMN = {name: column for column, name in enumerate(RESULTS)}
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
-    """N flights in one compiled call; flight i seeded with seed + i flies what a `QuadEnv` so seeded flies.
+    """N flights in one compiled call; flight i is that of a `QuadEnv` seeded with seed + i.
 
-    Observations, actions, rewards, endings and keywords are those of `QuadEnv`. `info` holds arrays (n,) of
-    the same names, each with its mask `_name`.
+    Observations, actions, rewards, endings and keywords are those of `QuadEnv`. `info` holds arrays
+    (n,) of the same names, each with its mask `_name`.
 
     Args:
         num_envs: Number of flights.
@@ -73,8 +73,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
 
         Args:
             seed: A number s seeds flight i with s + i; a list has one per flight; None goes on.
-            options: "reset_mask" (n,) bool: which flights; "position", "velocity" (3,) or (n, 3) and "yaw" to
-                start with.
+            options: "reset_mask" (n,) bool: which flights; "position", "velocity" (3,) or (n, 3)
+                and "yaw" to start with.
 
         Returns:
             Observations of all flights, and `info` of those that were reset.
@@ -123,9 +123,10 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             Observations, rewards, terminated, truncated, `info`: new arrays.
 
         Raises:
-            ValueError: If the actions have another shape or are not finite; nothing has been flown then.
-            gymnasium.error.ResetNeeded: Before the first reset, or with autoreset disabled if an episode is
-                over.
+            ValueError: If the actions have another shape or are not finite; nothing has been flown
+                then.
+            gymnasium.error.ResetNeeded: Before the first reset, or with autoreset disabled if an
+                episode is over.
         """
         numbers = checked_actions(actions, (self.num_envs, 4))
         if not self._seeded:
@@ -133,7 +134,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
         if disabled and self._over.any():
             raise gymnasium.error.ResetNeeded(
-                f"reset environment {int(np.flatnonzero(self._over)[0])} before step(): its episode is over"
+                f"the episode of environment {int(np.flatnonzero(self._over)[0])} is over: "
+                "reset it before step()"
             )
         batch = self.flights.batch
         began = self._over if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
@@ -177,7 +179,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         infos["gates_passed"][began] = 0
 
     def _with_finals(self, infos: dict[str, Any]) -> dict[str, Any]:
-        """Move what ended into `final_obs` and `final_info`, and describe the new episodes instead."""
+        """Move what ended into `final_obs` and `final_info`; describe the new episodes instead."""
         over = self._over.copy()
         finals = self.flights.batch.final_observations
         final_obs = np.full(self.num_envs, None, object)

@@ -1,0 +1,1 @@
+"""The compiled core: every number that flies is computed here."""

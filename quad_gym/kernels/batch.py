@@ -11,7 +11,7 @@ from quad_gym.records import WIDTH, Autoreset, Command
 
 @inlined
 def _write_rows(source, low, high, out, block, mask):
-    """Copy observations from lanes to the rows of the caller's array, held within the bounds of the space."""
+    """Copy observations from lanes to the rows of an array, held within the space's bounds."""
     first = block * WIDTH
     for lane in range(min(WIDTH, out.shape[0] - first)):
         if mask[lane] > 0.0:
@@ -53,7 +53,7 @@ def _write_results(block, results, index):
 
 @kernel
 def _fly_step(flight, world, model, settings, work):
-    """Fly a control period and judge it; return which lanes now begin an episode, and which ended one."""
+    """Fly a control period and judge it; return which lanes begin and which ended an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
     flight.position_fresh = 0.0
     flight.baseline_fresh = 0.0
@@ -100,7 +100,8 @@ def fly(
         actions: (n, 4); for STEP.
         low, high: (n_observation,) bounds of the observation space.
         observations: (n, n_observation), written; with no columns nothing is observed.
-        final_observations: Likewise, written where one episode ends and the next begins in this step.
+        final_observations: Likewise, written where one episode ends and the next begins in this
+            step.
         results: (n, 11), written in a STEP: see `quad_gym.records.RESULTS`.
     """
     scratch, believed, todo = lanes_of(work[0]), lanes_of(model[0]), settings[0]

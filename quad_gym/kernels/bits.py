@@ -26,11 +26,11 @@ def _constant(builder: ir.IRBuilder, like: ir.Value, scalar: ir.Type, number: An
 
 
 def _is_float(numba_type: Any) -> bool:
-    return numba_type == lanes or isinstance(numba_type, types.Float)
+    return bool(numba_type == lanes or isinstance(numba_type, types.Float))
 
 
 def _is_word(numba_type: Any) -> bool:
-    return numba_type == words or numba_type == types.uint64
+    return bool(numba_type == words or numba_type == types.uint64)
 
 
 @intrinsic
@@ -64,7 +64,7 @@ def _library_call(name: str) -> Any:
 
 
 library_sin = _library_call("llvm.sin")
-"""Sine by the C library, one lane after another: slow, for arguments that the fast path cannot reduce."""
+"""Sine by the C library, lane after lane: slow, for arguments too large to reduce."""
 library_cos = _library_call("llvm.cos")
 """Cosine by the C library, likewise."""
 

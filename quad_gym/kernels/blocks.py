@@ -2,8 +2,8 @@
 
 A block is a NumPy structured record whose every field ends in an axis of eight (`records.py`).
 `lanes_of(block)` is the same memory seen by a kernel: `block.mass` is a `Lanes`, `block.inertia` an
-array of `Lanes` of shape (3, 3). The scalar instance of a kernel gets a plain record of the same field
-names instead, where `record.mass` is a float and `record.inertia` a float array.
+array of `Lanes` of shape (3, 3). The scalar instance of a kernel gets a plain record of the same
+field names instead, where `record.mass` is a float and `record.inertia` a float array.
 """
 
 from typing import Any

@@ -1,8 +1,8 @@
 """How kernels are compiled: one decorator, one cache.
 
-`@kernel` marks a function that other kernels call; `@entry` one that Python calls. Entries are cached on
-disk. Numba's own cache notices a change in the file of an entry only, not in the kernels that the entry
-calls from other files, so this cache is stamped with the sources of all kernels.
+`@kernel` marks a function that other kernels call; `@entry` one that Python calls. Entries are
+cached on disk. Numba's own cache notices a change in the file of an entry only, not in the kernels
+that the entry calls from other files, so this cache is stamped with the sources of all kernels.
 """
 
 import functools
@@ -76,7 +76,7 @@ class _UserWide(_KernelSources, caching.UserWideCacheLocator):
 
 
 class _KernelCacheImplementation(caching.CompileResultCacheImpl):
-    _locator_classes = [_UserProvided, _InTree, _UserWide]
+    _locator_classes = (_UserProvided, _InTree, _UserWide)
 
 
 class _KernelCache(caching.Cache):

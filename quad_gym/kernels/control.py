@@ -1,4 +1,4 @@
-"""From what the controller sees to motor voltages: the PD controller and the inner loops of the actions.
+"""From what the controller sees to motor voltages: PD control and the actions' inner loops.
 
 All use the nominal parameters `p`, never the true ones.
 """
@@ -30,9 +30,9 @@ from quad_gym.records import Control
 def allocate(thrust, torque, p):
     """Motor voltages for a total thrust [N] and a torque in B [N m].
 
-    The thrust is held to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha <= 1 that
-    keeps every rotor force at most Fmax: with the forces f + alpha t that is the least (Fmax - f_i) / t_i
-    over the rotors that it loads. Negative forces are set to zero.
+    The thrust is held to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha <= 1
+    that keeps every rotor force at most Fmax: with the forces f + alpha t that is the least (Fmax -
+    f_i) / t_i over the rotors that it loads. Negative forces are set to zero.
     """
     limit = p.max_rotor_force
     zero = 0.0 * thrust
@@ -62,8 +62,8 @@ def _voltage(force, p):
 def pd_wrench(r, v, R_BI, w_B, reference, p):
     """Thrust and torque of the report's PD controller.
 
-    `F_I = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F_I/|F_I|`, thrust `F_I . z_I`; with
-    `b = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and its antisymmetric part e,
+    `F_I = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F_I/|F_I|`, thrust `F_I . z_I`; with `b
+    = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and its antisymmetric part e,
     `N = K e - Kd w + w x J w`.
 
     Args:

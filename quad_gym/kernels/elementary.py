@@ -18,7 +18,7 @@ from quad_gym.kernels.bits import (
 from quad_gym.kernels.compilation import inlined, kernel
 from quad_gym.kernels.lanes import any_of, select
 
-# pi/2 in three parts of 33 bits and a rest, so that k * part is exact for |k| < 2^20 (Cody and Waite)
+# pi/2 in three parts of 33 bits and a rest: k * part is exact for |k| < 2^20 (Cody and Waite)
 _PIO2_1, _PIO2_2, _PIO2_3 = (
     1.57079632673412561417e00,
     6.07710050630396597660e-11,
@@ -130,7 +130,7 @@ def sin_cos(x):
 
 @kernel
 def sin_cos_minus_one(x):
-    """(sin x, cos x - 1) without the cancellation, fastest for |x| < 0.05 rad as sigma points have."""
+    """(sin x, cos x - 1) without cancellation, fastest for |x| < 0.05 rad as of sigma points."""
     z = x * x
     sine = x + x * z * (-1.0 / 6.0 + z * (1.0 / 120.0 - z * (1.0 / 5040.0)))
     rest = z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40320.0))))

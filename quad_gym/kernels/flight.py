@@ -1,7 +1,7 @@
 """One flight: a tick, and an episode's first instant.
 
-A tick is one IMU sample: control with what is seen, predict with the sample of its start, let the true
-state and the biases evolve, then measure and update at its end.
+A tick is one IMU sample: control with what is seen, predict with the sample of its start, let the
+true state and the biases evolve, then measure and update at its end.
 """
 
 import numpy as np

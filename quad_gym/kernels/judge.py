@@ -7,10 +7,11 @@ from quad_gym.kernels.linalg import dot, keep3, load3, norm, sub
 from quad_gym.kernels.reference import evaluate_reference
 from quad_gym.kernels.rotation import quaternion_to_dcm
 from quad_gym.kernels.vehicle import load4
-from quad_gym.records import MAX_GATES, Ending, Task
+from quad_gym.params import MAX_GATES
+from quad_gym.records import Ending, Task
 
 NEAR_WEIGHT, FINE_WEIGHT, HEADING_WEIGHT, ACTION_COST, RATE_COST = 1.0, 0.5, 0.1, 0.02, 0.002
-"""Reward per second: exp(-2e), exp(-20e), heading alignment, |change of action|^2, |body rates|^2."""
+"""Reward a second: exp(-2e), exp(-20e), alignment, |change of action|^2, |body rates|^2."""
 PROGRESS_WEIGHT, GATE_BONUS = 1.0, 1.0
 """Reward of a course: per metre toward the next gate, and per gate passed."""
 
@@ -21,7 +22,7 @@ _OUT_OF_BOUNDS, _LAST_GATE = float(Ending.OUT_OF_BOUNDS), float(Ending.LAST_GATE
 
 @inlined
 def _pass_gate(flight, settings, active):
-    """Move on to the next gate where the present one has been reached; return where, and the progress."""
+    """Move on to the next gate where the present one is reached; return where, and progress."""
     target = load3(flight.ref_center)
     distance = norm(sub(target, load3(flight.r)))
     progress = flight.position_error - distance

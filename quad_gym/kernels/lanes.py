@@ -1,21 +1,21 @@
-"""The number type of the kernels: eight float64 that fly together.
+r"""The number type of the kernels: eight float64 that fly together.
 
-A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it serves
-the friendly classes and the tests; compiled for `Lanes` the same source flies eight flights on the SIMD
-unit. This file teaches Numba three value types and the operations on them:
+A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it
+serves the friendly classes and the tests; compiled for `Lanes` the same source flies eight flights
+on the SIMD unit. This file teaches Numba three value types and the operations on them:
 
 | type      | eight of | plain counterpart | operations                                           |
 |-----------|----------|-------------------|------------------------------------------------------|
 | `Lanes`   | float64  | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt`          |
-| `Mask`    | bool     | `boolean`         | `& \\|`, `logical_not`, `any_of`, `all_of`            |
+| `Mask`    | bool     | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`            |
 | `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `kernels.bits`        |
 
-There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never sees
-its neighbours, so what a flight does is independent of who flies beside it, NaN included.
+There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never
+sees its neighbours, so what a flight does is independent of who flies beside it, NaN included.
 
-LLVM lowers the eight-wide vectors to whatever registers the machine has (one AVX-512 register, two of
-AVX2, four of SSE2 or NEON). The only fast-math flag is `contract` (fused multiply-add): nothing is
-reassociated, so results do not depend on the batch.
+LLVM lowers the eight-wide vectors to whatever registers the machine has (one AVX-512 register, two
+of AVX2, four of SSE2 or NEON). The only fast-math flag is `contract` (fused multiply-add): nothing
+is reassociated, so results do not depend on the batch.
 """
 
 import math
@@ -100,7 +100,7 @@ def vector_of(
     return splat(builder, context.cast(builder, value, source, plain))
 
 
-# ---- conversions: a plain number is eight equal lanes -----------------------------------------------
+# ---- conversions: a plain number is eight equal lanes ----------------------------------------
 
 _PLAIN = {lanes: (types.Float, types.Integer), words: (types.Integer,), mask: (types.Boolean,)}
 
@@ -119,7 +119,7 @@ default_type_manager.set_compatible(types.uint64, words, Conversion.safe)
 default_type_manager.set_compatible(types.boolean, mask, Conversion.safe)
 
 
-# ---- operators ---------------------------------------------------------------------------------------
+# ---- operators -------------------------------------------------------------------------------
 
 
 def _binary(
@@ -133,6 +133,7 @@ def _binary(
             fits = all(a == operand or isinstance(a, _PLAIN[operand]) for a in args)
             if len(args) == 2 and operand in args and fits:
                 return signature(result, *args)
+            return None
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         left, right = (
@@ -193,6 +194,7 @@ def _unary(operation: Any, emit: Callable[[Any, ir.IRBuilder, Any], Any]) -> Non
         def generic(self, args, kws):  # type: ignore[no-untyped-def]
             if args == (lanes,):
                 return signature(lanes, lanes)
+            return None
 
     @lower_builtin(operation, lanes)
     def _lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -216,7 +218,7 @@ _unary(math.sqrt, lambda context, builder, value: call_llvm(builder, "llvm.sqrt"
 _unary(abs, lambda context, builder, value: call_llvm(builder, "llvm.fabs", value))
 
 
-# ---- choosing and asking -----------------------------------------------------------------------------
+# ---- choosing and asking ---------------------------------------------------------------------
 
 
 @intrinsic

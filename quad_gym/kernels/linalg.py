@@ -1,8 +1,9 @@
 """Small linear algebra on any number type.
 
 A vector is a tuple of three numbers, a matrix a tuple of three rows; they live in registers. Larger
-matrices are arrays in a workspace and are handled in blocks of 3 x 3, since the filter's states and its
-measurements all come in threes: nine sums run side by side and hide the latency of the multiply-adds.
+matrices are arrays in a workspace and are handled in blocks of 3 x 3, since the filter's states and
+its measurements all come in threes: nine sums run side by side and hide the latency of the
+multiply-adds.
 """
 
 import math
@@ -11,7 +12,7 @@ from quad_gym.kernels.compilation import inlined, kernel
 from quad_gym.kernels.elementary import minimum
 from quad_gym.kernels.lanes import select
 
-# ---- vectors of three --------------------------------------------------------------------------------
+# ---- vectors of three -------------------------------------------------------------------------
 
 
 @inlined
@@ -94,7 +95,7 @@ def select3(mask, a, b):
     return (select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
 
 
-# ---- matrices of three rows --------------------------------------------------------------------------
+# ---- matrices of three rows ------------------------------------------------------------------
 
 
 @inlined
@@ -159,7 +160,7 @@ def multiply(a, b):
     )
 
 
-# ---- blocks of larger arrays -------------------------------------------------------------------------
+# ---- blocks of larger arrays -----------------------------------------------------------------
 
 
 @inlined
@@ -256,7 +257,7 @@ def load_column3(a, i, j):
 
 @inlined
 def _cholesky33(m):
-    """The lower Cholesky factor of a symmetric matrix, with its diagonal inverted, and the least pivot."""
+    """The lower Cholesky factor with its diagonal inverted, the diagonal, and the least pivot."""
     p0 = m[0][0]
     i0 = 1.0 / math.sqrt(p0)
     l10, l20 = m[1][0] * i0, m[2][0] * i0

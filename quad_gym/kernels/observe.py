@@ -1,4 +1,4 @@
-"""Observations, from what the controller sees alone. `quad_gym.observations` has the same layout as a table."""
+"""Observations, from what the controller sees alone; `envs.spaces` has them as a table."""
 
 import math
 
@@ -8,7 +8,8 @@ from quad_gym.kernels.linalg import apply, load3, load33, scale, sub
 from quad_gym.kernels.reference import evaluate_reference, position_on_reference
 from quad_gym.kernels.rotation import quaternion_to_dcm
 from quad_gym.kernels.vehicle import load4
-from quad_gym.records import MAX_GATES, Layout, Source, Task
+from quad_gym.params import MAX_GATES
+from quad_gym.records import Layout, Source, Task
 
 
 @inlined
@@ -88,7 +89,7 @@ def _put_absolute(flight, p, settings, row):
 
 @inlined
 def _put_sensors(flight, p, settings, row):
-    """The last IMU sample, and GNSS and camera where they measured since the last step, else zeros."""
+    """The last IMU sample; GNSS and camera where they measured since the last step, else zeros."""
     R_IG = load33(p.R_IG)
     k = _put3(row, 0, load3(flight.gyro))
     k = _put3(row, k, load3(flight.accel))

@@ -1,7 +1,7 @@
 """References: a finite Fourier series per axis and a rule for the heading.
 
-`r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)`: hover has no terms, a circle one, a lemniscate two, a
-random flight several. One kernel evaluates them all, with exact derivatives.
+`r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)`: hover has no terms, a circle one, a lemniscate
+two, a random flight several. One kernel evaluates them all, with exact derivatives.
 """
 
 from quad_gym.kernels.compilation import inlined, kernel

@@ -25,9 +25,10 @@ def euler_to_dcm(e):
 
 @inlined
 def split_rotation(e):
-    """R(e) = I + even(e) + odd(e), the parts that keep and change sign with e, free of cancellation.
+    """R(e) = I + even(e) + odd(e), which keep and change sign with e, free of cancellation.
 
-    A pair of sigma points sits at +e and -e, so its sum and difference need one evaluation of these.
+    A pair of sigma points sits at +e and -e, so its sum and difference need one evaluation of
+    these.
 
     Returns:
         (even, odd), and the sines and cosines less one of roll and pitch

@@ -1,7 +1,8 @@
 """What the sensors measure at the present instant: IMU, dual-antenna GNSS, camera.
 
-Every draw has a fixed number within its instant, so that a measurement does not depend on which others
-are taken. The noise-free parts are functions of their own, for the friendly classes and the tests.
+Every draw has a fixed number within its instant, so that a measurement does not depend on which
+others are taken. The noise-free parts are functions of their own, for the friendly classes and the
+tests.
 """
 
 import math
@@ -54,7 +55,7 @@ def drift_biases(flight, p):
 
 @inlined
 def specific_force(flight, p, R_BI):
-    """f_B = R (a_I + g e3) of the accelerometer's place, without bias and noise (report equation 4)."""
+    """f_B = R (a_I + g e3) at the accelerometer, without bias and noise (report equation 4)."""
     w_B = load3(flight.w)
     a_I, dw_B = accelerations(
         R_BI, load3(flight.v), w_B, load4(flight.rotor_speeds), load3(flight.disturbance), p
@@ -76,9 +77,10 @@ def measure_imu(flight, p, mask):
 
 @inlined
 def noisy_baseline(r_b, normals, sigma_b, floor, length):
-    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, then the known length.
+    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, known length.
 
-    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section 3.1).
+    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section
+    3.1).
     """
     size = norm(r_b)
     u = scale(1.0 / size, r_b)

@@ -10,7 +10,8 @@ from quad_gym.kernels.random import normal_pair, uniform_pair
 from quad_gym.kernels.reference import evaluate_reference
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm
 from quad_gym.kernels.sensors import DRAW_RESET, six_normals
-from quad_gym.records import MAX_GATES, MAX_HARMONICS, Start, Task
+from quad_gym.params import MAX_GATES
+from quad_gym.records import MAX_HARMONICS, Start, Task
 
 DRAW_COURSE, DRAW_START, DRAW_SERIES = DRAW_RESET, DRAW_RESET + 2, DRAW_RESET + 16
 """Numbers of the draws of an episode's first instant."""
@@ -37,7 +38,7 @@ def _clear_reference(flight, mask, center, omega, rule, point):
 
 @kernel
 def _draw_series(flight, settings, stream, mask):
-    """A random flight: normal coefficients falling as 1/k^2, scaled to the bounds on speed and acceleration.
+    """A random flight: normal coefficients falling as 1/k^2, scaled to the bounds.
 
     |r' | <= sum k w |c_k| and |r''| <= sum (k w)^2 |c_k|, so the bounds hold at every time.
     """
@@ -90,7 +91,7 @@ def _draw_gates(flight, settings, stream, mask):
 
 @kernel
 def draw_reference(flight, settings, stream, mask):
-    """Set the reference of a new episode, where `mask`; drawn at random where the settings say so."""
+    """Set the reference of a new episode, where `mask`; at random where the settings say so."""
     u_phase, u_radius = uniform_pair(stream, DRAW_COURSE)
     u_period, u_sense = uniform_pair(stream, DRAW_COURSE + 1)
     zero = 0.0 * u_phase

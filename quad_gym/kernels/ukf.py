@@ -1,18 +1,19 @@
 """The unscented Kalman filter of the report, with its structure used and its result unchanged.
 
-State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The filter
-stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are those of the
-augmented filter (27 columns in the prediction, 15 + n_z in the update), but
+State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The
+filter stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are those of
+the augmented filter (27 columns in the prediction, 15 + n_z in the update), but
 
-* the augmented factor is block diagonal, so that noise which enters linearly contributes in closed form,
-  and so do the columns for states on which a model does not depend: 9 pairs of points remain;
-* a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and its half-sum less the centre s,
-  for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the moments are
+* the augmented factor is block diagonal, so that noise which enters linearly contributes in closed
+  form, and so do the columns for states on which a model does not depend: 9 pairs of points remain;
+* a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and its half-sum less the
+  centre s, for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the
+  moments are
       mean = f(x0) + mu,  mu = sum s / c^2
       cov  = sum (a a^T + s s^T) / c^2 + (beta - alpha^2) mu mu^T + noise
   in which nothing cancels, unlike in the usual weights near -1e6;
-* the update never forms P_zz. With A and E the columns a / c and s / c of the measurement, and
-  Rz = E E^T + (beta - alpha^2) mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion
+* the update never forms P_zz. With A and E the columns a / c and s / c of the measurement, and Rz =
+  E E^T + (beta - alpha^2) mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion
   lemma gives  P+ = L (I + C C^T)^-1 L^T  with  C = A^T Rz^-T/2  over the nine columns that matter.
   The new factor is L times the factor of that inverse, lower triangular again, and stays accurate
   when a measurement is 10^8 times as good as the prediction.
@@ -82,7 +83,7 @@ def _euler_rate_parts(parts, w_B, dg):
 
 @inlined
 def _propagate_sigma_points(flight, p, work, f_B, w_B):
-    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's, per row."""
+    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's."""
     L, F, S = flight.L, work.F, work.S
     R_BI = load33(flight.R_hat)
     dt = p.dt
@@ -96,7 +97,7 @@ def _propagate_sigma_points(flight, p, work, f_B, w_B):
         d = scale(c, load_column3(L, E, j))
         df, dg = scale(c, load_column3(L, BA, j)), scale(c, load_column3(L, BG, j))
         even, odd, parts = split_rotation(d)
-        # a_I = R^T R(e)^T (f - b_a) - g: its part odd in the offset, and its even part less the centre
+        # a_I = R^T R(e)^T (f - b_a) - g: its part odd in the offset, its even part less the centre
         odd_B = sub(sub(apply_transposed(odd, f_B), df), apply_transposed(even, df))
         even_B = sub(apply_transposed(even, f_B), apply_transposed(odd, df))
         a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
@@ -172,7 +173,8 @@ def predict(flight, p, work):
     `a = R^T (f_meas - b_a - v_a) - g e3`, `r+ = r + v dt + a dt^2/2`, `v+ = v + a dt`,
     `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`.
 
-    A lane whose predicted covariance is not positive definite keeps its state and sets PREDICTION_FAILED.
+    A lane whose predicted covariance is not positive definite keeps its state and sets
+    PREDICTION_FAILED.
 
     Args:
         flight: Record; reads gyro and accel, changes the estimate.
@@ -212,8 +214,8 @@ def predict(flight, p, work):
 def initialize(flight, p, mask):
     """Start the filter from the first fix, where `mask`.
 
-    Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical, with equal
-    weights; position from the antenna; velocity and biases zero.
+    Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
+    with equal weights; position from the antenna; velocity and biases zero.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.

@@ -1,10 +1,10 @@
-"""The filter's measurement update: antenna position, baseline direction and feature directions at once.
+"""The filter's update: antenna position, baseline direction and feature directions at once.
 
-See `ukf.py` for the form of the unscented transform and of the update. The stacked measurement is made of
-triples, all in I or B: r + R^T l_p, unit(R^T l_b), and for each feature unit(R (X - r) - l_c), for a
-direction in the camera frame differs from one in B by a fixed rotation only. A triple that a lane lacks
-is masked: its deviations and innovation are zero and its noise is one, which gives exactly the update
-without it. Triples that every lane lacks are left out.
+See `ukf.py` for the form of the unscented transform and of the update. The stacked measurement is
+made of triples, all in I or B: r + R^T l_p, unit(R^T l_b), and for each feature unit(R (X - r) -
+l_c), for a direction in the camera frame differs from one in B by a fixed rotation only. A triple
+that a lane lacks is masked: its deviations and innovation are zero and its noise is one, which
+gives exactly the update without it. Triples that every lane lacks are left out.
 """
 
 import math
@@ -78,7 +78,7 @@ def _has_feature(flight, k):
 
 @inlined
 def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
-    """Fill work.h (centre), work.z (measured) and the diagonal blocks of work.Rz; return n_z of the block."""
+    """Fill work.h (centre), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
     h, z, Rz = work.h, work.z, work.Rz
     R_IG, R_BI, R_CB = load33(p.R_IG), load33(flight.R_hat), load33(p.R_CB)
     r = load3(flight.r_hat)
@@ -156,9 +156,9 @@ def _shrinkage(d):
 
 @inlined
 def _direction_pair(v, inverse_norm, v_even, v_odd):
-    """Half-difference, and half-sum less unit(v), of unit(v + v_even + v_odd) and unit(v + v_even - v_odd).
+    """Half-difference, and half-sum less unit(v), of the pair unit(v + v_even +- v_odd).
 
-    |v + v_even +- v_odd|^2 = |v|^2 (1 + d), and the small d gives the new lengths without cancellation.
+    |v + v_even +- v_odd|^2 = |v|^2 (1 + d): the small d gives the lengths without cancellation.
     """
     centre = add(v, v_even)
     inverse_square = inverse_norm * inverse_norm

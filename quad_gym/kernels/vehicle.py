@@ -154,5 +154,5 @@ def integrate(flight, p, substeps):
 
 @inlined
 def imu_point_acceleration(R_BI, a_I, w_B, dw_B, l_B):
-    """Acceleration in I of a point fixed in the body: a_I + R^T (dw x l + w x (w x l)); report section 2.3."""
+    """Acceleration of a body-fixed point in I: a_I + R^T (dw x l + w x (w x l)); report 2.3."""
     return add(a_I, apply_transposed(R_BI, add(cross(dw_B, l_B), cross(w_B, cross(w_B, l_B)))))

@@ -1,8 +1,8 @@
 """Wahba's problem: the rotation that best turns one set of vectors into another.
 
-Minimise sum_i a_i |v_B,i - R_BI v_I,i|^2 over rotations R_BI. With B = sum a_i v_B,i v_I,i^T = U S V^T the
-solution is R_BI = U diag(1, 1, det U det V) V^T (G. Wahba, SIAM Review 7(3), 1965; F. L. Markley,
-J. Astronautical Sciences 36(3), 1988).
+Minimise sum_i a_i |v_B,i - R_BI v_I,i|^2 over rotations R_BI. With B = sum a_i v_B,i v_I,i^T = U S
+V^T the solution is R_BI = U diag(1, 1, det U det V) V^T (G. Wahba, SIAM Review 7(3), 1965; F. L.
+Markley, J. Astronautical Sciences 36(3), 1988).
 """
 
 import math
@@ -41,7 +41,7 @@ def _perpendicular(a):
 
 @inlined
 def _perpendicular_unit(candidate, a):
-    """The direction of `candidate` made perpendicular to a, or another perpendicular if it has none."""
+    """The direction of `candidate` made perpendicular to a, or another if it has none."""
     fallback = unit_or(_perpendicular(a), a)
     once = unit_or(sub(candidate, scale(dot(candidate, a), a)), fallback)
     return unit_or(sub(once, scale(dot(once, a), a)), fallback)
@@ -49,14 +49,15 @@ def _perpendicular_unit(candidate, a):
 
 @kernel
 def wahba(B):
-    """The rotation R_BI that maximises tr(R_BI^T B), by one-sided Jacobi rotations (M. R. Hestenes, 1958).
+    """The rotation R_BI that maximises tr(R_BI^T B), by one-sided Jacobi rotations.
 
     Args:
         B: Attitude profile matrix, sum of a_i v_B,i v_I,i^T.
 
     Returns:
-        (R_BI, uniqueness): the second is (s_2 + d s_3) / s_1 for singular values s and d = det U det V;
-        where it is zero, a whole family of rotations is equally good and R_BI is one of them.
+        (R_BI, uniqueness): the second is (s_2 + d s_3) / s_1 for singular values s and d = det U
+        det V; where it is zero, a whole family of rotations is equally good and R_BI is one of
+        them.
     """
     a0, a1, a2 = transpose(B)
     one, zero = 1.0 + 0.0 * B[0][0], 0.0 * B[0][0]
