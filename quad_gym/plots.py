@@ -6,7 +6,7 @@ and a server without a display will do. Colours are those of Okabe and Ito, whic
 colour vision deficiency can tell apart.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,7 +139,7 @@ def heading_ticks(
     direction = np.asarray(heading, np.float64)
     # half an instant's grace, so that rounding of times loses no tick
     grace = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
-    wanted = np.arange(t[0], t[-1] + grace, every)
+    wanted = t[0] + every * np.arange(1 + int((t[-1] - t[0] + grace) / every))
     chosen = np.minimum(np.searchsorted(t, wanted - grace), t.size - 1)
     unit = direction[chosen] / np.linalg.norm(direction[chosen], axis=1, keepdims=True)
     return np.stack([here[chosen], here[chosen] + length * unit], axis=1)
@@ -281,7 +281,7 @@ def error_figure(
 
 def overview_figure(
     trace: Trace,
-    errors: dict[str, tuple[Trace, Band | None]],
+    errors: Mapping[str, tuple[Trace, Band | None]],
     *,
     title: str = "",
     label: str = "one flight",

@@ -86,7 +86,6 @@ def record_flights(
         The recording; the start counts as the first of `steps + 1` instants.
     """
     count = batch.count
-    batch.reset(seeds=seeds)
     times = np.arange(steps + 1, dtype=np.float64) / batch.clocks.control_rate
     estimating = batch.source == Source.ESTIMATE
     flying = np.ones(count, bool)
@@ -99,7 +98,9 @@ def record_flights(
 
     instants = range(steps + 1)
     for step in instants if progress is None else progress(instants):
-        if step > 0:
+        if step == 0:
+            batch.reset(seeds=seeds)
+        else:
             batch.step()
             over = flying & (batch.result("terminated") + batch.result("truncated") > 0.0)
             ending[over], ended_at[over] = batch.result("ending")[over], times[step]

@@ -52,8 +52,8 @@ class FlightBatch:
     """N flights of one configuration, advanced together by compiled kernels.
 
     A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does
-        depends
-    on its seed and its actions alone, not on the batch's size, its order or the number of threads.
+    depends on its seed and its actions alone, not on the batch's size, its order or the number of
+    threads.
 
     Args:
         count: Number of flights.
@@ -216,7 +216,7 @@ class FlightBatch:
         return self._run(Command.STEP)
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        observations = np.zeros((self.count, self._low.size), np.float32)
+        observations = np.empty((self.count, self._low.size), np.float32)  # the kernel fills it
 
         def part(number: int, first: int, last: int) -> None:
             fly(
@@ -251,15 +251,21 @@ class FlightBatch:
 
     # ---- reading ------------------------------------------------------------------------------
 
-    def read(self, name: str) -> NDArray[Any]:
-        """One field of all flights, such as "r" or "b_a_hat", as a new array (count, ...).
+    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """One field, such as "r" or "b_a_hat", as a new array (n, ...).
+
+        Args:
+            name: The field.
+            flights: Whose, by their numbers; None: all flights'.
 
         Raises:
             ValueError: If there is no such field; see `records.FLIGHT_FIELDS`.
         """
         if name not in (FLIGHT_BLOCK.names or ()):
             raise ValueError(f"name must be a field of a flight, got {name!r}")
-        return field_of_flights(self._blocks, name, self.count)
+        if flights is None:
+            return field_of_flights(self._blocks, name, self.count)
+        return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
 
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
@@ -304,7 +310,10 @@ class FlightBatch:
             if value is None:
                 continue
             width = columns.stop - columns.start
-            numbers = np.asarray(value, np.float64)
+            try:
+                numbers = np.asarray(value, np.float64)
+            except (TypeError, ValueError):
+                raise ValueError(f"{name} must be numbers, got {value!r}") from None
             if name == "yaw":
                 numbers = numbers[..., np.newaxis]
             if numbers.shape not in ((width,), (self.count, width)):

@@ -149,11 +149,8 @@ class Flights:
             true_sensors=true_sensors,
         )
         if max_episode_steps is not None:
-            self.limit(max_episode_steps)
-
-    def limit(self, max_episode_steps: int) -> None:
-        """Truncate episodes after this many steps."""
-        self.batch.limit(check.whole("max_episode_steps", max_episode_steps))
+            steps = check.whole("max_episode_steps", max_episode_steps)
+            self.batch.limit(min(steps, self.batch.max_steps or steps))
 
     def split(self, observations: NDArray[np.float32]) -> Any:
         """Observations (..., n) as the space wants them: an array, or a Dict of parts."""

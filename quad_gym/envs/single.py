@@ -17,10 +17,11 @@ _COLUMN = {name: column for column, name in enumerate(RESULTS)}
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     """A quadrotor that is controlled on estimated state.
 
-    ## Description A quadrotor (0.78 kg, four rotors with a lag of 0.05 s) flies a reference. GNSS,
-    camera and IMU measure it 200 times a second, an unscented Kalman filter fuses them, and the
-    controller sees what `observation` says: by default the filter's estimate. The reward, the
-    endings and `info` use the true state.
+    ## Description
+    A quadrotor (0.78 kg, four rotors with a lag of 0.05 s) flies a reference. GNSS, camera and IMU
+    measure it 200 times a second, an unscented Kalman filter fuses them, and the controller sees
+    what `observation` says: by default the filter's estimate. The reward, the endings and `info`
+    use the true state.
 
     | id | reference | start | time limit |
     |---|---|---|---|
@@ -30,8 +31,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin | hovering near the origin | 20 s |
 
-    ## Observation space A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"`
-    and `layout="relative"`:
+    ## Observation space
+    A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and
+    `layout="relative"`:
 
     | slice | name | meaning | unit | frame |
     |---|---|---|---|---|
@@ -52,9 +54,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     `quad_gym.observation_layout(...)` returns any of these tables, with bounds; observations are
     held within them.
 
-    ## Action space `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal
-    vehicle. The inner loops run at every tick (200 Hz) on what the controller sees, its gyro
-    included.
+    ## Action space
+    `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal vehicle. The
+    inner loops run at every tick (200 Hz) on what the controller sees, its gyro included.
 
     | `action` | a[0] | a[1], a[2], a[3] |
     |---|---|---|
@@ -64,28 +66,32 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `"attitude"` | thrust m g (1 + a) | roll, pitch 45 deg, yaw rate 3 rad/s |
     | `"velocity"` | velocity ahead 5 m/s | to the left, up 5 m/s; yaw rate 3 rad/s |
 
-    ## Reward Per second of flight, with the position error e [m], the alignment h of body x with
-    the wanted heading (1: aligned), the change of the action da and the body rates w:
+    ## Reward
+    Per second of flight, with the position error e [m], the alignment h of body x with the wanted
+    heading (1: aligned), the change of the action da and the body rates w:
 
         exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
 
-    times the control period. At most 1.6 a second; a circle flown perfectly returns 16. `Waypoints`
-    gives 1 a metre of progress toward the next gate and 1 a gate instead of the two exponentials.
+    times the control period. At most 1.6 a second, so a circle flown perfectly returns 16; an
+    action that jumps from corner to corner costs 0.32 a second. `Waypoints` gives 1 a metre of
+    progress toward the next gate and 1 a gate instead of the two exponentials.
 
-    ## Episode end Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by
-    more than 100 degrees, below -0.5 m, or through the last gate. Truncated: at the time limit, or
-    when the filter has failed (`info["filter_status"]`). `info["ending"]` says which.
+    ## Episode end
+    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by more than 100
+    degrees, below -0.5 m, or through the last gate. Truncated: at the time limit, or when the
+    filter has failed (`info["filter_status"]`). `info["ending"]` says which.
 
-    ## Start "ground" (the report's): at rest at height 0 below the start of the reference, rotors
-    stopped, level, looking as wanted. "hover": hovering at rest, with standard deviations of 0.3 m,
-    0.2 rad in yaw, 0.03 rad in tilt. The filter starts from its first fix in either.
+    ## Start
+    "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped,
+    level, looking as wanted. "hover": hovering at rest, with standard deviations of 0.3 m, 0.2 rad
+    in yaw and 0.03 rad in tilt. The filter starts from its first fix in either.
     `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these for one
     episode.
 
-    ## Info `position_error` and `estimation_error` [m], both against the true position; `ending`;
+    ## Info
+    `position_error` and `estimation_error` [m], both against the true position; `ending`;
     `filter_status`, 0 while all is well; `gates_passed`.
 
-    ## Arguments
     Args:
         task: The kind of task; `gymnasium.make` fills it in from the id.
         observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the
@@ -94,21 +100,28 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors, vehicle: Presets by name, or parameter objects.
+        sensors: A preset by name, or a `SensorSuite`.
+        vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
         feature_noise_across: "predicted" or "measured", see `quad_gym.FilterParams`. None: as a
             given `SensorSuite` has it; for a suite by name "predicted", as the report's own
             "measured" makes some 6 circles in 1,000 crash in their first second.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
-        imu_rate, gnss_rate, camera_rate: Rates in place of the suite's [Hz].
+        imu_rate: In place of the suite's [Hz].
+        gnss_rate: In place of the suite's [Hz].
+        camera_rate: In place of the suite's [Hz].
         substeps: Runge-Kutta steps in a tick.
-        max_episode_steps: Time limit in steps, in place of `duration`.
-        true_vehicle, true_sensors: What really flies, where controller and filter believe something
-            else.
+        max_episode_steps: Time limit in steps; the earlier of this and `duration` holds, as with
+            `gymnasium.make`, so pass a longer `duration` (or 0: none) to fly longer.
+        true_vehicle: What really flies, where the controller believes in `vehicle`.
+        true_sensors: What really measures, where the filter believes in `sensors`.
         radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
             max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
             `quad_gym.TaskParams`.
+
+    Raises:
+        ValueError: If a keyword is unknown or its value makes no sense.
 
     ## Version history
     - v0: first version.
@@ -121,7 +134,6 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         if self.render_mode is not None:
             raise ValueError(f"render_mode must be None, got {self.render_mode!r}")
         self.flights = Flights(task, 1, Autoreset.DISABLED, threads=1, **keywords)
-        self._limited = keywords.get("max_episode_steps") is not None
         self.observation_space = self.flights.space
         self.action_space = action_space()
         self._seeded = self._over = False
@@ -143,7 +155,6 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         """
         start = start_options(options)
         super().reset(seed=seed)
-        self._honour_spec()
         batch = self.flights.batch
         if seed is not None or not self._seeded:
             keys = stream_key(self.np_random)[np.newaxis]
@@ -200,13 +211,6 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     def close(self) -> None:
         """Nothing is held open; closing twice is fine."""
-
-    def _honour_spec(self) -> None:
-        """A limit that was given to `gymnasium.make` replaces the task's duration."""
-        steps = getattr(self.spec, "max_episode_steps", None)
-        if steps is not None and not self._limited:
-            self.flights.limit(steps)
-            self._limited = True
 
 
 def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:

@@ -19,7 +19,28 @@ _MODES = {
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
 _ENDING_NAMES = np.array(ENDINGS, dtype=object)
-_COLUMN = {name: column for column, name in enumerate(RESULTS)}
+(
+    _REWARD,
+    _TERMINATED,
+    _TRUNCATED,
+    _ENDING,
+    _POSITION_ERROR,
+    _ESTIMATION_ERROR,
+    _FILTER_STATUS,
+    _GATES_PASSED,
+) = map(
+    RESULTS.index,
+    (
+        "reward",
+        "terminated",
+        "truncated",
+        "ending",
+        "position_error",
+        "estimation_error",
+        "filter_status",
+        "gates_passed",
+    ),
+)
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
@@ -62,6 +83,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seeded = False
         self._over = np.zeros(self.num_envs, bool)
+        self._everyone = np.ones(self.num_envs, bool)
+        self._no_ending = np.full(self.num_envs, ENDINGS[0], object)
 
     def reset(
         self,
@@ -128,7 +151,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             gymnasium.error.ResetNeeded: Before the first reset, or with autoreset disabled if an
                 episode is over.
         """
-        numbers = checked_actions(actions, (self.num_envs, 4))
+        shape = (self.num_envs, 4)
+        numbers = actions if _in_order(actions, shape) else checked_actions(actions, shape)
         if not self._seeded:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
@@ -138,17 +162,20 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
                 "reset it before step()"
             )
         batch = self.flights.batch
-        began = self._over if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
+        began = np.flatnonzero(self._over)
         observations = batch.step(numbers)
-        terminated, truncated = batch.result("terminated") > 0.0, batch.result("truncated") > 0.0
+        results = batch.results
+        terminated, truncated = results[:, _TERMINATED] > 0.0, results[:, _TRUNCATED] > 0.0
         self._over = terminated | truncated
-        everyone = np.ones(self.num_envs, bool)
-        infos = _masked(self._step_infos(began), everyone)
+        infos = self._step_infos(results)
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            self._replace_by_start(infos, began)
+        infos = _masked(infos, self._everyone)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
             infos = self._with_finals(infos)
         return (
             self.flights.split(observations),
-            batch.result("reward"),
+            results[:, _REWARD].copy(),
             terminated,
             truncated,
             infos,
@@ -157,24 +184,26 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is held open; closing twice is fine."""
 
-    def _step_infos(self, began: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """What the judge says of the step; of the new episode where one began in its stead."""
-        batch = self.flights.batch
+    def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
+        """What the judge says of the step."""
         infos: dict[str, Any] = {
-            "position_error": batch.result("position_error"),
-            "estimation_error": batch.result("estimation_error"),
-            "ending": _ENDING_NAMES[batch.result("ending").astype(np.intp)],
-            "filter_status": batch.result("filter_status").astype(np.int64),
-            "gates_passed": batch.result("gates_passed").astype(np.int64),
+            "position_error": results[:, _POSITION_ERROR].copy(),
+            "estimation_error": results[:, _ESTIMATION_ERROR].copy(),
+            "ending": self._no_ending.copy(),
+            "filter_status": results[:, _FILTER_STATUS].astype(np.int64),
+            "gates_passed": results[:, _GATES_PASSED].astype(np.int64),
         }
-        if began is not None and began.any():
-            self._replace_by_start(infos, began)
+        ended = np.flatnonzero(self._over)
+        if ended.size:  # seldom: looking up a name for every flight would cost more than the rest
+            infos["ending"][ended] = _ENDING_NAMES[results[ended, _ENDING].astype(np.intp)]
         return infos
 
-    def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.bool_]) -> None:
-        batch = self.flights.batch
+    def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
+        """Describe the new episode instead, of the flights where one began."""
+        if not began.size:
+            return
         for name in ("position_error", "estimation_error", "filter_status"):
-            infos[name][began] = batch.read(name)[began]
+            infos[name][began] = self.flights.batch.read(name, began)
         infos["ending"][began] = ENDINGS[0]
         infos["gates_passed"][began] = 0
 
@@ -190,7 +219,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             for name, values in infos.items()
             if not name.startswith("_")
         }
-        self._replace_by_start(infos, over)
+        self._replace_by_start(infos, np.flatnonzero(over))
         infos |= {
             "final_obs": final_obs,
             "_final_obs": over,
@@ -214,6 +243,16 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         if not mask.any():
             raise ValueError("options['reset_mask'] must choose at least one environment")
         return mask
+
+
+def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
+    """Whether actions need neither a check nor clipping; NaN and infinity are not within bounds."""
+    return (
+        isinstance(actions, np.ndarray)
+        and actions.dtype.kind == "f"
+        and actions.shape == shape
+        and bool(np.abs(actions).max() <= 1.0)
+    )
 
 
 def _blank(values: NDArray[Any]) -> Any:
