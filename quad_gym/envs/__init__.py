@@ -57,5 +57,6 @@ def make_sb3_vec_env(
             'make_sb3_vec_env needs Stable-Baselines3: pip install "quad-gym[train]"'
         ) from error
     env = QuadVecEnv(n_envs, IDS[name], **keywords)
-    env.seed(seed)
+    if seed is not None:
+        env.seed(seed)
     return env

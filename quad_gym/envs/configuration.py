@@ -169,9 +169,12 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float64]
         ValueError: If the shape is another or a number is not finite.
     """
     try:
-        numbers = np.asarray(actions, np.float64)
-    except (TypeError, ValueError):
+        given = np.asarray(actions)
+    except ValueError:
         raise ValueError(f"action must be {shape} numbers, got {actions!r}") from None
+    if given.dtype.kind not in "biuf":
+        raise ValueError(f"action must be {shape} numbers, got {actions!r}")
+    numbers = given.astype(np.float64)
     if numbers.shape != shape:
         raise ValueError(f"action must have shape {shape}, got {numbers.shape}")
     if not np.isfinite(numbers).all():

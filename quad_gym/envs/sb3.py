@@ -66,6 +66,8 @@ class QuadVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions of the coming step, (n, 4) in [-1, 1]; beyond is clipped."""
+        if not self._seeded:
+            raise RuntimeError("call reset() before step()")
         self._pending = checked_actions(actions, (self.num_envs, 4))
 
     def step_wait(self) -> Any:
@@ -110,6 +112,12 @@ class QuadVecEnv(VecEnv):
                 "e": float(row[_COLUMN["episode_error_sum"]]) / steps,
             },
         }
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed flight i with seed + i at the next reset; None takes fresh entropy."""
+        if seed is None:  # the base class would draw from NumPy's global generator
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        return super().seed(seed)
 
     def close(self) -> None:
         """Nothing is held open; closing twice is fine."""

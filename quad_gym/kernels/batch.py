@@ -59,8 +59,11 @@ def _fly_step(flight, world, model, settings, work):
     flight.baseline_fresh = 0.0
     for i in range(settings.feature_count):
         flight.feature_fresh[i] = 0.0
+    instant = flight.instant
     for _ in range(settings.ticks_per_step):
         tick(flight, world, model, settings, work)
+    # a step that begins an episode draws nothing before it
+    flight.instant = select(resetting, instant, flight.instant)
     judge(flight, model, settings, logical_not(resetting))
     done = (flight.terminated + flight.truncated) > 0.0
     flight.needs_reset = select(done, 1.0, flight.needs_reset)
