@@ -26,9 +26,20 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
         ValueError: If `r_G` is not three finite numbers, or lies within 1,000 km of the Earth's
             centre.
     """
-    x, y, z = check.array("r_G", r_G, (3,))
-    if np.sqrt(x * x + y * y + z * z) < 1e6:
-        raise ValueError(f"r_G must be a place near the Earth's surface in metres, got {r_G!r}")
+    return _geodetic(_checked_place("r_G", r_G))
+
+
+def _checked_place(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    place = check.array(name, value, (3,))
+    if np.linalg.norm(place) < 1e6:
+        raise ValueError(
+            f"{name} must be a place near the Earth's surface in metres, got {value!r}"
+        )
+    return place
+
+
+def _geodetic(r_G: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = r_G
     eccentricity2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING)
     p = np.hypot(x, y)
     lat = np.arctan2(z, p * (1.0 - eccentricity2))
@@ -59,7 +70,7 @@ def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: If `r0_G` is not three finite numbers on the Earth.
     """
-    lat, lon, _ = ecef_to_geodetic(r0_G)
+    lat, lon, _ = _geodetic(_checked_place("r0_G", r0_G))
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
     return np.array(
         [

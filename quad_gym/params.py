@@ -112,6 +112,11 @@ class VehicleParams(_Checked):
                 "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
                 f"{smallest:g}"
             )
+        if self.hover_voltage >= self.max_voltage:
+            raise ValueError(
+                f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: it takes "
+                f"{self.hover_voltage:.1f} V of {self.max_voltage:g} V"
+            )
         if any(abs(spin) != 1.0 for spin in self.rotor_spins):
             raise ValueError(f"VehicleParams.rotor_spins must be +1 or -1, got {self.rotor_spins}")
         if abs(np.linalg.det(self.effectiveness)) < 1e-12:
@@ -252,7 +257,7 @@ class CameraParams(_Checked):
             raise ValueError(
                 f"CameraParams.image_size must be greater than 0, got {self.image_size}"
             )
-        if len(self.features_I) == 0:
+        if np.size(self.features_I) == 0:
             raise ValueError("CameraParams.features_I must hold at least one feature, got none")
         self._check(check.matrix, "features_I", rows=None, columns=3)
         if len(self.features_I) > MAX_FEATURES:
@@ -328,6 +333,15 @@ class SensorSuite(_Checked):
     noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
 
     def __post_init__(self) -> None:
+        for name, kind in (
+            ("imu", ImuParams),
+            ("gnss", GnssParams),
+            ("estimator", FilterParams),
+            ("noisy", NoisyObservationParams),
+        ):
+            check.instance(f"SensorSuite.{name}", getattr(self, name), kind)
+        if self.camera is not None:
+            check.instance("SensorSuite.camera", self.camera, CameraParams)
         check.ticks("GnssParams.rate", self.gnss.rate, self.imu.rate)
         if self.camera is not None:
             check.ticks("CameraParams.rate", self.camera.rate, self.imu.rate)
@@ -434,10 +448,13 @@ class ActionParams(_Checked):
             "velocity_bandwidth",
         )
         self._check(check.vector, "rate_scale", length=3)
-        if min(self.rate_scale) <= 0.0 or self.tilt_scale >= math.pi / 2:
+        if min(self.rate_scale) <= 0.0:
             raise ValueError(
-                "ActionParams.rate_scale must be greater than 0 and tilt_scale less than pi/2, "
-                f"got {self.rate_scale} and {self.tilt_scale}"
+                f"ActionParams.rate_scale must be greater than 0, got {self.rate_scale}"
+            )
+        if self.tilt_scale >= math.pi / 2:
+            raise ValueError(
+                f"ActionParams.tilt_scale must be less than pi/2, got {self.tilt_scale}"
             )
 
 
@@ -530,6 +547,7 @@ class TaskParams(_Checked):
         )
         self._check(check.number, "duration", least=0.0)
         self._check(check.number, "ground")
+        self._check(check.flag, "randomize")
         self._check(check.vector, "preview", length=2)
         self._check(check.whole, "gate_count")
         if self.gate_count > MAX_GATES:

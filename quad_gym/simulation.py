@@ -138,7 +138,8 @@ class FlightBatch:
         )
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
-        self._blocks["idle"].reshape(-1)[self.count :] = 1.0
+        lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
+        self._blocks["idle"] = lanes >= self.count
         self._blocks["needs_reset"] = 1.0
         self._blocks["start_given"] = np.nan
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]

@@ -98,13 +98,9 @@ class Flights:
         check.choice("observation", observation, tuple(OBSERVATIONS))
         check.choice("action", action, tuple(ACTIONS))
         check.choice("layout", layout, tuple(LAYOUTS))
-        for name, flag in (
-            ("camera", camera),
-            ("include_covariance", include_covariance),
-            ("privileged", privileged),
-        ):
-            if not isinstance(flag, (bool, np.bool_)):
-                raise ValueError(f"{name} must be True or False, got {flag!r}")
+        check.flag("camera", camera)
+        check.flag("include_covariance", include_covariance)
+        check.flag("privileged", privileged)
         suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         if not isinstance(suite, SensorSuite):
             raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")

@@ -32,7 +32,8 @@ def allocate(thrust, torque, p):
 
     The thrust is held to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha <= 1
     that keeps every rotor force at most Fmax: with the forces f + alpha t that is the least (Fmax -
-    f_i) / t_i over the rotors that it loads. Negative forces are set to zero.
+    f_i) / t_i over the rotors that it loads. Negative forces are set to zero, and a rotor
+    that the thrust alone overloads, as unequal arms allow, is held to Fmax.
     """
     limit = p.max_rotor_force
     zero = 0.0 * thrust
@@ -55,7 +56,7 @@ def allocate(thrust, torque, p):
 
 @inlined
 def _voltage(force, p):
-    return math.sqrt(maximum(force, 0.0) / p.kF) / p.motor_gain
+    return math.sqrt(clip(force, 0.0, p.max_rotor_force) / p.kF) / p.motor_gain
 
 
 @inlined

@@ -263,4 +263,5 @@ def atan2(y, x):
     angle = select(steep, angle + 3.06161699786838301793e-17 + 0.78539816339744827900, angle)
     angle = select(ay > ax, 1.57079632679489655800 - angle, angle)
     angle = select(x < 0.0, 3.14159265358979311600 - angle, angle)
-    return select(y < 0.0, -angle, angle)
+    angle = select(y < 0.0, -angle, angle)
+    return select((x == x) & (y == y), angle, math.nan)

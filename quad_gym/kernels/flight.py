@@ -84,8 +84,9 @@ def sense(flight, world, model, settings, work, mask, starting):
         due = mask & (flight.gnss_wait <= 0.0)
         if any_of(due):
             measure_gnss(flight, world, due)
-        flight.position_valid = select(due, 1.0, 0.0)
-        flight.baseline_valid = select(due, 1.0, 0.0)
+        valid = select(due, 1.0, 0.0)
+        flight.position_valid = select(mask, valid, flight.position_valid)
+        flight.baseline_valid = select(mask, valid, flight.baseline_valid)
         wait = select(due, period, flight.gnss_wait) - 1.0
         flight.gnss_wait = select(mask, wait, flight.gnss_wait)
         flight.position_fresh = select(due, 1.0, flight.position_fresh)
@@ -94,11 +95,10 @@ def sense(flight, world, model, settings, work, mask, starting):
         if settings.camera_ticks > 0:
             period = 1.0 * settings.camera_ticks
             due = mask & (flight.camera_wait <= 0.0)
+            for i in range(settings.feature_count):
+                flight.feature_valid[i] = select(mask, 0.0, flight.feature_valid[i])
             if any_of(due):
                 measure_features(flight, world, settings.feature_count, due)
-            else:
-                for i in range(settings.feature_count):
-                    flight.feature_valid[i] = 0.0
             wait = select(due, period, flight.camera_wait) - 1.0
             flight.camera_wait = select(mask, wait, flight.camera_wait)
             for i in range(settings.feature_count):

@@ -120,7 +120,7 @@ def project(X_I, r_I, R_BI, p):
 
 @kernel
 def measure_features(flight, p, feature_count, mask):
-    """Project the features that the camera sees, where `mask`; elsewhere none is valid now."""
+    """Project the features and mark those that the camera sees, where `mask`."""
     stream = stream_of(flight)
     R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
     for i in range(feature_count):
@@ -129,4 +129,4 @@ def measure_features(flight, p, feature_count, mask):
         seen = seen & mask
         flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
         flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
-        flight.feature_valid[i] = select(seen, 1.0, 0.0)
+        flight.feature_valid[i] = select(mask, select(seen, 1.0, 0.0), flight.feature_valid[i])

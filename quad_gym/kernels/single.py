@@ -1,7 +1,7 @@
 """Entries for one flight: the scalar instances behind the friendly classes."""
 
 from quad_gym.kernels.compilation import entry
-from quad_gym.kernels.linalg import add_outer, load3, load33, scale, store3, store33
+from quad_gym.kernels.linalg import add_outer, load3, load33, scale, scale33, store3, store33
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.sensors import drift_biases, measure_features, measure_gnss, measure_imu
 from quad_gym.kernels.ukf import initialize, predict
@@ -75,6 +75,13 @@ def wahba_of_vectors(weights, v_I, v_B, R_BI):
     profile = (zeros, zeros, zeros)
     for i in range(len(weights)):
         profile = add_outer(profile, scale(weights[i], load3(v_B[i])), load3(v_I[i]))
+    # only ratios count: make the largest entry one, far from under- and overflow
+    largest = 0.0
+    for i in range(3):
+        for j in range(3):
+            largest = max(largest, abs(profile[i][j]))
+    if largest > 0.0:
+        profile = scale33(1.0 / largest, profile)
     rotation, uniqueness = wahba(profile)
     store33(R_BI, rotation)
     return uniqueness

@@ -1,0 +1,48 @@
+"""Bitwise comparison of whatever environments return, and actions that depend on the flight alone."""
+
+import numpy as np
+
+IDS = (
+    "QuadGym/Hover-v0",
+    "QuadGym/Circle-v0",
+    "QuadGym/Lemniscate-v0",
+    "QuadGym/RandomTrajectory-v0",
+    "QuadGym/Waypoints-v0",
+)
+OBSERVATIONS = ("estimate", "truth", "noisy", "sensors")
+ACTIONS = ("ctbr", "motor", "wrench", "attitude", "velocity")
+LAYOUTS = ("relative", "absolute")
+
+
+def assert_same(left, right, where="root"):
+    """Same types, same keys, same dtypes, same bits."""
+    assert type(left) is type(right), f"{where}: {type(left)} is not {type(right)}"
+    if isinstance(left, dict):
+        assert left.keys() == right.keys(), f"{where}: {set(left) ^ set(right)}"
+        for key in left:
+            assert_same(left[key], right[key], f"{where}.{key}")
+    elif isinstance(left, (list, tuple)):
+        assert len(left) == len(right), where
+        for k, (a, b) in enumerate(zip(left, right, strict=True)):
+            assert_same(a, b, f"{where}[{k}]")
+    elif isinstance(left, np.ndarray):
+        assert left.dtype == right.dtype, f"{where}: {left.dtype} is not {right.dtype}"
+        assert left.shape == right.shape, f"{where}: {left.shape} is not {right.shape}"
+        if left.dtype == object:
+            assert_same(list(left.ravel()), list(right.ravel()), where)
+        else:
+            np.testing.assert_array_equal(left, right, err_msg=where, strict=True)
+    else:
+        assert left == right, f"{where}: {left!r} is not {right!r}"
+
+
+def actions_of(flight, steps):
+    """(steps, 4) random actions that lean to one side, so that flights end at different times."""
+    rng = np.random.default_rng([flight, 77])
+    lean = rng.uniform(-0.5, 0.5, 4)
+    return np.clip(lean + rng.uniform(-0.6, 0.6, (steps, 4)), -1.0, 1.0).astype(np.float32)
+
+
+def state_of(env):
+    """The bits of all flights behind any of the three faces."""
+    return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()

@@ -1,0 +1,77 @@
+"""Gymnasium's and Stable-Baselines3's own checkers pass, with every warning an error."""
+
+import itertools
+import warnings
+
+import gymnasium
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from stable_baselines3.common.env_checker import check_env as sb3_check
+
+import quad_gym  # noqa: F401 - registers the ids
+from tests.contract.comparing import ACTIONS, IDS, LAYOUTS, OBSERVATIONS
+
+EVERYTHING = list(itertools.product(IDS, OBSERVATIONS, ACTIONS, LAYOUTS))
+COVERING = [
+    (env_id, OBSERVATIONS[(i + j) % 4], ACTIONS[j], LAYOUTS[(i + j + j // 2) % 2])
+    for i, env_id in enumerate(IDS)
+    for j in range(5)
+]
+
+
+def passes_both_checkers(env_id, **keywords):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(env_id, **keywords)
+        gymnasium_check(env.unwrapped)
+        sb3_check(gymnasium.make(env_id, **keywords).unwrapped)
+
+
+def test_the_covering_set_holds_every_pair_of_id_and_action_and_of_observation_and_action():
+    assert {(c[0], c[2]) for c in COVERING} == set(itertools.product(IDS, ACTIONS))
+    assert {(c[1], c[2]) for c in COVERING} == set(itertools.product(OBSERVATIONS, ACTIONS))
+    assert {(c[1], c[3]) for c in COVERING} == set(itertools.product(OBSERVATIONS, LAYOUTS))
+
+
+@pytest.mark.parametrize(("env_id", "observation", "action", "layout"), COVERING)
+def test_both_checkers_pass(env_id, observation, action, layout):
+    passes_both_checkers(env_id, observation=observation, action=action, layout=layout)
+
+
+@pytest.mark.slow
+def test_both_checkers_pass_for_every_id_observation_action_and_layout():
+    for env_id, observation, action, layout in EVERYTHING:
+        passes_both_checkers(env_id, observation=observation, action=action, layout=layout)
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {"include_covariance": True},
+        {"privileged": True},
+        {"include_covariance": True, "privileged": True, "layout": "absolute"},
+        {"camera": False},
+        {"camera": False, "privileged": True, "include_covariance": True},
+    ],
+    ids=lambda keywords: "+".join(keywords),
+)
+def test_both_checkers_pass_with_more_and_with_less_to_see(observation, keywords):
+    passes_both_checkers("QuadGym/Circle-v0", observation=observation, **keywords)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_both_checkers_pass_at_other_rates(env_id):
+    passes_both_checkers(env_id, control_rate=100, gnss_rate=10, camera_rate=20)
+    passes_both_checkers(env_id, imu_rate=400, control_rate=40, substeps=2)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_gymnasiums_wrapped_environment_passes_its_passive_checker(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(env_id)
+        env.reset(seed=3)
+        for _ in range(20):
+            env.step(env.action_space.sample())
+        env.close()

@@ -1,0 +1,210 @@
+"""The experiment's script: what it prints, what it writes, what it refuses."""
+
+import csv
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quad_gym import pd_gains
+from quad_gym.cli import parse
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("tqdm")
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "circle_experiment.py"
+CASES = ("truth", "estimate", "estimate_without_camera")
+
+
+def load_script():
+    spec = importlib.util.spec_from_file_location("circle_experiment", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+script = load_script()
+
+
+def run(folder, line=""):
+    script.main(parse(script.Args, [*line.split(), "--output", str(folder)]))
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Leave out the figures, which take most of the time of a short run."""
+    monkeypatch.setattr(script, "write_figures", lambda results, setup: [])
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("circle")
+    return folder, run(folder, "--seeds 20")
+
+
+class TestSummary:
+    def test_errors_are_those_expected(self, flown):
+        cases = flown[1]["cases"]
+        mean = {case: cases[case]["tracking_error"]["mean"]["mean"] for case in CASES}
+        late = {case: cases[case]["tracking_error"]["last_half"]["mean"] for case in CASES}
+        assert 0.109 < mean["truth"] < 0.112
+        assert 0.109 < mean["estimate"] < 0.125
+        assert 0.110 < mean["estimate_without_camera"] < 0.116
+        assert 0.018 < late["truth"] < 0.021
+        assert 0.019 < late["estimate"] < 0.026
+        estimation = cases["estimate"]["estimation_error"]["last_half"]["mean"]
+        assert 0.0025 < estimation < 0.0040
+
+    def test_every_flight_is_counted_once(self, flown):
+        for case in flown[1]["cases"].values():
+            assert case["finished"] + case["crashed"] + case["filter_failed"] == 20
+            assert case["tracking_error"]["mean"]["count"] == case["finished"]
+
+    def test_flights_on_the_truth_are_alike(self, flown):
+        truth = flown[1]["cases"]["truth"]
+        assert truth["tracking_error"]["mean"]["sd"] == 0.0
+        assert "estimation_error" not in truth
+
+    def test_holds_the_configuration(self, flown):
+        configuration = flown[1]["configuration"]
+        assert configuration["task"]["radius"] == 4.0
+        assert configuration["gains"]["position"] == 5.0
+        assert configuration["vehicle"]["mass"] == 0.78
+        assert configuration["sensors"]["estimate"]["camera"]["pixel_sigma"] == 20.0
+        assert configuration["sensors"]["estimate_without_camera"]["camera"] is None
+        assert configuration["arguments"]["seeds"] == 20
+        assert flown[1]["versions"]["numpy"] == np.__version__
+        assert flown[1]["seeds"] == {"first": 0, "count": 20}
+
+    def test_compares_the_cases_seed_by_seed(self, flown):
+        pairs = flown[1]["paired_differences_of_mean_tracking_error"]
+        found = pairs["estimate_without_camera - truth"]
+        low, high = found["interval"]
+        assert 0.0 < low < found["spread"]["mean"] < high
+
+
+def test_csv_agrees_with_the_summary(flown):
+    folder, summary = flown
+    with (folder / "flights.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 3 * 20
+    for case in CASES:
+        of_case = [row for row in rows if row["case"] == case]
+        assert [int(row["seed"]) for row in of_case] == list(range(20))
+        finished = [row for row in of_case if row["ending"] == "finished"]
+        errors = [float(row["tracking_error_mean_m"]) for row in finished]
+        want = summary["cases"][case]["tracking_error"]["mean"]["mean"]
+        assert np.mean(errors) == pytest.approx(want, rel=1e-9)
+        assert all(row["ended_at_s"] == "" for row in finished)
+
+
+def test_figures_are_those_of_the_report(flown):
+    names = {f"{kind}_{case}" for kind in ("path", "height") for case in CASES[1:]}
+    names |= {f"error_{case}" for case in CASES} | {"overview"}
+    written = {file.name for file in flown[0].iterdir() if file.suffix in (".png", ".svg")}
+    assert written == {f"{name}.{ending}" for name in names for ending in ("png", "svg")}
+
+
+def test_prints_a_table_and_says_what_it_means(tmp_path, capsys, no_figures):
+    run(tmp_path, "--seeds 3 --duration 1")
+    printed = capsys.readouterr()
+    for part in ("tracking error [mm]", "crash", "truth", "estimate, no camera", "±", "NEES"):
+        assert part in printed.out
+    assert "Flying on the estimate" in printed.out
+    assert "Having the camera" in printed.out
+    assert "ticks" not in printed.out
+    assert "ticks" in printed.err
+    assert max(map(len, printed.out.splitlines())) <= 100
+
+
+def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
+    one = run(tmp_path / "one", "--first-seed 3 --seeds 1 --threads 1")
+    with (flown[0] / "flights.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    for case in CASES:
+        want = next(r for r in rows if r["case"] == case and r["seed"] == "3")
+        found = one["cases"][case]["tracking_error"]["mean"]
+        assert found["mean"] == pytest.approx(float(want["tracking_error_mean_m"]), rel=1e-12)
+        assert found["sd"] is None
+
+
+def test_without_camera(tmp_path, capsys):
+    summary = run(tmp_path, "--seeds 2 --duration 1 --no-camera")
+    assert set(summary["cases"]) == {"truth", "estimate_without_camera"}
+    assert not (tmp_path / "path_estimate.png").exists()
+    assert "Having the camera" not in capsys.readouterr().out
+
+
+def test_options_reach_the_flights(tmp_path, no_figures):
+    line = "--seeds 2 --duration 1 --radius 2 --gains tuned --velocity-gain 4 --gnss-rate 10"
+    configuration = run(tmp_path, f"{line} --feature-noise-across predicted")["configuration"]
+    assert configuration["task"]["radius"] == 2.0
+    assert configuration["gains"]["position"] == pd_gains("tuned").position
+    assert configuration["gains"]["velocity"] == 4.0
+    suite = configuration["sensors"]["estimate"]
+    assert (suite["gnss"]["rate"], suite["camera"]["rate"]) == (10.0, 200.0)
+    assert suite["estimator"]["feature_noise_across"] == "predicted"
+
+
+def test_crashes_are_counted(tmp_path, capsys):
+    weak = "--seeds 3 --duration 4 --position-gain 0 --velocity-gain 0 --attitude-gain 0 0 0"
+    summary = run(tmp_path, weak)
+    for case in summary["cases"].values():
+        assert (case["finished"], case["crashed"]) == (0, 3)
+    with (tmp_path / "flights.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["ending"] for row in rows} <= {"out_of_bounds", "tipped_over", "on_the_ground"}
+    assert all(0.0 < float(row["ended_at_s"]) <= 4.0 for row in rows)
+    assert "too few flights finished" in capsys.readouterr().out
+
+
+def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
+    args = script.Args(seeds=1, duration=0.5, output=tmp_path)
+    trace = script.fly("estimate", script.configure(args)).trace
+    distance = np.linalg.norm(trace.position - trace.reference, axis=1)
+    np.testing.assert_allclose(trace.error, distance, atol=1e-12)
+    assert trace.time[-1] == pytest.approx(0.5)
+    np.testing.assert_allclose(trace.heading[0], [-1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("--seeds 0", "--seeds must be at least 1"),
+        ("--first-seed -1", "--first-seed must be at least 0"),
+        ("--threads 0", "--threads must be at least 1"),
+        ("--gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),
+        ("--camera-rate 400", "camera_rate must divide the IMU rate"),
+        ("--camera-rate 50 --no-camera", "has no meaning"),
+        ("--imu-rate -1", "imu_rate must be greater than 0"),
+        ("--duration 0.001", "--duration must be at least 0.01 s"),
+        ("--duration nan", "--duration must be at least"),
+        ("--radius -4", "radius must be greater than 0"),
+        ("--period inf", "period must be finite"),
+        ("--position-gain -1", "position must be at least 0"),
+    ],
+)
+def test_refuses_nonsense_in_one_line(tmp_path, capsys, line, reason):
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path / "new", line)
+    assert end.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert reason in printed.err
+    assert printed.err.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_refuses_a_folder_that_cannot_be(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(SystemExit) as end:
+        run(file)
+    assert end.value.code == 2
+    assert "cannot write to --output" in capsys.readouterr().err
+    assert file.read_text() == "mine"

@@ -1,0 +1,212 @@
+"""Whatever is passed as an action: it is flown as documented, or refused before anything changes."""
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import quad_gym
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import assert_same, state_of
+
+COUNT = 3
+FACES = ("single", "vector", "sb3")
+
+
+def make(face, action="ctbr"):
+    if face == "single":
+        env = QuadEnv("hover", action=action)
+    elif face == "vector":
+        env = QuadVectorEnv(COUNT, "hover", action=action)
+    else:
+        env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", COUNT, action=action)
+    begin(env)
+    return env
+
+
+def begin(env):
+    """The same episode every time."""
+    if isinstance(env, gymnasium.Env | QuadVectorEnv):
+        env.reset(seed=1)
+    else:
+        env.seed(1)
+        env.reset()
+
+
+def shape_of(face):
+    return (4,) if face == "single" else (COUNT, 4)
+
+
+def for_all(face, row):
+    """An action of one flight, for all flights of a face."""
+    return row if face == "single" else [row] * COUNT
+
+
+def refuses(env, action):
+    """The step raises a ValueError that names the action, and not a bit of the flights changes."""
+    before = state_of(env)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+    assert state_of(env) == before
+
+
+HOSTILE_ROWS = {
+    "NaN": np.array([0.0, np.nan, 0.0, 0.0]),
+    "infinity": np.array([np.inf, 0.0, 0.0, 0.0]),
+    "minus infinity": [0.0, 0.0, 0.0, -np.inf],
+    "NaN in float32": np.array([0.0, 0.0, np.nan, 0.0], np.float32),
+    "three numbers": np.zeros(3),
+    "five numbers": [0.0] * 5,
+    "no number": [],
+    "a column": np.zeros((4, 1)),
+    "None among numbers": [0.0, None, 0.0, 0.0],
+    "only None": [None] * 4,
+    "words": ["up", "down", "left", "right"],
+    "numbers as strings": ["0.1", "0.2", "0.3", "0.4"],
+    "bytes": [b"0", b"1", b"0", b"1"],
+    "complex numbers": np.array([1j, 0.0, 0.0, 0.0]),
+    "complex numbers in a list": [1j, 0.0, 0.0, 0.0],
+    "dates": np.array([0, 1, 2, 3], "datetime64[s]"),
+    "an integer beyond floats": [10**400, 0, 0, 0],
+    "ragged lists": [[0.0], [0.0, 1.0], 0.0, 0.0],
+    "sets": [set(), set(), set(), set()],
+}
+
+
+@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("name", HOSTILE_ROWS)
+def test_a_row_that_makes_no_sense_is_refused(face, name):
+    refuses(make(face), for_all(face, HOSTILE_ROWS[name]))
+
+
+@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize(
+    "action",
+    [None, "forward", 0.0, 7, {}, {"a": 1}, object(), (), [], np.zeros((2, 4)), np.zeros((4, 3))],
+    ids=repr,
+)
+def test_what_is_no_action_at_all_is_refused(face, action):
+    refuses(make(face), action)
+
+
+@pytest.mark.parametrize("face", ["vector", "sb3"])
+def test_one_flights_bad_action_stops_the_step_of_all(face):
+    actions = np.zeros((COUNT, 4))
+    actions[1, 2] = np.nan
+    env = make(face)
+    refuses(env, actions)
+    assert_same(env.step(np.zeros((COUNT, 4)))[0], make(face).step(np.zeros((COUNT, 4)))[0])
+
+
+@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("action", ["ctbr", "motor", "wrench", "attitude", "velocity"])
+def test_numbers_beyond_the_bounds_are_clipped(face, action):
+    env, twin = make(face, action), make(face, action)
+    wild = for_all(face, [1e308, -1e308, 1.0000001, -7.0])
+    assert_same(
+        env.step(np.array(wild))[0], twin.step(np.array(for_all(face, [1.0, -1.0, 1.0, -1.0])))[0]
+    )
+    assert state_of(env) == state_of(twin)
+
+
+@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.float16, np.int64, np.int8, bool])
+def test_any_type_of_real_numbers_is_flown(face, dtype):
+    env, twin = make(face), make(face)
+    row = np.array([1, 0, 1, 0], dtype)
+    env.step(np.array(for_all(face, row)))
+    twin.step(np.array(for_all(face, [1.0, 0.0, 1.0, 0.0])))
+    assert state_of(env) == state_of(twin)
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_lists_and_tuples_and_strided_arrays_are_flown(face):
+    row = [0.1, -0.2, 0.3, -0.4]
+    as_list, as_tuple, strided, plain = (make(face) for _ in range(4))
+    as_list.step(for_all(face, row))
+    as_tuple.step(tuple(for_all(face, tuple(row))))
+    padded = np.full((*shape_of(face), 3), np.nan)
+    padded[..., 1] = row
+    strided.step(padded[..., 1])
+    plain.step(np.array(for_all(face, row)))
+    assert state_of(as_list) == state_of(as_tuple) == state_of(strided) == state_of(plain)
+
+
+def test_the_action_of_the_caller_is_not_written_to():
+    env = make("single")
+    action = np.array([5.0, -5.0, 0.5, 0.0])
+    env.step(action)
+    np.testing.assert_array_equal(action, [5.0, -5.0, 0.5, 0.0])
+
+
+def test_an_error_of_order_is_not_hidden_by_an_error_of_the_action():
+    env = QuadEnv("hover")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(4))
+    with pytest.raises(ValueError, match="action"):
+        env.step(np.full(4, np.nan))
+
+
+# ---- thousands of them ------------------------------------------------------------------------------
+
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+rows = st.one_of(
+    hnp.arrays(np.float64, 4, elements=numbers),
+    hnp.arrays(np.float32, 4, elements=st.floats(width=32)),
+    hnp.arrays(np.float64, 4, elements=st.floats(-2.0, 2.0)),
+    hnp.arrays(np.int64, 4),
+    st.lists(numbers, min_size=0, max_size=6),
+    st.lists(st.one_of(numbers, st.none(), st.text(max_size=3), st.integers()), max_size=5),
+    hnp.arrays(st.sampled_from([np.float64, np.int8, bool, "U2", "complex128"]), hnp.array_shapes()),
+    st.one_of(st.none(), st.text(), st.integers(), numbers, st.binary(max_size=4)),
+)
+
+
+def meant(action, shape):
+    """The numbers that an action stands for, or None if it is no action; by the documentation."""
+    if not isinstance(action, (list, np.ndarray)):
+        return None
+    if isinstance(action, np.ndarray):
+        cells = action.ravel().tolist() if action.shape == shape else None
+    elif len(action) == shape[-1] and len(shape) == 1:
+        cells = action
+    else:
+        cells = None
+    if cells is None or not all(isinstance(cell, (float, int)) for cell in cells):
+        return None
+    if any(abs(cell) >= 2**1024 or cell != cell for cell in cells):
+        return None
+    return np.array([min(max(float(cell), -1.0), 1.0) for cell in cells]).reshape(shape)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return {face: (make(face), make(face)) for face in FACES}
+
+
+@settings(max_examples=1500)
+@given(action=rows)
+def test_a_single_flight_flies_any_action_as_documented_or_refuses_it(pairs, action):
+    check_one(pairs["single"], action, (4,))
+
+
+@settings(max_examples=800)
+@given(action=hnp.arrays(np.float64, (COUNT, 4), elements=numbers))
+def test_many_flights_fly_any_actions_as_documented_or_refuse_them(pairs, action):
+    check_one(pairs["vector"], action, (COUNT, 4))
+    check_one(pairs["sb3"], action, (COUNT, 4))
+
+
+def check_one(pair, action, shape):
+    env, twin = pair
+    for each in pair:
+        begin(each)
+    numbers = meant(action, shape)
+    if numbers is None:
+        refuses(env, action)
+        return
+    assert_same(env.step(action)[:3], twin.step(numbers)[:3])
+    assert state_of(env) == state_of(twin)

@@ -1,0 +1,286 @@
+"""Mistakes that environments are known for: none of them is made here."""
+
+import random
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import ACTIONS, IDS, OBSERVATIONS, actions_of, assert_same, state_of
+
+TASKS = tuple(quad_gym.IDS.values())
+
+
+# ---- seeds and options ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_seed_of_reset_is_honoured_at_any_time(env_id):
+    env = gymnasium.make(env_id)
+    first, _ = env.reset(seed=5)
+    after = [env.step(action)[0] for action in actions_of(1, 5)]
+    env.reset()
+    again, _ = env.reset(seed=5)
+    assert_same(first, again)
+    assert_same(after, [env.step(action)[0] for action in actions_of(1, 5)])
+    other, _ = env.reset(seed=6)
+    assert (other != first).any()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_episodes_after_a_seed_differ_and_repeat(env_id):
+    env = gymnasium.make(env_id)
+    run = [env.reset(seed=5)[0], *(env.reset()[0] for _ in range(4))]
+    assert len({observation.tobytes() for observation in run}) == 5
+    assert_same(run, [env.reset(seed=5)[0], *(env.reset()[0] for _ in range(4))])
+
+
+def test_the_number_of_steps_in_an_episode_does_not_lead_back_to_an_earlier_start():
+    env = QuadEnv("hover")
+    starts = set()
+    for steps in range(30):
+        env.reset(seed=5)
+        for _ in range(steps):
+            env.step(np.zeros(4))
+        starts.add(env.reset()[0].tobytes())
+    assert len(starts) == 30
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_options_of_reset_are_honoured_at_any_time(task):
+    env = QuadEnv(task)
+    start = {"position": [0.5, 1.0, 1.5], "velocity": [0.1, -0.1, 0.2], "yaw": 0.7}
+    for seed in (3, None):
+        env.reset(seed=seed, options=start)
+        batch = env.flights.batch
+        np.testing.assert_array_equal(batch.read("r")[0], start["position"])
+        np.testing.assert_array_equal(batch.read("v")[0], start["velocity"])
+        w, x, y, z = batch.read("q")[0]
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        assert yaw == pytest.approx(0.7, abs=0.02)
+    env.reset()
+    assert (env.flights.batch.read("r")[0] != start["position"]).all()
+
+
+def test_options_that_are_unknown_or_no_numbers_change_nothing():
+    env = QuadEnv("hover")
+    env.reset(seed=1)
+    before = state_of(env)
+    for options in ({"speed": 1.0}, {"position": [1.0, 2.0]}, {"yaw": np.nan}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            env.reset(options=options)
+        assert state_of(env) == before
+
+
+# ---- what is whose ----------------------------------------------------------------------------------
+
+
+def test_a_final_observation_is_that_of_the_flight_that_ended():
+    count = 9
+    env = QuadVectorEnv(count, "hover", autoreset_mode="SameStep", max_tilt=0.6)
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", count, seed=40, max_tilt=0.6)
+    alone = [QuadEnv("hover", max_tilt=0.6) for _ in range(count)]
+    env.reset(seed=40)
+    sb3.reset()
+    for i, one in enumerate(alone):
+        one.reset(seed=40 + i)
+    actions = np.stack([actions_of(i, 80) for i in range(count)], axis=1)
+    ended = []
+    for k in range(80):
+        *_, info = env.step(actions[k])
+        _, _, _, infos = sb3.step(actions[k])
+        for i, one in enumerate(alone):
+            observation, _, terminated, truncated, _ = one.step(actions[k, i])
+            mine = "final_obs" in info and info["_final_obs"][i]
+            assert mine == ("terminal_observation" in infos[i]) == (terminated or truncated)
+            if mine:
+                assert_same(info["final_obs"][i], observation)
+                assert_same(infos[i]["terminal_observation"], observation)
+                ended.append(i)
+                one.reset()
+    assert len(set(ended)) >= 5
+
+
+def test_a_crash_is_never_truncation_and_a_time_limit_never_a_crash():
+    env = QuadVectorEnv(64, "hover", autoreset_mode="SameStep", max_tilt=0.6, max_episode_steps=30)
+    env.reset(seed=2)
+    counts = {"time_limit": 0, "tipped_over": 0}
+    for k in range(100):
+        actions = np.stack([actions_of(100 * k + i, 1)[0] for i in range(64)])
+        _, _, terminated, truncated, info = env.step(np.sign(actions) * abs(actions) ** 0.5)
+        assert not (terminated & truncated).any()
+        if "final_info" not in info:
+            continue
+        ending = info["final_info"]["ending"]
+        np.testing.assert_array_equal(terminated, ending == "tipped_over")
+        np.testing.assert_array_equal(truncated, ending == "time_limit")
+        for name in counts:
+            counts[name] += (ending == name).sum()
+    assert min(counts.values()) > 20
+
+
+def test_a_crash_in_the_last_step_is_a_crash():
+    down = np.array([-1.0, 0.0, 0.0, 0.0])
+    env = QuadEnv("circle")
+    env.reset(seed=1)
+    last = next(k for k in range(1, 100) if env.step(down)[2])
+    env = QuadEnv("circle", max_episode_steps=last)
+    env.reset(seed=1)
+    for _ in range(last):
+        _, _, terminated, truncated, info = env.step(down)
+    assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")
+
+
+# ---- global state -----------------------------------------------------------------------------------
+
+
+def global_state():
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - it is what must not move
+    return random.getstate(), kind, keys.tobytes(), tuple(rest)
+
+
+@pytest.mark.parametrize("seed", [None, 4])
+def test_no_face_touches_the_global_random_states(seed):
+    before = global_state()
+    single, vector = QuadEnv("random_trajectory"), QuadVectorEnv(3, "hover")
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", 3, seed=seed)
+    for env in (single, vector):
+        env.reset(seed=seed)
+        env.reset()
+    sb3.reset()
+    sb3.reset()
+    single.step(np.zeros(4))
+    vector.step(np.zeros((3, 4)))
+    sb3.step(np.zeros((3, 4)))
+    assert global_state() == before
+
+
+def test_the_global_random_states_do_not_touch_the_flights():
+    seen = []
+    for seed in (1, 2):
+        np.random.seed(seed)  # noqa: NPY002
+        random.seed(seed)
+        env = QuadEnv("random_trajectory")
+        seen.append([env.reset(seed=9)[0], env.step(np.zeros(4))[0], env.reset()[0]])
+    assert_same(seen[0], seen[1])
+
+
+def test_two_environments_do_not_share_a_state():
+    env, alone = QuadEnv("hover"), QuadEnv("hover")
+    other = QuadEnv("hover")
+    env.reset(seed=3)
+    alone.reset(seed=3)
+    for k in range(20):
+        other.reset(seed=k)
+        other.step(np.ones(4))
+        assert_same(env.step(np.zeros(4)), alone.step(np.zeros(4)))
+
+
+# ---- keywords ---------------------------------------------------------------------------------------
+
+MAKERS = {
+    "make": lambda **keywords: gymnasium.make("QuadGym/Circle-v0", **keywords),
+    "make_vec": lambda **keywords: gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2, **keywords),
+    "make_sb3_vec_env": lambda **keywords: quad_gym.make_sb3_vec_env(
+        "QuadGym/Circle-v0", 2, **keywords
+    ),
+}
+NONSENSE = [
+    {"observations": "truth"},
+    {"observation": "camera"},
+    {"observation": None},
+    {"action": "rates"},
+    {"action": 3},
+    {"layout": "flat"},
+    {"sensors": "phone"},
+    {"sensors": 5},
+    {"vehicle": "balloon"},
+    {"vehicle": 5},
+    {"actions": "fast"},
+    {"include_covariance": "yes"},
+    {"privileged": 1},
+    {"camera": None},
+    {"feature_noise_across": "both"},
+    {"control_rate": 30},
+    {"control_rate": 400},
+    {"control_rate": 0},
+    {"control_rate": "fast"},
+    {"gnss_rate": 150},
+    {"gnss_rate": -1},
+    {"camera_rate": 90},
+    {"imu_rate": 0},
+    {"imu_rate": np.nan},
+    {"substeps": 0},
+    {"substeps": 1.5},
+    {"max_episode_steps": 2.5},
+    {"duration": -1.0},
+    {"radius": 0.0},
+    {"period": "long"},
+    {"height": np.inf},
+    {"start": "water"},
+    {"randomize": "yes"},
+    {"out_of_bounds": 0.0},
+    {"max_tilt": 4.0},
+    {"gate_count": 9},
+    {"gate_count": 0},
+    {"preview": (0.1,)},
+    {"preview": (-0.1, 0.2)},
+    {"true_vehicle": "lab"},
+    {"true_sensors": 1},
+    {"render_mode": "human"},
+]
+
+
+@pytest.mark.parametrize("keywords", NONSENSE, ids=repr)
+@pytest.mark.parametrize("maker", MAKERS)
+def test_keywords_that_make_no_sense_are_refused_by_name(maker, keywords):
+    if maker == "make" and "max_episode_steps" in keywords:
+        pytest.skip("that keyword is Gymnasium's own")
+    if maker != "make_sb3_vec_env" and "render_mode" in keywords:
+        pytest.skip("Gymnasium itself has a say in that keyword")
+    with pytest.raises(ValueError, match=next(iter(keywords))):
+        MAKERS[maker](**keywords)
+
+
+@pytest.mark.parametrize("env_id", ["QuadGym/Square-v0", "QuadGym/Circle-v1", "Circle", ""])
+def test_unknown_ids_are_refused(env_id):
+    with pytest.raises(ValueError, match="env_id"):
+        quad_gym.make_sb3_vec_env(env_id)
+    with pytest.raises(gymnasium.error.Error):
+        gymnasium.make(env_id)
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.5, "two", None, True])
+def test_a_number_of_flights_that_makes_no_sense_is_refused(count):
+    with pytest.raises(ValueError, match=r"count|num_envs|n_envs"):
+        QuadVectorEnv(count, "hover")
+    with pytest.raises(ValueError, match=r"count|num_envs|n_envs"):
+        quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=count)
+
+
+@pytest.mark.parametrize("threads", [0, -2, 1.5, "all", True])
+def test_a_number_of_threads_that_makes_no_sense_is_refused(threads):
+    with pytest.raises(ValueError, match="threads"):
+        QuadVectorEnv(4, "hover", threads=threads)
+
+
+def test_an_unknown_task_is_refused():
+    with pytest.raises(ValueError, match="task"):
+        QuadEnv("loop")
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("mode", ["Sometimes", None, 1])
+def test_an_unknown_autoreset_mode_is_refused(env_id, mode):
+    with pytest.raises(ValueError, match=r"autoreset_mode|AutoresetMode"):
+        gymnasium.make_vec(env_id, num_envs=2, autoreset_mode=mode)
+
+
+def test_every_observation_and_action_says_so_in_its_attributes():
+    for observation in OBSERVATIONS:
+        for action in ACTIONS:
+            env = QuadEnv("hover", observation=observation, action=action)
+            assert (env.flights.observation, env.flights.action) == (observation, action)

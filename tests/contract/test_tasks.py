@@ -1,0 +1,323 @@
+"""Rewards, endings and starts of the tasks, recomputed in NumPy from the true state."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from baselines import PDPolicy
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import actions_of
+
+SECONDS = 1 / 50
+"""A control period."""
+UNBOUNDED = {"out_of_bounds": 50.0, "max_tilt": np.pi, "ground": -50.0}
+
+
+def body_axes(q):
+    """(n, 3, 3) R_BI of unit quaternions (n, 4) from body to inertial: its rows are the body axes in I."""
+    w, x, y, z = q.T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1),
+            np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1),
+            np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        axis=1,
+    )
+
+
+def unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def level(v):
+    return unit(v * [1.0, 1.0, 0.0])
+
+
+def reference_of(task, t, batch):
+    """(r*, x*) (n, 3) each at the time t of an episode, by the task's description."""
+    w, n = 2 * np.pi / 10.0, batch.count
+    if task == "hover":
+        r = np.array([4.0, 0.0, 1.0])
+        heading = level(-r)
+    elif task == "circle":
+        r = np.array([4 * np.cos(w * t), 4 * np.sin(w * t), 1.0])
+        heading = level(-r)
+    elif task == "lemniscate":
+        r = np.array([3 * np.sin(w * t), 1.5 * np.sin(2 * w * t), 1.0])
+        heading = level(np.array([3 * w * np.cos(w * t), 3 * w * np.cos(2 * w * t), 0.0]))
+    else:
+        k = np.arange(1, 7)[np.newaxis, :, np.newaxis]
+        phase = k * batch.read("ref_omega")[:, np.newaxis, np.newaxis] * t
+        waves = batch.read("ref_cos") * np.cos(phase) + batch.read("ref_sin") * np.sin(phase)
+        return batch.read("ref_center") + waves.sum(axis=1), level(batch.read("ref_heading_point"))
+    return np.tile(r, (n, 1)), np.tile(heading, (n, 1))
+
+
+def costs(action, last_action, body_rates):
+    change = ((action - last_action) ** 2).sum(axis=1)
+    return 0.02 * change + 0.002 * (body_rates**2).sum(axis=1)
+
+
+@pytest.mark.parametrize("task", ["hover", "circle", "lemniscate", "random_trajectory"])
+def test_the_reward_of_a_tracking_task_is_the_documented_formula(task):
+    n = 20
+    env = QuadVectorEnv(n, task, autoreset_mode="Disabled", **UNBOUNDED)
+    batch = env.flights.batch
+    env.reset(seed=12)
+    last = np.zeros((n, 4))
+    actions = np.stack([actions_of(i, 25) for i in range(n)], axis=1)
+    for k in range(25):
+        given = actions[k] * 1.7  # beyond the bounds now and then
+        _, reward, _, _, info = env.step(given)
+        action = np.clip(given.astype(float), -1.0, 1.0)
+        r_ref, x_ref = reference_of(task, (k + 1) * SECONDS, batch)
+        e = np.linalg.norm(r_ref - batch.read("r"), axis=1)
+        aligned = (body_axes(batch.read("q"))[:, 0] * x_ref).sum(axis=1)
+        expected = np.exp(-2 * e) + 0.5 * np.exp(-20 * e) + 0.1 * aligned
+        expected -= costs(action, last, batch.read("w"))
+        np.testing.assert_allclose(reward, SECONDS * expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(info["position_error"], e, rtol=1e-9)
+        seen = np.linalg.norm(batch.read("r_hat") - batch.read("r"), axis=1)
+        np.testing.assert_allclose(info["estimation_error"], seen, rtol=1e-9, atol=1e-12)
+        last = action
+
+
+def test_the_reward_of_waypoints_is_the_documented_formula():
+    n = 40
+    env = QuadVectorEnv(n, "waypoints", autoreset_mode="Disabled", gate_count=4)
+    batch, policy = env.flights.batch, PDPolicy(env)
+    observation, info = env.reset(seed=3)
+    gates, passed = batch.read("gates"), np.zeros(n, int)
+    last, rows = np.zeros((n, 4)), np.arange(n)
+    np.testing.assert_allclose(
+        info["position_error"], np.linalg.norm(gates[:, 0] - batch.read("r"), axis=1)
+    )
+    for _ in range(500):
+        before = np.linalg.norm(gates[rows, passed] - batch.read("r"), axis=1)
+        action, _ = policy.predict(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+        distance = np.linalg.norm(gates[rows, passed] - batch.read("r"), axis=1)
+        through = distance < 0.3
+        passed += through
+        ahead = gates[rows, np.minimum(passed, 3)]
+        aligned = (body_axes(batch.read("q"))[:, 0] * level(-ahead)).sum(axis=1)
+        action = action.astype(float)
+        expected = before - distance + through
+        expected += SECONDS * (0.1 * aligned - costs(action, last, batch.read("w")))
+        np.testing.assert_allclose(reward, expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(info["gates_passed"], passed)
+        np.testing.assert_array_equal(terminated, passed == 4)
+        last = action
+        if (terminated | truncated).any():
+            break
+    assert info["gates_passed"].max() == 4
+    assert set(info["ending"][terminated]) == {"last_gate"}
+
+
+@pytest.mark.parametrize("action", ["ctbr", "wrench", "attitude", "velocity", "motor"])
+def test_nobody_earns_more_than_the_perfect_flight(action):
+    env = QuadVectorEnv(64, "circle", action=action, start="hover", autoreset_mode="SameStep")
+    env.reset(seed=5)
+    for k in range(50):
+        _, reward, *_ = env.step(0.2 * np.stack([actions_of(64 * k + i, 1)[0] for i in range(64)]))
+        assert (reward <= 1.6 * SECONDS).all()
+
+
+def test_resting_on_the_reference_earns_nearly_the_perfect_flight():
+    env = QuadEnv("hover", observation="truth", action="velocity")
+    env.reset(seed=1, options={"position": [4, 0, 1], "velocity": [0, 0, 0], "yaw": np.pi})
+    _, reward, *_ = env.step(np.zeros(4))
+    assert 1.5 * SECONDS < reward <= 1.6 * SECONDS
+
+
+def test_a_good_circle_earns_most_of_what_a_perfect_one_does():
+    env = QuadVectorEnv(32, "circle", start="hover", autoreset_mode="Disabled")
+    policy, total = PDPolicy(env), 0.0
+    observation, _ = env.reset(seed=5)
+    for _ in range(500):
+        observation, reward, *_ = env.step(policy.predict(observation)[0])
+        total += reward
+    assert (total <= 16.0).all()
+    assert total.mean() > 9.0
+
+
+# ---- endings ----------------------------------------------------------------------------------------
+
+
+def last_step(env, action, *, start=None, seed=1):
+    env.reset(seed=seed, options=start)
+    for _ in range(2000):
+        result = env.step(action)
+        if result[2] or result[3]:
+            return result
+    raise AssertionError("the episode does not end")
+
+
+STILL = np.zeros(4)
+
+
+@pytest.mark.parametrize("task", ["hover", "circle", "lemniscate", "random_trajectory"])
+def test_farther_than_three_metres_from_the_reference_is_out_of_bounds(task):
+    start = QuadEnv(task)
+    start.reset(seed=1)
+    r_ref, _ = reference_of(task, 0.0, start.flights.batch)
+    for away, over in ((2.8, False), (3.2, True)):
+        env = QuadEnv(task)
+        options = {"position": r_ref[0] + [0, 0, away], "velocity": [0, 0, 0]}
+        env.reset(seed=1, options=options)
+        _, _, terminated, truncated, info = env.step(STILL)
+        assert (terminated, truncated) == (over, False)
+        assert info["ending"] == ("out_of_bounds" if over else "none")
+
+
+def test_a_course_has_wider_bounds():
+    env = QuadEnv("waypoints")
+    env.reset(seed=1, options={"position": [0.0, 0.0, 9.0]})
+    assert not env.step(STILL)[2]
+    env.reset(seed=1, options={"position": [0.0, 0.0, 15.0]})
+    assert env.step(STILL)[4]["ending"] == "out_of_bounds"
+
+
+def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
+    env = QuadEnv("hover", action="motor", out_of_bounds=100.0, ground=-100.0)
+    *_, terminated, truncated, info = last_step(env, np.array([0.2, -0.2, -0.2, 0.2]))
+    assert (terminated, truncated, info["ending"]) == (True, False, "tipped_over")
+    up = body_axes(env.flights.batch.read("q"))[0, 2, 2]
+    assert up < np.cos(np.radians(100.0))
+
+
+@pytest.mark.parametrize("task", ["hover", "circle", "waypoints"])
+def test_half_a_metre_below_the_origin_is_on_the_ground(task):
+    env = QuadEnv(task)
+    *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
+    assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")
+    assert -1.0 < env.flights.batch.read("r")[0, 2] < -0.5
+
+
+@pytest.mark.parametrize(("task", "steps"), [("hover", 500), ("waypoints", 1000)])
+def test_the_time_limit_truncates(task, steps):
+    env = QuadEnv(task, observation="truth", action="velocity")
+    env.reset(seed=1)
+    for k in range(1, steps + 1):
+        _, _, terminated, truncated, info = env.step(STILL)
+        assert (terminated, truncated) == (False, k == steps)
+    assert info["ending"] == "time_limit"
+
+
+def test_the_last_gate_terminates():
+    env = QuadEnv("waypoints", gate_count=1)
+    env.reset(seed=1)
+    gate = env.flights.batch.read("gates")[0, 0]
+    env.reset(seed=1, options={"position": gate, "velocity": [0, 0, 0]})
+    _, reward, terminated, truncated, info = env.step(STILL)
+    assert (terminated, truncated, info["ending"]) == (True, False, "last_gate")
+    assert info["gates_passed"] == 1
+    assert 0.9 < reward < 1.1
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
+    env = QuadEnv("hover", privileged=privileged, include_covariance=True)
+    env.reset(seed=1)
+    batch = env.flights.batch
+    instant = batch.snapshot()
+    instant["L"] *= 1e160  # its square does not fit into a float
+    batch.restore(instant)
+    observation, reward, terminated, truncated, info = env.step(STILL)
+    assert (terminated, truncated, info["ending"]) == (False, True, "filter_failed")
+    assert info["filter_status"] > 0
+    assert observation in env.observation_space
+    assert np.isfinite(reward)
+    _, info = env.reset(seed=2)
+    assert info["filter_status"] == 0
+    assert not any(env.step(STILL)[2:4])
+
+
+# ---- starts -----------------------------------------------------------------------------------------
+
+
+def test_a_hovering_start_has_the_documented_spread():
+    n = 6000
+    env = QuadVectorEnv(n, "hover", observation="truth")
+    env.reset(seed=1)
+    batch = env.flights.batch
+    offset = batch.read("r") - [4.0, 0.0, 1.0]
+    axes = body_axes(batch.read("q"))
+    yaw = np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
+    tilts = axes[:, :2, 2]
+    off_yaw = (yaw - np.pi + np.pi) % (2 * np.pi) - np.pi
+    for values, sigma in ((offset[:, :2], 0.3), (off_yaw, 0.2), (tilts, 0.03)):
+        np.testing.assert_allclose(values.std(axis=0), sigma, rtol=0.05)
+        assert (abs(values.mean(axis=0)) < 4.5 * sigma / np.sqrt(n)).all()
+    assert (batch.read("r")[:, 2] >= 0.1).all()
+    assert (abs(batch.read("v")) < 0.2).all()
+    assert not batch.read("w").any()
+    lift = (6.11e-8 / 0.104719755**2 * batch.read("rotor_speeds") ** 2).sum(axis=1)
+    np.testing.assert_allclose(lift, 0.78 * 9.8, rtol=1e-9)
+
+
+def test_a_start_on_the_ground_is_the_reports():
+    env = QuadVectorEnv(50, "circle")
+    env.reset(seed=1)
+    batch = env.flights.batch
+    np.testing.assert_allclose(batch.read("r"), np.tile([4.0, 0.0, 0.0], (50, 1)), atol=1e-12)
+    for name in ("v", "w", "rotor_speeds"):
+        assert not batch.read(name).any()
+    axes = body_axes(batch.read("q"))
+    np.testing.assert_allclose(axes[:, 0], np.tile([-1.0, 0.0, 0.0], (50, 1)), atol=1e-9)
+    assert batch.read("b_a").std() == pytest.approx(0.98, rel=0.25)
+
+
+@pytest.mark.parametrize("task", ["circle", "lemniscate", "hover"])
+def test_randomize_draws_phase_radius_period_and_sense(task):
+    n = 2000
+    plain, drawn = (QuadVectorEnv(n, task, randomize=flag, out_of_bounds=99) for flag in (0 > 1, 1 > 0))
+    first, second = plain.reset(seed=1), drawn.reset(seed=1)
+    assert first[0].shape == second[0].shape
+    size = 3.0 if task == "lemniscate" else 4.0
+    assert np.ptp(np.abs(plain.flights.batch.read("ref_omega"))) == 0.0
+    batch = drawn.flights.batch
+    harmonic = batch.read("ref_center") if task == "hover" else batch.read("ref_cos")[:, 0]
+    harmonic = batch.read("ref_sin")[:, 0] if task == "lemniscate" else harmonic
+    radius = np.linalg.norm(harmonic[:, :2], axis=1)
+    assert 0.5 * size <= radius.min() < 0.55 * size
+    assert 1.2 * size < radius.max() <= 1.25 * size
+    phase = np.arctan2(harmonic[:, 1], harmonic[:, 0])
+    assert abs(np.exp(1j * phase).mean()) < 0.1
+    if task != "hover":
+        period = 2 * np.pi / batch.read("ref_omega")
+        assert 8.0 <= period.min() < 8.2
+        assert 14.8 < period.max() <= 15.0
+    if task == "circle":
+        turn = np.cross(batch.read("ref_cos")[:, 0], batch.read("ref_sin")[:, 0])[:, 2]
+        assert 0.4 < (turn > 0).mean() < 0.6
+
+
+def test_random_trajectories_keep_their_bounds_and_differ():
+    env = QuadVectorEnv(300, "random_trajectory", autoreset_mode="Disabled", out_of_bounds=999)
+    env.reset(seed=1)
+    batch = env.flights.batch
+    path = np.array([reference_of("random_trajectory", t, batch)[0] for t in np.arange(0, 12, 0.02)])
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=2) / 0.02
+    acceleration = np.linalg.norm(np.diff(path, 2, axis=0), axis=2) / 0.02**2
+    assert speed.max() <= 2.5
+    assert acceleration.max() <= 3.0 + 1e-6
+    assert speed.max() > 1.2
+    assert np.ptp(path[0], axis=0).min() > 0.1
+
+
+def test_gates_lie_within_the_radius_and_apart():
+    env = QuadVectorEnv(500, "waypoints")
+    env.reset(seed=1)
+    gates = env.flights.batch.read("gates")[:, :5]
+    assert np.linalg.norm(gates[..., :2], axis=2).max() <= 3.5
+    assert gates[..., 2].min() > 0.5
+    assert np.linalg.norm(np.diff(gates, axis=1), axis=2).min() > 1.0
+    assert (gates[0] != gates[1]).all()
+
+
+def test_the_registered_names_are_the_tasks():
+    for env_id, task in (("QuadGym/Circle-v0", "circle"), ("QuadGym/Waypoints-v0", "waypoints")):
+        assert gymnasium.make(env_id).unwrapped.flights.task.kind == task

@@ -1,0 +1,347 @@
+"""The vector environment against Gymnasium's book, and against its own SyncVectorEnv bit for bit."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import quad_gym
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import actions_of, assert_same, state_of
+
+MODES = ("NextStep", "SameStep", "Disabled")
+SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
+"""Some flights tip over before the limit, others do not."""
+
+
+def both(env_id, count, mode, **keywords):
+    """Ours, and Gymnasium's loop over single environments."""
+    ours = gymnasium.make_vec(env_id, num_envs=count, autoreset_mode=mode, **keywords)
+    envs = [lambda: QuadEnv(quad_gym.IDS[env_id], **keywords)] * count
+    return ours, SyncVectorEnv(envs, autoreset_mode=AutoresetMode(mode))
+
+
+def spoken_of(infos):
+    """Infos with zeros wherever the mask beside them says that they hold nothing."""
+    kept = {}
+    for name, values in infos.items():
+        mask = infos.get(f"_{name}")
+        if isinstance(values, dict):
+            kept[name] = spoken_of(values)
+        elif mask is not None and values.dtype != object:
+            kept[name] = np.where(mask, values, np.zeros_like(values))
+        elif mask is not None:
+            kept[name] = [value if said else None for value, said in zip(values, mask, strict=True)]
+        else:
+            kept[name] = values
+    return kept
+
+
+def assert_alike(mine, other, where):
+    """Everything the same, infos as far as their masks say that they hold something."""
+    assert_same(mine[:-1], other[:-1], where)
+    assert_same(spoken_of(mine[-1]), spoken_of(other[-1]), where)
+
+
+def fly_both(ours, theirs, steps, seed):
+    """Step both alike and compare everything; return how many episodes ended in which way."""
+    count = ours.num_envs
+    actions = np.stack([actions_of(i, steps) for i in range(count)], axis=1)
+    assert_alike(ours.reset(seed=seed), theirs.reset(seed=seed), "start")
+    ended = np.zeros(2, int)
+    for k in range(steps):
+        mine, other = ours.step(actions[k]), theirs.step(actions[k])
+        assert_alike(mine, other, f"step {k}")
+        ended += mine[2].sum(), mine[3].sum()
+        over = mine[2] | mine[3]
+        if ours.metadata["autoreset_mode"] == AutoresetMode.DISABLED and over.any():
+            chosen = {"reset_mask": over}
+            assert_alike(ours.reset(options={**chosen}), theirs.reset(options={**chosen}), f"reset {k}")
+    return ended
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("env_id", ["QuadGym/Hover-v0", "QuadGym/Waypoints-v0"])
+def test_it_returns_what_a_loop_over_single_environments_returns(env_id, mode):
+    terminated, truncated = fly_both(*both(env_id, 19, mode, **SHORT), steps=90, seed=5)
+    assert truncated > 10
+    assert terminated > 10
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_does_so_with_a_dict_of_policy_and_privileged(mode):
+    keywords = {"observation": "noisy", "privileged": True, "include_covariance": True, **SHORT}
+    fly_both(*both("QuadGym/RandomTrajectory-v0", 5, mode, **keywords), steps=40, seed=11)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_does_so_with_sensors_at_low_rates(mode):
+    keywords = {"observation": "sensors", "gnss_rate": 10, "camera_rate": 20, **SHORT}
+    fly_both(*both("QuadGym/Hover-v0", 5, mode, **keywords), steps=40, seed=12)
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+def test_spaces_hold_what_is_returned_with_the_stated_types(privileged):
+    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=6, privileged=privileged)
+    single = gymnasium.make("QuadGym/Circle-v0", privileged=privileged)
+    assert env.single_observation_space == single.observation_space
+    assert env.single_action_space == single.action_space
+    assert env.action_space.shape == (6, 4)
+    observation, _ = env.reset(seed=1)
+    assert observation in env.observation_space
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    assert observation in env.observation_space
+    assert (reward.dtype, reward.shape) == (np.float64, (6,))
+    assert terminated.dtype == truncated.dtype == np.bool_
+    for name in ("position_error", "estimation_error", "ending", "filter_status", "gates_passed"):
+        assert info[name].shape == (6,)
+        assert info[f"_{name}"].all()
+
+
+def arrays_in(value):
+    if isinstance(value, dict):
+        return [array for part in value.values() for array in arrays_in(part)]
+    if isinstance(value, (tuple, list)):
+        return [array for part in value for array in arrays_in(part)]
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return [value, *(array for part in value for array in arrays_in(part))]
+    return [value] if isinstance(value, np.ndarray) else []
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("privileged", [False, True])
+def test_every_call_returns_fresh_arrays(mode, privileged):
+    env = QuadVectorEnv(5, "hover", autoreset_mode=mode, privileged=privileged, max_episode_steps=4)
+    returned = arrays_in(env.reset(seed=2))
+    for _ in range(3):
+        returned += arrays_in(env.step(np.zeros((5, 4))))
+    returned += arrays_in(env.step(np.zeros((5, 4))))
+    returned += arrays_in(env.reset(seed=2))
+    for k, array in enumerate(returned):
+        assert not any(np.shares_memory(array, other) for other in returned[:k])
+
+
+def test_what_the_caller_does_to_the_arrays_does_not_reach_the_flights():
+    env, twin = (QuadVectorEnv(9, "circle", max_episode_steps=6) for _ in range(2))
+    env.reset(seed=8)
+    twin.reset(seed=8)
+    actions = np.stack([actions_of(i, 20) for i in range(9)], axis=1)
+    for k in range(20):
+        given = actions[k].copy()
+        spoiled = env.step(given)
+        assert_same(spoiled, twin.step(actions[k]))
+        assert_same(given, actions[k])
+        for array in arrays_in(spoiled):
+            array[...] = None if array.dtype == object else 1
+
+
+def test_same_step_keeps_the_last_observation_and_info_of_the_environment_concerned():
+    env = QuadVectorEnv(3, "hover", autoreset_mode="SameStep", out_of_bounds=1.5, duration=1.0)
+    env.reset(seed=4)
+    for _ in range(49):
+        *_, info = env.step(np.zeros((3, 4)))
+        assert "final_obs" not in info
+    observation, _, terminated, truncated, info = env.step(np.zeros((3, 4)))
+    assert truncated.all()
+    assert not terminated.any()
+    assert info["_final_obs"].all()
+    assert info["_final_info"].all()
+    assert (info["final_info"]["ending"] == "time_limit").all()
+    assert (info["ending"] == "none").all()
+    assert all((info["final_obs"][i] != observation[i]).any() for i in range(3))
+
+
+def test_an_integer_seeds_flight_i_with_seed_plus_i_and_a_list_one_by_one():
+    env = QuadVectorEnv(5, "random_trajectory")
+    by_number, _ = env.reset(seed=30)
+    by_list, _ = env.reset(seed=[34, 33, 32, 31, 30])
+    assert_same(by_number, by_list[::-1].copy())
+    single = gymnasium.make("QuadGym/RandomTrajectory-v0")
+    for i in range(5):
+        assert_same(by_number[i], single.reset(seed=30 + i)[0])
+
+
+def test_none_in_a_list_of_seeds_lets_a_flights_stream_go_on():
+    env, goes_on = (QuadVectorEnv(3, "hover") for _ in range(2))
+    env.reset(seed=6)
+    goes_on.reset(seed=6)
+    mixed, _ = env.reset(seed=[100, None, 101])
+    onward, _ = goes_on.reset()
+    fresh, _ = QuadVectorEnv(3, "hover").reset(seed=[100, 0, 101])
+    assert_same(mixed[1], onward[1])
+    assert_same(mixed[::2].copy(), fresh[::2].copy())
+    assert (onward != env.reset()[0]).any()
+
+
+def test_without_a_seed_flights_differ_from_one_another_and_from_the_next_environment():
+    first, second = (QuadVectorEnv(4, "hover").reset()[0] for _ in range(2))
+    assert len({row.tobytes() for row in np.concatenate([first, second])}) == 8
+
+
+@pytest.mark.parametrize("seed", [[1, 2], [1, 2, 3, 4], "abcd"])
+def test_seeds_that_do_not_fit_are_refused(seed):
+    with pytest.raises(ValueError, match=r"seed|int"):
+        QuadVectorEnv(3, "hover").reset(seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("mask", "error"),
+    [
+        ([True, False, True], TypeError),
+        (np.array([1, 0, 1]), TypeError),
+        (np.array([True, False]), ValueError),
+        (np.array([[True, False, True]]), ValueError),
+        (np.zeros(3, bool), ValueError),
+        (np.array([1.0, 0.0, 1.0]), TypeError),
+    ],
+)
+def test_a_reset_mask_that_makes_no_sense_changes_nothing(mask, error):
+    env = QuadVectorEnv(3, "hover", autoreset_mode="Disabled")
+    env.reset(seed=1)
+    before = state_of(env)
+    with pytest.raises(error, match="reset_mask"):
+        env.reset(seed=9, options={"reset_mask": mask})
+    assert state_of(env) == before
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_reset_mask_touches_no_other_flight(mode):
+    env, twin = (QuadVectorEnv(12, "circle", autoreset_mode=mode) for _ in range(2))
+    mask = np.arange(12) % 3 == 1
+    for each in (env, twin):
+        each.reset(seed=3)
+        each.step(np.full((12, 4), 0.1))
+    observation, info = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(info["_position_error"], mask)
+    mine, other = env.step(np.full((12, 4), 0.2)), twin.step(np.full((12, 4), 0.2))
+    np.testing.assert_array_equal(mine[0][~mask], other[0][~mask])
+    assert (mine[0][mask] != other[0][mask]).any(axis=1).all()
+    assert (observation[mask] != other[0][mask]).any(axis=1).all()
+
+
+def test_with_autoreset_disabled_a_finished_episode_is_not_flown_on():
+    env = QuadVectorEnv(4, "hover", autoreset_mode="Disabled", max_episode_steps=2)
+    env.reset(seed=0)
+    env.step(np.zeros((4, 4)))
+    *_, truncated, _ = env.step(np.zeros((4, 4)))
+    assert truncated.all()
+    before = state_of(env)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((4, 4)))
+    mask = np.array([True, True, False, True])
+    env.reset(options={"reset_mask": mask})
+    with pytest.raises(gymnasium.error.ResetNeeded, match="2"):
+        env.step(np.zeros((4, 4)))
+    assert state_of(env) != before
+    env.reset(options={"reset_mask": ~mask})
+    env.step(np.zeros((4, 4)))
+
+
+def test_stepping_before_the_first_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        QuadVectorEnv(2, "hover").step(np.zeros((2, 4)))
+
+
+def test_closing_twice_is_fine():
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2)
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    assert env.unwrapped.closed
+
+
+# ---- time limits ------------------------------------------------------------------------------------
+
+
+def length_of_an_episode(step, limit):
+    """Steps until `step()` says that the episode is over."""
+    return next(k for k in range(1, limit + 2) if step())
+
+
+@pytest.mark.parametrize("limit", [7, 499, 500, 501, 730])
+def test_all_three_faces_honour_max_episode_steps(limit):
+    keywords = {"observation": "truth", "action": "velocity", "max_episode_steps": limit}
+    single = gymnasium.make("QuadGym/Hover-v0", **keywords)
+    vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **keywords)
+    sync = gymnasium.make_vec(
+        "QuadGym/Hover-v0", num_envs=2, vectorization_mode="sync", **keywords
+    )
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=2, seed=1, **keywords)
+    for env in (single, vector, sync):
+        env.reset(seed=1)
+    sb3.reset()
+    still = np.zeros((2, 4), np.float32)
+    assert length_of_an_episode(lambda: single.step(still[0])[3], limit) == limit
+    assert length_of_an_episode(lambda: vector.step(still)[3].all(), limit) == limit
+    assert length_of_an_episode(lambda: sync.step(still)[3].all(), limit) == limit
+    assert length_of_an_episode(lambda: sb3.step(still)[2].all(), limit) == limit
+
+
+@pytest.mark.parametrize("duration", [0.1, 0.5])
+def test_the_duration_of_the_task_is_the_limit_unless_steps_are_given(duration):
+    keywords = {"observation": "truth", "action": "velocity", "duration": duration}
+    env = gymnasium.make("QuadGym/Hover-v0", **keywords)
+    env.reset(seed=1)
+    assert length_of_an_episode(lambda: env.step(np.zeros(4))[3], 50) == round(50 * duration)
+
+
+def test_without_a_duration_an_episode_has_no_limit():
+    env = QuadVectorEnv(2, "hover", duration=0.0, observation="truth", action="velocity")
+    env.reset(seed=1)
+    for _ in range(1200):
+        _, _, terminated, truncated, _ = env.step(np.zeros((2, 4)))
+        assert not (terminated | truncated).any()
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, True, "many"])
+def test_a_limit_that_makes_no_sense_is_refused(steps):
+    with pytest.raises(ValueError, match="max_episode_steps"):
+        QuadVectorEnv(2, "hover", max_episode_steps=steps)
+
+
+# ---- options ----------------------------------------------------------------------------------------
+
+
+def test_options_set_the_start_of_one_episode_for_all_or_one_by_one():
+    env = QuadVectorEnv(3, "hover", max_episode_steps=1)
+    start = {"position": [1.0, 2.0, 3.0], "velocity": [0.1, 0.2, 0.3]}
+    env.reset(seed=1, options=start)
+    batch = env.flights.batch
+    np.testing.assert_array_equal(batch.read("r"), np.tile(start["position"], (3, 1)))
+    np.testing.assert_array_equal(batch.read("v"), np.tile(start["velocity"], (3, 1)))
+    each = np.arange(9.0).reshape(3, 3)
+    env.reset(options={"position": each, "yaw": np.array([0.1, 0.2, 0.3])})
+    np.testing.assert_array_equal(batch.read("r"), each)
+    env.step(np.zeros((3, 4)))
+    env.step(np.zeros((3, 4)))
+    assert (np.linalg.norm(batch.read("r") - [4.0, 0.0, 1.0], axis=1) < 1.6).all()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"positon": [0, 0, 0]},
+        {"position": [0, 0]},
+        {"position": [0, 0, np.nan]},
+        {"velocity": np.zeros((2, 3))},
+        {"yaw": np.inf},
+        {"yaw": "north"},
+        {"position": None, "velocity": "fast"},
+    ],
+)
+def test_options_that_make_no_sense_change_nothing(options):
+    env = QuadVectorEnv(3, "hover")
+    env.reset(seed=1)
+    before = state_of(env)
+    with pytest.raises(ValueError, match=next(iter(set(options) - {"position"}), "position")):
+        env.reset(seed=5, options=options)
+    assert state_of(env) == before
+
+
+def test_the_callers_options_are_left_alone():
+    options = {"reset_mask": np.array([True, False]), "yaw": 0.3}
+    env = QuadVectorEnv(2, "hover")
+    env.reset(seed=1)
+    env.reset(options=options)
+    assert set(options) == {"reset_mask", "yaw"}

@@ -1,0 +1,289 @@
+"""A plain augmented unscented Kalman filter, written from the equations: the truth for the package.
+
+No structure is used: the noise is part of the state, every sigma point is evaluated, the weights
+are the textbook's near -1e6. Their cancellation costs some ten digits, so that neither float64 nor
+an 80-bit long double (which is off by 1e-9 m) can serve as truth; with `number=decimal.Decimal` the
+filter computes in as many digits as the decimal context has. In float64 it is the plain NumPy
+filter that speeds are compared with.
+
+State (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0 after each step. Prediction noise
+(v_g, v_g2, v_a, v_a2).
+"""
+
+from decimal import Decimal
+
+import numpy as np
+
+WGS84_A, WGS84_INVERSE_FLATTENING = 6378137, "298.257223563"
+
+
+def array_of(number, values):
+    """`values` as an array of the number type: np.float64, np.longdouble or Decimal."""
+    convert = np.frompyfunc(number, 1, 1)
+    return np.asarray(convert(np.asarray(values)), object if number is Decimal else number)
+
+
+def eye_of(number, n=3):
+    return array_of(number, np.eye(n))
+
+
+def cos_sin(x):
+    """Cosine and sine, by their series where NumPy has none."""
+    if x.dtype != object:
+        return np.cos(x), np.sin(x)
+    terms, cosine, sine, order = 1 + 0 * x, 0 * x, 0 * x, 0
+    while order < 4 or abs(terms).max() > Decimal("1e-45"):
+        if order % 2 == 0:
+            cosine = cosine + terms if order % 4 == 0 else cosine - terms
+        else:
+            sine = sine + terms if order % 4 == 1 else sine - terms
+        order += 1
+        terms = terms * x / order
+    return cosine, sine
+
+
+def rotation_312(e):
+    """R(e) of 3-1-2 Euler angles (..., 3) = (phi, theta, psi): R_y(theta) R_x(phi) R_z(psi)."""
+    (cf, ct, cp), (sf, st, sp) = (np.moveaxis(values, -1, 0) for values in cos_sin(e))
+    rows = [
+        [cp * ct - sf * sp * st, ct * sp + cp * sf * st, -cf * st],
+        [-cf * sp, cf * cp, sf],
+        [cp * st + ct * sf * sp, sp * st - cp * ct * sf, cf * ct],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def euler_rate_matrix(e):
+    """S(phi, theta) of de/dt = S w_B, (..., 3, 3)."""
+    (cf, ct, _), (sf, st, _) = (np.moveaxis(values, -1, 0) for values in cos_sin(e))
+    nought = 0 * cf
+    rows = [[cf * ct, nought, cf * st], [sf * st, cf, -ct * sf], [-st, nought, ct]]
+    S = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return S / cf[..., np.newaxis, np.newaxis]
+
+
+def east_north_up(r_G, number=np.float64):
+    """R_IG at a point in ECEF: rows east, north, up at its geodetic latitude and longitude."""
+    x, y, z = array_of(number, r_G)
+    f = 1 / number(WGS84_INVERSE_FLATTENING)
+    e2 = f * (2 - f)
+    p = np.sqrt(x * x + y * y)
+    tangent = z / p / (1 - e2)
+    for _ in range(60):
+        sin_lat = tangent / np.sqrt(1 + tangent**2)
+        N = WGS84_A / np.sqrt(1 - e2 * sin_lat**2)
+        tangent = (z + e2 * N * sin_lat) / p
+    up = unit(np.array([x, y, tangent * p]))
+    east = unit(np.array([-y, x, 0 * x]))
+    return np.stack([east, np.cross(up, east), up])
+
+
+def unit(v):
+    """Vectors (..., 3) scaled to length one."""
+    return v / np.sqrt((v * v).sum(axis=-1, keepdims=True))
+
+
+def cholesky(P):
+    """Lower Cholesky factor; `numpy.linalg` knows float64 only."""
+    if P.dtype == np.float64:
+        return np.linalg.cholesky(P)
+    L = 0 * P
+    for j in range(len(P)):
+        pivot = P[j, j] - L[j, :j] @ L[j, :j]
+        if not pivot > 0:
+            raise np.linalg.LinAlgError("matrix is not positive definite")
+        L[j, j] = np.sqrt(pivot)
+        L[j + 1 :, j] = (P[j + 1 :, j] - L[j + 1 :, :j] @ L[j, :j]) / L[j, j]
+    return L
+
+
+def solve_positive_definite(P, B):
+    """P^-1 B."""
+    if P.dtype == np.float64:
+        return np.linalg.solve(P, B)
+    L, X = cholesky(P), B.copy()
+    for i in range(len(P)):
+        X[i] = (X[i] - L[i, :i] @ X[:i]) / L[i, i]
+    for i in reversed(range(len(P))):
+        X[i] = (X[i] - L[i + 1 :, i] @ X[i + 1 :]) / L[i, i]
+    return X
+
+
+def block_diagonal(*blocks):
+    n, k = sum(len(block) for block in blocks), 0
+    whole = np.zeros((n, n), blocks[0].dtype)
+    for block in blocks:
+        whole[k : k + len(block), k : k + len(block)] = block
+        k += len(block)
+    return whole
+
+
+def attitude_from_two_pairs(u_B, v_B, u_I, v_I):
+    """Wahba's problem for two pairs of unit vectors of equal weight.
+
+    The sums of both pairs are then parallel, and so are the differences.
+    """
+
+    def triad(u, v):
+        s, d = unit(u + v), unit(u - v)
+        return np.stack([s, d, np.cross(s, d)], axis=-1)
+
+    return triad(u_B, v_B) @ triad(u_I, v_I).T
+
+
+class PlainUKF:
+    """The filter, called like `quad_gym.estimation.UnscentedKalmanFilter`, in any float type."""
+
+    def __init__(self, sensors, number=np.float64):
+        self.number, self.sensors = number, sensors
+        self.zeros, eye, array = array_of(number, np.zeros(12)), eye_of(number), self._array
+        imu, gnss, choice = sensors.imu, sensors.gnss, sensors.estimator
+        self.alpha, self.beta, self.kappa = (
+            number(choice.alpha),
+            number(choice.beta),
+            number(choice.kappa),
+        )
+        self.g_I = array([0.0, 0.0, choice.gravity])
+        self.floor = number(choice.direction_variance_floor) * eye
+        self.R_IG = east_north_up(gnss.reference_antenna_G, number)
+        self.l_p = array(gnss.primary_antenna_B)
+        self.l_b = array(gnss.secondary_antenna_B) - self.l_p
+        self.R_position = eye * array(gnss.position_sigma_I) ** 2
+        self.baseline_variance = number(gnss.baseline_sigma) ** 2
+        self.features = array(np.zeros((0, 3)))
+        if sensors.camera is not None:
+            self.features = array(sensors.camera.features_I)
+            self.l_c = array(sensors.camera.position_B)
+            self.R_CB = rotation_312(array(sensors.camera.attitude))
+
+        self.dt = 1 / number(imu.rate)
+        self.decay, drive = {}, {}
+        for kind in ("accel", "gyro"):
+            decay = np.exp(-self.dt / number(getattr(imu, f"{kind}_bias_tau")))
+            sigma = number(getattr(imu, f"{kind}_bias_sigma"))
+            self.decay[kind], drive[kind] = decay, sigma**2 * (1 - decay**2) * eye
+        Q_a = number(imu.accel_noise_density) ** 2 / self.dt * eye
+        Q_g = number(imu.gyro_noise_density) ** 2 / self.dt * eye
+        self.Q = block_diagonal(Q_g, drive["gyro"], Q_a, drive["accel"])
+
+    def _array(self, values):
+        return array_of(self.number, values)
+
+    # ---- the unscented transform ----
+
+    def _sigma_points(self, x, P):
+        """(2n + 1, n) points, and the weights of mean and covariance."""
+        n = len(x)
+        lam = self.alpha**2 * (self.kappa + n) - n
+        offsets = np.sqrt(n + lam) * cholesky(P).T
+        points = np.concatenate([x[np.newaxis], x + offsets, x - offsets])
+        weights = array_of(self.number, np.ones(2 * n + 1)) / (2 * (n + lam))
+        weights[0] = lam / (n + lam)
+        covariance_weights = weights.copy()
+        covariance_weights[0] += 1 - self.alpha**2 + self.beta
+        return points, weights, covariance_weights
+
+    def _inject(self, x, P):
+        self.r, self.v, e, self.b_a, self.b_g = x[:3], x[3:6], x[6:9], x[9:12], x[12:15]
+        self.R = rotation_312(e) @ self.R
+        self.P = (P + P.T) / 2
+
+    def _state(self):
+        return np.concatenate([self.r, self.v, self.zeros[:3], self.b_a, self.b_g])
+
+    # ---- the cycle ----
+
+    def initialize(self, gnss_position_G, gnss_baseline_G):
+        up = self._array([0.0, 0.0, 1.0])
+        baseline_I = unit(self.R_IG @ self._array(gnss_baseline_G))
+        self.R = attitude_from_two_pairs(unit(self.l_b), up, baseline_I, up)
+        self.r = self.R_IG @ self._array(gnss_position_G) - self.R.T @ self.l_p
+        self.v, self.b_a, self.b_g = (self.zeros[:3] for _ in range(3))
+        eye, choice, imu = eye_of(self.number), self.sensors.estimator, self.sensors.imu
+        scale = self.number(choice.initial_scale)
+        self.P = block_diagonal(
+            scale * self.R_position,
+            self.number(choice.initial_velocity_variance) * eye,
+            scale * self.baseline_variance * eye,
+            self.number(imu.accel_bias_sigma) ** 2 * eye,
+            self.number(imu.gyro_bias_sigma) ** 2 * eye,
+        )
+
+    def predict(self, gyro, accel):
+        w_B, f_B, dt = self._array(gyro), self._array(accel), self.dt
+        x0 = np.concatenate([self._state(), self.zeros])
+        points, w_mean, w_cov = self._sigma_points(x0, block_diagonal(self.P, self.Q))
+        r, v, e, b_a, b_g, v_g, v_g2, v_a, v_a2 = np.split(points, 9, axis=1)
+        R_BI = rotation_312(e) @ self.R
+        a_I = ((f_B - b_a - v_a)[:, np.newaxis] @ R_BI)[:, 0] - self.g_I
+        e_rate = (euler_rate_matrix(e) @ (w_B - b_g - v_g)[:, :, np.newaxis])[:, :, 0]
+        after = np.concatenate(
+            [
+                r + v * dt + a_I * dt**2 / 2,
+                v + a_I * dt,
+                e + dt * e_rate,
+                self.decay["accel"] * b_a + v_a2,
+                self.decay["gyro"] * b_g + v_g2,
+            ],
+            axis=1,
+        )
+        mean = w_mean @ after
+        deviations = after - mean
+        self._inject(mean, (w_cov * deviations.T) @ deviations)
+
+    def update(self, gnss_position_G=None, gnss_baseline_G=None, pixels=None):
+        measured, noises, models = [], [], []
+        if gnss_position_G is not None:
+            measured.append(self.R_IG @ self._array(gnss_position_G))
+            noises.append(self.R_position)
+            models.append(lambda r, R: r + self.l_p @ R)
+        if gnss_baseline_G is not None:
+            measured.append(unit(self.R_IG @ self._array(gnss_baseline_G)))
+            models.append(lambda r, R: unit(self.l_b @ R))
+            noises.append(self._direction_noise(unit(self.R.T @ self.l_b), self.baseline_variance))
+        for X_I, pixel in zip(self.features, [] if pixels is None else pixels, strict=False):
+            if np.isfinite(pixel).all():
+                self._add_feature(X_I, pixel, measured, noises, models)
+        if not measured:
+            return
+        z, noise = np.concatenate(measured), block_diagonal(*noises)
+
+        x0 = np.concatenate([self._state(), self._array(np.zeros(len(z)))])
+        points, w_mean, w_cov = self._sigma_points(x0, block_diagonal(self.P, noise))
+        r, R_BI = points[:, :3], rotation_312(points[:, 6:9]) @ self.R
+        Z = np.concatenate([model(r, R_BI) for model in models], axis=1) + points[:, 15:]
+        z_mean = w_mean @ Z
+        x_mean = w_mean @ points[:, :15]
+        dX, dZ = points[:, :15] - x_mean, Z - z_mean
+        P_zz, P_xz = (w_cov * dZ.T) @ dZ, (w_cov * dX.T) @ dZ
+        K = solve_positive_definite(P_zz, np.ascontiguousarray(P_xz.T)).T
+        self._inject(x_mean + K @ (z - z_mean), self.P - K @ P_zz @ K.T)
+
+    def _add_feature(self, X_I, pixel, measured, noises, models):
+        camera = self.sensors.camera
+        size, focal = self.number(camera.pixel_size), self.number(camera.focal_length)
+        v = size * self._array([pixel[0], pixel[1], focal])
+
+        def direction(r, R):
+            to_feature = X_I - r - self.l_c @ R
+            return unit((R @ to_feature[..., np.newaxis])[..., 0] @ self.R_CB.T)
+
+        variance = (self.number(camera.pixel_sigma) * size) ** 2 / (v @ v)
+        across = unit(v)
+        if self.sensors.estimator.feature_noise_across == "predicted":
+            across = direction(self.r, self.R)
+        measured.append(unit(v))
+        noises.append(self._direction_noise(across, variance))
+        models.append(direction)
+
+    def _direction_noise(self, u, variance):
+        return variance * (eye_of(self.number) - np.outer(u, u)) + self.floor
+
+    # ---- the estimate ----
+
+    position = property(lambda self: self.r)
+    velocity = property(lambda self: self.v)
+    R_BI = property(lambda self: self.R)
+    accel_bias = property(lambda self: self.b_a)
+    gyro_bias = property(lambda self: self.b_g)
+    covariance = property(lambda self: self.P)

@@ -1,0 +1,162 @@
+"""The camera: what it sees and where, against a projection in NumPy; points and lines of images."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym import homogeneous
+from quad_gym.sensors import Camera
+from tests.unit.alarms import assert_normal
+
+LAB = quad_gym.CameraParams()
+SHARP = LAB.replace(pixel_sigma=1e-9)
+HALF_IMAGE = np.array([1920.0, 1080.0])
+# R_CB of the roll of 120 and yaw of 90 degrees, by SciPy
+R_CB = Rotation.from_euler("ZXY", [90.0, 120.0, 0.0], degrees=True).as_matrix().T
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_pose(seed):
+    rng = np.random.default_rng(seed)
+    return rng.normal(0.0, 5.0, 3), Rotation.random(rng=rng).as_matrix()
+
+
+def point_seen_at(v_C, position, R_BI, params=LAB):
+    """The point in I whose camera coordinates are v_C."""
+    return position + R_BI.T @ (R_CB.T @ v_C + params.position_B)
+
+
+def picture(params, position, R_BI, seed=1):
+    return Camera(params, np.random.default_rng(seed)).measure(position, R_BI)
+
+
+def test_the_camera_looks_ahead_and_thirty_degrees_down():
+    optical_axis_B = R_CB.T @ [0.0, 0.0, 1.0]
+    expected = [np.cos(np.radians(30)), 0.0, -np.sin(np.radians(30))]
+    np.testing.assert_allclose(optical_axis_B, expected, rtol=0.0, atol=1e-15)
+    ahead = SHARP.replace(features_I=[LAB.position_B + 5.0 * optical_axis_B])
+    np.testing.assert_allclose(picture(ahead, np.zeros(3), np.eye(3)), 0.0, rtol=0.0, atol=1e-6)
+
+
+@given(seeds, st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(0.01, 100.0))
+def test_a_feature_is_reported_where_it_projects_if_that_is_inside_the_image(seed, x, y, depth):
+    position, R_BI = random_pose(seed)
+    pixel = np.array([x, y]) * HALF_IMAGE
+    assume(np.abs(np.abs([x, y]) - 1.0).min() > 1e-6)
+    v_C = depth * np.append(pixel / LAB.focal_length, 1.0)
+    params = SHARP.replace(features_I=[point_seen_at(v_C, position, R_BI)])
+    seen = picture(params, position, R_BI)
+    if max(abs(x), abs(y)) < 1.0:
+        np.testing.assert_allclose(seen[0], pixel, rtol=1e-8, atol=1e-6)
+    else:
+        assert np.isnan(seen).all()
+
+
+@given(seeds, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-100.0, 0.0))
+def test_a_feature_behind_the_camera_is_never_reported(seed, x, y, depth):
+    # it would project inside the image if its depth were not looked at
+    position, R_BI = random_pose(seed)
+    v_C = depth * np.append(np.array([x, y]) * HALF_IMAGE / LAB.focal_length, 1.0)
+    for size in (1.0, 0.01):  # large noise, which decides nothing, and small
+        params = LAB.replace(
+            features_I=[point_seen_at(v_C, position, R_BI)], pixel_sigma=500.0 * size
+        )
+        assert np.isnan(picture(params, position, R_BI)).all()
+
+
+@given(seeds)
+def test_random_features_are_seen_as_an_independent_projection_says(seed):
+    position, R_BI = random_pose(seed)
+    features = position + np.random.default_rng(seed).normal(0.0, 3.0, (16, 3))
+    got = picture(SHARP.replace(features_I=features), position, R_BI)
+    v_C = (R_CB @ ((features - position) @ R_BI.T - LAB.position_B).T).T
+    pixels = LAB.focal_length * v_C[:, :2] / v_C[:, 2:]
+    inside = (v_C[:, 2] > 0.0) & (np.abs(pixels) <= HALF_IMAGE).all(axis=1)
+    np.testing.assert_array_equal(np.isnan(got), np.repeat(~inside[:, np.newaxis], 2, axis=1))
+    np.testing.assert_allclose(got[inside], pixels[inside], rtol=1e-9, atol=1e-6)
+
+
+def test_pixel_noise_is_white_and_of_the_given_size():
+    # the laboratory's two features, from above the circle
+    position, R_BI = np.array([4.0, 0.0, 2.0]), Rotation.from_euler("z", np.pi).as_matrix().T
+    camera = Camera(LAB, np.random.default_rng(1))
+    pixels = np.array([camera.measure(position, R_BI) for _ in range(20_000)]).reshape(-1, 4)
+    truth = picture(SHARP, position, R_BI).ravel()
+    assert_normal(pixels, truth, 400.0 * np.eye(4))
+    noise = pixels - truth
+    serial = (noise[1:] * noise[:-1]).mean(axis=0) / 400.0
+    assert np.abs(serial).max() < 5.5 / np.sqrt(20_000)
+
+
+def test_noise_may_carry_a_pixel_over_the_edge_but_decides_nothing():
+    # a feature just inside the image is always reported, one just outside never
+    pose = np.zeros(3), np.eye(3)
+    for x, reported in ((0.999, True), (1.001, False)):
+        v_C = 3.0 * np.array([x * HALF_IMAGE[0] / LAB.focal_length, 0.0, 1.0])
+        camera = Camera(
+            LAB.replace(features_I=[point_seen_at(v_C, *pose)]), np.random.default_rng(2)
+        )
+        pictures = np.array([camera.measure(*pose) for _ in range(300)])
+        assert (np.isfinite(pictures) == reported).all()
+        if reported:
+            assert (pictures[:, 0, 0] > HALF_IMAGE[0]).any()
+
+
+lines = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)
+
+
+@given(lines, lines)
+def test_two_lines_meet_where_their_cross_product_says(l_1, l_2):
+    (a_1, b_1, c_1), (a_2, b_2, c_2) = l_1, l_2
+    determinant = a_1 * b_2 - a_2 * b_1
+    assume(abs(determinant) > 1e-3)
+    x, y = homogeneous.from_homogeneous(homogeneous.intersect(l_1, l_2))
+    expected = np.linalg.solve([[a_1, b_1], [a_2, b_2]], [-c_1, -c_2])
+    size = 1.0 + np.abs(expected).max()
+    np.testing.assert_allclose([x, y], expected, rtol=0.0, atol=1e-10 * size)
+    assert abs(a_1 * x + b_1 * y + c_1) <= 1e-10 * size
+    assert abs(a_2 * x + b_2 * y + c_2) <= 1e-10 * size
+
+
+@given(lines, lines)
+def test_a_line_goes_through_the_two_points_that_make_it(p_1, p_2):
+    line = homogeneous.line_through(p_1, p_2)
+    assert abs(line @ p_1) <= 1e-12
+    assert abs(line @ p_2) <= 1e-12
+
+
+@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(1e-3, 1e3))
+def test_a_point_is_any_multiple_of_its_coordinates(x, y, k):
+    point = k * homogeneous.to_homogeneous([x, y])
+    np.testing.assert_allclose(homogeneous.from_homogeneous(point), [x, y], rtol=1e-14, atol=1e-300)
+    np.testing.assert_allclose(
+        homogeneous.from_homogeneous(-point), [x, y], rtol=1e-14, atol=1e-300
+    )
+
+
+@given(lines.filter(lambda v: np.abs(v[:2]).max() > 0.1), st.floats(-10.0, 10.0))
+def test_parallel_lines_meet_at_infinity(line, shift):
+    meeting = homogeneous.intersect(line, line + np.array([0.0, 0.0, shift]))
+    with pytest.raises(ValueError, match="infinity"):
+        homogeneous.from_homogeneous(meeting)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("point", lambda bad: homogeneous.to_homogeneous(bad)),
+        ("point", lambda bad: homogeneous.from_homogeneous(bad)),
+        ("line_1", lambda bad: homogeneous.intersect(bad, [1.0, 2.0, 3.0])),
+        ("line_2", lambda bad: homogeneous.intersect([1.0, 2.0, 3.0], bad)),
+        ("point_1", lambda bad: homogeneous.line_through(bad, [1.0, 2.0, 3.0])),
+        ("point_2", lambda bad: homogeneous.line_through([1.0, 2.0, 3.0], bad)),
+    ],
+)
+def test_bad_points_and_lines_are_refused_by_name(name, call):
+    for bad in ([1.0], [1.0, np.nan], [1.0, 2.0, np.nan], "a", None):
+        with pytest.raises(ValueError, match=f"^{name} must"):
+            call(bad)

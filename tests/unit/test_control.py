@@ -1,0 +1,311 @@
+"""Allocation, the report's PD controller and the inner loops, against their equations in NumPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym.kernels.blocks import lanes_of
+from quad_gym.kernels.compilation import kernel
+from quad_gym.kernels.control import act, allocate
+from quad_gym.kernels.linalg import load3
+from quad_gym.kernels.vehicle import store4
+from quad_gym.packing import params_block, params_record
+from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, Control, aligned_zeros
+
+LAB, GAINS, ACTIONS = (
+    quad_gym.vehicle_params("lab"),
+    quad_gym.pd_gains("lab"),
+    quad_gym.ActionParams(),
+)
+TILTED = LAB.replace(
+    inertia=((0.002, 3e-4, 0.0), (3e-4, 0.004, 1e-4), (0.0, 1e-4, 0.005)),
+    rotor_spins=(-1.0, 1.0, -1.0, 1.0),
+)
+WEIGHT = LAB.mass * LAB.gravity
+FMAX = LAB.max_rotor_force
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@kernel
+def allocate_all(demands, params, voltages):
+    for i in range(len(demands)):
+        demand = demands[i]
+        torque = (demand[1], demand[2], demand[3])
+        store4(voltages[i], allocate(demand[0], torque, params[0]))
+
+
+@kernel
+def act_on_floats(flights, params, mode, ref):
+    reference = (load3(ref[0]), load3(ref[1]), load3(ref[2]), load3(ref[3]))
+    act(flights[0], params[0], mode, reference)
+
+
+@kernel
+def act_on_lanes(blocks, params, mode, ref):
+    one = 1.0 + 0.0 * lanes_of(blocks[0]).tick
+    reference = (
+        (one * ref[0, 0], one * ref[0, 1], one * ref[0, 2]),
+        (one * ref[1, 0], one * ref[1, 1], one * ref[1, 2]),
+        (one * ref[2, 0], one * ref[2, 1], one * ref[2, 2]),
+        (one * ref[3, 0], one * ref[3, 1], one * ref[3, 2]),
+    )
+    act(lanes_of(blocks[0]), lanes_of(params[0]), mode, reference)
+
+
+def numbers_of(vehicle):
+    return params_record(vehicle, quad_gym.SensorSuite(), GAINS, ACTIONS)
+
+
+def forces_of(voltages, vehicle=LAB):
+    return vehicle.thrust_coefficient * (vehicle.motor_speed_per_volt * voltages) ** 2
+
+
+def allocated(thrust, torque, vehicle=LAB):
+    """Rotor forces that the kernel asks for."""
+    voltages = np.empty((1, 4))
+    demand = np.array([[thrust, *torque]])
+    allocate_all(demand, numbers_of(vehicle), voltages)
+    assert voltages.min() >= 0.0
+    return forces_of(voltages[0], vehicle)
+
+
+def searched(thrust, torque, vehicle=LAB):
+    """Rotor forces by the laboratory's rule, with the largest alpha found by bisection."""
+    places, spins = np.array(vehicle.rotor_positions_B), np.array(vehicle.rotor_spins)
+    ratio = vehicle.torque_coefficient / vehicle.thrust_coefficient
+    matrix = np.array([np.ones(4), places[:, 1], -places[:, 0], -ratio * spins])
+    limit = vehicle.max_rotor_force
+
+    def forces(alpha):
+        demand = np.append(min(thrust, 0.9 * 4.0 * limit), alpha * np.asarray(torque))
+        return np.linalg.solve(matrix, demand)
+
+    low, high = 0.0, 1.0
+    if forces(1.0).max() <= limit:
+        low = 1.0
+    else:
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if forces(middle).max() <= limit else (low, middle)
+    return np.maximum(forces(low), 0.0), low
+
+
+thrusts = st.floats(-5.0, 60.0)
+torques = st.tuples(st.floats(-8.0, 8.0), st.floats(-8.0, 8.0), st.floats(-1.0, 1.0))
+
+
+@given(thrusts, torques)
+def test_the_torque_is_scaled_by_the_largest_factor_that_the_rotors_allow(thrust, torque):
+    expected, _ = searched(thrust, torque)
+    np.testing.assert_allclose(allocated(thrust, torque), expected, rtol=1e-12, atol=1e-11 * FMAX)
+
+
+@given(thrusts, torques)
+def test_no_rotor_is_asked_for_more_than_it_has(thrust, torque):
+    assert allocated(thrust, torque).max() <= FMAX * (1.0 + 1e-12)
+
+
+@given(
+    st.floats(0.0, 0.9 * 4.0 * FMAX), st.tuples(*[st.floats(-1.0, 1.0)] * 3), st.floats(0.0, 0.99)
+)
+def test_within_the_rotors_means_thrust_and_torque_are_met(thrust, direction, share):
+    # as large a torque as leaves every rotor force within [0, Fmax], times the share
+    inverse = np.linalg.inv(LAB.effectiveness)
+    turn = inverse @ np.append(0.0, direction)
+    room = min(thrust / 4.0, FMAX - thrust / 4.0)
+    torque = share * room / max(np.abs(turn).max(), 1e-9) * np.array(direction)
+    met = LAB.effectiveness @ allocated(thrust, torque)
+    np.testing.assert_allclose(met, [thrust, *torque], rtol=0.0, atol=1e-12 * FMAX)
+
+
+def test_pure_thrust_beyond_the_limit_is_nine_tenths_of_it_all():
+    np.testing.assert_allclose(allocated(1e3, np.zeros(3)), 0.9 * FMAX, rtol=1e-13)
+    np.testing.assert_array_equal(allocated(-1.0, np.zeros(3)), 0.0)
+
+
+@pytest.mark.parametrize("thrust", [5.0, 20.0, 1e3])
+def test_rotors_on_unequal_arms_are_not_asked_for_more_than_they_have(thrust):
+    front, rear = 0.1, -0.3
+    vehicle = LAB.replace(
+        rotor_positions_B=(
+            (front, -0.2, 0.0),
+            (front, 0.2, 0.0),
+            (rear, 0.2, 0.0),
+            (rear, -0.2, 0.0),
+        )
+    )
+    forces = allocated(thrust, (0.1, 0.2, 0.0), vehicle)
+    assert forces.max() <= vehicle.max_rotor_force * (1.0 + 1e-12)
+
+
+# ---- what an action means ----------------------------------------------------------------------
+
+
+def seen_state(seed):
+    """A random view of the state, a reference and an action."""
+    rng = np.random.default_rng(seed)
+    return {
+        "r": rng.normal(size=3),
+        "v": rng.normal(size=3),
+        "R_BI": (Rotation.from_rotvec(0.6 * rng.normal(size=3))).as_matrix(),
+        "w": rng.normal(size=3),
+        "action": rng.uniform(-1.0, 1.0, 4),
+        "ref": rng.normal(size=(4, 3)) * [[1.0], [1.0], [2.0], [1.0]],
+    }
+
+
+def commanded(mode, state, vehicle=LAB):
+    """Motor voltages that the kernel sets."""
+    flight = np.zeros(1, FLIGHT)
+    flight["r_seen"], flight["v_seen"] = state["r"], state["v"]
+    flight["R_seen"], flight["w_seen"] = state["R_BI"], state["w"]
+    flight["action"] = state["action"]
+    act_on_floats(flight, numbers_of(vehicle), int(mode), state["ref"])
+    return flight["voltages"][0]
+
+
+def unit(vector):
+    return vector / np.linalg.norm(vector)
+
+
+def voltages_for(thrust, torque, vehicle):
+    forces, _ = searched(thrust, torque, vehicle)
+    return np.sqrt(forces / vehicle.thrust_coefficient) / vehicle.motor_speed_per_volt
+
+
+def pd_controller(state, vehicle):
+    """The laboratory's controller as it is printed."""
+    r_ref, v_ref, a_ref, x_ref = state["ref"]
+    R_BI, w, m = state["R_BI"], state["w"], vehicle.mass
+    e3, J = np.array([0.0, 0.0, 1.0]), np.array(vehicle.inertia)
+    F_I = 5.0 * (r_ref - state["r"]) + 3.1 * (v_ref - state["v"])
+    F_I = F_I + m * vehicle.gravity * e3 + m * a_ref
+    z_ref = unit(F_I)
+    b = unit(np.cross(z_ref, x_ref))
+    R_E = np.stack([np.cross(b, z_ref), b, z_ref]) @ R_BI.T
+    e = np.array([R_E[1, 2] - R_E[2, 1], R_E[2, 0] - R_E[0, 2], R_E[0, 1] - R_E[1, 0]])
+    torque = np.diag([1.0, 0.95, 0.21]) @ e - np.diag([0.25, 0.25, 0.12]) @ w
+    return F_I @ (R_BI.T @ e3), torque + np.cross(w, J @ w)
+
+
+def rate_loop(w_wanted, w, vehicle):
+    J = np.array(vehicle.inertia)
+    return J @ (14.0 * (w_wanted - w)) + np.cross(w, J @ w)
+
+
+def tilt_loop(z_I, state, yaw_rate, vehicle):
+    """Rates k_a (e3 x R z*), plus the wanted yaw rate."""
+    rates = 7.0 * np.cross([0.0, 0.0, 1.0], state["R_BI"] @ z_I) + [0.0, 0.0, yaw_rate]
+    return rate_loop(rates, state["w"], vehicle)
+
+
+def heading_frame(state):
+    """Columns: ahead, left and up, in I."""
+    x = unit(state["R_BI"][0] * [1.0, 1.0, 0.0])
+    return np.stack([x, np.cross([0.0, 0.0, 1.0], x), [0.0, 0.0, 1.0]], axis=1)
+
+
+def demanded(mode, state, vehicle):
+    """Thrust and torque that an action asks for."""
+    a = state["action"]
+    weight = vehicle.mass * vehicle.gravity
+    if mode == Control.PD:
+        return pd_controller(state, vehicle)
+    if mode == Control.WRENCH:
+        ratio = vehicle.torque_coefficient / vehicle.thrust_coefficient
+        return weight * (1 + a[0]), weight * np.array([0.21, 0.21, ratio]) * a[1:]
+    if mode == Control.CTBR:
+        return weight * (1 + a[0]), rate_loop(
+            np.array([6.0, 6.0, 3.0]) * a[1:], state["w"], vehicle
+        )
+    if mode == Control.ATTITUDE:
+        tilt = Rotation.from_euler("XY", np.radians(45.0) * a[1:3]).apply([0.0, 0.0, 1.0])
+        return weight * (1 + a[0]), tilt_loop(
+            heading_frame(state) @ tilt, state, 3.0 * a[3], vehicle
+        )
+    level = heading_frame(state)
+    pull = vehicle.mass * 4.0 * (5.0 * a[:3] - level.T @ state["v"])
+    low = np.array([-weight, -weight, -0.5 * weight])
+    F_I = level @ (pull.clip(low, weight) + np.array([0.0, 0.0, weight]))
+    return F_I @ state["R_BI"][2], tilt_loop(unit(F_I), state, 3.0 * a[3], vehicle)
+
+
+MODES = [Control.PD, Control.WRENCH, Control.CTBR, Control.ATTITUDE, Control.VELOCITY]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("vehicle", [LAB, TILTED], ids=["lab", "tilted"])
+def test_the_voltages_are_those_of_the_equations(mode, vehicle):
+    for seed in range(60):
+        state = seen_state(seed)
+        expected = voltages_for(*demanded(mode, state, vehicle), vehicle)
+        got = commanded(mode, state, vehicle)
+        # near a force of zero a voltage is ill-conditioned: compare the forces
+        limit = 1e-11 * vehicle.max_rotor_force
+        np.testing.assert_allclose(
+            forces_of(got, vehicle), forces_of(expected, vehicle), rtol=0.0, atol=limit
+        )
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 4))
+def test_a_motor_action_is_a_share_of_the_hover_voltage(action):
+    got = commanded(Control.MOTOR, seen_state(1) | {"action": action})
+    expected = np.minimum(LAB.hover_voltage * (1.0 + np.array(action)), LAB.max_voltage)
+    np.testing.assert_allclose(got, expected, rtol=1e-14)
+    assert got.min() >= 0.0
+
+
+@pytest.mark.parametrize("mode", [Control.MOTOR, *MODES[1:]])
+def test_no_action_at_rest_is_hover(mode):
+    state = seen_state(1) | {"R_BI": np.eye(3), "action": np.zeros(4)}
+    state |= {"v": np.zeros(3), "w": np.zeros(3)}
+    np.testing.assert_allclose(commanded(mode, state), LAB.hover_voltage, rtol=1e-14)
+
+
+def test_on_its_reference_the_controller_hovers():
+    state = seen_state(2) | {"R_BI": np.eye(3), "w": np.zeros(3)}
+    state["ref"] = np.array([state["r"], state["v"], np.zeros(3), [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(commanded(Control.PD, state), LAB.hover_voltage, rtol=1e-13)
+
+
+@given(seeds, st.sampled_from([Control.MOTOR, *MODES]), st.floats(0.0, 100.0))
+def test_no_voltage_ever_leaves_its_range(seed, mode, size):
+    state = seen_state(seed)
+    for name in ("r", "v", "w", "ref"):
+        state[name] = size * state[name]
+    got = commanded(mode, state)
+    assert np.isfinite(got).all()
+    assert got.min() >= 0.0
+    assert got.max() <= LAB.max_voltage * (1.0 + 1e-12)
+
+
+@pytest.mark.parametrize("ref_force", ["none", "along the heading", "vertical heading"])
+def test_a_controller_without_a_wanted_direction_still_gives_voltages(ref_force):
+    state = seen_state(3) | {"R_BI": np.eye(3), "w": np.zeros(3), "v": np.zeros(3)}
+    x_ref, a_ref = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -9.8])
+    if ref_force == "along the heading":
+        a_ref = np.array([5.0, 0.0, -9.8])
+    if ref_force == "vertical heading":
+        x_ref, a_ref = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    state["ref"] = np.array([state["r"], np.zeros(3), a_ref, x_ref])
+    assert np.isfinite(commanded(Control.PD, state)).all()
+
+
+@pytest.mark.parametrize("mode", [Control.MOTOR, *MODES])
+def test_lanes_command_eight_flights_as_floats_do(mode):
+    states = [seen_state(seed) for seed in range(WIDTH)]
+    ref = states[0]["ref"]
+    block = aligned_zeros(1, FLIGHT_BLOCK)
+    for lane, state in enumerate(states):
+        state["ref"] = ref
+        block["r_seen"][0, :, lane], block["v_seen"][0, :, lane] = state["r"], state["v"]
+        block["R_seen"][0, ..., lane], block["w_seen"][0, :, lane] = state["R_BI"], state["w"]
+        block["action"][0, :, lane] = state["action"]
+    act_on_lanes(block, params_block(numbers_of(LAB)), int(mode), ref)
+    for lane, state in enumerate(states):
+        got, expected = block["voltages"][0, :, lane], commanded(mode, state)
+        np.testing.assert_allclose(forces_of(got), forces_of(expected), rtol=0.0, atol=1e-11 * FMAX)

@@ -1,0 +1,220 @@
+"""The elementary functions against the C library and arbitrary-precision arithmetic."""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quad_gym.kernels.elementary import atan2, exp, log, sin_cos, sin_cos_minus_one
+from quad_gym.records import WIDTH
+from tests.unit.compiled import Compiled
+
+
+def functions(f, option):
+    x = f.x
+    f.sin, f.cos = sin_cos(x)
+    f.sin_small, f.cos_less_one = sin_cos_minus_one(x)
+    f.exp = exp(x)
+    f.log = log(x)
+    f.angle = atan2(f.y, x)
+
+
+NAMES = ("sin", "cos", "sin_small", "cos_less_one", "exp", "log", "angle")
+compiled = Compiled(functions, x=(), y=(), **dict.fromkeys(NAMES, ()))
+
+
+@pytest.fixture(params=["on_floats", "on_lanes"])
+def evaluate(request):
+    run = getattr(compiled, request.param)
+
+    def values(x, y=0.0):
+        x = np.asarray(x, float)
+        return run(x=x, y=np.broadcast_to(y, x.shape))
+
+    return values
+
+
+def ulps(got, expected):
+    """The error in units in the last place of the truth."""
+    got, expected = np.broadcast_arrays(np.asarray(got), np.asarray(expected))
+    return np.max(np.abs(got - expected) / np.spacing(np.maximum(np.abs(expected), 2.3e-308)))
+
+
+def in_precision(function, values, digits=60):
+    """`function` of mpmath at every value, rounded to floats."""
+    with mpmath.workdps(digits):
+        return np.array([float(function(mpmath.mpf(float(v)))) for v in values])
+
+
+def test_sine_and_cosine_at_ordinary_angles(evaluate):
+    rng = np.random.default_rng(1)
+    x = np.concatenate(
+        [rng.uniform(-10, 10, 4000), rng.normal(size=4000) * 10 ** rng.uniform(-9, 5.9, 4000)]
+    )
+    out = evaluate(x)
+    assert ulps(out["sin"], np.sin(x)) <= 3
+    assert ulps(out["cos"], np.cos(x)) <= 3
+
+
+def test_sine_and_cosine_around_multiples_of_a_quarter_turn(evaluate):
+    k = np.concatenate([np.arange(-40, 41), np.geomspace(41, 636_000, 150).round()])
+    x = (k[:, np.newaxis] * (np.pi / 2) + np.array([0.0, 1e-9, -1e-7, 1e-3])).ravel()
+    x = np.concatenate([x, np.nextafter(x, np.inf)])
+    out = evaluate(x)
+    assert ulps(out["sin"], in_precision(mpmath.sin, x)) <= 3
+    assert ulps(out["cos"], in_precision(mpmath.cos, x)) <= 3
+
+
+def test_sine_and_cosine_of_huge_angles(evaluate):
+    rng = np.random.default_rng(2)
+    x = np.concatenate(
+        [
+            [999_999.9, 1e6, -1e6, 1e8, -1e8, 1e22, 1e300, -1e300, 1.7e308],
+            10 ** rng.uniform(6, 308, 60),
+        ]
+    )
+    out = evaluate(x)
+    assert ulps(out["sin"], in_precision(mpmath.sin, x, 400)) <= 3
+    assert ulps(out["cos"], in_precision(mpmath.cos, x, 400)) <= 3
+
+
+@given(x=st.floats(-1e12, 1e12))
+def test_sine_and_cosine_lie_on_the_unit_circle(x):
+    out = compiled.on_lanes(x=[x])
+    assert abs(math.hypot(out["sin"][0], out["cos"][0]) - 1.0) <= 4e-16
+    assert out["sin"][0] == -compiled.on_lanes(x=[-x])["sin"][0]
+
+
+def test_cosine_less_one_keeps_its_relative_accuracy(evaluate):
+    rng = np.random.default_rng(3)
+    x = np.concatenate(
+        [
+            rng.normal(size=400) * 10 ** rng.uniform(-150, 0.5, 400),
+            [0.05, -0.05, np.nextafter(0.05, 0.0), 0.0499, 0.0501, 1e-150, 3.0, -6.0, 1e5],
+        ]
+    )
+    out = evaluate(x)
+    expected = in_precision(lambda v: -2 * mpmath.sin(v / 2) ** 2, x)
+    normal = np.abs(expected) > 1e-300
+    assert np.abs(out["cos_less_one"][normal] / expected[normal] - 1.0).max() <= 1e-15
+    assert (out["cos_less_one"][~normal] <= 0.0).all()
+    assert ulps(out["sin_small"], in_precision(mpmath.sin, x)) <= 3
+
+
+def test_exponential(evaluate):
+    rng = np.random.default_rng(4)
+    x = np.concatenate(
+        [
+            rng.uniform(-708, 709, 4000),
+            rng.uniform(-1, 1, 4000),
+            [0.0, -0.0, 1e-300, 709.78, -708.39],
+        ]
+    )
+    out = evaluate(x)["exp"]
+    assert ulps(out, np.exp(x)) <= 2
+    assert evaluate([0.0])["exp"][0] == 1.0
+
+
+def test_exponential_beyond_its_range(evaluate):
+    x = [709.79, 1e4, 1e308, math.inf, -709.0, -1e4, -1e308, -math.inf, math.nan]
+    out = evaluate(x)["exp"]
+    np.testing.assert_array_equal(out, [math.inf] * 4 + [0.0] * 4 + [math.nan])
+
+
+def test_logarithm(evaluate):
+    rng = np.random.default_rng(5)
+    x = np.concatenate(
+        [
+            10 ** rng.uniform(-307, 308, 4000),
+            1.0 + rng.normal(0.0, 0.2, 2000).clip(-0.9),
+            1.0 + rng.normal(size=2000) * 10 ** rng.uniform(-16, -1, 2000),
+            [2.3e-308, 1.7976931348623157e308, 2.0, 0.5, math.sqrt(2.0), math.sqrt(0.5)],
+        ]
+    )
+    out = evaluate(x)["log"]
+    assert ulps(out, np.log(x)) <= 3
+    assert evaluate([1.0])["log"][0] == 0.0
+
+
+def test_logarithm_beyond_its_range(evaluate):
+    out = evaluate([0.0, -0.0, -1.0, -math.inf, math.nan, math.inf])["log"]
+    expected = [-math.inf, -math.inf, math.nan, math.nan, math.nan, math.inf]
+    np.testing.assert_array_equal(out, expected)
+
+
+def test_angle_of_a_point(evaluate):
+    rng = np.random.default_rng(6)
+    x, y = rng.normal(size=(2, 8000)) * 10 ** rng.uniform(-100, 100, (2, 8000))
+    x[:4000], y[:4000] = rng.normal(size=(2, 4000))
+    assert ulps(evaluate(x, y)["angle"], np.arctan2(y, x)) <= 4
+
+
+@pytest.mark.parametrize(
+    ("y", "x", "angle"),
+    [
+        (0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (1.0, 0.0, math.pi / 2),
+        (-1.0, 0.0, -math.pi / 2),
+        (0.0, -1.0, math.pi),
+        (1.0, 1.0, math.pi / 4),
+        (1.0, -1.0, 3 * math.pi / 4),
+        (-1.0, -1.0, -3 * math.pi / 4),
+        (1.0, math.inf, 0.0),
+        (1.0, -math.inf, math.pi),
+        (math.inf, 1.0, math.pi / 2),
+        (-math.inf, -1.0, -math.pi / 2),
+        (1e-320, 1e308, 0.0),
+    ],
+)
+def test_angles_of_special_points(evaluate, y, x, angle):
+    assert evaluate([x], y)["angle"][0] == pytest.approx(angle, rel=3e-16, abs=0.0)
+
+
+@pytest.mark.parametrize(("y", "x"), [(math.nan, 1.0), (1.0, math.nan), (math.nan, math.nan)])
+def test_the_angle_of_no_point_is_not_a_number(evaluate, y, x):
+    assert math.isnan(evaluate([x], y)["angle"][0])
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, -math.inf])
+def test_there_is_no_sine_of_no_angle(evaluate, x):
+    out = evaluate([x])
+    assert all(math.isnan(out[name][0]) for name in ("sin", "cos", "sin_small", "cos_less_one"))
+
+
+def test_no_turn_at_all_is_exact(evaluate):
+    out = evaluate([0.0, -0.0])
+    np.testing.assert_array_equal(out["sin"], [0.0, 0.0])
+    np.testing.assert_array_equal(out["cos"], [1.0, 1.0])
+    np.testing.assert_array_equal(out["cos_less_one"], [0.0, 0.0])
+
+
+@given(
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e8, 0.5]),
+    st.integers(0, WIDTH - 1),
+    st.lists(st.floats(-0.04, 0.04) | st.floats(-1e5, 1e5), min_size=WIDTH, max_size=WIDTH),
+)
+def test_a_strange_angle_in_one_lane_changes_no_other(bad, where, values):
+    x = np.array(values)
+    spoilt = x.copy()
+    spoilt[where] = bad
+    clean, dirty = (
+        compiled.on_lanes(x=x),
+        compiled.on_lanes(x=spoilt, y=np.where(x == spoilt, 0, bad)),
+    )
+    others = np.arange(WIDTH) != where
+    for name in NAMES:
+        assert clean[name][others].tobytes() == dirty[name][others].tobytes(), name
+
+
+@given(st.lists(st.floats(-1e9, 1e9), min_size=1, max_size=WIDTH), st.floats(-1e3, 1e3))
+def test_floats_and_lanes_give_the_same_functions(values, y):
+    x = np.array(values)
+    plain, lanes = (
+        run(x=x, y=np.full(x.shape, y)) for run in (compiled.on_floats, compiled.on_lanes)
+    )
+    for name in NAMES:
+        np.testing.assert_array_max_ulp(plain[name], lanes[name], 2)

@@ -1,0 +1,327 @@
+"""The friendly filter: what it refuses, what it survives, how it starts."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import UnscentedKalmanFilter
+from quad_gym.records import FilterStatus
+from tests.circle_flight import record_circle
+from tests.reference_ukf import east_north_up, rotation_312
+
+LAB = quad_gym.sensor_suite("lab")
+R_IG = east_north_up(LAB.gnss.reference_antenna_G)
+RECORDING = record_circle(LAB, 50, seed=1)
+PROPERTIES = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias", "covariance")
+
+
+def running_filter(cycles=5):
+    ukf = UnscentedKalmanFilter(sensors=LAB)
+    ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    for k in range(cycles):
+        ukf.update(RECORDING.gnss_position[k], RECORDING.gnss_baseline[k], RECORDING.pixels[k])
+        ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
+    return ukf
+
+
+def estimate(ukf):
+    return [getattr(ukf, name) for name in PROPERTIES]
+
+
+def assert_same(before, after):
+    for name, was, now in zip(PROPERTIES, before, after, strict=True):
+        np.testing.assert_array_equal(was, now, err_msg=name)
+
+
+BAD_TRIPLES = [(1.0, 2.0), np.zeros((3, 3)), 1.0, "abc", (np.nan, 0, 1), (0, np.inf, 1), [None] * 3]
+BAD_IMAGES = [np.zeros((3, 2)), np.zeros(2), np.zeros((2, 3)), [[0, np.inf], [0, 0]], "abc"]
+
+
+@pytest.mark.parametrize("value", BAD_TRIPLES, ids=repr)
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        ("update", "gnss_position_G"),
+        ("update", "gnss_baseline_G"),
+        ("initialize", "gnss_position_G"),
+        ("initialize", "gnss_baseline_G"),
+        ("predict", "gyro"),
+        ("predict", "accel"),
+    ],
+)
+def test_bad_vectors_raise_and_leave_the_estimate_as_it_was(method, name, value):
+    good = {
+        "update": {"gnss_position_G": RECORDING.gnss_position[5]},
+        "initialize": {
+            "gnss_position_G": RECORDING.gnss_position[5],
+            "gnss_baseline_G": RECORDING.gnss_baseline[5],
+        },
+        "predict": {"gyro": RECORDING.gyro[5], "accel": RECORDING.accel[5]},
+    }
+    ukf = running_filter()
+    before = estimate(ukf)
+    with pytest.raises(ValueError, match=name):
+        getattr(ukf, method)(**{**good[method], name: value})
+    assert_same(before, estimate(ukf))
+    assert ukf.status == FilterStatus(0)
+
+
+@pytest.mark.parametrize("value", BAD_IMAGES, ids=repr)
+def test_bad_pixels_raise_and_leave_the_estimate_as_it_was(value):
+    ukf = running_filter()
+    before = estimate(ukf)
+    with pytest.raises(ValueError, match="pixels"):
+        ukf.update(RECORDING.gnss_position[5], RECORDING.gnss_baseline[5], value)
+    assert_same(before, estimate(ukf))
+
+
+def test_a_refused_measurement_has_no_later_effect():
+    calm, upset = running_filter(), running_filter()
+    for call in (
+        lambda: upset.update(RECORDING.gnss_position[7], RECORDING.gnss_baseline[7], [[0, np.inf]]),
+        lambda: upset.predict((9.0, 9.0, 9.0), (0.0, 0.0, np.nan)),
+        lambda: upset.update(gnss_baseline_G=(0.0, 0.0, 0.0)),
+    ):
+        with pytest.raises(ValueError, match="must"):
+            call()
+    for ukf in (calm, upset):
+        ukf.update(RECORDING.gnss_position[5])
+        ukf.predict(RECORDING.gyro[5], RECORDING.accel[5])
+    assert_same(estimate(calm), estimate(upset))
+
+
+def test_a_baseline_of_no_length_raises():
+    ukf = UnscentedKalmanFilter(LAB)
+    with pytest.raises(ValueError, match="gnss_baseline_G"):
+        ukf.initialize((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    with pytest.raises(RuntimeError, match="initialize"):
+        _ = ukf.position
+
+
+@pytest.mark.parametrize("partly", [(np.nan, np.nan), (np.nan, 3.0), (3.0, np.nan)])
+def test_a_nan_pixel_is_a_feature_not_seen(partly):
+    first, second = running_filter(), running_filter()
+    first.update(pixels=[(100.0, -50.0), partly])
+    second.update(pixels=[(100.0, -50.0), (np.nan, np.nan)])
+    assert_same(estimate(first), estimate(second))
+    assert first.nis[1] == 3
+    before = estimate(first)
+    first.update(pixels=[partly, partly])
+    assert_same(before, estimate(first))
+
+
+def test_an_update_without_measurements_changes_nothing():
+    ukf = running_filter()
+    before, nis = estimate(ukf), ukf.nis
+    ukf.update()
+    ukf.update(None, None, None)
+    ukf.update(pixels=np.full((2, 2), np.nan))
+    assert_same(before, estimate(ukf))
+    assert ukf.nis == nis
+    assert ukf.status == FilterStatus(0)
+
+
+def test_a_filter_without_a_camera_takes_no_pixels():
+    ukf = UnscentedKalmanFilter(LAB.replace(camera=None))
+    ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    before = estimate(ukf)
+    ukf.update(pixels=np.zeros((0, 2)))
+    assert_same(before, estimate(ukf))
+    with pytest.raises(ValueError, match="pixels"):
+        ukf.update(pixels=np.zeros((2, 2)))
+
+
+def test_calls_before_the_start_raise():
+    ukf = UnscentedKalmanFilter(LAB)
+    with pytest.raises(RuntimeError, match="initialize"):
+        ukf.update(RECORDING.gnss_position[0])
+    with pytest.raises(RuntimeError, match="initialize"):
+        ukf.predict((0, 0, 0), (0, 0, 9.8))
+    for name in PROPERTIES:
+        with pytest.raises(RuntimeError, match="initialize"):
+            getattr(ukf, name)
+
+
+@pytest.mark.parametrize("sensors", ["lab", None, 3, quad_gym.ImuParams()], ids=repr)
+def test_sensors_must_be_a_suite(sensors):
+    with pytest.raises(ValueError, match="sensors"):
+        UnscentedKalmanFilter(sensors=sensors)
+
+
+def test_what_the_properties_return_is_the_callers_own():
+    ukf = running_filter()
+    before = estimate(ukf)
+    for name in PROPERTIES:
+        getattr(ukf, name)[...] = 7.0
+    assert_same(before, estimate(ukf))
+
+
+# ---- the start ----
+
+
+@pytest.mark.parametrize("yaw", np.linspace(-3.0, 3.0, 7))
+def test_an_exact_fix_of_a_level_vehicle_gives_its_position_and_attitude(yaw):
+    gnss, ukf = LAB.gnss, UnscentedKalmanFilter(LAB)
+    r, R_BI = np.array([1.0, -2.0, 3.0]), rotation_312(np.array([0.0, 0.0, yaw]))
+    antenna = r + R_BI.T @ gnss.primary_antenna_B
+    ukf.initialize(R_IG.T @ antenna, R_IG.T @ R_BI.T @ gnss.baseline_B)
+    np.testing.assert_allclose(ukf.R_BI, R_BI, atol=1e-14)
+    np.testing.assert_allclose(ukf.position, r, atol=1e-14)
+    for name in ("velocity", "accel_bias", "gyro_bias"):
+        np.testing.assert_array_equal(getattr(ukf, name), 0.0)
+
+
+def test_the_first_covariance_is_the_laboratorys():
+    ukf = running_filter(cycles=0)
+    milli_g, degree_per_hour = 9.8e-3, np.radians(1.0) / 3600.0
+    variances = np.repeat(
+        [2 * 0.006**2, 0.001, 2 * 0.05**2, (100 * milli_g) ** 2, (100 * degree_per_hour) ** 2], 3
+    )
+    variances[2] = 2 * 0.012**2
+    np.testing.assert_allclose(ukf.covariance, np.diag(variances), rtol=1e-14, atol=0.0)
+
+
+def test_a_tilted_baseline_splits_its_angle_between_baseline_and_vertical():
+    """Two directions of equal weight that disagree by 2d: each is turned by d."""
+    ukf, tilt = UnscentedKalmanFilter(LAB), 0.3
+    baseline_I = 0.19 * np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
+    ukf.initialize((0.0, 0.0, 0.0), R_IG.T @ baseline_I)
+    expected = rotation_312(np.array([0.0, tilt / 2, 0.0]))
+    np.testing.assert_allclose(ukf.R_BI, expected, atol=1e-13)
+
+
+def test_initialize_starts_anew_and_forgets_failures():
+    ukf = running_filter()
+    with pytest.warns(RuntimeWarning, match="last good state"):
+        ukf.predict((0.0, 0.0, 0.0), (1e300, 0.0, 0.0))
+    ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    assert ukf.status == FilterStatus(0)
+    assert_same(estimate(running_filter(cycles=0)), estimate(ukf))
+
+
+# ---- set_state ----
+
+
+def given_state(**changes):
+    factor = np.tril(np.random.default_rng(2).normal(size=(15, 15))) + 5.0 * np.eye(15)
+    state = {
+        "position": (1.0, 2.0, 3.0),
+        "velocity": (-1.0, 0.5, 0.1),
+        "R_BI": rotation_312(np.array([0.1, -0.2, 2.0])),
+        "accel_bias": (0.3, 0.2, 0.1),
+        "gyro_bias": (1e-4, 2e-4, -3e-4),
+        "covariance": factor @ factor.T,
+    }
+    return {**state, **changes}
+
+
+def test_set_state_is_what_one_reads_back():
+    ukf, state = UnscentedKalmanFilter(LAB), given_state()
+    ukf.set_state(**state)
+    for name in PROPERTIES:
+        np.testing.assert_allclose(getattr(ukf, name), state[name], rtol=1e-13, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("position", (1.0, 2.0)),
+        ("velocity", (1.0, np.nan, 0.0)),
+        ("accel_bias", (np.inf, 0.0, 0.0)),
+        ("gyro_bias", np.zeros((3, 1))),
+        ("R_BI", np.diag([1.0, 1.0, -1.0])),
+        ("R_BI", 1.001 * np.eye(3)),
+        ("R_BI", np.eye(4)),
+        ("covariance", np.eye(14)),
+        ("covariance", -np.eye(15)),
+        ("covariance", np.zeros((15, 15))),
+        ("covariance", np.eye(15) + np.eye(15, k=1)),
+        ("covariance", np.full((15, 15), np.nan)),
+    ],
+    ids=str,
+)
+def test_set_state_refuses_what_is_no_state_and_changes_nothing(name, value):
+    ukf = running_filter()
+    before = estimate(ukf)
+    with pytest.raises(ValueError, match=name):
+        ukf.set_state(**given_state(**{name: value}))
+    assert_same(before, estimate(ukf))
+
+
+# ---- what it survives ----
+
+EXTREMES = [1e300, -1e300, 1e160, 1e100, -1e30, 1e17]
+
+
+@pytest.mark.parametrize("value", EXTREMES)
+@pytest.mark.parametrize("name", ["gyro", "accel"])
+def test_an_enormous_imu_sample_warns_or_is_followed_but_never_makes_nan(name, value):
+    ukf = running_filter()
+    before = estimate(ukf)
+    sample = {"gyro": (0.0, 0.0, 0.1), "accel": (0.0, 0.0, 9.8), name: (0.1 * value, value, value)}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ukf.predict(**sample)
+    assert (ukf.status == FilterStatus.PREDICTION_FAILED) == bool(caught)
+    if caught:
+        assert "PREDICTION_FAILED" in str(caught[0].message)
+        assert_same(before, estimate(ukf))
+    assert all(np.isfinite(value).all() for value in estimate(ukf))
+    np.testing.assert_allclose(ukf.R_BI @ ukf.R_BI.T, np.eye(3), atol=1e-12)
+    if abs(value) >= 1e160:
+        assert caught
+
+
+@pytest.mark.parametrize("value", EXTREMES)
+@pytest.mark.parametrize("name", ["gnss_position_G", "pixels"])
+def test_an_enormous_measurement_warns_or_is_followed_but_never_makes_nan(name, value):
+    ukf = running_filter()
+    before = estimate(ukf)
+    shape = (2, 2) if name == "pixels" else (3,)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ukf.update(**{name: np.full(shape, value)})
+    assert (ukf.status == FilterStatus.UPDATE_FAILED) == bool(caught)
+    if caught:
+        assert_same(before, estimate(ukf))
+    assert all(np.isfinite(value).all() for value in estimate(ukf))
+    np.testing.assert_allclose(ukf.R_BI @ ukf.R_BI.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [1e300, 1e160, 1e100, 1e-8])
+def test_a_baseline_of_any_length_is_refused_or_counts_by_its_direction(length):
+    wild, tame = running_filter(), running_filter()
+    before, direction = estimate(wild), RECORDING.gnss_baseline[5] / 0.19
+    try:
+        wild.update(gnss_baseline_G=length * direction)
+    except ValueError:
+        assert_same(before, estimate(wild))
+    else:
+        tame.update(gnss_baseline_G=direction)
+        np.testing.assert_allclose(wild.R_BI, tame.R_BI, atol=1e-12)
+
+
+def test_the_filter_goes_on_after_a_failure():
+    calm, upset = running_filter(), running_filter()
+    with pytest.warns(RuntimeWarning, match="PREDICTION_FAILED"):
+        upset.predict((0.0, 0.0, 0.0), (1e300, 0.0, 0.0))
+    for ukf in (calm, upset):
+        ukf.update(RECORDING.gnss_position[5])
+        ukf.predict(RECORDING.gyro[5], RECORDING.accel[5])
+    assert_same(estimate(calm), estimate(upset))
+    assert upset.status == FilterStatus.PREDICTION_FAILED
+
+
+def test_the_attitude_stays_a_rotation_over_ten_thousand_cycles():
+    ticks = 10_000
+    recording, ukf = record_circle(LAB, ticks, seed=4), UnscentedKalmanFilter(LAB)
+    ukf.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
+    for k in range(ticks):
+        ukf.update(recording.gnss_position[k], recording.gnss_baseline[k], recording.pixels[k])
+        ukf.predict(recording.gyro[k], recording.accel[k])
+    np.testing.assert_allclose(ukf.R_BI @ ukf.R_BI.T, np.eye(3), atol=1e-12)
+    assert np.linalg.eigvalsh(ukf.covariance)[0] > 0.0
+    assert np.linalg.norm(ukf.position - recording.r[-1]) < 0.1
+    assert ukf.status == FilterStatus(0)

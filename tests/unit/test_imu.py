@@ -1,0 +1,183 @@
+"""The IMU: lever arm, white noise and Gauss-Markov biases."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym.kernels.single import integrate_flight
+from quad_gym.packing import params_record
+from quad_gym.records import FLIGHT
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+from quad_gym.sensors import Imu
+from tests.unit.alarms import alarm_score, assert_normal
+
+LAB = quad_gym.ImuParams()
+QUIET = LAB.replace(
+    accel_noise_density=1e-15,
+    gyro_noise_density=1e-15,
+    accel_bias_sigma=1e-15,
+    gyro_bias_sigma=1e-15,
+)
+VEHICLE = quad_gym.VehicleParams(disc_area=0.2)
+GRAVITY_UP = np.array([0.0, 0.0, 9.8])
+
+
+def random_state(seed):
+    rng = np.random.default_rng(seed)
+    return {
+        "position": rng.normal(0.0, 0.1, 3),
+        "velocity": rng.normal(0.0, 3.0, 3),
+        "R_BI": Rotation.random(rng=rng).as_matrix(),
+        "body_rates": rng.normal(0.0, 3.0, 3),
+        "rotor_speeds": rng.uniform(500.0, 1500.0, 4),
+    }
+
+
+def resting():
+    speed = VEHICLE.hover_voltage * VEHICLE.motor_speed_per_volt
+    return {
+        "position": np.zeros(3),
+        "velocity": np.zeros(3),
+        "R_BI": np.eye(3),
+        "body_rates": np.zeros(3),
+        "rotor_speeds": np.full(4, speed),
+    }
+
+
+def position_of_body_point(state, disturbance_I, l_B, t):
+    """Where a point fixed in the body is at time t, by flying there with steady rotors."""
+    flight, params = np.zeros(1, FLIGHT), params_record(VEHICLE, quad_gym.SensorSuite())
+    flight["r"], flight["v"], flight["w"] = (
+        state["position"],
+        state["velocity"],
+        state["body_rates"],
+    )
+    flight["q"], flight["rotor_speeds"] = dcm_to_quaternion(state["R_BI"]), state["rotor_speeds"]
+    flight["voltages"] = state["rotor_speeds"] / VEHICLE.motor_speed_per_volt
+    flight["disturbance"] = disturbance_I
+    params["dt"] = t
+    if t != 0.0:
+        integrate_flight(flight, params, 1)
+    return flight["r"][0] + quaternion_to_dcm(flight["q"][0]).T @ l_B
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_specific_force_is_that_of_a_moving_point_of_the_body(seed):
+    state, rng = random_state(seed), np.random.default_rng(seed)
+    l_B, force = rng.normal(0.0, 0.3, 3), rng.normal(size=3)
+    h = 1e-3
+    ahead, now, behind, far_ahead, far_behind = (
+        position_of_body_point(state, force, l_B, k * h) for k in (1, 0, -1, 2, -2)
+    )
+    acceleration = (16 * (ahead + behind) - 30 * now - far_ahead - far_behind) / (12 * h**2)
+    imu = Imu(QUIET.replace(lever_arm_B=l_B), rng, VEHICLE)
+    gyro, accel = imu.measure(state, force)
+    expected = state["R_BI"] @ (acceleration + GRAVITY_UP)
+    limit = 1e-6 * (1.0 + np.abs(expected).max())
+    np.testing.assert_allclose(accel, expected, rtol=0.0, atol=limit)
+    np.testing.assert_allclose(gyro, state["body_rates"], rtol=0.0, atol=1e-12)
+
+
+def test_a_steady_spin_presses_outward_on_an_offset_accelerometer():
+    state = resting() | {"body_rates": np.array([0.0, 0.0, 5.0])}
+    imu = Imu(QUIET.replace(lever_arm_B=(0.1, 0.0, 0.2)), np.random.default_rng(1), VEHICLE)
+    _, accel = imu.measure(state)
+    # centripetal acceleration toward the axis, and the weight that the rotors carry
+    np.testing.assert_allclose(accel, [-0.1 * 25.0, 0.0, 9.8], rtol=0.0, atol=1e-10)
+
+
+def test_in_free_fall_nothing_is_felt():
+    state = resting() | {"rotor_speeds": np.zeros(4), "R_BI": Rotation.random(rng=1).as_matrix()}
+    gyro, accel = Imu(QUIET, np.random.default_rng(1), VEHICLE).measure(state)
+    np.testing.assert_allclose(accel, 0.0, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(gyro, 0.0, rtol=0.0, atol=1e-12)
+
+
+def sampled(params, count, seed=1):
+    """Readings of a hovering vehicle less the truth, and the biases before each of them."""
+    imu, state = Imu(params, np.random.default_rng(seed), VEHICLE), resting()
+    rows = [(imu.gyro_bias, imu.accel_bias, *imu.measure(state)) for _ in range(count)]
+    gyro_bias, accel_bias, gyro, accel = (np.array(column) for column in zip(*rows, strict=True))
+    return gyro, accel - GRAVITY_UP, gyro_bias, accel_bias
+
+
+def test_white_noise_has_the_density_of_the_laboratory():
+    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 20_000)
+    dt = 1.0 / 200.0
+    noise = np.concatenate([gyro - gyro_bias, accel - accel_bias], axis=1)
+    gyro_variance = (np.pi / 180.0 * 0.05) ** 2 / dt
+    accel_variance = (9.8e-3 * 0.1) ** 2 / dt
+    assert_normal(noise, np.zeros(6), np.diag([gyro_variance] * 3 + [accel_variance] * 3))
+    white = noise / noise.std(axis=0)
+    serial = np.abs((white[1:, :, np.newaxis] * white[:-1, np.newaxis]).mean(axis=0))
+    assert serial.max() < alarm_score(36) / np.sqrt(len(white))
+
+
+def test_each_step_of_a_bias_follows_equations_6_and_7():
+    params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.02)
+    _, _, gyro_bias, accel_bias = sampled(params, 20_000)
+    for bias, tau, sigma in (
+        (accel_bias, 0.05, params.accel_bias_sigma),
+        (gyro_bias, 0.02, params.gyro_bias_sigma),
+    ):
+        alpha = np.exp(-params.dt / tau)
+        driving = bias[1:] - alpha * bias[:-1]
+        assert_normal(driving, np.zeros(3), sigma**2 * (1.0 - alpha**2) * np.eye(3))
+        # what drives it is new each time: independent of the bias itself
+        correlation = (driving * bias[:-1]).mean(axis=0) / (driving.std(axis=0) * sigma)
+        assert np.abs(correlation).max() < alarm_score(3) / np.sqrt(len(driving))
+
+
+def test_what_drives_a_bias_is_independent_of_the_white_noise():
+    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 20_000, seed=5)
+    noise = np.concatenate([gyro - gyro_bias, accel - accel_bias], axis=1)
+    driving = np.diff(np.concatenate([gyro_bias, accel_bias], axis=1), axis=0)
+    noise, driving = noise / noise.std(axis=0), driving / driving.std(axis=0)
+    for white in (noise[:-1], noise[1:]):  # of the tick's start and of its end
+        correlation = driving.T @ white / len(driving)
+        assert np.abs(correlation).max() < alarm_score(36) / np.sqrt(len(driving))
+
+
+def test_a_bias_keeps_its_stationary_variance_and_forgets_over_its_correlation_time():
+    params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.05)
+    _, _, *biases = sampled(params, 30_000, seed=2)
+    alpha, lag = np.exp(-0.1), 10  # ten ticks are one correlation time
+    # Bartlett: variance of the sample variance of a first-order process
+    deviation = np.sqrt(2.0 * (1.0 + alpha**2) / (1.0 - alpha**2) / 30_000)
+    for bias, sigma in zip(biases, (params.gyro_bias_sigma, params.accel_bias_sigma), strict=True):
+        scaled = bias / sigma
+        assert np.abs((scaled**2).mean(axis=0) - 1.0).max() < alarm_score(3) * deviation
+        kept = (scaled[lag:] * scaled[:-lag]).mean(axis=0)
+        assert np.abs(kept - np.exp(-1.0)).max() < alarm_score(3) * deviation
+
+
+def test_a_bias_begins_at_its_stationary_distribution():
+    rng = np.random.default_rng(3)
+    imus = [Imu(LAB, rng) for _ in range(3_000)]
+    biases = np.array([np.append(imu.accel_bias, imu.gyro_bias) for imu in imus])
+    variances = [LAB.accel_bias_sigma**2] * 3 + [LAB.gyro_bias_sigma**2] * 3
+    assert_normal(biases, np.zeros(6), np.diag(variances))
+
+
+def test_a_bias_is_in_the_reading_at_once():
+    imu = Imu(
+        LAB.replace(accel_noise_density=1e-15, gyro_noise_density=1e-15), np.random.default_rng(4)
+    )
+    for _ in range(3):
+        gyro_bias, accel_bias = imu.gyro_bias, imu.accel_bias
+        gyro, accel = imu.measure(resting())
+        np.testing.assert_allclose(gyro, gyro_bias, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(accel - GRAVITY_UP, accel_bias, rtol=0.0, atol=1e-12)
+
+
+def test_a_bad_state_is_refused_by_name():
+    imu = Imu(LAB, np.random.default_rng(1))
+    with pytest.raises(ValueError, match=r"^state\['velocity'\] must"):
+        imu.measure(resting() | {"velocity": np.zeros(2)})
+    with pytest.raises(ValueError, match=r"^state must have the keys"):
+        imu.measure({"position": np.zeros(3)})
+    with pytest.raises(ValueError, match=r"^disturbance_I must"):
+        imu.measure(resting(), disturbance_I=1.0)

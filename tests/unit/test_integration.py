@@ -1,0 +1,226 @@
+"""The Runge-Kutta integration of a flight: its order, conservation laws, closed forms and SciPy."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym.kernels.single import integrate_flight
+from quad_gym.kernels.vehicle import integrate
+from quad_gym.packing import params_record
+from quad_gym.records import FLIGHT
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+from quad_gym.vehicle import state_derivative
+from tests.unit.compiled import Compiled
+
+LAB = quad_gym.vehicle_params("lab")
+SKEWED_INERTIA = ((0.02, 0.003, -0.001), (0.003, 0.03, 0.002), (-0.001, 0.002, 0.04))
+
+
+def flown(vehicle, duration, substeps, *, R_BI=None, **start):
+    """The record of one flight after `duration`, from rest where `start` does not say otherwise."""
+    flight, params = np.zeros(1, FLIGHT), params_record(vehicle, quad_gym.SensorSuite())
+    flight["q"] = dcm_to_quaternion(np.eye(3) if R_BI is None else R_BI)
+    for name, value in start.items():
+        flight[name] = value
+    params["dt"] = duration
+    integrate_flight(flight, params, substeps)
+    return flight[0]
+
+
+def random_start(seed):
+    rng = np.random.default_rng(seed)
+    return {
+        "R_BI": Rotation.random(rng=rng).as_matrix(),
+        "r": rng.normal(size=3),
+        "v": rng.normal(0.0, 3.0, 3),
+        "w": rng.normal(0.0, 2.0, 3),
+        "rotor_speeds": rng.uniform(900.0, 1000.0, 4),
+        "voltages": rng.uniform(4.8, 5.2, 4),
+        "disturbance": rng.normal(0.0, 2.0, 3),
+    }
+
+
+def scipy_flight(vehicle, duration, start):
+    """The state after a flight by DOP853 on the matrix form of the equations."""
+    shapes = {
+        "position": (3,),
+        "velocity": (3,),
+        "R_BI": (3, 3),
+        "body_rates": (3,),
+        "rotor_speeds": (4,),
+    }
+    cuts = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])[:-1]
+
+    def unpack(y):
+        parts = np.split(y, cuts)
+        return {n: v.reshape(s) for (n, s), v in zip(shapes.items(), parts, strict=True)}
+
+    def rate(t, y):
+        force = start["disturbance"]
+        rates = state_derivative(unpack(y), start["voltages"], force, vehicle)
+        return np.concatenate([rates[name].ravel() for name in shapes])
+
+    first = [start[n].ravel() for n in ("r", "v", "R_BI", "w", "rotor_speeds")]
+    solution = solve_ivp(
+        rate, (0.0, duration), np.concatenate(first), method="DOP853", rtol=1e-12, atol=1e-11
+    )
+    return unpack(solution.y[:, -1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("skewed", [False, True])
+def test_random_flights_agree_with_scipy(seed, skewed):
+    vehicle = LAB.replace(inertia=SKEWED_INERTIA, disc_area=0.2) if skewed else LAB
+    start = random_start(seed)
+    mine = flown(vehicle, 0.3, 3_000, **start)
+    expected = scipy_flight(vehicle, 0.3, start)
+    np.testing.assert_allclose(mine["r"], expected["position"], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(mine["v"], expected["velocity"], rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(quaternion_to_dcm(mine["q"]), expected["R_BI"], atol=1e-10)
+    np.testing.assert_allclose(mine["w"], expected["body_rates"], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(mine["rotor_speeds"], expected["rotor_speeds"], rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["r", "v", "q", "w", "rotor_speeds"])
+def test_the_error_falls_with_the_fourth_power_of_the_step(name):
+    # it climbs so fast that z_I . v keeps its sign: at the kink of the drag the order is lower
+    start = random_start(5) | {"R_BI": np.eye(3), "v": (3.0, 2.0, 30.0), "w": (2.0, -3.0, 4.0)}
+    vehicle = LAB.replace(disc_area=0.3)
+    exact = flown(vehicle, 0.2, 20_000, **start)[name]
+    substeps = np.array([16, 32, 64, 128])
+    errors = [np.linalg.norm(flown(vehicle, 0.2, n, **start)[name] - exact) for n in substeps]
+    slope = -np.polyfit(np.log(substeps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.parametrize("inertia", [LAB.inertia, SKEWED_INERTIA])
+def test_a_body_free_of_torque_keeps_its_energy_and_angular_momentum(inertia):
+    J = np.array(inertia)
+    # close to the axis of middle inertia, about which it tumbles
+    w = np.linalg.eigh(J)[1] @ np.array([0.05, 6.0, 0.02])
+    R_BI = Rotation.from_euler("zxy", [0.3, 1.0, -0.4]).as_matrix()
+    vehicle = LAB.replace(inertia=inertia)
+    end = flown(vehicle, 8.0, 16_000, R_BI=R_BI, w=w)
+    turned = quaternion_to_dcm(end["q"])
+    assert np.abs(end["w"] - w).max() > 1.0 or np.abs(turned - R_BI).max() > 0.5
+    assert end["w"] @ J @ end["w"] == pytest.approx(w @ J @ w, rel=1e-9)
+    np.testing.assert_allclose(
+        turned.T @ J @ end["w"], R_BI.T @ J @ w, rtol=0.0, atol=1e-9 * np.linalg.norm(J @ w)
+    )
+    assert np.linalg.norm(end["q"]) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_a_steady_spin_about_a_principal_axis_turns_by_rate_times_time():
+    end = flown(LAB, 2.0, 4_000, w=(0.0, 0.0, 3.0))
+    expected = Rotation.from_rotvec([0.0, 0.0, 6.0]).as_matrix().T
+    np.testing.assert_allclose(quaternion_to_dcm(end["q"]), expected, rtol=0.0, atol=1e-11)
+
+
+def test_a_fall_in_vacuum_is_a_parabola():
+    r, v = np.array([1.0, -2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+    end = flown(LAB.replace(disc_area=0.0), 1.5, 10, r=r, v=v, w=(1.0, 2.0, 3.0))
+    g = np.array([0.0, 0.0, -9.8])
+    np.testing.assert_allclose(end["r"], r + 1.5 * v + 0.5 * 1.5**2 * g, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(end["v"], v + 1.5 * g, rtol=0.0, atol=1e-13)
+
+
+def test_a_flat_fall_in_air_approaches_the_terminal_speed():
+    vehicle = LAB.replace(disc_area=1.0)
+    drag = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
+    terminal = np.sqrt(vehicle.mass * vehicle.gravity / drag)
+    end = flown(vehicle, 1.2, 1_000)
+    phase = vehicle.gravity * 1.2 / terminal
+    height = -(terminal**2) / vehicle.gravity * np.log(np.cosh(phase))
+    assert end["v"][2] == pytest.approx(-terminal * np.tanh(phase), rel=1e-11)
+    assert end["r"][2] == pytest.approx(height, rel=1e-11)
+
+
+def test_an_edge_on_fall_feels_no_air():
+    R_BI = Rotation.from_euler("x", np.pi / 2).as_matrix().T
+    end = flown(LAB.replace(disc_area=10.0), 1.0, 100, R_BI=R_BI)
+    assert end["v"][2] == pytest.approx(-9.8, rel=1e-12)
+
+
+def test_rotors_approach_their_speed_exponentially():
+    speeds, voltages = np.array([0.0, 500.0, 2400.0, 100.0]), np.array([12.0, 1.0, 0.0, 3.0])
+    end = flown(LAB, 0.12, 200, rotor_speeds=speeds, voltages=voltages)
+    target = LAB.motor_speed_per_volt * voltages
+    expected = target + (speeds - target) * np.exp(-0.12 / LAB.motor_time_constant)
+    np.testing.assert_allclose(end["rotor_speeds"], expected, rtol=1e-9)
+
+
+def test_a_hovering_vehicle_stays_where_it_is():
+    speed = LAB.motor_speed_per_volt * LAB.hover_voltage
+    end = flown(LAB, 10.0, 2_000, r=(1.0, 2.0, 3.0), rotor_speeds=speed, voltages=LAB.hover_voltage)
+    np.testing.assert_allclose(end["r"], [1.0, 2.0, 3.0], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(end["v"], 0.0, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(end["w"], 0.0, rtol=0.0, atol=1e-9)
+
+
+def test_drag_never_adds_energy_to_a_tumbling_fall():
+    vehicle, start = LAB.replace(disc_area=2.0), random_start(7)
+    for name in ("rotor_speeds", "voltages", "disturbance"):
+        start[name] = 0.0
+
+    def energy(flight):
+        return 0.5 * vehicle.mass * flight["v"] @ flight["v"] + vehicle.mass * 9.8 * flight["r"][2]
+
+    energies = [energy(flown(vehicle, t, 400, **start)) for t in np.linspace(1e-3, 2.0, 30)]
+    assert (np.diff(energies) < 0.0).all()
+
+
+STATE = {"r": (3,), "v": (3,), "q": (4,), "w": (3,), "rotor_speeds": (4,)}
+PARAMS = {
+    "dt": (),
+    "gravity": (),
+    "mass": (),
+    "inertia": (3, 3),
+    "inertia_inverse": (3, 3),
+    "half_drag": (),
+    "kF": (),
+    "effectiveness": (4, 4),
+    "motor_tau": (),
+    "motor_gain": (),
+}
+lanes_and_floats = Compiled(
+    lambda f, substeps: integrate(f, f, substeps),
+    **STATE,
+    **PARAMS,
+    voltages=(4,),
+    disturbance=(3,),
+)
+
+
+def eight_flights():
+    """Fields of eight flights that differ in everything, their vehicles included."""
+    vehicles = [LAB.replace(mass=0.5 + 0.1 * i, disc_area=0.1 * i) for i in range(8)]
+    records = [params_record(v, quad_gym.SensorSuite())[0] for v in vehicles]
+    fields = {name: np.array([record[name] for record in records]) for name in PARAMS}
+    starts = [random_start(seed) for seed in range(8)]
+    for start in starts:
+        start["q"] = dcm_to_quaternion(start.pop("R_BI"))
+    return fields | {name: np.array([start[name] for start in starts]) for name in starts[0]}
+
+
+def test_eight_flights_in_lanes_are_eight_flights_in_floats():
+    flights = eight_flights()
+    plain, lanes = (
+        lanes_and_floats.on_floats(20, **flights),
+        lanes_and_floats.on_lanes(20, **flights),
+    )
+    for name in STATE:
+        np.testing.assert_allclose(plain[name], lanes[name], rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_a_flight_that_is_not_a_number_does_not_touch_its_neighbours():
+    flights = eight_flights()
+    clean = lanes_and_floats.on_lanes(5, **flights)
+    spoilt = {name: value.copy() for name, value in flights.items()}
+    spoilt["w"][2], spoilt["r"][5], spoilt["mass"][5] = np.nan, np.inf, 0.0
+    dirty = lanes_and_floats.on_lanes(5, **spoilt)
+    for name in STATE:
+        others = [0, 1, 3, 4, 6, 7]
+        assert clean[name][others].tobytes() == dirty[name][others].tobytes(), name
+    assert np.isnan(dirty["q"][2]).any()

@@ -1,0 +1,240 @@
+"""Errors, consistency and intervals, against distributions that are known."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from quad_gym import metrics
+from quad_gym.rotations import euler_to_dcm
+
+
+def random_covariance(rng: np.random.Generator, n: int) -> np.ndarray:
+    factor = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-3, 3, size=(n, 1))
+    return factor @ factor.T
+
+
+class TestTrackingSummary:
+    def test_means_over_the_flight_and_over_its_last_half(self):
+        errors = np.array([[4.0, 2.0, 1.0, 3.0], [0.0, 0.0, 8.0, 0.0]])
+        found = metrics.tracking_summary(errors)
+        assert found.mean.tolist() == [2.5, 2.0]
+        assert found.last_half.tolist() == [2.0, 4.0]
+
+    def test_of_a_single_flight_is_a_scalar(self):
+        assert metrics.tracking_summary([1.0, 3.0, 5.0]).last_half == 4.0
+
+    @pytest.mark.parametrize("errors", [3.0, [], np.zeros((5, 0))])
+    def test_refuses_no_instants(self, errors):
+        with pytest.raises(ValueError, match="errors must have shape"):
+            metrics.tracking_summary(errors)
+
+    @pytest.mark.parametrize("instants", [1, 2, 7, 20])
+    def test_running_summary_agrees(self, instants):
+        errors = np.random.default_rng(0).exponential(size=(5, instants))
+        running = metrics.RunningSummary(5, instants)
+        for error in errors.T:
+            running.add(error)
+        whole, built = metrics.tracking_summary(errors), running.result()
+        np.testing.assert_allclose(built.mean, whole.mean, rtol=1e-13)
+        np.testing.assert_allclose(built.last_half, whole.last_half, rtol=1e-13)
+
+    def test_flights_that_have_ended_do_not_count(self):
+        running = metrics.RunningSummary(2, 4)
+        for error, counts in zip([1.0, 2.0, 3.0, np.nan], [True, True, True, False], strict=True):
+            running.add([error, 1.0], [counts, True])
+        assert running.result().mean.tolist() == [2.0, 1.0]
+        assert running.result().last_half.tolist() == [3.0, 1.0]
+
+    def test_flight_that_ended_in_its_first_half_has_no_last_half(self):
+        running = metrics.RunningSummary(1, 4)
+        for counts in (True, False, False, False):
+            running.add([1.0], [counts])
+        assert running.result().mean.tolist() == [1.0]
+        assert np.isnan(running.result().last_half).all()
+
+    def test_spreads_of_chosen_flights(self):
+        found = metrics.TrackingSummary(np.array([1.0, 2.0, 9.0]), np.array([5.0, 5.0, np.nan]))
+        spreads = found.spreads([True, True, False])
+        assert (spreads["mean"].count, spreads["mean"].mean) == (2, 1.5)
+        assert spreads["last_half"].mean == 5.0
+
+
+class TestSpread:
+    def test_of_known_numbers(self):
+        found = metrics.spread([1.0, 2.0, 3.0, 4.0, 10.0])
+        assert (found.count, found.mean, found.median, found.largest) == (5, 4.0, 3.0, 10.0)
+        assert found.sd == pytest.approx(np.sqrt(50.0 / 4))
+        assert (found.low, found.high) == pytest.approx((1.2, 8.8))
+
+    def test_equal_numbers_do_not_spread_at_all(self):
+        found = metrics.spread(np.full(1000, 0.1))
+        assert (found.mean, found.sd) == (0.1, 0.0)
+
+    def test_of_one_number_has_no_deviation(self):
+        found = metrics.spread([2.0])
+        assert found.mean == 2.0
+        assert np.isnan(found.sd)
+
+    def test_of_nothing_is_nan(self):
+        found = metrics.spread([])
+        assert found.count == 0
+        assert np.isnan(found.mean)
+
+
+class TestStateError:
+    names = ("position", "velocity", "accel_bias", "gyro_bias")
+
+    def states(self, shape=()):
+        rng = np.random.default_rng(3)
+        truth = {name: rng.normal(size=(*shape, 3)) for name in self.names}
+        estimate = {name: rng.normal(size=(*shape, 3)) for name in self.names}
+        truth["R_BI"] = euler_to_dcm(rng.uniform(-1, 1, size=(*shape, 3)))
+        estimate["R_BI"] = euler_to_dcm(rng.uniform(-1, 1, size=(*shape, 3)))
+        return truth, estimate
+
+    @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+    def test_estimate_and_error_make_the_truth(self, shape):
+        truth, estimate = self.states(shape)
+        x = metrics.state_error(truth, estimate)
+        assert x.shape == (*shape, 15)
+        for name, first in zip(self.names, (0, 3, 9, 12), strict=True):
+            error = x[..., first : first + 3]
+            np.testing.assert_allclose(estimate[name] + error, truth[name], atol=1e-15)
+        R_BI = euler_to_dcm(x[..., 6:9]) @ estimate["R_BI"]
+        np.testing.assert_allclose(R_BI, truth["R_BI"], atol=1e-14)
+
+    def test_missing_quantity(self):
+        truth, estimate = self.states()
+        del estimate["gyro_bias"]
+        with pytest.raises(KeyError, match="gyro_bias"):
+            metrics.state_error(truth, estimate)
+
+
+class TestNees:
+    def test_of_a_diagonal_covariance_is_a_sum_of_squares(self):
+        assert metrics.nees([2.0, 3.0], np.diag([4.0, 0.25])) == pytest.approx(1.0 + 36.0)
+
+    def test_does_not_depend_on_coordinates(self):
+        rng = np.random.default_rng(1)
+        B, e, A = rng.normal(size=(6, 9)), rng.normal(size=6), rng.normal(size=(6, 6))
+        P = B @ B.T
+        assert metrics.nees(A @ e, A @ P @ A.T) == pytest.approx(metrics.nees(e, P), rel=1e-9)
+
+    def test_of_honest_errors_is_chi_square(self):
+        from scipy.stats import kstest
+
+        rng = np.random.default_rng(2)
+        P = random_covariance(rng, 15)
+        errors = rng.normal(size=(4000, 15)) @ np.linalg.cholesky(P).T
+        values = metrics.nees(errors, np.broadcast_to(P, (4000, 15, 15)))
+        assert values.shape == (4000,)
+        assert kstest(values, "chi2", args=(15,)).pvalue > 0.01
+        assert metrics.chi_square_band(15, 4000, 0.999).holds(values.mean())
+
+    @pytest.mark.parametrize(("factor", "too_high"), [(0.9, False), (1.1, True)])
+    def test_mean_leaves_the_band_when_errors_are_not_as_claimed(self, factor, too_high):
+        rng = np.random.default_rng(4)
+        errors = factor * rng.normal(size=(1000, 15))
+        mean = metrics.nees(errors, np.broadcast_to(np.eye(15), (1000, 15, 15))).mean()
+        band = metrics.chi_square_band(15, 1000)
+        assert mean > band.high if too_high else mean < band.low
+
+    @pytest.mark.parametrize("P", [np.eye(3), np.ones(2), np.ones((2, 3))])
+    def test_refuses_shapes_that_do_not_fit(self, P):
+        with pytest.raises(ValueError, match=r"covariances must have shape \(\.\.\., n, n\)"):
+            metrics.nees(np.ones(2), P)
+
+    def test_refuses_singular_covariance(self):
+        with pytest.raises(ValueError, match="singular"):
+            metrics.nees(np.ones(2), np.zeros((2, 2)))
+
+
+class TestChiSquare:
+    def test_band_from_tables(self):
+        # 2.5 % and 97.5 % points of chi-square with 15 degrees of freedom
+        assert metrics.chi_square_band(15) == pytest.approx((6.262, 27.488), abs=5e-4)
+
+    def test_band_holds_its_share(self):
+        rng = np.random.default_rng(5)
+        means = rng.chisquare(15, size=(4000, 10)).mean(axis=1)
+        band = metrics.chi_square_band(15, 10, 0.9)
+        assert np.mean([band.holds(m) for m in means]) == pytest.approx(0.9, abs=0.015)
+
+    def test_quantile_from_tables(self):
+        assert metrics.chi_square_quantile(15, 0.999) == pytest.approx(37.697, abs=5e-4)
+
+    @pytest.mark.parametrize("arguments", [(0,), (15, 0), (15, 1, 0.0), (15, 1, 1.0)])
+    def test_band_refuses_nonsense(self, arguments):
+        with pytest.raises(ValueError, match="must be"):
+            metrics.chi_square_band(*arguments)
+
+    @pytest.mark.parametrize("arguments", [(0, 0.5), (15, 0.0), (15, 2.0)])
+    def test_quantile_refuses_nonsense(self, arguments):
+        with pytest.raises(ValueError, match="must be"):
+            metrics.chi_square_quantile(*arguments)
+
+
+class TestBootstrap:
+    def test_interval_is_about_that_of_a_normal_mean(self):
+        x = np.random.default_rng(6).normal(3.0, 2.0, size=400)
+        half = 1.96 * x.std(ddof=1) / np.sqrt(x.size)
+        found = metrics.bootstrap_interval(x)
+        assert found == pytest.approx((x.mean() - half, x.mean() + half), abs=0.2 * half)
+
+    def test_interval_holds_the_mean_as_often_as_it_says(self):
+        rng = np.random.default_rng(7)
+        samples = rng.exponential(size=(100, 30))
+        held = [metrics.bootstrap_interval(x, probability=0.8).holds(1.0) for x in samples]
+        assert np.mean(held) == pytest.approx(0.8, abs=0.12)
+
+    def test_interval_can_be_reproduced(self):
+        x = np.random.default_rng(8).exponential(size=50)
+        assert metrics.bootstrap_interval(x) == metrics.bootstrap_interval(x)
+
+    def test_large_samples(self):
+        x = np.random.default_rng(9).normal(size=6000)
+        assert metrics.bootstrap_interval(x).holds(x.mean())
+
+    def test_interval_of_equal_numbers_is_a_point(self):
+        assert metrics.bootstrap_interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
+
+    @pytest.mark.parametrize("values", [[], [1.0], [1.0, np.nan]])
+    def test_refuses_too_few_or_unknown_values(self, values):
+        with pytest.raises(ValueError, match="at least two finite numbers"):
+            metrics.bootstrap_interval(values)
+
+
+class TestPairedDifference:
+    def test_finds_what_seeds_hide(self):
+        rng = np.random.default_rng(10)
+        seeds = rng.normal(0.0, 10.0, size=200)
+        first, second = seeds + rng.normal(0.5, 0.1, size=200), seeds
+        found = metrics.paired_difference(first, second)
+        assert found.significant
+        assert found.interval.holds(0.5)
+        assert found.spread.mean == pytest.approx(0.5, abs=0.05)
+
+    def test_of_the_same_is_not_significant(self):
+        found = metrics.paired_difference([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+        assert not found.significant
+        assert found.interval == (0.0, 0.0)
+
+    def test_leaves_out_unknown_seeds(self):
+        found = metrics.paired_difference([1.0, np.nan, 3.0], [0.0, 1.0, 2.0])
+        assert (found.spread.count, found.spread.mean) == (2, 1.0)
+
+    def test_of_one_seed_has_no_interval(self):
+        found = metrics.paired_difference([1.0], [2.0])
+        assert found.interval is None
+        assert not found.significant
+
+    def test_refuses_different_numbers_of_seeds(self):
+        with pytest.raises(ValueError, match="first and second must have shape"):
+            metrics.paired_difference([1.0, 2.0], [1.0])
+
+
+def test_scipy_is_imported_when_it_is_needed():
+    code = "import quad_gym.metrics, sys; sys.exit('scipy.stats' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

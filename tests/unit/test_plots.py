@@ -1,0 +1,154 @@
+"""Figures: that they show what they are given; how they look is for eyes."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from quad_gym import plots
+
+pytest.importorskip("matplotlib")
+
+
+def circle(n=201, duration=10.0, gap=0.1):
+    """A flight on a circle at some distance from its reference, looking at the centre."""
+    time = np.linspace(0.0, duration, n)
+    c, s = np.cos(2 * np.pi * time / duration), np.sin(2 * np.pi * time / duration)
+    reference = np.stack([4.0 * c, 4.0 * s, np.ones(n)], axis=1)
+    return plots.Trace(
+        time=time,
+        position=reference - [0.0, 0.0, gap],
+        heading=np.stack([-c, -s], axis=1),
+        reference=reference,
+        error=np.full(n, gap),
+    )
+
+
+def band(trace, low=0.5, high=2.0):
+    return plots.Band(low=low * trace.error, high=high * trace.error, label="range")
+
+
+def axes_of(figure):
+    (axes,) = figure.axes
+    return axes
+
+
+class TestHeadingTicks:
+    def test_begin_on_the_path_and_point_along_the_heading(self):
+        trace = circle()
+        ticks = plots.heading_ticks(
+            trace.time, trace.position, 7.0 * trace.heading, every=2.5, length=0.5
+        )
+        want = [[4, 0], [0, 4], [-4, 0], [0, -4], [4, 0]]
+        np.testing.assert_allclose(ticks[:, 0], want, atol=1e-12)
+        np.testing.assert_allclose(ticks[:, 1], 3.5 / 4.0 * np.array(want), atol=1e-12)
+
+    @pytest.mark.parametrize("dt", [0.005, 0.1, 1.0 / 3.0])
+    def test_rounding_loses_no_tick(self, dt):
+        time = dt * np.arange(round(10.0 / dt) + 1)
+        position = np.stack([time, 0.0 * time], axis=1)
+        ticks = plots.heading_ticks(time, position, position + 1.0, every=1.0, length=1.0)
+        np.testing.assert_allclose(ticks[:, 0, 0], np.arange(11), atol=dt / 2 + 1e-9)
+
+    def test_flight_of_one_instant(self):
+        ticks = plots.heading_ticks([0.0], [[1.0, 2.0, 3.0]], [[0.0, 1.0]], every=0.5, length=1.0)
+        assert ticks.tolist() == [[[1.0, 2.0], [1.0, 3.0]]]
+
+
+class TestPath:
+    def test_shows_path_reference_and_start_to_scale(self):
+        trace = circle()
+        axes = axes_of(plots.path_figure(trace, "Title"))
+        assert axes.get_aspect() == 1.0
+        assert axes.get_title(loc="left") == "Title"
+        assert "[m]" in axes.get_xlabel()
+        assert "[m]" in axes.get_ylabel()
+        flown, reference, start = axes.lines
+        np.testing.assert_array_equal(flown.get_xydata(), trace.position[:, :2])
+        np.testing.assert_array_equal(reference.get_xydata(), trace.reference[:, :2])
+        np.testing.assert_array_equal(start.get_xydata(), trace.position[:1, :2])
+
+    def test_has_a_tick_every_half_second(self):
+        (ticks,) = axes_of(plots.path_figure(circle())).collections
+        assert len(ticks.get_segments()) == 21
+
+    def test_everything_lies_inside(self):
+        axes = axes_of(plots.path_figure(circle()))
+        for low, high in (axes.get_xlim(), axes.get_ylim()):
+            assert low < -4.0 < 4.0 < high
+
+
+class TestHeight:
+    def test_shows_height_and_reference(self):
+        trace = circle()
+        axes = axes_of(plots.height_figure(trace))
+        flown, reference, _ = axes.lines
+        np.testing.assert_array_equal(flown.get_ydata(), trace.position[:, 2])
+        np.testing.assert_array_equal(reference.get_ydata(), trace.reference[:, 2])
+        assert axes.get_xlabel() == "time [s]"
+        assert axes.get_ylabel() == "height z [m]"
+
+
+class TestError:
+    def labels(self, axes):
+        return [text.get_text() for text in axes.get_legend().get_texts()]
+
+    def test_shows_flight_and_band(self):
+        trace = circle()
+        axes = axes_of(plots.error_figure(trace, band(trace), label="seed 7"))
+        assert self.labels(axes) == ["seed 7", "range"]
+        np.testing.assert_array_equal(axes.lines[-1].get_ydata(), trace.error)
+        assert len(axes.collections) == 1
+        assert axes.get_yscale() == "log"
+
+    def test_band_without_width_is_drawn_as_a_line(self):
+        trace = circle()
+        axes = axes_of(plots.error_figure(trace, band(trace, 1.0, 1.0)))
+        assert len(axes.lines) == 2
+
+    def test_needs_no_band(self):
+        assert self.labels(axes_of(plots.error_figure(circle()))) == ["one flight"]
+
+    def test_limits_can_be_shared(self):
+        near, far = circle(gap=0.01), circle(gap=1.0)
+        limits = plots.error_limits([near, far], [band(far)])
+        assert limits[0] < 0.01
+        assert limits[1] > 2.0
+        assert axes_of(plots.error_figure(near, limits=limits)).get_ylim() == limits
+
+    def test_limits_do_not_follow_a_zero(self):
+        trace = circle()
+        trace.error[50] = 0.0
+        assert plots.error_limits([trace], [])[0] > 0.01
+
+
+def test_overview_shows_all(tmp_path):
+    trace = circle()
+    errors = {"one": (trace, band(trace)), "two": (trace, None)}
+    figure = plots.overview_figure(trace, errors, title="Path")
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["Path", "Height", "one", "two"]
+
+
+def test_saves_png_and_svg_with_the_same_bytes_each_time(tmp_path):
+    first = plots.save_figure(plots.height_figure(circle()), tmp_path / "first")
+    second = plots.save_figure(plots.height_figure(circle()), tmp_path / "second")
+    assert [file.name for file in first] == ["first.png", "first.svg"]
+    assert first[0].read_bytes()[:4] == b"\x89PNG"
+    assert b"<svg" in first[1].read_bytes()
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_leaves_the_users_matplotlib_settings_alone(tmp_path):
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    plots.save_figure(plots.path_figure(circle()), tmp_path / "path")
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_missing_matplotlib_is_explained(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r'pip install "quad-gym\[plot\]"'):
+        plots.path_figure(circle())

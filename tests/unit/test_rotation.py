@@ -1,0 +1,234 @@
+"""Attitude conversions against SciPy's rotations; a rotation's even and odd parts."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from quad_gym import rotations
+from quad_gym.kernels.compilation import inlined
+from quad_gym.kernels.linalg import load3, store3, store33
+from quad_gym.kernels.rotation import (
+    dcm_to_quaternion,
+    euler_to_dcm,
+    quaternion_rate,
+    quaternion_to_dcm,
+    split_rotation,
+)
+from quad_gym.kernels.vehicle import store4
+from tests.unit.compiled import Compiled
+
+
+@inlined
+def store_rows(array, matrix):
+    """Like `store33` for a matrix some of whose entries are plain zeros."""
+    store3(array[0], matrix[0])
+    store3(array[1], matrix[1])
+    store3(array[2], matrix[2])
+
+
+def attitude(f, option):
+    e = load3(f.e)
+    R_BI = euler_to_dcm(e)
+    store33(f.R, R_BI)
+    q = dcm_to_quaternion(R_BI)
+    store4(f.q, q)
+    store33(f.R_again, quaternion_to_dcm(q))
+    store4(f.q_rate, quaternion_rate(q, load3(f.w)))
+    even, odd, parts = split_rotation(e)
+    store_rows(f.even, even)
+    store_rows(f.odd, odd)
+    store4(f.parts, parts)
+
+
+FIELDS = {"e": (3,), "w": (3,), "q": (4,), "q_rate": (4,), "parts": (4,)}
+FIELDS |= dict.fromkeys(("R", "R_again", "even", "odd"), (3, 3))
+kernels = Compiled(attitude, **FIELDS)
+INSTANCES = ("on_floats", "on_lanes")
+
+angles = st.floats(-np.pi, np.pi)
+eulers = st.tuples(angles, angles, angles).map(np.array)
+unit_quaternions = (
+    st.tuples(*[st.floats(-1.0, 1.0)] * 4)
+    .map(np.array)
+    .filter(lambda q: np.linalg.norm(q) > 0.1)
+    .map(lambda q: q / np.linalg.norm(q))
+)
+
+
+def scipy_dcm(e):
+    """R_BI of 3-1-2 Euler angles: SciPy's intrinsic z-x-y rotation takes body to inertial."""
+    roll, pitch, yaw = np.moveaxis(np.asarray(e), -1, 0)
+    turn = Rotation.from_euler("ZXY", np.stack([yaw, roll, pitch], axis=-1))
+    return np.swapaxes(turn.as_matrix(), -1, -2)
+
+
+def random_eulers(seed, count):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 3))
+
+
+def test_euler_angles_are_yaw_then_roll_then_pitch():
+    e = random_eulers(1, 500)
+    np.testing.assert_allclose(rotations.euler_to_dcm(e), scipy_dcm(e), rtol=0.0, atol=2e-15)
+
+
+@pytest.mark.parametrize(
+    ("e", "x_I", "x_B"),
+    [
+        ((0.0, 0.0, np.pi / 2), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)),  # heading north, north is ahead
+        ((np.pi / 2, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),  # left side up
+        ((0.0, np.pi / 2, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)),  # nose down
+    ],
+)
+def test_the_sense_of_each_angle(e, x_I, x_B):
+    np.testing.assert_allclose(rotations.euler_to_dcm(e) @ x_I, x_B, rtol=0.0, atol=1e-15)
+
+
+@given(eulers)
+def test_euler_angles_make_a_proper_rotation(e):
+    R = rotations.euler_to_dcm(e)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), rtol=0.0, atol=1e-15)
+    assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-15)
+
+
+@given(eulers)
+def test_a_rotation_survives_the_way_through_euler_angles(e):
+    R = rotations.euler_to_dcm(e)
+    back = rotations.dcm_to_euler(R)
+    assert abs(back[0]) <= np.pi / 2
+    assert np.abs(back[1:]).max() <= np.pi
+    np.testing.assert_allclose(rotations.euler_to_dcm(back), R, rtol=0.0, atol=3e-12)
+
+
+@given(eulers)
+def test_euler_angles_survive_the_way_through_a_rotation(e):
+    e[0] /= 2.0
+    assume(abs(e[0]) < 1.57 and np.abs(e[1:]).max() < 3.14)
+    back = rotations.dcm_to_euler(rotations.euler_to_dcm(e))
+    np.testing.assert_allclose(back, e, rtol=0.0, atol=1e-12)
+
+
+@given(st.sampled_from([-1.0, 1.0]), angles, angles)
+def test_at_a_roll_of_a_quarter_turn_the_pitch_is_zero(side, pitch, yaw):
+    R = scipy_dcm([side * np.pi / 2, pitch, yaw])
+    back = rotations.dcm_to_euler(R)
+    assert back[0] == pytest.approx(side * np.pi / 2, abs=1e-15)
+    assert back[1] == 0.0
+    np.testing.assert_allclose(rotations.euler_to_dcm(back), R, rtol=0.0, atol=1e-15)
+
+
+@given(unit_quaternions)
+def test_a_quaternion_survives_the_way_through_a_rotation(q):
+    R = rotations.quaternion_to_dcm(q)
+    back = rotations.dcm_to_quaternion(R)
+    assert np.linalg.norm(back) == pytest.approx(1.0, abs=1e-15)
+    assert back[np.argmax(np.abs(back))] > 0.0
+    np.testing.assert_allclose(back * np.sign(back @ q), q, rtol=0.0, atol=1e-15)
+
+
+@given(unit_quaternions)
+def test_quaternions_are_hamiltons_from_body_to_inertial(q):
+    R_IB = Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R_IB.T, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (-1, 1, 1)])
+def test_half_turns_have_well_conditioned_quaternions(axis):
+    R = Rotation.from_rotvec(np.pi * np.array(axis) / np.linalg.norm(axis)).as_matrix().T
+    q = rotations.dcm_to_quaternion(R)
+    np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R, rtol=0.0, atol=1e-15)
+
+
+def test_a_quaternion_is_normalised_first():
+    q = np.array([0.1, -0.2, 0.3, 0.4])
+    R = rotations.quaternion_to_dcm(q / np.linalg.norm(q))
+    np.testing.assert_allclose(rotations.quaternion_to_dcm(1e-3 * q), R, rtol=0.0, atol=1e-15)
+
+
+def test_leading_axes_are_kept():
+    e = random_eulers(2, 24).reshape(2, 3, 4, 3)
+    R = rotations.euler_to_dcm(e)
+    assert R.shape == (2, 3, 4, 3, 3)
+    q = rotations.dcm_to_quaternion(R)
+    assert q.shape == (2, 3, 4, 4)
+    assert rotations.dcm_to_euler(R).shape == e.shape
+    np.testing.assert_allclose(R[1, 2, 3], rotations.euler_to_dcm(e[1, 2, 3]), rtol=0, atol=0)
+    np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+@pytest.mark.parametrize("size", [1e-8, 1e-3, 0.04, 0.5, np.pi])
+def test_the_even_and_odd_parts_add_up_to_the_rotation(instance, size):
+    e = size / np.pi * random_eulers(3, 200)
+    got, mirrored = (getattr(kernels, instance)(e=sign * e) for sign in (1.0, -1.0))
+    whole = np.eye(3) + got["even"] + got["odd"]
+    np.testing.assert_allclose(whole, scipy_dcm(e), rtol=0.0, atol=2e-15)
+    np.testing.assert_array_equal(mirrored["even"], got["even"])
+    np.testing.assert_array_equal(mirrored["odd"], -got["odd"])
+    roll, pitch = e[:, 0], e[:, 1]
+    parts = [np.sin(roll), -2 * np.sin(roll / 2) ** 2, np.sin(pitch), -2 * np.sin(pitch / 2) ** 2]
+    np.testing.assert_allclose(got["parts"], np.transpose(parts), rtol=2e-15)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+def test_the_even_part_of_a_small_rotation_keeps_its_relative_accuracy(instance):
+    # to second order: -1/2 [e x]^2 with the order of the rotations, here about one axis at a time
+    for axis, (i, j) in enumerate([(1, 2), (0, 2), (0, 1)]):
+        e = np.zeros((1, 3))
+        e[0, axis] = 1e-7
+        even = getattr(kernels, instance)(e=e)["even"][0]
+        for k in (i, j):
+            assert even[k, k] == pytest.approx(-0.5e-14, rel=1e-13)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+def test_a_quaternion_turns_at_the_body_rates(instance):
+    rng = np.random.default_rng(4)
+    e, w = random_eulers(5, 50), rng.normal(size=(50, 3))
+    got = getattr(kernels, instance)(e=e, w=w)
+    np.testing.assert_allclose(got["R_again"], got["R"], rtol=0.0, atol=2e-15)
+    now = Rotation.from_quat(got["q"][:, [1, 2, 3, 0]])
+    h = 1e-5
+    ahead, behind = (
+        (now * Rotation.from_rotvec(s * h * w)).as_quat()[:, [3, 0, 1, 2]] for s in (1, -1)
+    )
+    ahead *= np.sign((ahead * got["q"]).sum(axis=1, keepdims=True))
+    behind *= np.sign((behind * got["q"]).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(got["q_rate"], (ahead - behind) / (2 * h), rtol=0.0, atol=1e-9)
+
+
+@given(eulers, eulers)
+def test_floats_and_lanes_give_the_same_attitude(e, w):
+    plain, lanes = kernels.on_floats(e=[e], w=[w]), kernels.on_lanes(e=[e], w=[w])
+    for name in FIELDS:
+        np.testing.assert_allclose(plain[name], lanes[name], rtol=0.0, atol=2e-15, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("function", "name", "good_shape"),
+    [
+        (rotations.euler_to_dcm, "e", (3,)),
+        (rotations.dcm_to_euler, "R_BI", (3, 3)),
+        (rotations.quaternion_to_dcm, "q", (4,)),
+        (rotations.dcm_to_quaternion, "R_BI", (3, 3)),
+    ],
+)
+def test_bad_input_is_refused_by_name(function, name, good_shape):
+    for bad in (
+        np.zeros((*good_shape[:-1], 5)),
+        0.0,
+        [],
+        "north",
+        [[1.0], [1.0, 2.0]],
+        None,
+        np.full(good_shape, np.nan),
+        np.full(good_shape, np.inf),
+    ):
+        with pytest.raises(ValueError, match=rf"^{name} must"):
+            function(bad)
+
+
+def test_the_zero_quaternion_is_no_rotation():
+    with pytest.raises(ValueError, match=r"^q must not be zero"):
+        rotations.quaternion_to_dcm([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])

@@ -1,0 +1,285 @@
+"""A batch of flights: nothing that a flight does depends on which others it flies with."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.params import TaskParams
+from quad_gym.records import FLIGHT, RESULTS, Autoreset, Control, Source
+from quad_gym.simulation import FlightBatch
+
+ENDLESS = TaskParams(duration=0)
+SEEDS = np.random.default_rng(5).permutation(1000)[:100].tolist()
+
+
+def new_batch(count, **options):
+    return FlightBatch(count, **{"task": ENDLESS, "threads": 1, **options})
+
+
+def fly(seeds, steps=60, **options):
+    batch = new_batch(len(seeds), **options)
+    batch.reset(seeds=seeds)
+    for _ in range(steps):
+        batch.step()
+    return batch
+
+
+def assert_same_flights(batch, other, flights=None, others=None):
+    """Every field of every flight is bitwise the same (of `flights` and `others`, where given)."""
+    here = slice(None) if flights is None else flights
+    there = slice(None) if others is None else others
+    for name in FLIGHT.names:
+        np.testing.assert_array_equal(batch.read(name)[here], other.read(name)[there], err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def hundred():
+    return fly(SEEDS)
+
+
+@pytest.mark.parametrize("size", [1, 7, 8, 9, 99])
+def test_a_flight_does_not_depend_on_the_size_of_its_batch(hundred, size):
+    assert_same_flights(fly(SEEDS[:size]), hundred, others=slice(0, size))
+
+
+def test_a_flight_does_not_depend_on_its_place_in_the_batch(hundred):
+    order = np.random.default_rng(6).permutation(100)
+    assert_same_flights(fly([SEEDS[i] for i in order]), hundred, others=order)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+def test_a_flight_does_not_depend_on_the_number_of_threads(hundred, threads):
+    other = fly(SEEDS, threads=threads)
+    assert_same_flights(other, hundred)
+    np.testing.assert_array_equal(other.results, hundred.results)
+
+
+def test_flights_of_different_seeds_differ_and_a_seed_repeats_itself(hundred):
+    assert len(np.unique(hundred.read("gyro"), axis=0)) == 100
+    again = new_batch(100)
+    again.reset(seeds=[0] * 100)
+    for _ in range(3):
+        again.step()
+    again.reset(seeds=SEEDS)
+    for _ in range(60):
+        again.step()
+    np.testing.assert_array_equal(again.read("r_hat"), hundred.read("r_hat"))
+
+
+@pytest.mark.parametrize("source", list(Source))
+def test_a_snapshot_in_mid_flight_comes_back_bit_for_bit(source):
+    batch = fly(SEEDS[:11], source=source)
+    kept = batch.snapshot()
+    path = []
+    for _ in range(40):
+        batch.step()
+        path.append(batch.read("r"))
+    after = batch.snapshot()
+    batch.reset(seeds=list(range(11)))
+    batch.step()
+    batch.restore(kept)
+    for position in path:
+        batch.step()
+        np.testing.assert_array_equal(batch.read("r"), position)
+    assert batch.snapshot().tobytes() == after.tobytes()
+
+    elsewhere = new_batch(11, source=source)
+    elsewhere.restore(kept)
+    for _ in range(40):
+        elsewhere.step()
+    assert_same_flights(elsewhere, batch)
+
+
+def test_a_snapshot_is_a_copy():
+    batch = fly(SEEDS[:3], steps=5)
+    kept = batch.snapshot()
+    bytes_then = kept.tobytes()
+    batch.step()
+    assert kept.tobytes() == bytes_then
+    batch.restore(kept)
+    batch.step()
+    assert kept.tobytes() == bytes_then
+
+
+def test_a_masked_reset_begins_the_chosen_flights_alone(hundred):
+    batch, mask = fly(SEEDS), np.random.default_rng(7).random(100) < 0.3
+    batch.reset(seeds=[9] * 100, mask=mask)
+    assert_same_flights(batch, hundred, flights=~mask, others=~mask)
+    fresh = new_batch(100)
+    fresh.reset(seeds=[9] * 100)
+    for name in ("r", "q", "r_hat", "L", "key", "instant", "tick", "gyro", "b_a", "episode"):
+        np.testing.assert_array_equal(batch.read(name)[mask], fresh.read(name)[mask], err_msg=name)
+
+
+def test_a_reset_without_seeds_goes_on_with_the_stream():
+    batch = fly(SEEDS[:5], steps=0)
+    first = batch.read("b_a")
+    batch.reset()
+    assert (batch.read("b_a") != first).all()
+    np.testing.assert_array_equal(batch.read("episode"), 2.0)
+    batch.reset(seeds=SEEDS[:5])
+    np.testing.assert_array_equal(batch.read("b_a"), first)
+
+
+def test_a_batch_flies_on_the_motors_it_is_told():
+    batch = new_batch(2, control=Control.MOTOR, source=Source.TRUTH)
+    batch.reset(seeds=[1, 1])
+    for _ in range(20):
+        batch.step(np.array([[-1.0] * 4, [1.0] * 4]))
+    voltages = batch.read("voltages")
+    assert (voltages[0] == 0.0).all()
+    assert (voltages[1] == voltages[1, 0]).all()
+    assert batch.read("v")[0, 2] < -0.5 < 0.5 < batch.read("v")[1, 2]
+    batch.step()  # keeps the present actions
+    np.testing.assert_array_equal(batch.read("voltages"), voltages)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"count": 0},
+        {"count": -3},
+        {"count": 2.5},
+        {"count": "many"},
+        {"sensors": "laboratory"},
+        {"vehicle": "boat"},
+        {"gains": "best"},
+        {"threads": 0},
+        {"threads": 1.5},
+        {"substeps": 0},
+        {"control_rate": 70.0},
+        {"control_rate": -1.0},
+        {"control_rate": np.nan},
+        {"source": 9},
+        {"control": 77},
+        {"layout": 5},
+        {"autoreset": 4},
+        {"true_sensors": quad_gym.sensor_suite("lab").with_rates(imu=100.0)},
+    ],
+    ids=str,
+)
+def test_a_batch_that_makes_no_sense_raises(options):
+    with pytest.raises(ValueError, match=r".+"):
+        FlightBatch(**{"count": 4, **options})
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"seeds": [1, 2]},
+        {"seeds": [1, 2, 3, -1]},
+        {"seeds": []},
+        {"keys": np.zeros((3, 2), np.uint64)},
+        {"keys": np.zeros(8, np.uint64)},
+        {"mask": np.ones(3, bool)},
+        {"mask": [1, 0, 1, 0]},
+        {"mask": np.ones((4, 1), bool)},
+        {"seeds": [1, 2, 3, 4], "mask": "all"},
+    ],
+    ids=str,
+)
+def test_a_reset_that_does_not_fit_raises_and_changes_nothing(arguments):
+    batch = fly(SEEDS[:4], steps=3)
+    before, results = batch.snapshot(), batch.results.copy()
+    with pytest.raises(ValueError, match=r"seeds|keys|mask|non-negative"):
+        batch.reset(**arguments)
+    assert batch.snapshot().tobytes() == before.tobytes()
+    np.testing.assert_array_equal(batch.results, results)
+
+
+def test_actions_that_do_not_fit_raise_and_change_nothing():
+    batch = fly(SEEDS[:4], steps=3, control=Control.MOTOR)
+    before = batch.snapshot()
+    with pytest.raises(ValueError, match="shape"):
+        batch.step(np.zeros((3, 4)))
+    assert batch.snapshot().tobytes() == before.tobytes()
+
+
+def test_a_snapshot_of_another_kind_is_refused():
+    batch = fly(SEEDS[:4], steps=3)
+    before = batch.snapshot()
+    for snapshot in (np.zeros(3), np.zeros(1), new_batch(9).snapshot()):
+        with pytest.raises(ValueError, match="snapshot"):
+            batch.restore(snapshot)
+    assert batch.snapshot().tobytes() == before.tobytes()
+
+
+def test_every_field_is_readable_and_what_is_read_is_the_callers_own(hundred):
+    for name in FLIGHT.names:
+        values = hundred.read(name)
+        assert values.shape == (100, *FLIGHT[name].shape)
+        before = values.copy()
+        values[...] = 7
+        np.testing.assert_array_equal(hundred.read(name), before)
+    for name in RESULTS:
+        assert hundred.result(name).shape == (100,)
+    with pytest.raises(ValueError, match="altitude"):
+        hundred.read("altitude")
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 20])
+def test_the_lanes_that_pad_the_last_block_are_idle(count):
+    idle = new_batch(count).snapshot()["idle"].ravel()
+    np.testing.assert_array_equal(idle, np.arange(idle.size) >= count)
+
+
+def test_the_covariance_is_that_of_the_factor(hundred):
+    P, L = hundred.covariance(), hundred.read("L")
+    assert P.shape == (100, 15, 15)
+    np.testing.assert_allclose(P[42], L[42] @ L[42].T, rtol=1e-13, atol=1e-25)
+    assert (np.linalg.eigvalsh(P)[:, 0] > 0.0).all()
+    assert (np.triu(L, k=1) == 0.0).all()
+
+
+def test_results_are_those_of_the_records(hundred):
+    for name in ("position_error", "estimation_error", "reward"):
+        np.testing.assert_array_equal(hundred.result(name), hundred.read(name))
+    gap = np.linalg.norm(hundred.read("r_hat") - hundred.read("r"), axis=1)
+    np.testing.assert_allclose(hundred.result("estimation_error"), gap, rtol=1e-12)
+
+
+def test_four_thousand_flights_fit_in_two_hundred_megabytes():
+    tracemalloc.start()
+    try:
+        batch = FlightBatch(4096, threads=2)
+        batch.reset(seeds=list(range(4096)))
+        batch.step()
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 200e6
+    assert batch.snapshot().nbytes < 100e6
+
+
+def test_more_substeps_change_a_flight_by_the_error_of_runge_kutta_alone():
+    """The truth's path converges with the fourth power of the step."""
+
+    def path(substeps):
+        batch = new_batch(1, source=Source.TRUTH, substeps=substeps)
+        batch.reset(seeds=[0])
+        states = []
+        for _ in range(200):
+            batch.step()
+            states.append(np.concatenate([batch.read(name)[0] for name in ("r", "v", "q")]))
+        return np.array(states)
+
+    best = path(32)
+    errors = [abs(path(substeps) - best).max() for substeps in (1, 2, 4)]
+    assert errors[0] < 1e-5
+    assert 13.0 < errors[0] / errors[1] < 20.0
+    assert 13.0 < errors[1] / errors[2] < 20.0
+
+
+def test_an_episode_ends_at_its_time_limit_and_the_next_step_begins_another():
+    task = TaskParams(duration=0.05, out_of_bounds=100.0)
+    batch = new_batch(9, task=task, autoreset=Autoreset.NEXT_STEP)
+    batch.reset(seeds=list(range(9)))
+    for k in range(1, 11):
+        batch.step()
+        np.testing.assert_array_equal(batch.result("truncated"), float(k == 10))
+    batch.step()
+    np.testing.assert_array_equal(batch.read("tick"), 0.0)
+    np.testing.assert_array_equal(batch.read("episode"), 2.0)
+    np.testing.assert_array_equal(batch.result("truncated"), 0.0)

@@ -1,0 +1,128 @@
+"""The filter equals the plain augmented filter of the equations, computed in 40 digits."""
+
+import decimal
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import UnscentedKalmanFilter
+from tests.circle_flight import record_circle
+from tests.reference_ukf import PlainUKF, array_of
+
+LAB = quad_gym.sensor_suite("lab")
+QUANTITIES = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias")
+
+
+def estimator(**choices):
+    return LAB.replace(estimator=LAB.estimator.replace(**choices))
+
+
+def distance(value, truth):
+    """Largest difference, taken in 40 digits."""
+    return float(abs(array_of(Decimal, value) - truth).max())
+
+
+def compare(sensors, ticks, seed, *, present=0.8, filter_class=UnscentedKalmanFilter):
+    """The largest deviations from the reference over a flight with measurements coming and going.
+
+    Returns:
+        Deviations by name, the covariance's relative to the standard deviations; how many cycles
+        had which measurements, by (position, baseline, features).
+    """
+    recording = record_circle(sensors, ticks, seed)
+    has = np.random.default_rng(seed).random((ticks, 2)) < present
+    ours, cases = filter_class(sensors), {}
+    worst = dict.fromkeys((*QUANTITIES, "covariance"), 0.0)
+    with decimal.localcontext() as context:
+        context.prec = 40
+        reference = PlainUKF(sensors, Decimal)
+        for ukf in (ours, reference):
+            ukf.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
+        for k in range(ticks):
+            image = recording.pixels[k]
+            case = (*has[k].tolist(), int(np.isfinite(image[:, 0]).sum()))
+            cases[case] = cases.get(case, 0) + 1
+            for ukf in (ours, reference):
+                ukf.update(
+                    recording.gnss_position[k] if case[0] else None,
+                    recording.gnss_baseline[k] if case[1] else None,
+                    image,
+                )
+            note_deviations(ours, reference, worst)
+            for ukf in (ours, reference):
+                ukf.predict(recording.gyro[k], recording.accel[k])
+            note_deviations(ours, reference, worst)
+    return worst, cases
+
+
+def note_deviations(ours, reference, worst):
+    for name in QUANTITIES:
+        gap = distance(getattr(ours, name), getattr(reference, name))
+        worst[name] = max(worst[name], gap)
+    P = reference.covariance.astype(float)
+    sigma = np.sqrt(np.diag(P))
+    gap = abs(ours.covariance - P) / np.outer(sigma, sigma)
+    worst["covariance"] = max(worst["covariance"], gap.max())
+
+
+def assert_equal(worst):
+    """Promised are 1e-10 m, 1e-10 in R_BI, 1e-8 in the covariance; the filter does better."""
+    assert worst["position"] < 3e-11
+    assert worst["velocity"] < 3e-10
+    assert worst["R_BI"] < 1e-10
+    assert worst["accel_bias"] < 3e-9
+    assert worst["gyro_bias"] < 3e-12
+    assert worst["covariance"] < 1e-9
+
+
+def test_the_filter_equals_the_plain_filter_over_a_thousand_cycles():
+    worst, cases = compare(LAB, 1000, seed=3)
+    assert_equal(worst)
+    assert {features for *_, features in cases} == {0, 1, 2}
+    assert len({(position, baseline) for position, baseline, _ in cases}) == 4
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"alpha": 1.0, "beta": 0.0, "kappa": -12.0},
+        {"alpha": 0.5},
+        {"alpha": 0.1, "kappa": 1.0},
+        {"alpha": 1e-2, "beta": 3.0, "kappa": -5.0},
+        {"feature_noise_across": "predicted"},
+        {"direction_variance_floor": 1e-6, "initial_velocity_variance": 0.5, "initial_scale": 5.0},
+        {"gravity": 9.81},
+    ],
+    ids=str,
+)
+def test_the_filter_equals_the_plain_filter_with_other_choices(choices):
+    worst, _ = compare(estimator(**choices), 60, seed=4)
+    assert_equal(worst)
+
+
+def test_the_filter_equals_the_plain_filter_without_a_camera_and_at_another_rate():
+    worst, _ = compare(LAB.replace(camera=None).with_rates(imu=100.0), 100, seed=5)
+    assert_equal(worst)
+
+
+def test_the_filter_equals_the_plain_filter_with_every_measurement_and_with_few():
+    assert_equal(compare(LAB, 60, seed=6, present=1.1)[0])
+    assert_equal(compare(LAB, 60, seed=7, present=0.1)[0])
+
+
+def test_the_filter_equals_the_plain_filter_with_many_features():
+    rng = np.random.default_rng(8)
+    features = tuple(map(tuple, rng.uniform((-1, -1, 0), (1, 1, 1), (16, 3))))
+    sensors = LAB.replace(camera=LAB.camera.replace(features_I=features))
+    worst, cases = compare(sensors, 30, seed=9)
+    assert_equal(worst)
+    assert max(features for *_, features in cases) > 8
+
+
+def test_the_usual_weights_in_float64_are_a_thousand_times_less_accurate():
+    ours, _ = compare(LAB, 60, seed=3)
+    plain, _ = compare(LAB, 60, seed=3, filter_class=PlainUKF)
+    assert plain["position"] > 1000 * ours["position"]
+    assert plain["position"] < 1e-4
