@@ -110,6 +110,16 @@ class FlightBatch:
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
         self.actions = ActionParams() if actions is None else actions
         self.task = TaskParams() if task is None else task
+        for name, value, kind in (
+            ("vehicle", self.vehicle, VehicleParams),
+            ("sensors", self.sensors, SensorSuite),
+            ("gains", self.gains, PDGains),
+            ("actions", self.actions, ActionParams),
+            ("task", self.task, TaskParams),
+            ("true_vehicle", true_vehicle or self.vehicle, VehicleParams),
+            ("true_sensors", true_sensors or self.sensors, SensorSuite),
+        ):
+            check.instance(name, value, kind)
         self.source, self.control = Source(source), Control(control)
         rate = self.sensors.imu.rate if control_rate is None else control_rate
         self.clocks = Clocks.of(self.sensors, rate, substeps)
@@ -185,9 +195,12 @@ class FlightBatch:
                 raise ValueError(f"seeds must hold {self.count} seeds, got {len(seeds)}")
             keys = stream_keys(seeds)
         if keys is not None:
-            words = np.asarray(keys, np.uint64)
-            if words.shape != (self.count, 2):
-                raise ValueError(f"keys must have shape ({self.count}, 2), got {words.shape}")
+            words = np.asarray(keys)
+            if words.shape != (self.count, 2) or words.dtype != np.uint64:
+                raise ValueError(
+                    f"keys must be uint64 of shape ({self.count}, 2), got {words.dtype} of "
+                    f"{words.shape}"
+                )
             for flight in np.flatnonzero(chosen):
                 block, lane = divmod(int(flight), WIDTH)
                 self._blocks["key"][block, :, lane] = words[flight]
@@ -212,8 +225,7 @@ class FlightBatch:
         Returns:
             (count, n_observation) float32 observations; `results` holds the rest.
         """
-        if actions is not None:
-            self._actions[:] = actions
+        self._actions[:] = self.read("action") if actions is None else actions
         return self._run(Command.STEP)
 
     def _run(self, command: Command) -> NDArray[np.float32]:
@@ -289,11 +301,14 @@ class FlightBatch:
         Raises:
             ValueError: If the snapshot is of another size or kind.
         """
-        if snapshot.dtype != FLIGHT_BLOCK or snapshot.shape != self._blocks.shape:
-            raise ValueError(
-                f"snapshot must be that of a batch of {len(self._blocks)} blocks, got shape "
-                f"{getattr(snapshot, 'shape', None)}"
-            )
+        fits = (
+            isinstance(snapshot, np.ndarray)
+            and snapshot.dtype == FLIGHT_BLOCK
+            and snapshot.shape == self._blocks.shape
+            and np.array_equal(snapshot["idle"], self._blocks["idle"])
+        )
+        if not fits:
+            raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
         self._blocks[:] = snapshot
 
     def _checked_start(

@@ -102,7 +102,7 @@ def sense(flight, world, model, settings, work, mask, starting):
             wait = select(due, period, flight.camera_wait) - 1.0
             flight.camera_wait = select(mask, wait, flight.camera_wait)
             for i in range(settings.feature_count):
-                seen = flight.feature_valid[i] > 0.0
+                seen = due & (flight.feature_valid[i] > 0.0)
                 flight.feature_fresh[i] = select(seen, 1.0, flight.feature_fresh[i])
 
         if starting:
