@@ -10,6 +10,9 @@ from quad_gym.params import PDGains, pd_gains
 
 Array = NDArray[np.float64]
 
+LEAST_LIFT = 0.3
+"""Share of the weight that the wanted force keeps upward, so that no descent turns the vehicle over."""
+
 
 class _Seen(NamedTuple):
     """What the controller needs of an observation, all (n, 3) in the body frame."""
@@ -41,6 +44,8 @@ class PDPolicy:
     | "ctbr" | thrust and the body rates (K/Kd) e at which N would be zero but for w x J w |
     | "attitude" | thrust, roll and pitch of z*, yaw rate (K/Kd) e |
     | "velocity" | the velocity whose error the inner loop turns into F (`layout="absolute"` only) |
+
+    The vertical part of F is kept at 0.3 m g at least; on the report's circle it never is that small.
 
     Args:
         env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be
@@ -139,11 +144,14 @@ class PDPolicy:
         g, vehicle = self.gains, self._vehicle
         distance = np.linalg.norm(seen.position_error, axis=1, keepdims=True)
         error = seen.position_error * np.minimum(1.0, self._reach / np.maximum(distance, 1e-9))
-        return (
+        force = (
             g.position * error
             + g.velocity * seen.velocity_error
             + vehicle.mass * (vehicle.gravity * seen.up + seen.reference_acceleration)
         )
+        lift = (force * seen.up).sum(axis=1, keepdims=True)
+        least = LEAST_LIFT * vehicle.mass * vehicle.gravity
+        return force + np.maximum(least - lift, 0.0) * seen.up
 
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:

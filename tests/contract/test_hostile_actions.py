@@ -160,7 +160,9 @@ rows = st.one_of(
     hnp.arrays(np.int64, 4),
     st.lists(numbers, min_size=0, max_size=6),
     st.lists(st.one_of(numbers, st.none(), st.text(max_size=3), st.integers()), max_size=5),
-    hnp.arrays(st.sampled_from([np.float64, np.int8, bool, "U2", "complex128"]), hnp.array_shapes()),
+    hnp.arrays(
+        st.sampled_from([np.float64, np.int8, bool, "U2", "complex128"]), hnp.array_shapes()
+    ),
     st.one_of(st.none(), st.text(), st.integers(), numbers, st.binary(max_size=4)),
 )
 

@@ -167,6 +167,7 @@ def test_attributes_and_methods_are_shared_by_all_flights():
     env.close()
 
 
+@pytest.mark.filterwarnings("ignore:The environment is already wrapped:UserWarning")
 @pytest.mark.parametrize("wrapper", [VecMonitor, VecNormalize])
 def test_the_usual_wrappers_fit(wrapper):
     env = wrapper(make(4, **SHORT))

@@ -87,7 +87,7 @@ def test_the_reward_of_a_tracking_task_is_the_documented_formula(task):
 def test_the_reward_of_waypoints_is_the_documented_formula():
     n = 40
     env = QuadVectorEnv(n, "waypoints", autoreset_mode="Disabled", gate_count=4)
-    batch, policy = env.flights.batch, PDPolicy(env)
+    batch, policy = env.flights.batch, PDPolicy(env, gains="lab")
     observation, info = env.reset(seed=3)
     gates, passed = batch.read("gates"), np.zeros(n, int)
     last, rows = np.zeros((n, 4)), np.arange(n)
@@ -273,7 +273,9 @@ def test_a_start_on_the_ground_is_the_reports():
 @pytest.mark.parametrize("task", ["circle", "lemniscate", "hover"])
 def test_randomize_draws_phase_radius_period_and_sense(task):
     n = 2000
-    plain, drawn = (QuadVectorEnv(n, task, randomize=flag, out_of_bounds=99) for flag in (0 > 1, 1 > 0))
+    plain, drawn = (
+        QuadVectorEnv(n, task, randomize=flag, out_of_bounds=99) for flag in (0 > 1, 1 > 0)
+    )
     first, second = plain.reset(seed=1), drawn.reset(seed=1)
     assert first[0].shape == second[0].shape
     size = 3.0 if task == "lemniscate" else 4.0
@@ -299,7 +301,9 @@ def test_random_trajectories_keep_their_bounds_and_differ():
     env = QuadVectorEnv(300, "random_trajectory", autoreset_mode="Disabled", out_of_bounds=999)
     env.reset(seed=1)
     batch = env.flights.batch
-    path = np.array([reference_of("random_trajectory", t, batch)[0] for t in np.arange(0, 12, 0.02)])
+    path = np.array(
+        [reference_of("random_trajectory", t, batch)[0] for t in np.arange(0, 12, 0.02)]
+    )
     speed = np.linalg.norm(np.diff(path, axis=0), axis=2) / 0.02
     acceleration = np.linalg.norm(np.diff(path, 2, axis=0), axis=2) / 0.02**2
     assert speed.max() <= 2.5

@@ -57,7 +57,9 @@ def fly_both(ours, theirs, steps, seed):
         over = mine[2] | mine[3]
         if ours.metadata["autoreset_mode"] == AutoresetMode.DISABLED and over.any():
             chosen = {"reset_mask": over}
-            assert_alike(ours.reset(options={**chosen}), theirs.reset(options={**chosen}), f"reset {k}")
+            assert_alike(
+                ours.reset(options={**chosen}), theirs.reset(options={**chosen}), f"reset {k}"
+            )
     return ended
 
 
@@ -259,23 +261,32 @@ def length_of_an_episode(step, limit):
     return next(k for k in range(1, limit + 2) if step())
 
 
-@pytest.mark.parametrize("limit", [7, 499, 500, 501, 730])
-def test_all_three_faces_honour_max_episode_steps(limit):
-    keywords = {"observation": "truth", "action": "velocity", "max_episode_steps": limit}
+@pytest.mark.parametrize(
+    ("limit", "given", "expected"),
+    [
+        (7, {}, 7),
+        (499, {}, 499),
+        (501, {}, 500),  # the task's own ten seconds come earlier
+        (501, {"duration": 0.0}, 501),
+        (730, {"duration": 60.0}, 730),
+        (60, {"duration": 1.0}, 50),
+        (60, {"duration": 1.0, "control_rate": 100}, 60),
+    ],
+)
+def test_in_all_faces_the_earlier_of_duration_and_max_episode_steps_holds(limit, given, expected):
+    keywords = {"observation": "truth", "action": "velocity", "max_episode_steps": limit, **given}
     single = gymnasium.make("QuadGym/Hover-v0", **keywords)
     vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **keywords)
-    sync = gymnasium.make_vec(
-        "QuadGym/Hover-v0", num_envs=2, vectorization_mode="sync", **keywords
-    )
+    sync = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, vectorization_mode="sync", **keywords)
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=2, seed=1, **keywords)
     for env in (single, vector, sync):
         env.reset(seed=1)
     sb3.reset()
     still = np.zeros((2, 4), np.float32)
-    assert length_of_an_episode(lambda: single.step(still[0])[3], limit) == limit
-    assert length_of_an_episode(lambda: vector.step(still)[3].all(), limit) == limit
-    assert length_of_an_episode(lambda: sync.step(still)[3].all(), limit) == limit
-    assert length_of_an_episode(lambda: sb3.step(still)[2].all(), limit) == limit
+    assert length_of_an_episode(lambda: single.step(still[0])[3], limit) == expected
+    assert length_of_an_episode(lambda: vector.step(still)[3].all(), limit) == expected
+    assert length_of_an_episode(lambda: sync.step(still)[3].all(), limit) == expected
+    assert length_of_an_episode(lambda: sb3.step(still)[2].all(), limit) == expected
 
 
 @pytest.mark.parametrize("duration", [0.1, 0.5])

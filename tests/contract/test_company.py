@@ -1,0 +1,315 @@
+"""The environments among processes, threads and caches that are not theirs alone."""
+
+import functools
+import os
+import pickle
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+import quad_gym
+from quad_gym import threads
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import actions_of, assert_same
+
+PATIENCE = 300
+"""Seconds after which a process is taken to hang."""
+SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
+STARTS = ["fork", "spawn"]
+
+
+def hover():
+    return gymnasium.make("quad_gym:QuadGym/Hover-v0", **SHORT)
+
+
+def expected_run(n, mode, seed=7, steps=40, batch_threads=1):
+    """(observations, rewards, over) of every step, flown in this process."""
+    env = QuadVectorEnv(n, "hover", autoreset_mode=mode, threads=batch_threads, **SHORT)
+    rows = [(env.reset(seed=seed)[0], np.zeros(n), np.zeros(n, bool))]
+    for k in range(steps):
+        observation, reward, terminated, truncated, _ = env.step(actions_at(n, k, steps))
+        rows.append((observation, reward, terminated | truncated))
+    return rows
+
+
+def actions_at(n, k, steps):
+    return np.stack([actions_of(i, steps)[k] for i in range(n)])
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("context", STARTS)
+def test_gymnasiums_processes_fly_the_same(context):
+    expected_run(64, "NextStep", steps=2, batch_threads=2)  # this process has flown, with threads
+    env = AsyncVectorEnv([hover] * 2, context=context)
+    try:
+        observation, _ = env.reset(seed=7)
+        for k, (expected, reward, over) in enumerate(expected_run(2, "NextStep")):
+            if k > 0:
+                observation, mine, term, trunc, _ = env.step(actions_at(2, k - 1, 40))
+                np.testing.assert_array_equal(mine, reward)
+                np.testing.assert_array_equal(term | trunc, over)
+            np.testing.assert_array_equal(observation, expected)
+    finally:
+        env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("start_method", STARTS)
+def test_stable_baselines3s_processes_fly_the_same(start_method):
+    env = SubprocVecEnv([hover] * 2, start_method=start_method)
+    try:
+        env.seed(7)
+        observation = env.reset()
+        for k, (expected, reward, over) in enumerate(expected_run(2, "SameStep")):
+            if k > 0:
+                observation, mine, done, _ = env.step(actions_at(2, k - 1, 40))
+                np.testing.assert_array_equal(mine, reward)
+                np.testing.assert_array_equal(done, over)
+            np.testing.assert_array_equal(observation, expected)
+    finally:
+        env.close()
+
+
+def test_two_environments_may_be_stepped_from_two_threads_at_once():
+    runs, errors = {}, []
+
+    def run(seed):
+        try:
+            runs[seed] = expected_run(200, "SameStep", seed=seed, batch_threads=2)
+        except BaseException as error:
+            errors.append(error)
+
+    workers = [threading.Thread(target=run, args=(seed,)) for seed in (1, 2, 3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(PATIENCE)
+    assert not errors
+    for seed in (1, 2, 3):
+        assert_same(runs[seed], expected_run(200, "SameStep", seed=seed))
+
+
+def in_a_fork(work):
+    """What `work()` returns in a forked child; fails if the child hangs or dies."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read)
+        try:
+            payload = pickle.dumps(work())
+            with os.fdopen(write, "wb") as pipe:
+                pipe.write(payload)
+        finally:
+            os._exit(0)
+    os.close(write)
+    with os.fdopen(read, "rb") as pipe:
+        ready, _, _ = select.select([pipe], [], [], PATIENCE)
+        if not ready:
+            os.kill(child, signal.SIGKILL)
+        payload = pipe.read()
+    os.waitpid(child, 0)
+    assert payload, "the child hung or died"
+    return pickle.loads(payload)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_fork_after_the_first_step_flies_on_with_its_own_threads():
+    env = QuadVectorEnv(128, "circle", threads=2, **SHORT)
+    env.reset(seed=3)
+    env.step(np.zeros((128, 4)))
+
+    def fly_on():
+        return [env.step(actions_at(128, k, 30))[:4] for k in range(30)]
+
+    in_child = in_a_fork(fly_on)
+    assert_same(in_child, fly_on())
+    assert_same(in_a_fork(fly_on), in_a_fork(fly_on))
+
+
+def further(env, k=3):
+    return [env.step(np.full((9, 4), 0.1))[:4] for _ in range(k)]
+
+
+def test_an_environment_travels_to_a_worker_in_mid_episode():
+    env = QuadVectorEnv(9, "hover", threads=2)
+    env.reset(seed=3)
+    env.step(np.zeros((9, 4)))
+    code = (
+        "import pickle, sys; from tests.contract.test_company import further;"
+        "env = pickle.load(sys.stdin.buffer);"
+        "sys.stdout.buffer.write(pickle.dumps(further(env)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        input=pickle.dumps(env),
+        capture_output=True,
+        check=True,
+        timeout=PATIENCE,
+    )
+    assert_same(pickle.loads(done.stdout), further(env))
+
+
+# ---- the cache of compiled kernels ------------------------------------------------------------------
+
+SMALL = (
+    "import numpy as np; from quad_gym.rotations import euler_to_dcm;"
+    "print(np.abs(euler_to_dcm([0.1, 0.2, 0.3]) @ euler_to_dcm([0.1, 0.2, 0.3]).T - np.eye(3)).max()"
+    " < 1e-12)"
+)
+"""A program that compiles one small kernel."""
+
+
+def start(cache, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-c", SMALL],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(cache), **environment},
+    )
+
+
+def outcome(process):
+    """Whether it compiled rather than loaded; fails if it did not compute the right thing."""
+    output, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, errors
+    assert output.strip() == "True"
+    return "compiling" in errors
+
+
+@pytest.fixture(scope="module")
+def filled_cache(tmp_path_factory):
+    cache = tmp_path_factory.mktemp("cache")
+    assert outcome(start(cache)), "an empty cache means compiling"
+    return cache
+
+
+def test_a_kernel_is_compiled_once_and_loaded_ever_after(filled_cache):
+    assert not outcome(start(filled_cache))
+
+
+def test_two_processes_may_fill_an_empty_cache_at_once(tmp_path):
+    both = [start(tmp_path) for _ in range(2)]
+    assert all([outcome(process) for process in both])
+    assert not outcome(start(tmp_path))
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+@pytest.mark.parametrize("damage", ["emptied", "cut", "overwritten"])
+def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, ending, damage):
+    cache = tmp_path / "cache"
+    shutil.copytree(filled_cache, cache)
+    files = list(cache.rglob(f"*{ending}"))
+    assert files
+    for file in files:
+        content = file.read_bytes()
+        spoiled = {"emptied": b"", "cut": content[: len(content) // 2], "overwritten": b"\x00" * 99}
+        file.write_bytes(spoiled[damage])
+    assert outcome(start(cache))
+    assert not outcome(start(cache))
+
+
+def test_a_change_in_any_kernel_means_compiling_anew(filled_cache, tmp_path):
+    copy = tmp_path / "quad_gym"
+    source = Path(quad_gym.__file__).parent
+    shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    anew = functools.partial(start, tmp_path / "cache", PYTHONPATH=str(tmp_path))
+    where = subprocess.run(
+        [sys.executable, "-c", "import quad_gym; print(quad_gym.__file__)"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    if not where.stdout.startswith(str(tmp_path)):
+        pytest.skip("the installed package comes before PYTHONPATH")
+    assert run_in(tmp_path, anew)
+    assert not run_in(tmp_path, anew)
+    with (copy / "kernels" / "reference.py").open("a") as file:
+        file.write("\n# changed\n")
+    assert run_in(tmp_path, anew)
+
+
+def run_in(folder, begin):
+    """`outcome(begin())` with another working folder, where another copy of the package lies."""
+    here = Path.cwd()
+    os.chdir(folder)
+    try:
+        return outcome(begin())
+    finally:
+        os.chdir(here)
+
+
+def test_without_any_writable_folder_kernels_are_compiled_in_every_process(tmp_path):
+    source, blocked = Path(quad_gym.__file__).parent, tmp_path / "file"
+    copy = tmp_path / "quad_gym"
+    shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    blocked.write_text("no folder can be made below a file")
+    (copy / "kernels" / "__pycache__").write_text("nor here")
+    places = ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA")
+    environment = {name: str(blocked / "below") for name in places}
+    environment |= {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    for _ in range(2):
+        assert run_in(tmp_path, lambda: start(blocked / "cache", **environment))
+
+
+# ---- cores and imports ------------------------------------------------------------------------------
+
+
+def cores_in_a_process(code, **environment):
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}; from quad_gym.threads import *; print(available_cores())"],
+        env={**{k: v for k, v in os.environ.items() if k != "NUMBA_NUM_THREADS"}, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no affinity on this system")
+def test_cores_are_limited_by_affinity_and_by_numbas_variable():
+    one = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
+    everything = cores_in_a_process("pass")
+    assert cores_in_a_process(one) == 1
+    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="1") == 1
+    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="999") == everything
+    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="") == everything
+
+
+def test_cores_are_limited_by_a_containers_quota(monkeypatch):
+    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
+    for quota, expected in ((None, 16), (4, 4), (64, 16)):
+        monkeypatch.setattr(threads, "_cgroup_cores", lambda quota=quota: quota)
+        assert threads.available_cores() == expected
+    for limit, expected in (("3", 3), ("0", 16), ("-2", 16), ("many", 16)):
+        monkeypatch.setattr(threads, "_cgroup_cores", lambda: None)
+        monkeypatch.setenv("NUMBA_NUM_THREADS", limit)
+        assert threads.available_cores() == expected
+
+
+def test_an_environment_takes_the_available_cores(monkeypatch):
+    monkeypatch.setattr(threads, "available_cores", lambda: 3)
+    assert QuadVectorEnv(4, "hover").flights.batch.threads == 3
+    assert QuadVectorEnv(4, "hover", threads=2).flights.batch.threads == 2
+
+
+def test_importing_the_package_brings_in_nothing_heavy():
+    code = "import sys, quad_gym; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    heavy = ("numba", "llvmlite", "scipy", "torch", "stable_baselines3", "matplotlib", "pygame")
+    assert not modules & {*heavy, "quad_gym.kernels", "quad_gym.kernels.batch"}
+    assert "gymnasium" in modules

@@ -1,0 +1,255 @@
+"""Observations hold what their table says, computed here from the state in NumPy."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import actions_of
+from tests.contract.test_tasks import SECONDS, UNBOUNDED, body_axes, level, unit
+from tests.reference_ukf import east_north_up, rotation_312
+
+OMEGA = 2 * np.pi / 10
+
+
+def on_circle(t):
+    """r*, v*, a* and x* of the circle at the time t."""
+    c, s = np.cos(OMEGA * t), np.sin(OMEGA * t)
+    r = np.array([4 * c, 4 * s, 1.0])
+    v = 4 * OMEGA * np.array([-s, c, 0.0])
+    return r, v, -(OMEGA**2) * r * [1, 1, 0], level(-r)
+
+
+def flown(steps=13, n=6, **keywords):
+    """A vector environment after some steps, its observation, and the last action."""
+    env = QuadVectorEnv(n, "circle", autoreset_mode="Disabled", **{**UNBOUNDED, **keywords})
+    env.reset(seed=21)
+    for k in range(steps):
+        actions = 0.3 * np.stack([actions_of(i, steps)[k] for i in range(n)])
+        observation, *_ = env.step(actions)
+    return env, observation, actions
+
+
+def parts_of(observation, /, **keywords):
+    if isinstance(observation, dict):
+        observation = np.hstack([observation["policy"], observation["privileged"]])
+    table = quad_gym.observation_layout(**keywords)
+    assert table[-1].slice.stop == observation.shape[1]
+    return {field.name: observation[:, field.slice].astype(float) for field in table}
+
+
+def close(actual, expected, scale=1.0):
+    np.testing.assert_allclose(actual, np.broadcast_to(expected, actual.shape), atol=2e-6 * scale)
+
+
+def seen_state(env, source):
+    """r, v, R_BI and w_B as the controller's source has them."""
+    batch = env.flights.batch
+    if source == "truth":
+        return batch.read("r"), batch.read("v"), body_axes(batch.read("q")), batch.read("w")
+    rates = batch.read("gyro") - batch.read("b_g_hat")
+    return batch.read("r_hat"), batch.read("v_hat"), batch.read("R_hat"), rates
+
+
+def in_body(R_BI, v_I):
+    return np.einsum("nij,nj->ni", R_BI, np.broadcast_to(v_I, (len(R_BI), 3)))
+
+
+@pytest.mark.parametrize("source", ["estimate", "truth"])
+def test_the_relative_layout(source):
+    env, observation, actions = flown(observation=source)
+    seen = parts_of(observation, observation=source)
+    r, v, R, w = seen_state(env, source)
+    t = 13 * SECONDS
+    r_ref, v_ref, a_ref, x_ref = on_circle(t)
+    close(seen["position_error"], in_body(R, r_ref - r), 4)
+    close(seen["velocity_error"], in_body(R, v_ref - v), 4)
+    close(seen["up"], R[:, :, 2])
+    close(seen["heading"], in_body(R, x_ref))
+    close(seen["body_rates"], w, 10)
+    close(seen["reference_acceleration"], in_body(R, a_ref))
+    close(seen["preview_1"], in_body(R, on_circle(t + 0.2)[0] - r_ref))
+    close(seen["preview_2"], in_body(R, on_circle(t + 0.4)[0] - r_ref))
+    close(seen["last_action"], actions)
+
+
+@pytest.mark.parametrize("source", ["estimate", "truth"])
+def test_the_absolute_layout(source):
+    env, observation, actions = flown(observation=source, layout="absolute")
+    seen = parts_of(observation, observation=source, layout="absolute")
+    r, v, R, w = seen_state(env, source)
+    batch, hat, t = env.flights.batch, "_hat" if source == "estimate" else "", 13 * SECONDS
+    r_ref, v_ref, a_ref, x_ref = on_circle(t)
+    close(seen["position"], r, 4)
+    close(seen["velocity"], v, 4)
+    close(seen["R_BI"], R.reshape(-1, 9))
+    close(seen["accel_bias"], batch.read(f"b_a{hat}"))
+    close(seen["gyro_bias"], batch.read(f"b_g{hat}"))
+    close(seen["body_rates"], w, 10)
+    close(seen["reference_position"], r_ref, 4)
+    close(seen["reference_velocity"], v_ref, 4)
+    close(seen["reference_acceleration"], a_ref)
+    close(seen["reference_heading"], x_ref)
+    close(seen["preview_1"], on_circle(t + 0.2)[0], 4)
+    close(seen["preview_2"], on_circle(t + 0.4)[0], 4)
+    close(seen["last_action"], actions)
+
+
+def test_the_estimate_is_not_the_truth_but_near_it():
+    env, observation, _ = flown(steps=100, start="hover", layout="absolute")
+    seen = parts_of(observation, layout="absolute")
+    off = np.linalg.norm(seen["position"] - env.flights.batch.read("r"), axis=1)
+    assert (off > 1e-5).all()
+    assert (off < 0.1).all()
+
+
+def test_on_a_course_the_previews_are_the_coming_gates():
+    env = QuadVectorEnv(5, "waypoints", observation="truth", gate_count=3)
+    observation, _ = env.reset(seed=2)
+    seen = parts_of(observation, observation="truth")
+    gates, R = env.flights.batch.read("gates"), body_axes(env.flights.batch.read("q"))
+    close(seen["position_error"], in_body(R, gates[:, 0] - env.flights.batch.read("r")), 4)
+    close(seen["preview_1"], in_body(R, gates[:, 1] - gates[:, 0]), 4)
+    close(seen["preview_2"], in_body(R, gates[:, 2] - gates[:, 0]), 4)
+
+
+def test_the_covariance_part_is_the_root_of_the_diagonal():
+    env, observation, _ = flown(include_covariance=True)
+    seen = parts_of(observation, include_covariance=True)
+    names = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+    sigmas = np.hstack([seen[f"{name}_sigma"] for name in names])
+    P = env.flights.batch.covariance()
+    np.testing.assert_allclose(sigmas, np.sqrt(np.einsum("nii->ni", P)), rtol=1e-5)
+    assert (sigmas > 0).all()
+
+
+@pytest.mark.parametrize("source", ["estimate", "noisy", "sensors", "truth"])
+def test_the_privileged_part_is_the_truth(source):
+    env, observation, _ = flown(observation=source, privileged=True)
+    assert set(observation) == {"policy", "privileged"}
+    seen = parts_of(observation, observation=source, privileged=True)
+    batch = env.flights.batch
+    R = body_axes(batch.read("q"))
+    r_ref, v_ref, _, x_ref = on_circle(13 * SECONDS)
+    close(seen["true_position_error"], in_body(R, r_ref - batch.read("r")), 4)
+    close(seen["true_velocity_error"], in_body(R, v_ref - batch.read("v")), 4)
+    close(seen["true_up"], R[:, :, 2])
+    close(seen["true_heading"], in_body(R, x_ref))
+    close(seen["true_body_rates"], batch.read("w"), 10)
+    close(seen["true_accel_bias"], batch.read("b_a"))
+    close(seen["true_gyro_bias"], batch.read("b_g"))
+    hover = np.sqrt(0.78 * 9.8 / 4 / (6.11e-8 / 0.104719755**2))
+    close(seen["rotor_speeds"], batch.read("rotor_speeds") / hover)
+
+
+# ---- sensors ----------------------------------------------------------------------------------------
+
+
+def test_measurements_come_with_flags_at_their_own_rates():
+    # looking at the origin from where the camera sees both features
+    env = QuadVectorEnv(4, "hover", observation="sensors", gnss_rate=10, camera_rate=25)
+    observation, _ = env.reset(seed=1)
+    flags = []
+    for _ in range(21):
+        seen = parts_of(observation, observation="sensors")
+        for name in ("gnss_position", "gnss_baseline", "feature_1", "feature_2"):
+            off = seen[f"{name}_valid"][:, 0] == 0.0
+            assert set(np.unique(seen[f"{name}_valid"])) <= {0.0, 1.0}
+            assert not seen[name][off].any()
+            assert seen[name][~off].any(axis=1).all()
+        flags.append((seen["gnss_position_valid"][0, 0], seen["feature_2_valid"][0, 0]))
+        observation, *_ = env.step(np.zeros((4, 4)))
+    gnss, camera = np.array(flags).T
+    np.testing.assert_array_equal(np.flatnonzero(gnss), [0, 5, 10, 15, 20])
+    np.testing.assert_array_equal(np.flatnonzero(camera), np.arange(0, 21, 2))
+
+
+def test_a_slow_controller_hears_of_every_fix_since_its_last_step():
+    env = QuadVectorEnv(2, "hover", observation="sensors", control_rate=10, gnss_rate=25)
+    env.reset(seed=1)
+    for _ in range(5):
+        seen = parts_of(env.step(np.zeros((2, 4)))[0], observation="sensors")
+        assert seen["gnss_position_valid"].all()
+
+
+def test_measurements_scatter_about_what_the_true_state_implies():
+    n = 1500
+    env, observation, _ = flown(n=n, start="hover", observation="sensors")
+    seen, batch = parts_of(observation, observation="sensors"), env.flights.batch
+    suite = quad_gym.sensor_suite("lab")
+    r, R = batch.read("r"), body_axes(batch.read("q"))
+    antenna = r + np.array(suite.gnss.primary_antenna_B) @ R
+    baseline = unit(suite.gnss.baseline_B @ R)
+    off = seen["gnss_position"] - antenna
+    np.testing.assert_allclose(off.std(axis=0), suite.gnss.position_sigma_I, rtol=0.1)
+    assert (abs(off.mean(axis=0)) < 5 * np.array(suite.gnss.position_sigma_I) / np.sqrt(n)).all()
+    angle = np.linalg.norm(seen["gnss_baseline"] - baseline, axis=1)
+    assert np.sqrt((angle**2).mean()) == pytest.approx(np.sqrt(2) * 0.05, rel=0.1)
+    np.testing.assert_allclose(np.linalg.norm(seen["gnss_baseline"], axis=1), 1.0, atol=1e-6)
+    gyro = seen["gyro"] - batch.read("w") - batch.read("b_g")
+    np.testing.assert_allclose(gyro.std(axis=0), np.radians(0.05) * np.sqrt(200), rtol=0.1)
+
+    R_CB, camera = rotation_312(np.array(suite.camera.attitude)), suite.camera
+    for k, feature in enumerate(camera.features_I, start=1):
+        v_B = np.einsum("nij,nj->ni", R, np.array(feature) - r) - camera.position_B
+        v_C = v_B @ R_CB.T
+        pixel = camera.focal_length * v_C[:, :2] / v_C[:, 2:]
+        half = np.array(camera.image_size) / 2
+        inside = (v_C[:, 2] > 0) & (abs(pixel) <= half).all(axis=1)
+        valid = seen[f"feature_{k}_valid"][:, 0] > 0
+        assert (valid >= inside).all()
+        assert inside.mean() > 0.5
+        noise = (seen[f"feature_{k}"] * half - pixel)[inside]
+        np.testing.assert_allclose(noise.std(axis=0), camera.pixel_sigma, rtol=0.1)
+
+
+def test_positions_are_east_north_up_though_gnss_measures_in_ecef():
+    env, observation, _ = flown(observation="sensors")
+    measured = env.flights.batch.read("gnss_position")
+    R_IG = east_north_up(quad_gym.sensor_suite("lab").gnss.reference_antenna_G)
+    seen = parts_of(observation, observation="sensors")["gnss_position"]
+    np.testing.assert_allclose(seen, measured @ R_IG.T, atol=1e-6)
+
+
+def test_without_a_camera_no_features_are_seen():
+    env, observation, _ = flown(observation="sensors", camera=False)
+    parts_of(observation, observation="sensors", feature_count=0)
+
+
+# ---- noise ------------------------------------------------------------------------------------------
+
+
+def test_noisy_observations_have_the_stated_noise_and_no_memory():
+    n = 3000
+    env = QuadVectorEnv(n, "circle", observation="noisy", layout="absolute", **UNBOUNDED)
+    env.reset(seed=4)
+    batch, sigma = env.flights.batch, quad_gym.sensor_suite("lab").noisy
+    seconds = []
+    for _ in range(2):
+        seen = parts_of(env.step(np.zeros((n, 4)))[0], layout="absolute")
+        R = body_axes(batch.read("q"))
+        E = seen["R_BI"].reshape(-1, 3, 3) @ R.transpose(0, 2, 1)
+        turn = np.stack([E[:, 1, 2] - E[:, 2, 1], E[:, 2, 0] - E[:, 0, 2], E[:, 0, 1] - E[:, 1, 0]])
+        errors = {
+            "position": seen["position"] - batch.read("r"),
+            "velocity": seen["velocity"] - batch.read("v"),
+            "attitude": 0.5 * turn.T,
+            "body_rates": seen["body_rates"] - batch.read("w"),
+        }
+        for name, error in errors.items():
+            stated = getattr(sigma, name)
+            np.testing.assert_allclose(error.std(axis=0), stated, rtol=0.06, err_msg=name)
+            assert (abs(error.mean(axis=0)) < 5 * stated / np.sqrt(n)).all()
+        seconds.append(np.hstack(list(errors.values())))
+        assert not seen["accel_bias"].any()
+    both = np.corrcoef(np.hstack(seconds), rowvar=False) - np.eye(24)
+    assert abs(both).max() < 6 / np.sqrt(n)
+
+
+def test_observations_are_held_within_their_bounds():
+    env = QuadVectorEnv(2, "hover", observation="truth")
+    observation, _ = env.reset(
+        seed=1, options={"position": [5e3, 0, -5e3], "velocity": [0, 1e4, 0]}
+    )
+    assert observation in env.observation_space
+    assert abs(observation).max() == 100.0

@@ -1,0 +1,190 @@
+"""The PD policy computes from observations what the compiled PD controller computes from the estimate."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.evaluation import evaluate, roll_out
+from quad_gym.params import PDGains
+from quad_gym.records import Control
+from quad_gym.simulation import FlightBatch
+from tests.contract.comparing import ACTIONS
+
+TRACKING = ("QuadGym/Hover-v0", "QuadGym/Circle-v0", "QuadGym/Lemniscate-v0")
+TRACKING += ("QuadGym/RandomTrajectory-v0",)
+
+
+def keywords_for(action, **keywords):
+    """What an environment needs to admit the controller with an action."""
+    if action == "velocity":
+        keywords["layout"] = "absolute"
+    if action in ("motor", "wrench"):
+        keywords["control_rate"] = 200
+    return keywords
+
+
+def errors_of_the_compiled_controller(seeds, sensors):
+    """(ticks, n) true position errors of the report's circle, flown by the kernel itself."""
+    batch = FlightBatch(len(seeds), control=Control.PD, gains="lab", sensors=sensors)
+    batch.reset(seeds=seeds)
+    errors = []
+    for _ in range(2000):
+        batch.step()
+        errors.append(batch.result("position_error"))
+    return np.array(errors)
+
+
+@pytest.fixture(scope="module")
+def direct():
+    suite = quad_gym.sensor_suite("lab")
+    estimator = suite.estimator.replace(feature_noise_across="predicted")
+    return errors_of_the_compiled_controller(range(60), suite.replace(estimator=estimator))
+
+
+@pytest.mark.parametrize("layout", ["relative", "absolute"])
+@pytest.mark.parametrize("action", ["motor", "wrench"])
+def test_at_every_tick_it_flies_the_circle_like_the_compiled_controller(action, layout, direct):
+    env = QuadVectorEnv(
+        60, "circle", action=action, layout=layout, control_rate=200, autoreset_mode="Disabled"
+    )
+    policy = PDPolicy(env, gains="lab")
+    observation, _ = env.reset(seed=0)
+    errors = []
+    for _ in range(2000):
+        observation, *_, info = env.step(policy.predict(observation)[0])
+        errors.append(info["position_error"])
+    errors = np.array(errors)
+    spread = direct.mean(axis=0).std()
+    assert abs(errors.mean() - direct.mean()) < spread
+    late, late_direct = errors[1000:], direct[1000:]
+    assert late.mean() == pytest.approx(late_direct.mean(), rel=0.05)
+    # the same seeds bring the same noise: flight by flight nearly the same errors
+    assert np.corrcoef(late.mean(axis=0), late_direct.mean(axis=0))[0, 1] > 0.9
+
+
+@pytest.mark.parametrize("gains", ["lab", "tuned"])
+@pytest.mark.parametrize("env_id", TRACKING)
+def test_it_flies_a_thousand_episodes_of_every_tracking_task_on_the_estimate(env_id, gains):
+    env = gymnasium.make_vec(env_id, num_envs=1000)
+    episodes = roll_out(PDPolicy(env, gains), env, seed=0)
+    assert not episodes.crashed.any()
+    assert (episodes.ending == "time_limit").all()
+    assert episodes.late_error.mean() < 0.15
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_it_flies_with_every_action(action):
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=50, **keywords_for(action))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        policy = PDPolicy(env)
+    episodes = roll_out(policy, env, seed=3)
+    assert not episodes.crashed.any()
+    assert episodes.late_error.mean() < 0.1
+
+
+@pytest.mark.parametrize("observation", ["estimate", "truth", "noisy"])
+@pytest.mark.parametrize("layout", ["relative", "absolute"])
+def test_it_flies_on_every_observation_of_a_state(observation, layout):
+    env = gymnasium.make_vec(
+        "QuadGym/RandomTrajectory-v0", num_envs=40, observation=observation, layout=layout
+    )
+    episodes = roll_out(PDPolicy(env, gains="lab"), env, seed=3)
+    assert not episodes.crashed.any()
+    assert episodes.late_error.mean() < 0.1
+
+
+def test_it_passes_all_gates():
+    env = gymnasium.make_vec("QuadGym/Waypoints-v0", num_envs=200)
+    episodes = roll_out(PDPolicy(env, gains="lab"), env, seed=0)
+    assert (episodes.gates_passed == 5).all()
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+@pytest.mark.parametrize("action", ACTIONS)
+def test_single_and_batched_predictions_agree(action, privileged):
+    env = QuadVectorEnv(7, "lemniscate", privileged=privileged, **keywords_for(action))
+    single = QuadEnv("lemniscate", privileged=privileged, **keywords_for(action))
+    policy, alone = PDPolicy(env, gains="lab"), PDPolicy(single, gains="lab")
+    observation, _ = env.reset(seed=1)
+    for _ in range(5):
+        together, state = policy.predict(observation)
+        assert state is None
+        assert together.shape == (7, 4)
+        assert together.dtype == np.float32
+        assert (abs(together) <= 1.0).all()
+        for i in range(7):
+            if privileged:
+                own = {name: values[i] for name, values in observation.items()}
+            else:
+                own = observation[i]
+            action_of_one, _ = alone.predict(own, deterministic=True)
+            np.testing.assert_allclose(action_of_one, together[i], rtol=1e-5, atol=1e-6)
+            assert action_of_one.shape == (4,)
+        observation, *_ = env.step(together)
+
+
+def test_it_reads_its_environment_through_wrappers_and_all_faces():
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=2)
+    single = gymnasium.make("QuadGym/Hover-v0")
+    observation, _ = single.reset(seed=2)
+    one, _ = PDPolicy(single).predict(observation)
+    many, _ = PDPolicy(sb3).predict(sb3.reset())
+    np.testing.assert_allclose(many[0], one, atol=1e-6)
+
+
+def test_it_does_not_change_the_observation_and_has_no_memory():
+    env = QuadEnv("circle")
+    observation, _ = env.reset(seed=2)
+    kept = observation.copy()
+    policy = PDPolicy(env)
+    first, _ = policy.predict(observation)
+    policy.predict(observation + 1.0)
+    np.testing.assert_array_equal(observation, kept)
+    np.testing.assert_array_equal(policy.predict(observation)[0], first)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "complaint"),
+    [
+        ({"observation": "sensors"}, "sensors"),
+        ({"action": "velocity"}, "absolute"),
+        ({"action": "velocity", "observation": "truth"}, "absolute"),
+    ],
+)
+def test_what_does_not_admit_it_is_refused(keywords, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        PDPolicy(QuadEnv("hover", **keywords))
+
+
+def test_other_environments_and_gains_are_refused():
+    with pytest.raises(ValueError, match="QuadGym"):
+        PDPolicy(gymnasium.make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="gains"):
+        PDPolicy(QuadEnv("hover"), gains="huge")
+
+
+@pytest.mark.parametrize("action", ["motor", "wrench"])
+def test_torques_at_a_low_rate_are_warned_of(action):
+    with pytest.warns(UserWarning, match="Hz"):
+        PDPolicy(QuadEnv("hover", action=action, control_rate=50))
+
+
+@pytest.mark.parametrize("action", ["ctbr", "attitude"])
+def test_nothing_is_warned_of_where_inner_loops_run(action):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PDPolicy(QuadEnv("hover", action=action, control_rate=50))
+
+
+def test_gains_may_be_given_as_an_object():
+    episodes = evaluate(
+        PDPolicy(QuadEnv("hover"), gains=PDGains(position=7.0)), TRACKING[0], episodes=8
+    )
+    assert not episodes.crashed.any()

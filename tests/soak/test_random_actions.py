@@ -1,0 +1,64 @@
+"""Random actions for a long time, over all tasks and actions: every number stays finite.
+
+QUAD_GYM_SOAK_STEPS sets how many steps of single flights are flown in all, by default 10^6; the full soak
+flies 10^8.
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import FLIGHT_FIELDS
+from tests.contract.comparing import ACTIONS, OBSERVATIONS
+
+STEPS = int(float(os.environ.get("QUAD_GYM_SOAK_STEPS", "1e6")))
+COUNT = 1000
+COMBINATIONS = [(task, action) for task in quad_gym.IDS.values() for action in ACTIONS]
+ALWAYS_FINITE = [field.name for field in FLIGHT_FIELDS if field.name != "start_given"]
+
+
+def assert_records_are_finite(env):
+    for name in ALWAYS_FINITE:
+        bad = ~np.isfinite(env.flights.batch.read(name).astype(float))
+        assert not bad.any(), f"{name} of flights {np.unique(np.nonzero(bad)[0])[:9]}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "action"), COMBINATIONS)
+def test_random_actions_leave_no_number_that_is_not_finite(task, action, record_property):
+    number = COMBINATIONS.index((task, action))
+    env = QuadVectorEnv(
+        COUNT,
+        task,
+        action=action,
+        observation=OBSERVATIONS[number % 4],
+        layout=("relative", "absolute")[number // 4 % 2],
+        include_covariance=True,
+        privileged=True,
+        gnss_rate=(200, 10)[number % 2],
+        camera=number % 3 != 0,
+        autoreset_mode=("NextStep", "SameStep")[number % 2],
+    )
+    rng = np.random.default_rng(number)
+    observation, _ = env.reset(seed=number)
+    failures, flown = 0, 0
+    steps = -(-STEPS // (len(COMBINATIONS) * COUNT))
+    styles = rng.integers(0, 4, COUNT)
+    held = rng.uniform(-1.0, 1.0, (COUNT, 4))
+    for k in range(steps):
+        noise = rng.uniform(-1.0, 1.0, (COUNT, 4))
+        if k % 50 == 0:
+            held = noise
+        # white, held, extreme, and gentle actions
+        actions = np.choose(styles[:, np.newaxis], [noise, held, np.sign(noise), 0.1 * noise])
+        observation, reward, *_, info = env.step(actions)
+        flown += COUNT
+        failures += int((info["filter_status"] > 0).sum())
+        assert all(np.isfinite(values).all() for values in (*observation.values(), reward))
+        if k % 20 == 0 or k == steps - 1:
+            assert_records_are_finite(env)
+    record_property("steps", flown)
+    print(f"{task}, {action}: {flown:,} steps, {failures:,} of them with a failed filter")

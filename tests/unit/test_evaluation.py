@@ -1,0 +1,112 @@
+"""`roll_out` against a plain loop over single environments."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from baselines import PDPolicy
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.evaluation import evaluate, roll_out
+
+LIMIT = 41
+
+
+class Wobbly:
+    """Acts at random by the observation's bits, so that some flights crash."""
+
+    def __init__(self, size):
+        self.size = size
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        turns = np.sin(1e4 * np.asarray(observation, float)[..., :4])
+        return (self.size * turns).astype(np.float32), state
+
+
+def plain_loop(task, policy, seed, **keywords):
+    """One episode: return, length, mean, late and estimation error, crashed, gates, ending."""
+    env = QuadEnv(task, **keywords)
+    observation, _ = env.reset(seed=seed)
+    rewards, errors, estimation = [], [], []
+    while True:
+        action, _ = policy.predict(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+        rewards.append(reward)
+        errors.append(info["position_error"])
+        estimation.append(info["estimation_error"])
+        if terminated or truncated:
+            break
+    complete = len(errors) == LIMIT and not (terminated and info["ending"] != "last_gate")
+    return {
+        "returns": sum(rewards),
+        "lengths": len(rewards),
+        "mean_error": np.mean(errors),
+        "late_error": np.mean(errors[LIMIT // 2 :]) if complete else np.nan,
+        "estimation_error": np.mean(estimation),
+        "crashed": terminated and info["ending"] != "last_gate",
+        "gates_passed": info["gates_passed"],
+        "ending": info["ending"],
+    }
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize(("task", "size"), [("hover", 0.8), ("circle", 0.3), ("waypoints", 0.6)])
+def test_it_measures_what_a_plain_loop_measures(task, size, mode):
+    keywords = {"max_episode_steps": LIMIT, "max_tilt": 0.9}
+    env = QuadVectorEnv(24, task, autoreset_mode=mode, **keywords)
+    policy = Wobbly(size)
+    episodes = roll_out(policy, env, seed=100)
+    expected = [plain_loop(task, policy, 100 + i, **keywords) for i in range(24)]
+    for name in episodes._fields:
+        values, wanted = getattr(episodes, name), [row[name] for row in expected]
+        if name in ("lengths", "crashed", "gates_passed", "ending"):
+            assert values.tolist() == wanted, name
+        else:
+            np.testing.assert_allclose(values, wanted, rtol=1e-9, err_msg=name)
+    if task == "hover":
+        assert 0 < episodes.crashed.sum() < 24
+
+
+def test_a_course_that_is_finished_is_no_crash():
+    env = QuadVectorEnv(20, "waypoints", gate_count=1)
+    episodes = roll_out(PDPolicy(env, gains="lab"), env, seed=0)
+    assert (episodes.ending == "last_gate").all()
+    assert not episodes.crashed.any()
+    assert (episodes.gates_passed == 1).all()
+
+
+def test_the_summary_holds_means_and_the_share_that_crashed():
+    env = QuadVectorEnv(24, "hover", max_episode_steps=LIMIT, max_tilt=0.9)
+    episodes = roll_out(Wobbly(0.8), env, seed=100)
+    summary = episodes.summary()
+    assert summary["episodes"] == 24
+    assert summary["return"] == pytest.approx(episodes.returns.mean())
+    assert summary["crash_rate"] == pytest.approx(episodes.crashed.sum() / 24)
+    assert summary["late_error"] == pytest.approx(np.nanmean(episodes.late_error))
+
+
+def test_evaluate_is_a_roll_out_of_an_environment_made_for_it():
+    policy = Wobbly(0.5)
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=9, max_tilt=0.7)
+    by_hand = roll_out(policy, env, seed=4)
+    episodes = evaluate(policy, "QuadGym/Hover-v0", episodes=9, seed=4, max_tilt=0.7)
+    for mine, other in zip(episodes, by_hand, strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+def test_an_earlier_flight_of_the_environment_changes_nothing():
+    env = QuadVectorEnv(6, "hover", max_episode_steps=20)
+    first = roll_out(Wobbly(0.5), env, seed=4)
+    np.testing.assert_array_equal(first.returns, roll_out(Wobbly(0.5), env, seed=4).returns)
+
+
+def test_what_cannot_be_rolled_out_is_refused():
+    policy = Wobbly(0.5)
+    with pytest.raises(ValueError, match="QuadVectorEnv"):
+        roll_out(policy, gymnasium.make_vec("Pendulum-v1", num_envs=2))
+    with pytest.raises(ValueError, match="time limit"):
+        roll_out(policy, QuadVectorEnv(2, "hover", duration=0.0))
+    with pytest.raises(ValueError, match="env_id"):
+        evaluate(policy, "QuadGym/Square-v0")
+    with pytest.raises(ValueError, match="episodes"):
+        evaluate(policy, "QuadGym/Hover-v0", episodes=0)
