@@ -10,8 +10,9 @@ from quad_gym.params import PDGains, pd_gains
 
 Array = NDArray[np.float64]
 
-LEAST_LIFT = 0.3
-"""Share of the weight that the wanted force keeps upward, so that no descent turns the vehicle over."""
+LEAST_LIFT, MOST_TILT = 0.3, 1.2
+"""The wanted force keeps this share of the weight upward, and at most this ratio of its horizontal
+to its vertical part (50 degrees): no step of the reference turns the vehicle over."""
 
 
 class _Seen(NamedTuple):
@@ -45,7 +46,8 @@ class PDPolicy:
     | "attitude" | thrust, roll and pitch of z*, yaw rate (K/Kd) e |
     | "velocity" | the velocity whose error the inner loop turns into F (`layout="absolute"` only) |
 
-    The vertical part of F is kept at 0.3 m g at least; on the report's circle it never is that small.
+    F is kept from pointing down or far sideways (`LEAST_LIFT`, `MOST_TILT`), as it would between
+    gates; on the report's circle it never does.
 
     Args:
         env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be
@@ -150,8 +152,12 @@ class PDPolicy:
             + vehicle.mass * (vehicle.gravity * seen.up + seen.reference_acceleration)
         )
         lift = (force * seen.up).sum(axis=1, keepdims=True)
-        least = LEAST_LIFT * vehicle.mass * vehicle.gravity
-        return force + np.maximum(least - lift, 0.0) * seen.up
+        sideways = force - lift * seen.up
+        lift = np.maximum(lift, LEAST_LIFT * vehicle.mass * vehicle.gravity)
+        push = np.linalg.norm(sideways, axis=1, keepdims=True)
+        return lift * seen.up + sideways * np.minimum(
+            1.0, MOST_TILT * lift / np.maximum(push, 1e-9)
+        )
 
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 import quad_gym
@@ -78,6 +79,8 @@ def roll_out(
     quads = env.unwrapped
     if not isinstance(quads, QuadVectorEnv):
         raise ValueError(f"env must be a QuadVectorEnv, got {type(env).__name__}")
+    if quads.autoreset_mode == AutoresetMode.SAME_STEP:
+        raise ValueError('env must not have autoreset_mode="SameStep": its last info is lost')
     limit = quads.flights.batch.max_steps
     if limit == 0:
         raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")

@@ -175,7 +175,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float64]
         raise ValueError(f"action must have shape {shape}, got {numbers.shape}")
     if not np.isfinite(numbers).all():
         raise ValueError("action must be finite, got NaN or infinity among its numbers")
-    return np.minimum(np.maximum(numbers, -1.0), 1.0)
+    return numbers.clip(-1.0, 1.0)
 
 
 def start_options(options: dict[str, Any] | None) -> dict[str, Any]:

@@ -124,7 +124,8 @@ def draw_reference(flight, settings, stream, mask):
         flight.ref_omega = select(mask, 2.0 * math.pi / settings.period, flight.ref_omega)
         _draw_series(flight, settings, stream, mask)
     else:
-        _clear_reference(flight, mask, over_origin, zero, HEADING_TOWARD, origin)
+        # a fixed heading: one that follows the gates would turn about from one to the next
+        _clear_reference(flight, mask, over_origin, zero, HEADING_ALONG, ahead)
         _draw_gates(flight, settings, stream, mask)
 
 

@@ -1,4 +1,4 @@
-"""Bitwise comparison of whatever environments return, and actions that depend on the flight alone."""
+"""Bitwise comparison of what environments return, and actions that depend on the flight alone."""
 
 import numpy as np
 

@@ -159,12 +159,12 @@ def test_an_environment_travels_to_a_worker_in_mid_episode():
     assert_same(pickle.loads(done.stdout), further(env))
 
 
-# ---- the cache of compiled kernels ------------------------------------------------------------------
+# ---- the cache of compiled kernels ---------------------------------------------------------------
 
 SMALL = (
     "import numpy as np; from quad_gym.rotations import euler_to_dcm;"
-    "print(np.abs(euler_to_dcm([0.1, 0.2, 0.3]) @ euler_to_dcm([0.1, 0.2, 0.3]).T - np.eye(3)).max()"
-    " < 1e-12)"
+    "R = euler_to_dcm([0.1, 0.2, 0.3]);"
+    "print(np.abs(R @ R.T - np.eye(3)).max() < 1e-12)"
 )
 """A program that compiles one small kernel."""
 
@@ -200,7 +200,8 @@ def test_a_kernel_is_compiled_once_and_loaded_ever_after(filled_cache):
 
 def test_two_processes_may_fill_an_empty_cache_at_once(tmp_path):
     both = [start(tmp_path) for _ in range(2)]
-    assert all([outcome(process) for process in both])
+    outcomes = [outcome(process) for process in both]
+    assert all(outcomes)
     assert not outcome(start(tmp_path))
 
 
@@ -264,7 +265,7 @@ def test_without_any_writable_folder_kernels_are_compiled_in_every_process(tmp_p
         assert run_in(tmp_path, lambda: start(blocked / "cache", **environment))
 
 
-# ---- cores and imports ------------------------------------------------------------------------------
+# ---- cores and imports ---------------------------------------------------------------------------
 
 
 def cores_in_a_process(code, **environment):

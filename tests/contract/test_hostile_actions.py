@@ -1,4 +1,4 @@
-"""Whatever is passed as an action: it is flown as documented, or refused before anything changes."""
+"""Whatever is passed as an action is flown as documented or refused before anything changes."""
 
 import gymnasium
 import numpy as np
@@ -150,7 +150,7 @@ def test_an_error_of_order_is_not_hidden_by_an_error_of_the_action():
         env.step(np.full(4, np.nan))
 
 
-# ---- thousands of them ------------------------------------------------------------------------------
+# ---- thousands of them ---------------------------------------------------------------------------
 
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 rows = st.one_of(

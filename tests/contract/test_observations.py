@@ -142,7 +142,7 @@ def test_the_privileged_part_is_the_truth(source):
     close(seen["rotor_speeds"], batch.read("rotor_speeds") / hover)
 
 
-# ---- sensors ----------------------------------------------------------------------------------------
+# ---- sensors -------------------------------------------------------------------------------------
 
 
 def test_measurements_come_with_flags_at_their_own_rates():
@@ -212,11 +212,11 @@ def test_positions_are_east_north_up_though_gnss_measures_in_ecef():
 
 
 def test_without_a_camera_no_features_are_seen():
-    env, observation, _ = flown(observation="sensors", camera=False)
+    _, observation, _ = flown(observation="sensors", camera=False)
     parts_of(observation, observation="sensors", feature_count=0)
 
 
-# ---- noise ------------------------------------------------------------------------------------------
+# ---- noise ---------------------------------------------------------------------------------------
 
 
 def test_noisy_observations_have_the_stated_noise_and_no_memory():

@@ -1,4 +1,4 @@
-"""The PD policy computes from observations what the compiled PD controller computes from the estimate."""
+"""The PD policy computes from observations what the compiled controller does from the estimate."""
 
 import warnings
 

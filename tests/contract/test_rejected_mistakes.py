@@ -14,7 +14,7 @@ from tests.contract.comparing import ACTIONS, IDS, OBSERVATIONS, actions_of, ass
 TASKS = tuple(quad_gym.IDS.values())
 
 
-# ---- seeds and options ------------------------------------------------------------------------------
+# ---- seeds and options ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -75,7 +75,7 @@ def test_options_that_are_unknown_or_no_numbers_change_nothing():
         assert state_of(env) == before
 
 
-# ---- what is whose ----------------------------------------------------------------------------------
+# ---- what is whose -------------------------------------------------------------------------------
 
 
 def test_a_final_observation_is_that_of_the_flight_that_ended():
@@ -134,7 +134,7 @@ def test_a_crash_in_the_last_step_is_a_crash():
     assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")
 
 
-# ---- global state -----------------------------------------------------------------------------------
+# ---- global state --------------------------------------------------------------------------------
 
 
 def global_state():
@@ -179,7 +179,7 @@ def test_two_environments_do_not_share_a_state():
         assert_same(env.step(np.zeros(4)), alone.step(np.zeros(4)))
 
 
-# ---- keywords ---------------------------------------------------------------------------------------
+# ---- keywords ------------------------------------------------------------------------------------
 
 MAKERS = {
     "make": lambda **keywords: gymnasium.make("QuadGym/Circle-v0", **keywords),

@@ -22,9 +22,9 @@ SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 
 
 def fly_single(task, flight, *, wait, **keywords):
-    """What flight `flight` goes through: (observations, rewards, terminated, truncated) step by step.
+    """What flight `flight` goes through: observations, rewards, terminated, truncated.
 
-    With `wait` a new episode takes a step to begin, otherwise it begins in the step that ends the last.
+    With `wait` a new episode takes a step to begin, else it begins in the step that ends the last.
     """
     env = QuadEnv(task, **SHORT, **keywords)
     observation, _ = env.reset(seed=1000 + flight)
@@ -147,7 +147,7 @@ def test_another_process_flies_the_same():
     assert other.stdout.strip() == digest()
 
 
-# ---- copies in mid-episode --------------------------------------------------------------------------
+# ---- copies in mid-episode -----------------------------------------------------------------------
 
 
 def pickled(env):

@@ -15,7 +15,7 @@ UNBOUNDED = {"out_of_bounds": 50.0, "max_tilt": np.pi, "ground": -50.0}
 
 
 def body_axes(q):
-    """(n, 3, 3) R_BI of unit quaternions (n, 4) from body to inertial: its rows are the body axes in I."""
+    """(n, 3, 3) R_BI of quaternions (n, 4), body to inertial; its rows are the body axes in I."""
     w, x, y, z = q.T
     return np.stack(
         [
@@ -143,7 +143,7 @@ def test_a_good_circle_earns_most_of_what_a_perfect_one_does():
     assert total.mean() > 9.0
 
 
-# ---- endings ----------------------------------------------------------------------------------------
+# ---- endings -------------------------------------------------------------------------------------
 
 
 def last_step(env, action, *, start=None, seed=1):
@@ -235,7 +235,7 @@ def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
     assert not any(env.step(STILL)[2:4])
 
 
-# ---- starts -----------------------------------------------------------------------------------------
+# ---- starts --------------------------------------------------------------------------------------
 
 
 def test_a_hovering_start_has_the_documented_spread():

@@ -1,4 +1,4 @@
-"""The vector environment against Gymnasium's book, and against its own SyncVectorEnv bit for bit."""
+"""The vector environment against Gymnasium's book, and bit for bit against its SyncVectorEnv."""
 
 import gymnasium
 import numpy as np
@@ -253,7 +253,7 @@ def test_closing_twice_is_fine():
     assert env.unwrapped.closed
 
 
-# ---- time limits ------------------------------------------------------------------------------------
+# ---- time limits ---------------------------------------------------------------------------------
 
 
 def length_of_an_episode(step, limit):
@@ -311,7 +311,7 @@ def test_a_limit_that_makes_no_sense_is_refused(steps):
         QuadVectorEnv(2, "hover", max_episode_steps=steps)
 
 
-# ---- options ----------------------------------------------------------------------------------------
+# ---- options -------------------------------------------------------------------------------------
 
 
 def test_options_set_the_start_of_one_episode_for_all_or_one_by_one():
