@@ -4,7 +4,6 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 import quad_gym
@@ -79,8 +78,6 @@ def roll_out(
     quads = env.unwrapped
     if not isinstance(quads, QuadVectorEnv):
         raise ValueError(f"env must be a QuadVectorEnv, got {type(env).__name__}")
-    if quads.autoreset_mode == AutoresetMode.SAME_STEP:
-        raise ValueError('env must not have autoreset_mode="SameStep": its last info is lost')
     limit = quads.flights.batch.max_steps
     if limit == 0:
         raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")
@@ -97,6 +94,7 @@ def roll_out(
             observation, state=state, episode_start=starts, deterministic=True
         )
         observation, reward, terminated, truncated, info = env.step(action)
+        info = _info_of_step(info)
         starts = np.zeros(count, bool)
         returns[flying] += reward[flying]
         errors[flying] += info["position_error"][flying]
@@ -124,6 +122,16 @@ def roll_out(
         gates,
         ending,
     )
+
+
+def _info_of_step(info: dict[str, Any]) -> dict[str, Any]:
+    """What was judged of the step, also where a new episode has begun within it."""
+    if "final_info" not in info:
+        return info
+    over, final = info["_final_info"], info["final_info"]
+    return info | {
+        name: np.where(over, final[name], info[name]) for name in final if not name.startswith("_")
+    }
 
 
 def evaluate(

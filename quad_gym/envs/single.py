@@ -113,7 +113,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         camera_rate: In place of the suite's [Hz].
         substeps: Runge-Kutta steps in a tick.
         max_episode_steps: Time limit in steps; the earlier of this and `duration` holds, as with
-            `gymnasium.make`, so pass a longer `duration` (or 0: none) to fly longer.
+            `gymnasium.make`, so pass a longer `duration` (or 0: none) to fly longer. (Where the
+            wrapper of `gymnasium.make` cuts, `info["ending"]` stays "none".)
         true_vehicle: What really flies, where the controller believes in `vehicle`.
         true_sensors: What really measures, where the filter believes in `sensors`.
         radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,

@@ -85,8 +85,8 @@ class _KernelCache(caching.Cache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             found = super().load_overload(sig, target_context)
-        except (EOFError, OSError, ValueError, caching.pickle.UnpicklingError):
-            found = None  # a damaged cache file is as good as none
+        except Exception:  # whatever unpickling a damaged file raises, it is as good as none
+            found = None
         if found is None:
             _announce(self._py_func.__name__, f"cached in {self.cache_path}")
         return found
@@ -96,6 +96,9 @@ class _KernelCache(caching.Cache):
             super().save_overload(sig, data)
         except OSError as error:
             print(f"quad_gym: the compiled kernel was not cached: {error}", file=sys.stderr)
+        except Exception:  # the index is damaged: begin a new one
+            Path(self._cache_file._index_path).unlink(missing_ok=True)
+            super().save_overload(sig, data)
 
 
 class _NoCache(caching.NullCache):

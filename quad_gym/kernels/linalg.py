@@ -217,6 +217,18 @@ def sum_of_outers(a, i, b, k, columns):
 
 
 @inlined
+def sum_of_squares(a, i, columns):
+    """The sum over the first columns j of a[i : i + 3, j] a[i : i + 3, j]^T, which is symmetric."""
+    x, y, z = load_column3(a, i, 0)
+    xx, yx, yy, zx, zy, zz = x * x, y * x, y * y, z * x, z * y, z * z
+    for j in range(1, columns):
+        x, y, z = load_column3(a, i, j)
+        xx, yx, yy = xx + x * x, yx + y * x, yy + y * y
+        zx, zy, zz = zx + z * x, zy + z * y, zz + z * z
+    return ((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
+
+
+@inlined
 def sum_of_outers_of_rows(a, b, i, k, rows):
     """The sum over the first rows j of a[j, i : i + 3]^T b[j, k : k + 3]."""
     total = outer((a[0, i], a[0, i + 1], a[0, i + 2]), (b[0, k], b[0, k + 1], b[0, k + 2]))
@@ -328,13 +340,15 @@ def cholesky(a, n, inverse_diagonal):
 
 
 @kernel
-def solve_right(x, rows, factor, n, inverse_diagonal):
+def solve_right(x, rows, factor, n, inverse_diagonal, staircase):
     """Replace x by the solution y of y L^T = x, for the factor L of `cholesky`.
 
     Args:
         x: (rows, n).
         rows: A multiple of three.
         factor, n, inverse_diagonal: As left by `cholesky`.
+        staircase: Rows 0 to 2 of x are zero before this column, rows 3 to 5 before the column three
+            less, and so on, and so are those of y; 0: x is full.
     """
     for j in range(0, n, 3):
         d = (
@@ -342,9 +356,9 @@ def solve_right(x, rows, factor, n, inverse_diagonal):
             (factor[j + 1, j], inverse_diagonal[j + 1], 0.0),
             (factor[j + 2, j], factor[j + 2, j + 1], inverse_diagonal[j + 2]),
         )
-        for i in range(0, rows, 3):
+        for i in range(max(0, staircase - j), rows, 3):
             block = load_block(x, i, j)
-            for k in range(j):
+            for k in range(max(0, staircase - i), j):
                 block = subtract_outer(block, load_column3(x, i, k), load_column3(factor, j, k))
             store_block(x, i, j, _solve_right33(block, d))
 

@@ -48,6 +48,7 @@ from quad_gym.kernels.linalg import (
     store_block,
     sub,
     sum_of_outers,
+    sum_of_squares,
     unit_or,
 )
 from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
@@ -138,11 +139,12 @@ def _sum_moments(flight, p, work, mean_r, mean_v, mean_e):
     accel_variance = p.accel_sigma * p.accel_sigma
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
 
-    # rows and columns r, v, e: (i, j, their mean offsets)
     for i in range(0, 9, 3):
-        mean_i = mean_r if i == 0 else (mean_v if i == 3 else mean_e)
-        for j in range(0, i + 3, 3):
-            mean_j = mean_r if j == 0 else (mean_v if j == 3 else mean_e)
+        mean_i = mean_r if i == R else (mean_v if i == V else mean_e)
+        block = add33(sum_of_squares(F, i, 15), sum_of_squares(S, i, 9))
+        store_block(P, i, i, add_outer(block, scale(excess, mean_i), mean_i))
+        for j in range(0, i, 3):
+            mean_j = mean_r if j == R else mean_v
             block = add33(sum_of_outers(F, i, F, j, 15), sum_of_outers(S, i, S, j, 9))
             store_block(P, i, j, add_outer(block, scale(excess, mean_i), mean_j))
     for i in range(3):
@@ -156,9 +158,9 @@ def _sum_moments(flight, p, work, mean_r, mean_v, mean_e):
         store_block(P, BA, j, scale33(decay_a, sum_of_outers(L, BA, F, j, 12)))
         store_block(P, BG, j, scale33(decay_g, sum_of_outers(L, BG, F, j, 15)))
     aa, ga, gg = (
-        sum_of_outers(L, BA, L, BA, 12),
+        sum_of_squares(L, BA, 12),
         sum_of_outers(L, BG, L, BA, 12),
-        sum_of_outers(L, BG, L, BG, 15),
+        sum_of_squares(L, BG, 15),
     )
     drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
     store_block(P, BA, BA, add_to_diagonal(scale33(decay_a * decay_a, aa), drive_a * drive_a))

@@ -39,6 +39,7 @@ from quad_gym.kernels.linalg import (
     sub,
     sum_of_outers,
     sum_of_outers_of_rows,
+    sum_of_squares,
 )
 from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
 from quad_gym.kernels.ukf import BA, BG, E, R, V
@@ -263,7 +264,7 @@ def update(flight, p, work, feature_count, mask):
     # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
     A, z, N, t, L9 = work.A, work.z, work.N, work.t, work.L9
     pivot = cholesky(work.Rz, n, work.inverse_diagonal)
-    solve_right(A, 9, work.Rz, n, work.inverse_diagonal)
+    solve_right(A, 9, work.Rz, n, work.inverse_diagonal, 0)
     solve_left_vector(work.Rz, z, n, work.inverse_diagonal)
     nis = z[0] * z[0]
     for k in range(1, n):
@@ -277,8 +278,10 @@ def update(flight, p, work, feature_count, mask):
         t[j] = total
     for i in range(0, 9, 3):
         for j in range(0, i + 3, 3):
-            block = sum_of_outers(A, i, A, j, n)
-            store_block(N, i, j, add_to_diagonal(block, 1.0) if i == j else block)
+            if i == j:
+                store_block(N, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
+            else:
+                store_block(N, i, j, sum_of_outers(A, i, A, j, n))
     cholesky(N, 9, work.inverse_diagonal)
     solve_left_vector(N, t, 9, work.inverse_diagonal)
     for j in range(9):
@@ -289,7 +292,7 @@ def update(flight, p, work, feature_count, mask):
     for i in range(15):
         for j in range(9):
             L9[i, 8 - j] = L[i, j]
-    solve_right(L9, 15, N, 9, work.inverse_diagonal)
+    solve_right(L9, 15, N, 9, work.inverse_diagonal, 6)
 
     dx = work.h  # no longer needed
     total = 0.0 * nis

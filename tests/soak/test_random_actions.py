@@ -26,9 +26,17 @@ def assert_records_are_finite(env):
         assert not bad.any(), f"{name} of flights {np.unique(np.nonzero(bad)[0])[:9]}"
 
 
+@pytest.fixture(scope="module")
+def total():
+    """Counts the steps of all cases and prints them at the end."""
+    steps = []
+    yield steps
+    print(f"\n{sum(steps):,} steps in all")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "action"), COMBINATIONS)
-def test_random_actions_leave_no_number_that_is_not_finite(task, action, record_property):
+def test_random_actions_leave_no_number_that_is_not_finite(task, action, total):
     number = COMBINATIONS.index((task, action))
     env = QuadVectorEnv(
         COUNT,
@@ -60,5 +68,5 @@ def test_random_actions_leave_no_number_that_is_not_finite(task, action, record_
         assert all(np.isfinite(values).all() for values in (*observation.values(), reward))
         if k % 20 == 0 or k == steps - 1:
             assert_records_are_finite(env)
-    record_property("steps", flown)
+    total.append(flown)
     print(f"{task}, {action}: {flown:,} steps, {failures:,} of them with a failed filter")

@@ -23,7 +23,7 @@ LARGEST, ROWS = 18, 9
 
 def factor_and_solve(f, n):
     f.least = cholesky(f.a, n, f.inverse)
-    solve_right(f.x, ROWS, f.a, n, f.inverse)
+    solve_right(f.x, ROWS, f.a, n, f.inverse, 0)
     solve_left_vector(f.a, f.b, n, f.inverse)
 
 
