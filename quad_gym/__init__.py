@@ -9,19 +9,21 @@ from typing import Any
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all
 from quad_gym.params import (
     ActionParams,
-    CameraParams,
     Clocks,
+    PDGains,
+    TaskParams,
+    VehicleParams,
+    pd_gains,
+    vehicle_params,
+)
+from quad_gym.sensor_params import (
+    CameraParams,
     FilterParams,
     GnssParams,
     ImuParams,
     NoisyObservationParams,
-    PDGains,
     SensorSuite,
-    TaskParams,
-    VehicleParams,
-    pd_gains,
     sensor_suite,
-    vehicle_params,
 )
 
 __version__ = "0.1.0"

@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym import validation as check
 from quad_gym.kernels import single
 from quad_gym.packing import params_record
-from quad_gym.params import SensorSuite, VehicleParams
+from quad_gym.params import VehicleParams
 from quad_gym.records import FLIGHT, WORK, FilterStatus
+from quad_gym.sensor_params import SensorSuite
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 

@@ -6,16 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.frames import ecef_to_enu
-from quad_gym.params import (
-    STARTS,
-    TASKS,
-    ActionParams,
-    Clocks,
-    PDGains,
-    SensorSuite,
-    TaskParams,
-    VehicleParams,
-)
+from quad_gym.params import STARTS, TASKS, ActionParams, Clocks, PDGains, TaskParams, VehicleParams
 from quad_gym.records import (
     PARAMS,
     PARAMS_BLOCK,
@@ -27,6 +18,7 @@ from quad_gym.records import (
     aligned_zeros,
 )
 from quad_gym.rotations import euler_to_dcm
+from quad_gym.sensor_params import SensorSuite
 
 
 def params_record(

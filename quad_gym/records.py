@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.params import MAX_FEATURES, MAX_GATES
+from quad_gym.params import MAX_GATES
+from quad_gym.sensor_params import MAX_FEATURES
 
 WIDTH = 8
 """Flights in a block."""

@@ -13,11 +13,9 @@ from quad_gym.params import (
     ActionParams,
     Clocks,
     PDGains,
-    SensorSuite,
     TaskParams,
     VehicleParams,
     pd_gains,
-    sensor_suite,
     vehicle_params,
 )
 from quad_gym.records import (
@@ -33,6 +31,7 @@ from quad_gym.records import (
     aligned_zeros,
     field_of_flights,
 )
+from quad_gym.sensor_params import SensorSuite, sensor_suite
 from quad_gym.threads import resolve_threads, run_ranges
 
 _NO_BOUNDS = np.zeros(0)

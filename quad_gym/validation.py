@@ -1,5 +1,6 @@
 """Checks of what users pass in: each raises a ValueError that names the argument."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -94,3 +95,23 @@ def ticks(name: str, rate: float, tick_rate: float) -> int:
             f"{name} must divide the IMU rate of {tick_rate:g} Hz into whole ticks, got {rate:g} Hz"
         )
     return round(ratio)
+
+
+Vector = tuple[float, ...]
+Matrix = tuple[tuple[float, ...], ...]
+
+
+class Checked:
+    """A frozen dataclass whose fields are replaced by their checked form on creation."""
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _check(self, rule: Any, *names: str, **options: Any) -> None:
+        for name in names:
+            label = f"{type(self).__name__}.{name}"
+            self._set(name, rule(label, getattr(self, name), **options))
+
+    def replace(self, **changes: Any) -> Any:
+        """A copy with some fields changed, checked anew."""
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]

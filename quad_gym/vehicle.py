@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym import validation as check
 from quad_gym.kernels import single
 from quad_gym.packing import params_record
-from quad_gym.params import SensorSuite, VehicleParams
+from quad_gym.params import VehicleParams
+from quad_gym.sensor_params import SensorSuite
 
 State = Mapping[str, ArrayLike]
 STATE_SHAPES: dict[str, tuple[int, ...]] = {

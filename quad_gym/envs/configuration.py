@@ -17,14 +17,9 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
-from quad_gym.params import (
-    ActionParams,
-    SensorSuite,
-    TaskParams,
-    VehicleParams,
-    sensor_suite,
-)
+from quad_gym.params import ActionParams, TaskParams, VehicleParams
 from quad_gym.records import Autoreset, Ending, Layout
+from quad_gym.sensor_params import SensorSuite, sensor_suite
 from quad_gym.simulation import FlightBatch
 
 TASK_DEFAULTS: dict[str, TaskParams] = {

@@ -8,7 +8,8 @@ import pytest
 import quad_gym
 from quad_gym import params
 from quad_gym.packing import params_record
-from quad_gym.params import MAX_FEATURES, MAX_GATES
+from quad_gym.params import MAX_GATES
+from quad_gym.sensor_params import MAX_FEATURES
 
 CLASSES = [
     quad_gym.VehicleParams,

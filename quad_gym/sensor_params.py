@@ -1,0 +1,278 @@
+"""Sensors and the filter that fuses them: frozen parameters with the source of every number.
+
+As in `params`: SI units, body frame B with x forward and z up along the thrust; the laboratory's
+numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Austin).
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from quad_gym import validation as check
+from quad_gym.validation import Checked, Matrix, Vector
+
+GRAVITY = 9.8
+"""Standard gravity as the laboratory rounds it [m/s^2]."""
+
+MAX_FEATURES = 16
+"""The most features that a camera model can hold."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuParams(Checked):
+    """Accelerometer and gyro: white noise, Gauss-Markov biases (report equations 4, 6, 7)."""
+
+    rate: float = 200.0
+    """[Hz]; one sample is one tick of the simulation; report section 4"""
+    lever_arm_B: Vector = (0.0, 0.0, 0.0)
+    """(3,) position of the accelerometer in B [m]; report section 2.3"""
+    accel_noise_density: float = 9.8e-3 * 0.1
+    """[m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
+    gyro_noise_density: float = math.radians(0.05)
+    """[rad/s/sqrt(Hz)]; laboratory: 0.05 deg/s/sqrt(Hz)"""
+    accel_bias_sigma: float = 9.8e-3 * 100.0
+    """stationary standard deviation [m/s^2]; laboratory: 100 milli-g"""
+    gyro_bias_sigma: float = math.radians(100.0) / 3600.0
+    """stationary standard deviation [rad/s]; laboratory: 100 deg/h"""
+    accel_bias_tau: float = 100.0
+    """correlation time [s]; laboratory"""
+    gyro_bias_tau: float = 100.0
+    """correlation time [s]; laboratory"""
+
+    def __post_init__(self) -> None:
+        self._check(check.positive, "rate", "accel_bias_tau", "gyro_bias_tau")
+        self._check(check.positive, "accel_noise_density", "gyro_noise_density")
+        self._check(check.positive, "accel_bias_sigma", "gyro_bias_sigma")
+        self._check(check.vector, "lever_arm_B", length=3)
+
+    @property
+    def dt(self) -> float:
+        """The tick: time between two samples [s]."""
+        return 1.0 / self.rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssParams(Checked):
+    """Two GNSS antennas: position of the primary one, and the baseline to the secondary one."""
+
+    rate: float = 200.0
+    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
+    primary_antenna_B: Vector = (0.1013, -0.0004, 0.0472)
+    """(3,) in B [m]; laboratory vehicle"""
+    secondary_antenna_B: Vector = (-0.0887, -0.0004, 0.0472)
+    """(3,) in B [m]; laboratory vehicle"""
+    reference_antenna_G: Vector = (-742080.456, -5462030.875, 3198338.956)
+    """(3,) origin of the east-north-up frame I, in ECEF [m]; laboratory"""
+    position_sigma_I: Vector = (0.006, 0.006, 0.012)
+    """(3,) standard deviation east, north, up [m]; laboratory (RTK)"""
+    baseline_sigma: float = 0.05
+    """standard deviation of the baseline's direction [rad]; laboratory"""
+
+    def __post_init__(self) -> None:
+        self._check(check.positive, "rate", "baseline_sigma")
+        self._check(
+            check.vector,
+            "primary_antenna_B",
+            "secondary_antenna_B",
+            "reference_antenna_G",
+            "position_sigma_I",
+            length=3,
+        )
+        if min(self.position_sigma_I) <= 0.0:
+            raise ValueError(
+                f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
+            )
+        if np.linalg.norm(self.baseline_B) < 1e-3:
+            raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
+        if np.linalg.norm(self.reference_antenna_G) < 1e6:
+            raise ValueError(
+                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF metres, "
+                f"got {self.reference_antenna_G}"
+            )
+
+    @property
+    def baseline_B(self) -> np.ndarray:
+        """(3,) from the primary to the secondary antenna, in B [m]."""
+        return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraParams(Checked):
+    """A pinhole camera that sees known features."""
+
+    rate: float = 200.0
+    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
+    position_B: Vector = (0.1159, -0.0004, -0.0435)
+    """(3,) projection centre in B [m]; laboratory vehicle"""
+    attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
+    """(3,) Euler angles of R_CB, camera z along the optical axis [rad]; laboratory"""
+    pixel_size: float = 2e-6
+    """[m]; laboratory"""
+    focal_length: float = 1657.72
+    """[pixels]; laboratory"""
+    image_size: Vector = (3840.0, 2160.0)
+    """(2,) width and height, with the origin of coordinates at the centre [pixels]; laboratory"""
+    pixel_sigma: float = 20.0
+    """standard deviation per axis [pixels]; laboratory"""
+    features_I: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
+    """(n, 3) known points in I, at most MAX_FEATURES [m]; laboratory"""
+
+    def __post_init__(self) -> None:
+        self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
+        self._check(check.vector, "position_B", "attitude", length=3)
+        self._check(check.vector, "image_size", length=2)
+        if min(self.image_size) <= 0.0:
+            raise ValueError(
+                f"CameraParams.image_size must be greater than 0, got {self.image_size}"
+            )
+        if np.size(self.features_I) == 0:
+            raise ValueError("CameraParams.features_I must hold at least one feature, got none")
+        self._check(check.matrix, "features_I", rows=None, columns=3)
+        if len(self.features_I) > MAX_FEATURES:
+            raise ValueError(
+                f"CameraParams.features_I must hold at most {MAX_FEATURES} features, "
+                f"got {len(self.features_I)}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterParams(Checked):
+    """The unscented Kalman filter's own choices."""
+
+    alpha: float = 1e-3
+    """spread of the sigma points; laboratory"""
+    beta: float = 2.0
+    """weight of the central point's excess, 2 for Gaussians; laboratory"""
+    kappa: float = 0.0
+    """secondary scaling; laboratory"""
+    direction_variance_floor: float = 1e-8
+    """added to the diagonal of a direction's covariance, of rank 2 [-]; report section 3.1"""
+    feature_noise_across: str = "measured"
+    """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
+    across the "predicted" one, as the baseline's does. The first takes the angle between the two,
+    tens of milliradians in the first second, for information that it trusts to 0.1 mrad."""
+    initial_velocity_variance: float = 1e-3
+    """[m^2/s^2]; laboratory"""
+    initial_scale: float = 2.0
+    """factor on the first fix's covariance; laboratory"""
+    gravity: float = GRAVITY
+    """[m/s^2] that the filter subtracts"""
+
+    def __post_init__(self) -> None:
+        self._check(
+            check.positive,
+            "alpha",
+            "direction_variance_floor",
+            "initial_velocity_variance",
+            "initial_scale",
+            "gravity",
+        )
+        self._check(check.number, "beta", least=0.0)
+        self._check(check.choice, "feature_noise_across", choices=("measured", "predicted"))
+        self._check(check.number, "kappa", least=-14.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoisyObservationParams(Checked):
+    """Standard deviations of `observation="noisy"`: the size of the converged filter's errors."""
+
+    position: float = 0.0018
+    """per axis [m]; measured on the laboratory's circle"""
+    velocity: float = 0.012
+    """per axis [m/s]; measured on the laboratory's circle"""
+    attitude: float = 0.006
+    """per axis [rad]; measured on the laboratory's circle"""
+    body_rates: float = 0.0123
+    """per axis [rad/s]; the gyro's noise at 200 Hz"""
+
+    def __post_init__(self) -> None:
+        self._check(check.number, "position", "velocity", "attitude", "body_rates", least=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorSuite(Checked):
+    """All sensors of a vehicle and the filter that fuses them."""
+
+    imu: ImuParams = field(default_factory=ImuParams)
+    gnss: GnssParams = field(default_factory=GnssParams)
+    camera: CameraParams | None = field(default_factory=CameraParams)
+    """None: no camera"""
+    estimator: FilterParams = field(default_factory=FilterParams)
+    noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
+
+    def __post_init__(self) -> None:
+        for name, kind in (
+            ("imu", ImuParams),
+            ("gnss", GnssParams),
+            ("estimator", FilterParams),
+            ("noisy", NoisyObservationParams),
+        ):
+            check.instance(f"SensorSuite.{name}", getattr(self, name), kind)
+        if self.camera is not None:
+            check.instance("SensorSuite.camera", self.camera, CameraParams)
+        check.ticks("GnssParams.rate", self.gnss.rate, self.imu.rate)
+        if self.camera is not None:
+            check.ticks("CameraParams.rate", self.camera.rate, self.imu.rate)
+
+    def with_rates(
+        self,
+        *,
+        imu: float | None = None,
+        gnss: float | None = None,
+        camera: float | None = None,
+    ) -> "SensorSuite":
+        """A copy whose sensors run at other rates [Hz]; None keeps a rate.
+
+        A new IMU rate changes the tick: sensors that measured at every tick keep doing so.
+
+        Raises:
+            ValueError: If a rate is not positive or not a whole division of the IMU's.
+        """
+        imu_rate = self.imu.rate if imu is None else check.positive("imu_rate", imu)
+
+        def rate_of(name: str, wanted: float | None, current: float) -> float:
+            follows = current == self.imu.rate or imu_rate < current
+            rate = wanted if wanted is not None else (imu_rate if follows else current)
+            check.ticks(name, rate, imu_rate)
+            return rate
+
+        gnss_params = self.gnss.replace(rate=rate_of("gnss_rate", gnss, self.gnss.rate))
+        camera_params = self.camera
+        if camera_params is not None:
+            camera_params = camera_params.replace(
+                rate=rate_of("camera_rate", camera, camera_params.rate)
+            )
+        return SensorSuite(
+            imu=self.imu.replace(rate=imu_rate),
+            gnss=gnss_params,
+            camera=camera_params,
+            estimator=self.estimator,
+            noisy=self.noisy,
+        )
+
+    def scaled_noise(self, factor: float) -> "SensorSuite":
+        """A copy whose white noise is `factor` times as large; the filter knows of it."""
+        check.positive("factor", factor)
+        camera = self.camera
+        if camera is not None:
+            camera = camera.replace(pixel_sigma=factor * camera.pixel_sigma)
+        return self.replace(  # type: ignore[no-any-return]
+            imu=self.imu.replace(
+                accel_noise_density=factor * self.imu.accel_noise_density,
+                gyro_noise_density=factor * self.imu.gyro_noise_density,
+            ),
+            gnss=self.gnss.replace(
+                position_sigma_I=tuple(factor * s for s in self.gnss.position_sigma_I),
+                baseline_sigma=factor * self.gnss.baseline_sigma,
+            ),
+            camera=camera,
+        )
+
+
+_SUITES = {"lab": SensorSuite()}
+
+
+def sensor_suite(name: str) -> SensorSuite:
+    """The sensor suite called `name`: "lab", the report's."""
+    return _SUITES[check.choice("sensors", name, tuple(_SUITES))]
