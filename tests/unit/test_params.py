@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import params
 from quad_gym.packing import params_record
 from quad_gym.params import MAX_GATES
 from quad_gym.sensor_params import MAX_FEATURES
@@ -153,7 +152,7 @@ def test_parameters_are_values_that_compare_and_hash(kind):
 def test_a_value_that_makes_no_sense_is_refused_by_the_name_of_its_field(kind, name):
     for bad in BAD_VALUES[kind, name]:
         with pytest.raises(ValueError, match=rf"\b{name}\b"):
-            getattr(params, kind)(**{name: bad})
+            getattr(quad_gym, kind)(**{name: bad})
 
 
 def test_every_field_but_flags_is_tried():
