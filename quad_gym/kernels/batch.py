@@ -1,7 +1,7 @@
 """The one entry that flies: a step, or a reset, of a range of blocks."""
 
 from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import entry, inlined, kernel
+from quad_gym.kernels.compilation import entry, kernel
 from quad_gym.kernels.flight import begin_episode, tick
 from quad_gym.kernels.judge import judge
 from quad_gym.kernels.lanes import any_of, logical_not, select
@@ -9,7 +9,7 @@ from quad_gym.kernels.observe import observe
 from quad_gym.records import WIDTH, Autoreset, Command
 
 
-@inlined
+@kernel
 def _write_rows(source, low, high, out, block, mask):
     """Copy observations from lanes to the rows of an array, held within the space's bounds."""
     first = block * WIDTH

@@ -19,12 +19,13 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` into whatever kernel calls it."""
-    return numba.njit(**_OPTIONS)(function)
+    """Compile `function` into the entry that calls it, always inlined.
 
-
-def inlined(function: Callable[..., Any]) -> Any:
-    """Like `kernel`, always inlined: for small functions on tuples of numbers."""
+    A kernel left out of line would exist twice in a process that compiles, as the copy within the
+    entry's code and as one by itself, whose multiply-adds LLVM may fuse otherwise; which of the two
+    is called would depend on whether the entry was compiled or loaded, and flights would differ in
+    their last bits from process to process.
+    """
     return numba.njit(forceinline=True, **_OPTIONS)(function)
 
 

@@ -5,7 +5,7 @@ All use the nominal parameters `p`, never the true ones.
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import clip, maximum, minimum, sin_cos
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import (
@@ -26,7 +26,7 @@ from quad_gym.kernels.vehicle import combine, load4, store4
 from quad_gym.records import Control
 
 
-@inlined
+@kernel
 def allocate(thrust, torque, p):
     """Motor voltages for a total thrust [N] and a torque in B [N m].
 
@@ -54,12 +54,12 @@ def allocate(thrust, torque, p):
     )
 
 
-@inlined
+@kernel
 def _voltage(force, p):
     return math.sqrt(clip(force, 0.0, p.max_rotor_force) / p.kF) / p.motor_gain
 
 
-@inlined
+@kernel
 def pd_wrench(r, v, R_BI, w_B, reference, p):
     """Thrust and torque of the report's PD controller.
 
@@ -95,7 +95,7 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
     return dot(F_I, z_I), torque
 
 
-@inlined
+@kernel
 def rate_torque(w_wanted, w_B, p):
     """Torque of the inner rate loop: J k_w (w* - w) + w x J w."""
     J = load33(p.inertia)
@@ -103,7 +103,7 @@ def rate_torque(w_wanted, w_B, p):
     return add(wanted, cross(w_B, apply(J, w_B)))
 
 
-@inlined
+@kernel
 def level_axes(R_BI):
     """The axes of the level frame in I: x ahead along the body's heading, y to its left, z up."""
     x_B_I = R_BI[0]
@@ -112,7 +112,7 @@ def level_axes(R_BI):
     return (ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
 
 
-@inlined
+@kernel
 def tilt_rates(z_wanted_I, R_BI, yaw_rate, p):
     """Body rates that turn the thrust axis toward a direction: k_a (e3 x R z*), and a yaw rate."""
     z_wanted_B = apply(R_BI, z_wanted_I)

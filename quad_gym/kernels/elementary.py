@@ -15,7 +15,7 @@ from quad_gym.kernels.bits import (
     power_of_two,
     round_to_even,
 )
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.lanes import any_of, select
 
 # pi/2 in three parts of 33 bits and a rest: k * part is exact for |k| < 2^20 (Cody and Waite)
@@ -30,31 +30,31 @@ _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _SMALL_ANGLE = 0.05
 
 
-@inlined
+@kernel
 def minimum(a, b):
     """The smaller of two numbers; `b` where either is NaN."""
     return select(a < b, a, b)
 
 
-@inlined
+@kernel
 def maximum(a, b):
     """The larger of two numbers; `b` where either is NaN."""
     return select(a > b, a, b)
 
 
-@inlined
+@kernel
 def clip(x, low, high):
     """`x` held within [low, high]."""
     return minimum(maximum(x, low), high)
 
 
-@inlined
+@kernel
 def is_finite(x):
     """Whether x is neither infinite nor NaN."""
     return abs(x) <= 1.7976931348623157e308
 
 
-@inlined
+@kernel
 def sin_near_zero(x):
     """Sin x for |x| <= pi/4."""
     z = x * x
@@ -76,7 +76,7 @@ def sin_near_zero(x):
     )
 
 
-@inlined
+@kernel
 def cos_near_zero_minus_one(x):
     """Cos x - 1 for |x| <= pi/4."""
     z = x * x
@@ -98,7 +98,7 @@ def cos_near_zero_minus_one(x):
     )
 
 
-@inlined
+@kernel
 def quarter_turns(sine, cosine, quadrant):
     """(sin, cos) of an angle, from those of the angle less `quadrant` (0 to 4) quarter turns."""
     odd = (quadrant == 1.0) | (quadrant == 3.0)
@@ -206,7 +206,7 @@ def log(x):
     return select(x == math.inf, x, value)
 
 
-@inlined
+@kernel
 def _atan_polynomial(x):
     z = x * x
     return x - x * z * (

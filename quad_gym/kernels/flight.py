@@ -6,7 +6,7 @@ true state and the biases evolve, then measure and update at its end.
 
 import numpy as np
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.control import act
 from quad_gym.kernels.lanes import any_of, select
 from quad_gym.kernels.linalg import (
@@ -40,7 +40,7 @@ from quad_gym.records import Control, Source
 _ONE = np.uint64(1)
 
 
-@inlined
+@kernel
 def _look(flight, model, settings, mask):
     """Set what the controller sees from its source, where `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))

@@ -1,6 +1,6 @@
 """The judge of a step: errors, reward and endings, from the true state alone."""
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import exp, is_finite
 from quad_gym.kernels.lanes import logical_not, select
 from quad_gym.kernels.linalg import dot, keep3, load3, norm, sub
@@ -20,7 +20,7 @@ _ON_THE_GROUND, _TIPPED_OVER = float(Ending.ON_THE_GROUND), float(Ending.TIPPED_
 _OUT_OF_BOUNDS, _LAST_GATE = float(Ending.OUT_OF_BOUNDS), float(Ending.LAST_GATE)
 
 
-@inlined
+@kernel
 def _pass_gate(flight, settings, active):
     """Move on to the next gate where the present one is reached; return where, and progress."""
     target = load3(flight.ref_center)

@@ -8,20 +8,20 @@ multiply-adds.
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import minimum
 from quad_gym.kernels.lanes import select
 
 # ---- vectors of three -------------------------------------------------------------------------
 
 
-@inlined
+@kernel
 def load3(a):
     """The first three numbers of an array, as a vector."""
     return (a[0], a[1], a[2])
 
 
-@inlined
+@kernel
 def store3(a, v):
     """Write a vector into the first three places of an array."""
     a[0] = v[0]
@@ -29,38 +29,38 @@ def store3(a, v):
     a[2] = v[2]
 
 
-@inlined
+@kernel
 def keep3(a, mask, v):
     """Write a vector into an array where `mask` is set."""
     for i in range(3):
         a[i] = select(mask, v[i], a[i])
 
 
-@inlined
+@kernel
 def add(a, b):
     """A + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@inlined
+@kernel
 def sub(a, b):
     """A - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-@inlined
+@kernel
 def scale(s, a):
     """S a."""
     return (s * a[0], s * a[1], s * a[2])
 
 
-@inlined
+@kernel
 def dot(a, b):
     """A . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inlined
+@kernel
 def cross(a, b):
     """A x b."""
     return (
@@ -70,13 +70,13 @@ def cross(a, b):
     )
 
 
-@inlined
+@kernel
 def norm(a):
     """|a|."""
     return math.sqrt(dot(a, a))
 
 
-@inlined
+@kernel
 def unit_or(a, fallback):
     """A / |a|, or `fallback` where a is too short to have a direction."""
     square = dot(a, a)
@@ -89,7 +89,7 @@ def unit_or(a, fallback):
     )
 
 
-@inlined
+@kernel
 def select3(mask, a, b):
     """The vector `a` where `mask`, else `b`."""
     return (select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
@@ -98,7 +98,7 @@ def select3(mask, a, b):
 # ---- matrices of three rows ------------------------------------------------------------------
 
 
-@inlined
+@kernel
 def load33(a):
     """A 3 x 3 array as a matrix."""
     return (
@@ -108,7 +108,7 @@ def load33(a):
     )
 
 
-@inlined
+@kernel
 def store33(a, m):
     """Write a matrix into a 3 x 3 array."""
     for i in range(3):
@@ -116,7 +116,7 @@ def store33(a, m):
             a[i, j] = m[i][j]
 
 
-@inlined
+@kernel
 def keep33(a, mask, m):
     """Write a matrix into a 3 x 3 array where `mask` is set."""
     for i in range(3):
@@ -124,7 +124,7 @@ def keep33(a, mask, m):
             a[i, j] = select(mask, m[i][j], a[i, j])
 
 
-@inlined
+@kernel
 def transpose(m):
     """m^T."""
     return (
@@ -134,13 +134,13 @@ def transpose(m):
     )
 
 
-@inlined
+@kernel
 def apply(m, v):
     """M v."""
     return (dot(m[0], v), dot(m[1], v), dot(m[2], v))
 
 
-@inlined
+@kernel
 def apply_transposed(m, v):
     """m^T v."""
     return (
@@ -150,7 +150,7 @@ def apply_transposed(m, v):
     )
 
 
-@inlined
+@kernel
 def multiply(a, b):
     """A b."""
     return (
@@ -163,7 +163,7 @@ def multiply(a, b):
 # ---- blocks of larger arrays -----------------------------------------------------------------
 
 
-@inlined
+@kernel
 def load_block(a, i, j):
     """The 3 x 3 block of an array whose corner is at row i, column j."""
     return (
@@ -173,7 +173,7 @@ def load_block(a, i, j):
     )
 
 
-@inlined
+@kernel
 def store_block(a, i, j, m):
     """Write a 3 x 3 block."""
     a[i, j], a[i, j + 1], a[i, j + 2] = m[0]
@@ -181,13 +181,13 @@ def store_block(a, i, j, m):
     a[i + 2, j], a[i + 2, j + 1], a[i + 2, j + 2] = m[2]
 
 
-@inlined
+@kernel
 def outer(a, b):
     """A b^T."""
     return (scale(a[0], b), scale(a[1], b), scale(a[2], b))
 
 
-@inlined
+@kernel
 def add_outer(m, a, b):
     """M + a b^T."""
     return (
@@ -197,7 +197,7 @@ def add_outer(m, a, b):
     )
 
 
-@inlined
+@kernel
 def subtract_outer(m, a, b):
     """M - a b^T."""
     return (
@@ -207,7 +207,7 @@ def subtract_outer(m, a, b):
     )
 
 
-@inlined
+@kernel
 def sum_of_outers(a, i, b, k, columns):
     """The sum over the first columns j of a[i : i + 3, j] b[k : k + 3, j]^T."""
     total = outer(load_column3(a, i, 0), load_column3(b, k, 0))
@@ -216,7 +216,7 @@ def sum_of_outers(a, i, b, k, columns):
     return total
 
 
-@inlined
+@kernel
 def sum_of_squares(a, i, columns):
     """The sum over the first columns j of a[i : i + 3, j] a[i : i + 3, j]^T, which is symmetric."""
     x, y, z = load_column3(a, i, 0)
@@ -228,7 +228,7 @@ def sum_of_squares(a, i, columns):
     return ((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
 
 
-@inlined
+@kernel
 def sum_of_outers_of_rows(a, b, i, k, rows):
     """The sum over the first rows j of a[j, i : i + 3]^T b[j, k : k + 3]."""
     total = outer((a[0, i], a[0, i + 1], a[0, i + 2]), (b[0, k], b[0, k + 1], b[0, k + 2]))
@@ -239,19 +239,19 @@ def sum_of_outers_of_rows(a, b, i, k, rows):
     return total
 
 
-@inlined
+@kernel
 def add33(a, b):
     """A + b."""
     return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
 
 
-@inlined
+@kernel
 def scale33(s, a):
     """S a."""
     return (scale(s, a[0]), scale(s, a[1]), scale(s, a[2]))
 
 
-@inlined
+@kernel
 def add_to_diagonal(m, s):
     """M + s I."""
     return (
@@ -261,13 +261,13 @@ def add_to_diagonal(m, s):
     )
 
 
-@inlined
+@kernel
 def load_column3(a, i, j):
     """Rows i to i + 2 of column j."""
     return (a[i, j], a[i + 1, j], a[i + 2, j])
 
 
-@inlined
+@kernel
 def _cholesky33(m):
     """The lower Cholesky factor with its diagonal inverted, the diagonal, and the least pivot."""
     p0 = m[0][0]
@@ -285,7 +285,7 @@ def _cholesky33(m):
     )
 
 
-@inlined
+@kernel
 def _solve_right33(m, d):
     """X with x l^T = m, for the factor `d` of `_cholesky33`."""
     x0 = (m[0][0] * d[0][0], m[1][0] * d[0][0], m[2][0] * d[0][0])

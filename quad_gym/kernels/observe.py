@@ -2,7 +2,7 @@
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import apply, load3, load33, scale, sub
 from quad_gym.kernels.reference import evaluate_reference, position_on_reference
@@ -12,7 +12,7 @@ from quad_gym.params import MAX_GATES
 from quad_gym.records import Layout, Source, Task
 
 
-@inlined
+@kernel
 def _put3(row, k, v):
     row[k] = v[0]
     row[k + 1] = v[1]
@@ -20,7 +20,7 @@ def _put3(row, k, v):
     return k + 3
 
 
-@inlined
+@kernel
 def _upcoming_gate(flight, ahead):
     """The gate that is `ahead` gates after the present one; the last one is repeated."""
     x, y, z = load3(flight.gates[MAX_GATES - 1])
@@ -31,7 +31,7 @@ def _upcoming_gate(flight, ahead):
     return (x, y, z)
 
 
-@inlined
+@kernel
 def _preview(flight, p, settings, i):
     """The reference a little later: in time, or on a course the gates after the next."""
     if settings.task == Task.WAYPOINTS:
@@ -39,7 +39,7 @@ def _preview(flight, p, settings, i):
     return position_on_reference(flight, flight.tick * p.dt + settings.preview[i])
 
 
-@inlined
+@kernel
 def _put_relative(flight, p, settings, row, r, v, R_BI, w_B):
     """Errors, directions and rates in the body frame."""
     r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt)
@@ -54,7 +54,7 @@ def _put_relative(flight, p, settings, row, r, v, R_BI, w_B):
     return k
 
 
-@inlined
+@kernel
 def _put_reference(flight, p, settings, row, k):
     """The reference in I."""
     r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt)
@@ -67,7 +67,7 @@ def _put_reference(flight, p, settings, row, k):
     return k
 
 
-@inlined
+@kernel
 def _put_absolute(flight, p, settings, row):
     """The state in I and the reference in I; biases as far as the source knows them."""
     k = _put3(row, 0, load3(flight.r_seen))
@@ -87,7 +87,7 @@ def _put_absolute(flight, p, settings, row):
     return _put_reference(flight, p, settings, row, k)
 
 
-@inlined
+@kernel
 def _put_sensors(flight, p, settings, row):
     """The last IMU sample; GNSS and camera where they measured since the last step, else zeros."""
     R_IG = load33(p.R_IG)
@@ -110,7 +110,7 @@ def _put_sensors(flight, p, settings, row):
     return _put_reference(flight, p, settings, row, k)
 
 
-@inlined
+@kernel
 def _put_privileged(flight, p, settings, row, k):
     """The truth, for critics: relative state, biases and rotor speeds."""
     R_BI = quaternion_to_dcm(load4(flight.q))

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from quad_gym.kernels.bits import one_to_two, rotate_left, round_to_even
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import (
     cos_near_zero_minus_one,
     log,
@@ -24,7 +24,7 @@ _PARITY = np.uint64(0x1BD11BDAA9FC1A22)
 _ONE, _TWO, _THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 
 
-@inlined
+@kernel
 def _mix(a, b, places):
     a = a + b
     return a, rotate_left(b, places) ^ a
@@ -54,7 +54,7 @@ def threefry(key0, key1, counter0, counter1):
     return a, b
 
 
-@inlined
+@kernel
 def uniform_pair(stream, draw):
     """Two independent numbers, uniform on [0, 1).
 

@@ -4,7 +4,7 @@
 two, a random flight several. One kernel evaluates them all, with exact derivatives.
 """
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import sin_cos
 from quad_gym.kernels.linalg import load3, select3, sub, unit_or
 from quad_gym.records import MAX_HARMONICS
@@ -23,7 +23,7 @@ def position_on_reference(flight, t):
     return (x, y, z)
 
 
-@inlined
+@kernel
 def heading(flight, r_ref, v_ref):
     """x*: the horizontal unit direction that the body x axis is to point in."""
     zero = 0.0 * r_ref[0]

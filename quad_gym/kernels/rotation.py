@@ -5,7 +5,7 @@ Quaternions are Hamilton's, (w, x, y, z), and turn body components into inertial
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import sin_cos, sin_cos_minus_one
 from quad_gym.kernels.lanes import select
 
@@ -23,7 +23,7 @@ def euler_to_dcm(e):
     )
 
 
-@inlined
+@kernel
 def split_rotation(e):
     """R(e) = I + even(e) + odd(e), which keep and change sign with e, free of cancellation.
 
@@ -51,7 +51,7 @@ def split_rotation(e):
     return even, odd, (s_phi, m_phi, s_th, m_th)
 
 
-@inlined
+@kernel
 def quaternion_to_dcm(q):
     """R_BI of the unit quaternion q (w, x, y, z)."""
     w, x, y, z = q
@@ -102,14 +102,14 @@ def dcm_to_quaternion(R_BI):
     return normalize_quaternion((w, x, y, z))
 
 
-@inlined
+@kernel
 def normalize_quaternion(q):
     """Q / |q|."""
     inverse = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (inverse * q[0], inverse * q[1], inverse * q[2], inverse * q[3])
 
 
-@inlined
+@kernel
 def quaternion_rate(q, w_B):
     """dq/dt = 1/2 q (0, w_B)."""
     w, x, y, z = q
@@ -121,7 +121,7 @@ def quaternion_rate(q, w_B):
     )
 
 
-@inlined
+@kernel
 def yaw_to_quaternion(yaw):
     """The level attitude whose x axis points `yaw` from east."""
     s, c = sin_cos(0.5 * yaw)

@@ -7,7 +7,7 @@ tests.
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import (
     add,
@@ -29,13 +29,13 @@ from quad_gym.kernels.vehicle import accelerations, imu_point_acceleration, load
 DRAW_BIAS, DRAW_IMU, DRAW_GNSS, DRAW_NOISY, DRAW_FEATURE, DRAW_RESET = 0, 3, 6, 9, 16, 64
 
 
-@inlined
+@kernel
 def stream_of(flight):
     """The random stream of a flight at its present instant."""
     return (flight.key[0], flight.key[1], flight.instant)
 
 
-@inlined
+@kernel
 def six_normals(stream, draw):
     """Two vectors of independent standard normals, from three draws."""
     a, b = normal_pair(stream, draw)
@@ -53,7 +53,7 @@ def drift_biases(flight, p):
         flight.b_g[i] = p.gyro_bias_decay * flight.b_g[i] + p.gyro_bias_drive * n_g[i]
 
 
-@inlined
+@kernel
 def specific_force(flight, p, R_BI):
     """f_B = R (a_I + g e3) at the accelerometer, without bias and noise (report equation 4)."""
     w_B = load3(flight.w)
@@ -75,7 +75,7 @@ def measure_imu(flight, p, mask):
     keep3(flight.gyro, mask, add(w_B, scale(p.gyro_sigma, n_g)))
 
 
-@inlined
+@kernel
 def noisy_baseline(r_b, normals, sigma_b, floor, length):
     """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, known length.
 
@@ -107,7 +107,7 @@ def measure_gnss(flight, p, mask):
     keep3(flight.gnss_baseline, mask, measured)
 
 
-@inlined
+@kernel
 def project(X_I, r_I, R_BI, p):
     """Pixel of a point, and whether it is in front of the camera and inside the image."""
     v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))

@@ -2,7 +2,7 @@
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import atan2, clip, maximum, minimum, sin_cos
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import keep3, load3, multiply
@@ -20,7 +20,7 @@ START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 
 HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY = 0.0, 1.0, 2.0
 
 
-@inlined
+@kernel
 def _keep(array, i, j, mask, value):
     array[i, j] = select(mask, value, array[i, j])
 
@@ -129,7 +129,7 @@ def draw_reference(flight, settings, stream, mask):
         _draw_gates(flight, settings, stream, mask)
 
 
-@inlined
+@kernel
 def _given_or(given, drawn):
     """A start value that the caller gave, or the drawn one where it is NaN."""
     return select(given == given, given, drawn)

@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import is_finite
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import (
@@ -60,7 +60,7 @@ R, V, E, BA, BG = 0, 3, 6, 9, 12
 _PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
 
 
-@inlined
+@kernel
 def _euler_rate_parts(parts, w_B, dg):
     """The parts odd and even in the sigma offset of S(e) (w_B - dg), the even one less w_B.
 
@@ -82,7 +82,7 @@ def _euler_rate_parts(parts, w_B, dg):
     return odd, even
 
 
-@inlined
+@kernel
 def _propagate_sigma_points(flight, p, work, f_B, w_B):
     """Fill work.F and work.S with the propagated pairs; return their mean less the centre's."""
     L, F, S = flight.L, work.F, work.S
@@ -129,7 +129,7 @@ def _propagate_sigma_points(flight, p, work, f_B, w_B):
     return scale(half_dt2, mean_a), scale(dt, mean_a), scale(inverse_c, mean_e)
 
 
-@inlined
+@kernel
 def _sum_moments(flight, p, work, mean_r, mean_v, mean_e):
     """Fill the lower triangle of work.P from the propagated pairs and the process noise."""
     L, F, S, P = flight.L, work.F, work.S, work.P

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import is_finite
 from quad_gym.kernels.lanes import any_of, logical_not, select
 from quad_gym.kernels.linalg import (
@@ -48,14 +48,14 @@ from quad_gym.records import FilterStatus
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
-@inlined
+@kernel
 def _set_triple(row, k, has, values):
     """Write three numbers of the stacked measurement, zero where a lane lacks it."""
     for i in range(3):
         row[k + i] = select(has, values[i], 0.0)
 
 
-@inlined
+@kernel
 def _set_noise(Rz, k, has, block):
     """Write a diagonal block of the measurement noise, the identity where a lane lacks it."""
     for i in range(3):
@@ -63,7 +63,7 @@ def _set_noise(Rz, k, has, block):
             Rz[k + i, k + j] = select(has, block[i][j], 1.0 if i == j else 0.0)
 
 
-@inlined
+@kernel
 def _direction_noise(direction, variance, floor):
     """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 but for the floor."""
     negative = scale(-variance, direction)
@@ -72,12 +72,12 @@ def _direction_noise(direction, variance, floor):
     return add_to_diagonal(add_outer(empty, negative, direction), variance + floor)
 
 
-@inlined
+@kernel
 def _has_feature(flight, k):
     return flight.feature_valid[k] > 0.0
 
 
-@inlined
+@kernel
 def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
     """Fill work.h (centre), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
     h, z, Rz = work.h, work.z, work.Rz
@@ -127,7 +127,7 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
     return k
 
 
-@inlined
+@kernel
 def _inverse_root_minus_one(d):
     """(1 + d)^(-1/2) - 1 by its binomial series, exact to float64 for |d| < 0.01."""
     return d * (
@@ -145,7 +145,7 @@ def _inverse_root_minus_one(d):
     )
 
 
-@inlined
+@kernel
 def _shrinkage(d):
     """(1 + d)^(-1/2) - 1 for d > -1."""
     value = _inverse_root_minus_one(d)
@@ -155,7 +155,7 @@ def _shrinkage(d):
     return value
 
 
-@inlined
+@kernel
 def _direction_pair(v, inverse_norm, v_even, v_odd):
     """Half-difference, and half-sum less unit(v), of the pair unit(v + v_even +- v_odd).
 
@@ -172,7 +172,7 @@ def _direction_pair(v, inverse_norm, v_even, v_odd):
     return scale(inverse_norm, difference), scale(inverse_norm, half_sum)
 
 
-@inlined
+@kernel
 def _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c):
     """Fill work.A and work.E with the measured pairs; column j of L is their row 8 - j."""
     L = flight.L
@@ -214,7 +214,7 @@ def _measure_sigma_points(flight, p, work, feature_count, use_position, use_base
                 k += 3
 
 
-@inlined
+@kernel
 def _sum_noise(p, work, n, c):
     """Turn work.z into the innovation and add the even parts' share to work.Rz."""
     S, mu = work.E, work.mu

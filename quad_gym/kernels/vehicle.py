@@ -3,7 +3,7 @@
 A state is (r_I, v_I, q, w_B, rotor_speeds), a tuple of tuples; its derivative has the same form.
 """
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.linalg import (
     add,
     apply,
@@ -19,20 +19,20 @@ from quad_gym.kernels.linalg import (
 from quad_gym.kernels.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
 
 
-@inlined
+@kernel
 def load4(a):
     """The first four numbers of an array, as a tuple."""
     return (a[0], a[1], a[2], a[3])
 
 
-@inlined
+@kernel
 def store4(a, v):
     """Write four numbers into an array."""
     for i in range(4):
         a[i] = v[i]
 
 
-@inlined
+@kernel
 def combine(matrix, column):
     """A (4, 4) array times a tuple of four."""
     return (
@@ -55,7 +55,7 @@ def combine(matrix, column):
     )
 
 
-@inlined
+@kernel
 def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     """Acceleration of the centre of mass in I and angular acceleration in B.
 
@@ -77,7 +77,7 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     return a_I, apply(load33(p.inertia_inverse), N_B)
 
 
-@inlined
+@kernel
 def derivative(state, voltages, d_I, p):
     """The time derivative of a state under motor voltages [V] and a disturbance force [N]."""
     _, v_I, q, w_B, W = state
@@ -92,12 +92,12 @@ def derivative(state, voltages, d_I, p):
     return v_I, a_I, quaternion_rate(q, w_B), dw_B, dW
 
 
-@inlined
+@kernel
 def _advance4(x, h, k):
     return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3])
 
 
-@inlined
+@kernel
 def advance(state, h, rate):
     """State + h rate."""
     return (
@@ -109,7 +109,7 @@ def advance(state, h, rate):
     )
 
 
-@inlined
+@kernel
 def load_state(flight):
     """The true state of a flight."""
     return (
@@ -121,7 +121,7 @@ def load_state(flight):
     )
 
 
-@inlined
+@kernel
 def store_state(flight, state):
     """Write the true state of a flight."""
     store3(flight.r, state[0])
@@ -152,7 +152,7 @@ def integrate(flight, p, substeps):
         store_state(flight, (r, v, normalize_quaternion(q), w, W))
 
 
-@inlined
+@kernel
 def imu_point_acceleration(R_BI, a_I, w_B, dw_B, l_B):
     """Acceleration of a body-fixed point in I: a_I + R^T (dw x l + w x (w x l)); report 2.3."""
     return add(a_I, apply_transposed(R_BI, add(cross(dw_B, l_B), cross(w_B, cross(w_B, l_B)))))

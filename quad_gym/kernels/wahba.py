@@ -7,7 +7,7 @@ Markley, J. Astronautical Sciences 36(3), 1988).
 
 import math
 
-from quad_gym.kernels.compilation import inlined, kernel
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import maximum
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import add, cross, dot, scale, select3, sub, transpose, unit_or
@@ -15,7 +15,7 @@ from quad_gym.kernels.linalg import add, cross, dot, scale, select3, sub, transp
 _SWEEPS = 10
 
 
-@inlined
+@kernel
 def _rotate_pair(a, b, v, w):
     """Rotate columns a and b of B (and v and w of V alike) until a . b = 0."""
     gamma = dot(a, b)
@@ -33,13 +33,13 @@ def _rotate_pair(a, b, v, w):
     )
 
 
-@inlined
+@kernel
 def _perpendicular(a):
     """Some vector perpendicular to the unit vector a, not short."""
     return select3(abs(a[0]) < 0.6, cross(a, (1.0, 0.0, 0.0)), cross(a, (0.0, 1.0, 0.0)))
 
 
-@inlined
+@kernel
 def _perpendicular_unit(candidate, a):
     """The direction of `candidate` made perpendicular to a, or another if it has none."""
     fallback = unit_or(_perpendicular(a), a)
