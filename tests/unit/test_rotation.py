@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quad_gym import rotations
-from quad_gym.kernels.compilation import inlined
+from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.linalg import load3, store3, store33
 from quad_gym.kernels.rotation import (
     dcm_to_quaternion,
@@ -20,7 +20,7 @@ from quad_gym.kernels.vehicle import store4
 from tests.unit.compiled import Compiled
 
 
-@inlined
+@kernel
 def store_rows(array, matrix):
     """Like `store33` for a matrix some of whose entries are plain zeros."""
     store3(array[0], matrix[0])
