@@ -9,12 +9,10 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from quad_gym.envs.configuration import ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
 from quad_gym.envs.single import keys_of
 from quad_gym.envs.spaces import action_space
-from quad_gym.records import RESULTS, Autoreset
-
-_COLUMN = {name: column for column, name in enumerate(RESULTS)}
+from quad_gym.records import Autoreset
 
 
 class QuadVecEnv(VecEnv):
@@ -78,7 +76,7 @@ class QuadVecEnv(VecEnv):
         observations = batch.step(self._pending)
         self._pending = None
         results = batch.results
-        done = (results[:, 1] + results[:, 2]) > 0.0
+        done = (results[:, COLUMN["terminated"]] + results[:, COLUMN["truncated"]]) > 0.0
         infos: list[dict[str, Any]] = [
             {
                 "position_error": position,
@@ -87,29 +85,31 @@ class QuadVecEnv(VecEnv):
             }
             # two lists of numbers are made faster than a list of pairs
             for position, estimation in zip(
-                results[:, 4].tolist(), results[:, 5].tolist(), strict=True
+                results[:, COLUMN["position_error"]].tolist(),
+                results[:, COLUMN["estimation_error"]].tolist(),
+                strict=True,
             )
         ]
         for i in np.flatnonzero(done).tolist():
             infos[i] |= self._episode_end(i, results[i])
-        rewards = results[:, 0].astype(np.float32)
+        rewards = results[:, COLUMN["reward"]].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
 
     def _episode_end(self, i: int, row: np.ndarray) -> dict[str, Any]:
         """What the last `info` of an episode adds."""
         final = self.flights.batch.final_observations[i].copy()
-        steps = int(row[_COLUMN["episode_steps"]])
+        steps = int(row[COLUMN["episode_steps"]])
         return {
             "terminal_observation": self.flights.split(final),
-            "TimeLimit.truncated": bool(row[2] > 0.0),
-            "ending": ENDINGS[int(row[3])],
-            "filter_status": int(row[6]),
-            "gates_passed": int(row[_COLUMN["gates_passed"]]),
+            "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > 0.0),
+            "ending": ENDINGS[int(row[COLUMN["ending"]])],
+            "filter_status": int(row[COLUMN["filter_status"]]),
+            "gates_passed": int(row[COLUMN["gates_passed"]]),
             "episode": {
-                "r": float(row[_COLUMN["episode_return"]]),
+                "r": float(row[COLUMN["episode_return"]]),
                 "l": steps,
                 "t": round(time.monotonic() - self._began, 6),
-                "e": float(row[_COLUMN["episode_error_sum"]]) / steps,
+                "e": float(row[COLUMN["episode_error_sum"]]) / steps,
             },
         }
 

@@ -6,12 +6,10 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 
-from quad_gym.envs.configuration import ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
 from quad_gym.envs.spaces import action_space
-from quad_gym.records import RESULTS, Autoreset
+from quad_gym.records import Autoreset
 from quad_gym.simulation import stream_key
-
-_COLUMN = {name: column for column, name in enumerate(RESULTS)}
 
 
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
@@ -194,19 +192,19 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         batch = self.flights.batch
         observations = batch.step(numbers)
         row = batch.results[0].tolist()
-        terminated, truncated = row[1] > 0.0, row[2] > 0.0
+        terminated, truncated = row[COLUMN["terminated"]] > 0.0, row[COLUMN["truncated"]] > 0.0
         self._over = terminated or truncated
         return (
             self.flights.split(observations[0]),
-            row[0],
+            row[COLUMN["reward"]],
             terminated,
             truncated,
             {
-                "position_error": row[4],
-                "estimation_error": row[5],
-                "ending": ENDINGS[int(row[3])],
-                "filter_status": int(row[6]),
-                "gates_passed": int(row[10]),
+                "position_error": row[COLUMN["position_error"]],
+                "estimation_error": row[COLUMN["estimation_error"]],
+                "ending": ENDINGS[int(row[COLUMN["ending"]])],
+                "filter_status": int(row[COLUMN["filter_status"]]),
+                "gates_passed": int(row[COLUMN["gates_passed"]]),
             },
         )
 

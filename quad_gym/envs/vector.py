@@ -8,10 +8,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from quad_gym.envs.configuration import ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
 from quad_gym.envs.single import keys_of, seeds_of
 from quad_gym.envs.spaces import action_space
-from quad_gym.records import RESULTS, Autoreset
+from quad_gym.records import Autoreset
 
 _MODES = {
     AutoresetMode.NEXT_STEP: Autoreset.NEXT_STEP,
@@ -19,28 +19,6 @@ _MODES = {
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
 _ENDING_NAMES = np.array(ENDINGS, dtype=object)
-(
-    _REWARD,
-    _TERMINATED,
-    _TRUNCATED,
-    _ENDING,
-    _POSITION_ERROR,
-    _ESTIMATION_ERROR,
-    _FILTER_STATUS,
-    _GATES_PASSED,
-) = map(
-    RESULTS.index,
-    (
-        "reward",
-        "terminated",
-        "truncated",
-        "ending",
-        "position_error",
-        "estimation_error",
-        "filter_status",
-        "gates_passed",
-    ),
-)
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
@@ -151,8 +129,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             gymnasium.error.ResetNeeded: Before the first reset, or with autoreset disabled if an
                 episode is over.
         """
-        shape = (self.num_envs, 4)
-        numbers = actions if _in_order(actions, shape) else checked_actions(actions, shape)
+        numbers = checked_actions(actions, (self.num_envs, 4))
         if not self._seeded:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
@@ -165,7 +142,10 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         began = np.flatnonzero(self._over)
         observations = batch.step(numbers)
         results = batch.results
-        terminated, truncated = results[:, _TERMINATED] > 0.0, results[:, _TRUNCATED] > 0.0
+        terminated, truncated = (
+            results[:, COLUMN["terminated"]] > 0.0,
+            results[:, COLUMN["truncated"]] > 0.0,
+        )
         self._over = terminated | truncated
         infos = self._step_infos(results)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
@@ -175,7 +155,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos = self._with_finals(infos)
         return (
             self.flights.split(observations),
-            results[:, _REWARD].copy(),
+            results[:, COLUMN["reward"]].copy(),
             terminated,
             truncated,
             infos,
@@ -187,15 +167,15 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
         """What the judge says of the step."""
         infos: dict[str, Any] = {
-            "position_error": results[:, _POSITION_ERROR].copy(),
-            "estimation_error": results[:, _ESTIMATION_ERROR].copy(),
+            "position_error": results[:, COLUMN["position_error"]].copy(),
+            "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
             "ending": self._no_ending.copy(),
-            "filter_status": results[:, _FILTER_STATUS].astype(np.int64),
-            "gates_passed": results[:, _GATES_PASSED].astype(np.int64),
+            "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
+            "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
         }
         ended = np.flatnonzero(self._over)
         if ended.size:  # seldom: looking up a name for every flight would cost more than the rest
-            infos["ending"][ended] = _ENDING_NAMES[results[ended, _ENDING].astype(np.intp)]
+            infos["ending"][ended] = _ENDING_NAMES[results[ended, COLUMN["ending"]].astype(np.intp)]
         return infos
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
@@ -243,16 +223,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         if not mask.any():
             raise ValueError("options['reset_mask'] must choose at least one environment")
         return mask
-
-
-def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
-    """Whether actions need neither a check nor clipping; NaN and infinity are not within bounds."""
-    return (
-        isinstance(actions, np.ndarray)
-        and actions.dtype.kind == "f"
-        and actions.shape == shape
-        and bool(np.abs(actions).max() <= 1.0)
-    )
 
 
 def _blank(values: NDArray[Any]) -> Any:
