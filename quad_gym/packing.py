@@ -116,6 +116,7 @@ def settings_record(
     s = record[0]
     s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
     s["gnss_ticks"] = clocks.ticks_between("gnss")
+    s["imu_averages"] = sensors.imu.samples == "average"
     if sensors.camera is not None:
         s["camera_ticks"] = clocks.ticks_between("camera")
         s["feature_count"] = len(sensors.camera.features_I)

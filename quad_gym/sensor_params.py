@@ -27,6 +27,12 @@ class ImuParams(Checked):
     """[Hz]; one sample is one tick of the simulation; report section 4"""
     lever_arm_B: Vector = (0.0, 0.0, 0.0)
     """(3,) position of the accelerometer in B [m]; report section 2.3"""
+    samples: str = "instant"
+    """what the filter predicts a tick with: "instant", a sample of the motion at its start
+    (report); or "average", the mean over it, as real IMUs deliver delta angles and delta
+    velocities, corrected for coning and sculling. The inner loops read the gyro at the present
+    instant either way, with the noise of the last sample: a mean lags by half a tick, which a
+    tight rate loop does not bear."""
     accel_noise_density: float = 9.8e-3 * 0.1
     """[m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
     gyro_noise_density: float = math.radians(0.05)
@@ -45,6 +51,7 @@ class ImuParams(Checked):
         self._check(check.positive, "accel_noise_density", "gyro_noise_density")
         self._check(check.positive, "accel_bias_sigma", "gyro_bias_sigma")
         self._check(check.vector, "lever_arm_B", length=3)
+        self._check(check.choice, "samples", choices=("instant", "average"))
 
     @property
     def dt(self) -> float:

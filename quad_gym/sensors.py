@@ -1,5 +1,7 @@
 """Sensors of one vehicle: each turns a true state into one measurement."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -117,6 +119,7 @@ class Imu(_Sensor):
     ) -> None:
         gnss = GnssParams(rate=params.rate)
         super().__init__(SensorSuite(imu=params, gnss=gnss, camera=None), rng, vehicle)
+        self._averages, self._start = params.samples == "average", np.zeros(1, FLIGHT)
         self._flight["b_a"] = rng.normal(0.0, params.accel_bias_sigma, 3)
         self._flight["b_g"] = rng.normal(0.0, params.gyro_bias_sigma, 3)
 
@@ -131,27 +134,50 @@ class Imu(_Sensor):
         return self._flight["b_g"][0].copy()
 
     def measure(
-        self, state: State, disturbance_I: ArrayLike = (0.0, 0.0, 0.0)
+        self,
+        state: State,
+        disturbance_I: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        since: State | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """One sample; the biases drift by one tick after it.
 
         Args:
-            state: The true state, see `quad_gym.vehicle.STATE_SHAPES`.
-            disturbance_I: (3,) external force in I [N].
+            state: The true state now, see `quad_gym.vehicle.STATE_SHAPES`.
+            disturbance_I: (3,) external force in I [N]; where samples are averages, it is in the
+                change of the state already.
+            since: The true state one tick ago; needed where samples are averages, and only there.
 
         Returns:
             (3,) angular rate in B [rad/s] and (3,) specific force in B [m/s^2].
 
         Raises:
-            ValueError: If the state is incomplete, has other shapes or is not finite.
+            ValueError: If a state is missing, incomplete, has other shapes or is not finite.
         """
         s = checked_state(state)
         force = check.array("disturbance_I", disturbance_I, (3,))
+        if self._averages is (since is None):
+            raise ValueError(
+                "since must be the state one tick ago if ImuParams.samples is 'average', and only "
+                "then"
+            )
+        if since is not None:
+            self._set(self._start, checked_state(since, "since"))
         self._place(s["position"], s["R_BI"])
         f = self._flight
-        f["v"], f["w"], f["rotor_speeds"] = s["velocity"], s["body_rates"], s["rotor_speeds"]
+        self._set(f, s)
         f["disturbance"] = force
-        single.sense_imu(f, self._params)
+        if self._averages:
+            single.sense_imu_average(f, self._params, self._start)
+        else:
+            single.sense_imu(f, self._params)
         gyro, accel = f["gyro"][0].copy(), f["accel"][0].copy()
         single.step_biases(f, self._params)
         return gyro, accel
+
+    @staticmethod
+    def _set(flight: NDArray[Any], state: dict[str, NDArray[np.float64]]) -> None:
+        """Write a checked state into a record."""
+        flight["r"], flight["q"] = state["position"], dcm_to_quaternion(state["R_BI"])
+        flight["v"], flight["w"] = state["velocity"], state["body_rates"]
+        flight["rotor_speeds"] = state["rotor_speeds"]

@@ -127,6 +127,11 @@ class FlightBatch:
         true_sensors = self.sensors if true_sensors is None else true_sensors
         if true_sensors.imu.rate != self.sensors.imu.rate:
             raise ValueError("true_sensors must have the IMU rate of sensors, as it is the tick")
+        if true_sensors.imu.samples != self.sensors.imu.samples:
+            raise ValueError(
+                "true_sensors must have the IMU samples of sensors, as they order the tick: "
+                f"{true_sensors.imu.samples!r} is not {self.sensors.imu.samples!r}"
+            )
         if run_filter is None:
             run_filter = include_covariance or self.source in (Source.ESTIMATE, Source.SENSORS)
 

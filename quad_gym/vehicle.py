@@ -22,17 +22,17 @@ STATE_SHAPES: dict[str, tuple[int, ...]] = {
 """Keys and shapes of a state: [m] in I, [m/s] in I, attitude, [rad/s] in B, [rad/s]."""
 
 
-def checked_state(state: State) -> dict[str, NDArray[np.float64]]:
-    """A copy of a state as float64 arrays.
+def checked_state(state: State, name: str = "state") -> dict[str, NDArray[np.float64]]:
+    """A copy of a state as float64 arrays; `name` is what messages call it.
 
     Raises:
         ValueError: If a key is missing or unknown, or a value has another shape or is not finite.
     """
     if set(state) != set(STATE_SHAPES):
-        raise ValueError(f"state must have the keys {sorted(STATE_SHAPES)}, got {sorted(state)}")
+        raise ValueError(f"{name} must have the keys {sorted(STATE_SHAPES)}, got {sorted(state)}")
     return {
-        name: check.array(f"state[{name!r}]", state[name], shape)
-        for name, shape in STATE_SHAPES.items()
+        key: check.array(f"{name}[{key!r}]", state[key], shape)
+        for key, shape in STATE_SHAPES.items()
     }
 
 

@@ -1,7 +1,8 @@
 """One flight: a tick, and an episode's first instant.
 
-A tick is one IMU sample: control with what is seen, predict with the sample of its start, let the
-true state and the biases evolve, then measure and update at its end.
+A tick is one IMU sample: control with what is seen, let the true state evolve, predict with the
+tick's sample - the one taken at its start or, where samples are averages, the one over it - let the
+biases evolve, then measure and update at its end.
 """
 
 import numpy as np
@@ -28,13 +29,14 @@ from quad_gym.kernels.sensors import (
     measure_features,
     measure_gnss,
     measure_imu,
+    measure_imu_average,
     six_normals,
     stream_of,
 )
 from quad_gym.kernels.task import draw_reference, draw_start
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
-from quad_gym.kernels.vehicle import integrate, load4
+from quad_gym.kernels.vehicle import integrate, load4, load_state
 from quad_gym.records import Control, Source
 
 _ONE = np.uint64(1)
@@ -47,7 +49,7 @@ def _look(flight, model, settings, mask):
     r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
     if settings.source == Source.ESTIMATE or settings.source == Source.SENSORS:
         r, v, R_BI = load3(flight.r_hat), load3(flight.v_hat), load33(flight.R_hat)
-        w_B = load3(flight.gyro)
+        w_B = load3(flight.w_meas)
         if settings.source == Source.ESTIMATE:
             w_B = sub(w_B, load3(flight.b_g_hat))
     elif settings.source == Source.NOISY:
@@ -79,7 +81,8 @@ def sense(flight, world, model, settings, work, mask, starting):
         starting: Whether this is the first instant of their episode.
     """
     if settings.run_filter:
-        measure_imu(flight, world, mask)
+        if starting or not settings.imu_averages:  # at its start an average has nothing behind it
+            measure_imu(flight, world, mask)
         period = 1.0 * settings.gnss_ticks
         due = mask & (flight.gnss_wait <= 0.0)
         if any_of(due):
@@ -120,12 +123,16 @@ def tick(flight, world, model, settings, work):
         reference = evaluate_reference(flight, flight.tick * model.dt)
     act(flight, model, settings.control, reference)
     flight.instant = flight.instant + _ONE
+    everyone = flight.tick >= 0.0
+    start = load_state(flight)
+    integrate(flight, world, settings.substeps)
     if settings.run_filter:
+        if settings.imu_averages:
+            measure_imu_average(flight, world, start, everyone)
         predict(flight, model, work)
         drift_biases(flight, world)
-    integrate(flight, world, settings.substeps)
     flight.tick = flight.tick + 1.0
-    sense(flight, world, model, settings, work, flight.tick >= 0.0, False)
+    sense(flight, world, model, settings, work, everyone, False)
 
 
 @kernel

@@ -6,7 +6,7 @@ Quaternions are Hamilton's, (w, x, y, z), and turn body components into inertial
 import math
 
 from quad_gym.kernels.compilation import kernel
-from quad_gym.kernels.elementary import sin_cos, sin_cos_minus_one
+from quad_gym.kernels.elementary import atan2, sin_cos, sin_cos_minus_one
 from quad_gym.kernels.lanes import select
 
 
@@ -107,6 +107,28 @@ def normalize_quaternion(q):
     """Q / |q|."""
     inverse = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (inverse * q[0], inverse * q[1], inverse * q[2], inverse * q[3])
+
+
+@kernel
+def mean_quaternion(a, b):
+    """The attitude halfway from a to b, two unit quaternions less than half a turn apart."""
+    return normalize_quaternion((a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]))
+
+
+@kernel
+def rotation_between(a, b):
+    """The rotation vector [rad] in B of the turn from attitude a to attitude b, quaternions.
+
+    It is phi with b = a (cos |phi|/2, sin |phi|/2 phi/|phi|), less than half a turn.
+    """
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    x = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
+    y = a[0] * b[2] - a[2] * b[0] - a[3] * b[1] + a[1] * b[3]
+    z = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1]
+    sine = math.sqrt(x * x + y * y + z * z)
+    turned = sine > 1e-100
+    per_sine = select(turned, atan2(sine, w) / select(turned, sine, 1.0), 1.0)
+    return (2.0 * per_sine * x, 2.0 * per_sine * y, 2.0 * per_sine * z)
 
 
 @kernel

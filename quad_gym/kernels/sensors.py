@@ -22,8 +22,13 @@ from quad_gym.kernels.linalg import (
     sub,
 )
 from quad_gym.kernels.random import normal_pair
-from quad_gym.kernels.rotation import quaternion_to_dcm
-from quad_gym.kernels.vehicle import accelerations, imu_point_acceleration, load4
+from quad_gym.kernels.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
+from quad_gym.kernels.vehicle import (
+    accelerations,
+    body_point_velocity,
+    imu_point_acceleration,
+    load4,
+)
 
 # numbers of the draws (of two normals each) within an instant
 DRAW_BIAS, DRAW_IMU, DRAW_GNSS, DRAW_NOISY, DRAW_FEATURE, DRAW_RESET = 0, 3, 6, 9, 16, 64
@@ -65,14 +70,50 @@ def specific_force(flight, p, R_BI):
 
 
 @kernel
-def measure_imu(flight, p, mask):
-    """Sample accelerometer and gyro, where `mask`."""
-    R_BI = quaternion_to_dcm(load4(flight.q))
+def _sample_imu(flight, p, w_B, f_B, mask):
+    """Add biases and white noise to the filter's body rates and specific force, where `mask`.
+
+    Inner loops read the gyro at the present instant, with the same bias and noise.
+    """
     n_a, n_g = six_normals(stream_of(flight), DRAW_IMU)
-    f_B = add(specific_force(flight, p, R_BI), load3(flight.b_a))
-    w_B = add(load3(flight.w), load3(flight.b_g))
+    noise_g, b_g = scale(p.gyro_sigma, n_g), load3(flight.b_g)
+    f_B = add(f_B, load3(flight.b_a))
     keep3(flight.accel, mask, add(f_B, scale(p.accel_sigma, n_a)))
-    keep3(flight.gyro, mask, add(w_B, scale(p.gyro_sigma, n_g)))
+    keep3(flight.gyro, mask, add(add(w_B, b_g), noise_g))
+    keep3(flight.w_meas, mask, add(add(load3(flight.w), b_g), noise_g))
+
+
+@kernel
+def measure_imu(flight, p, mask):
+    """Sample accelerometer and gyro at this instant, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    _sample_imu(flight, p, load3(flight.w), specific_force(flight, p, R_BI), mask)
+
+
+@kernel
+def measure_imu_average(flight, p, start, mask):
+    """Sample the means of body rates and specific force over the tick that ends now, where `mask`.
+
+    As an IMU that integrates faster than it reports: the mean rate is that of the turn from the
+    body frame at the start to that at the end (coning corrected), and the mean specific force is
+    R_mid (dv_I + g dt e3) / dt with the change of the accelerometer's velocity and the attitude
+    halfway (sculling corrected; P. G. Savage, J. Guidance, Control, and Dynamics 21, 1998). Density
+    over sqrt(dt) is the standard deviation of white noise in a mean over dt.
+
+    Args:
+        flight: Record, with the true state at the tick's end and the biases of its start.
+        p: Parameters as they are.
+        start: The true state at the tick's start, as of `load_state`.
+        mask: Which lanes.
+    """
+    _, v_start, q_start, w_start, _ = start
+    q_end, rate, lever = load4(flight.q), 1.0 / p.dt, load3(p.imu_lever_arm)
+    v_before = body_point_velocity(quaternion_to_dcm(q_start), v_start, w_start, lever)
+    v_after = body_point_velocity(quaternion_to_dcm(q_end), load3(flight.v), load3(flight.w), lever)
+    a_I = scale(rate, sub(v_after, v_before))
+    R_mid = quaternion_to_dcm(mean_quaternion(q_start, q_end))
+    f_B = apply(R_mid, (a_I[0], a_I[1], a_I[2] + p.gravity))
+    _sample_imu(flight, p, scale(rate, rotation_between(q_start, q_end)), f_B, mask)
 
 
 @kernel

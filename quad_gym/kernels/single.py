@@ -3,10 +3,16 @@
 from quad_gym.kernels.compilation import entry
 from quad_gym.kernels.linalg import add_outer, load3, load33, scale, scale33, store3, store33
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
-from quad_gym.kernels.sensors import drift_biases, measure_features, measure_gnss, measure_imu
+from quad_gym.kernels.sensors import (
+    drift_biases,
+    measure_features,
+    measure_gnss,
+    measure_imu,
+    measure_imu_average,
+)
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
-from quad_gym.kernels.vehicle import accelerations, integrate, load4, store4
+from quad_gym.kernels.vehicle import accelerations, integrate, load4, load_state, store4
 from quad_gym.kernels.wahba import wahba
 
 
@@ -32,6 +38,12 @@ def ukf_predict(flights, params, work):
 def sense_imu(flights, params):
     """Sample the IMU of flights[0]."""
     measure_imu(flights[0], params[0], True)
+
+
+@entry
+def sense_imu_average(flights, params, starts):
+    """Sample the averaging IMU of flights[0] over a tick from the true state of starts[0]."""
+    measure_imu_average(flights[0], params[0], load_state(starts[0]), True)
 
 
 @entry

@@ -153,6 +153,12 @@ def integrate(flight, p, substeps):
 
 
 @kernel
+def body_point_velocity(R_BI, v_I, w_B, l_B):
+    """Velocity of a body-fixed point in I: v_I + R^T (w x l)."""
+    return add(v_I, apply_transposed(R_BI, cross(w_B, l_B)))
+
+
+@kernel
 def imu_point_acceleration(R_BI, a_I, w_B, dw_B, l_B):
     """Acceleration of a body-fixed point in I: a_I + R^T (dw x l + w x (w x l)); report 2.3."""
     return add(a_I, apply_transposed(R_BI, add(cross(dw_B, l_B), cross(w_B, cross(w_B, l_B)))))

@@ -20,6 +20,9 @@ STEPS = 60
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 """Episodes end by the time limit and by tipping over, at different steps in different flights."""
 
+LAB = quad_gym.sensor_suite("lab")
+AVERAGES = LAB.replace(imu=LAB.imu.replace(samples="average"))
+
 
 def fly_single(task, flight, *, wait, **keywords):
     """What flight `flight` goes through: observations, rewards, terminated, truncated.
@@ -74,8 +77,9 @@ def test_a_flight_in_a_batch_is_the_flight_alone(task, mode):
         {"observation": "truth", "action": "velocity", "randomize": True},
         {"include_covariance": True, "layout": "absolute", "action": "wrench"},
         {"camera": False, "control_rate": 100},
+        {"sensors": AVERAGES, "gnss_rate": 20},
     ],
-    ids=lambda keywords: "+".join(map(str, keywords.values())),
+    ids=lambda keywords: "+".join(map(str, keywords)),
 )
 def test_whatever_is_observed_and_commanded(keywords):
     together = fly_vector("circle", range(3), mode="SameStep", **keywords)

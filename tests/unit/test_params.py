@@ -56,6 +56,7 @@ BAD_VALUES = {
     ("VehicleParams", "rotor_spins"): [*NO_VECTORS[:5], (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, 0.5)],
     ("ImuParams", "rate"): NOT_POSITIVE,
     ("ImuParams", "lever_arm_B"): NO_VECTORS,
+    ("ImuParams", "samples"): ["mean", None, 1],
     ("ImuParams", "accel_noise_density"): NOT_POSITIVE,
     ("ImuParams", "gyro_noise_density"): NOT_POSITIVE,
     ("ImuParams", "accel_bias_sigma"): NOT_POSITIVE,

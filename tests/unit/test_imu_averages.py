@@ -1,0 +1,236 @@
+"""Averaged IMU samples: the means of the simulated motion over a tick, against fine integration."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym.kernels.single import integrate_flight
+from quad_gym.packing import params_record
+from quad_gym.records import FLIGHT, Source
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+from quad_gym.sensors import Imu
+from quad_gym.simulation import FlightBatch
+from quad_gym.vehicle import state_derivative
+from tests.unit.alarms import assert_normal
+from tests.unit.test_imu import QUIET, random_state
+
+LAB = quad_gym.sensor_suite("lab")
+AVERAGE = LAB.replace(imu=LAB.imu.replace(samples="average"))
+# hardly any drag: it has a kink where the flow through the rotors turns, which quadrature feels
+VEHICLE = quad_gym.VehicleParams(disc_area=1e-9)
+LEVER = (0.05, -0.03, 0.02)
+SHAPES = {
+    "position": 3,
+    "velocity": 3,
+    "R_BI": (3, 3),
+    "body_rates": 3,
+    "rotor_speeds": 4,
+}
+
+
+def packed(state):
+    return np.concatenate([np.ravel(state[name]) for name in SHAPES])
+
+
+def unpacked(x):
+    cuts = np.split(x, np.cumsum([np.prod(shape) for shape in SHAPES.values()])[:-1])
+    return {
+        name: part.reshape(shape) for part, (name, shape) in zip(cuts, SHAPES.items(), strict=True)
+    }
+
+
+def fly_finely(state, voltages, force, dt):
+    """The state at the ends and at Gauss points of a tick, with their weights, by SciPy."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    instants = np.append(0.5 * dt * (nodes + 1.0), dt)
+    solution = solve_ivp(
+        lambda t, x: packed(state_derivative(unpacked(x), voltages, force, VEHICLE)),
+        (0.0, dt),
+        packed(state),
+        method="DOP853",
+        t_eval=instants,
+        rtol=1e-11,
+        atol=1e-12,
+    )
+    states = [unpacked(x) for x in solution.y.T]
+    return states[:-1], weights / 2.0, states[-1]
+
+
+def orthonormal(R):
+    u, _, v = np.linalg.svd(R)
+    return u @ v
+
+
+def average_sample(start, end, lever, dt):
+    params = QUIET.replace(samples="average", lever_arm_B=lever, rate=1.0 / dt)
+    end = end | {"R_BI": orthonormal(end["R_BI"])}
+    return Imu(params, np.random.default_rng(1), VEHICLE).measure(end, since=start)
+
+
+def instant_force(state, force, lever):
+    state = state | {"R_BI": orthonormal(state["R_BI"])}
+    imu = Imu(QUIET.replace(lever_arm_B=lever), np.random.default_rng(1), VEHICLE)
+    return imu.measure(state, force)[1]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_sample_is_the_mean_of_what_is_felt_over_the_tick(seed):
+    """Seen from the attitude halfway; SciPy integrates, the IMU's instants give what is felt."""
+    start, rng, dt = random_state(seed), np.random.default_rng(seed), 0.005
+    voltages, force = rng.uniform(3.0, 9.0, 4), rng.normal(size=3)
+    states, weights, end = fly_finely(start, voltages, force, dt)
+    gyro, accel = average_sample(start, end, LEVER, dt)
+
+    turn = Rotation.from_matrix(orthonormal(end["R_BI"]) @ start["R_BI"].T)
+    np.testing.assert_allclose(gyro * dt, -turn.as_rotvec(), rtol=0.0, atol=1e-11)
+    half = Rotation.from_rotvec(turn.as_rotvec() / 2.0).as_matrix() @ start["R_BI"]
+    mean = sum(
+        w * (half @ s["R_BI"].T @ instant_force(s, force, LEVER))
+        for w, s in zip(weights, states, strict=True)
+    )
+    np.testing.assert_allclose(accel, mean, rtol=0.0, atol=1e-7)
+
+
+def test_coning_and_sculling_are_what_tells_it_from_the_plain_mean():
+    """They fall with the square of the tick."""
+    gaps = {}
+    for dt in (0.004, 0.001):
+        total = np.zeros(2)
+        for seed in range(10):
+            start, rng = random_state(seed), np.random.default_rng(seed)
+            states, weights, end = fly_finely(start, rng.uniform(3.0, 9.0, 4), np.zeros(3), dt)
+            gyro, accel = average_sample(start, end, LEVER, dt)
+            felt = [instant_force(s, np.zeros(3), LEVER) for s in states]
+            rates = [s["body_rates"] for s in states]
+            total += [abs(gyro - weights @ rates).max(), abs(accel - weights @ felt).max()]
+        gaps[dt] = total
+    assert (gaps[0.001] > 1e-6).all()
+    assert (gaps[0.001] < gaps[0.004] / 14.0).all()
+
+
+def test_noise_and_bias_of_a_sample_are_those_of_an_instant():
+    params = LAB.imu.replace(samples="average")
+    hover = random_state(1) | {"body_rates": np.zeros(3), "velocity": np.zeros(3)}
+    imu = Imu(params, np.random.default_rng(2))
+    rows = [(imu.gyro_bias, imu.accel_bias, *imu.measure(hover, since=hover)) for _ in range(9000)]
+    gyro_bias, accel_bias, gyro, accel = (np.array(column) for column in zip(*rows, strict=True))
+    up_B = hover["R_BI"] @ [0.0, 0.0, 9.8]
+    noise = np.concatenate([gyro - gyro_bias, accel - up_B - accel_bias], axis=1)
+    gyro_variance = (np.pi / 180.0 * 0.05) ** 2 * 200.0
+    accel_variance = (9.8e-3 * 0.1) ** 2 * 200.0
+    assert_normal(noise, np.zeros(6), np.diag([gyro_variance] * 3 + [accel_variance] * 3))
+
+
+def test_a_batch_samples_the_tick_that_it_flew():
+    """Its samples are those of the friendly class between its states, noise and bias apart."""
+    quiet = AVERAGE.replace(imu=QUIET.replace(samples="average", lever_arm_B=LEVER))
+    batch = FlightBatch(8, sensors=quiet, source=Source.TRUTH, run_filter=True)
+    batch.reset(seeds=range(8))
+    imu = Imu(quiet.imu, np.random.default_rng(1))
+    for _ in range(40):
+        before = [state_of(batch, lane) for lane in range(8)]
+        batch.step()
+        for lane in range(8):
+            gyro, accel = imu.measure(state_of(batch, lane), since=before[lane])
+            np.testing.assert_allclose(batch.read("gyro")[lane], gyro, rtol=0.0, atol=1e-10)
+            np.testing.assert_allclose(batch.read("accel")[lane], accel, rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(batch.read("w_meas"), batch.read("w"), rtol=0.0, atol=1e-12)
+
+
+def state_of(batch, lane):
+    return {
+        "position": batch.read("r")[lane],
+        "velocity": batch.read("v")[lane],
+        "R_BI": quaternion_to_dcm(batch.read("q")[lane]),
+        "body_rates": batch.read("w")[lane],
+        "rotor_speeds": batch.read("rotor_speeds")[lane],
+    }
+
+
+def test_inner_loops_read_the_gyro_now_and_the_filter_the_mean():
+    batch = FlightBatch(8, sensors=AVERAGE)
+    batch.reset(seeds=range(8))
+    for _ in range(50):
+        start = batch.read("w")
+        batch.step()
+        bias = batch.read("b_g")
+        noise = batch.read("w_meas") - batch.read("w") - bias
+        np.testing.assert_allclose(
+            batch.read("w_seen"), batch.read("w_meas") - batch.read("b_g_hat"), rtol=0.0, atol=0.0
+        )
+        # the same noise in both; the mean rate is near the middle of the tick's ends
+        middle = 0.5 * (start + batch.read("w"))
+        spread = abs(batch.read("w") - start).max()
+        assert abs(batch.read("gyro") - bias - noise - middle).max() < 0.3 * spread + 1e-6
+
+
+def test_the_estimate_follows_without_a_bias_of_half_a_tick():
+    """Where the rotors speed up, averages know the mean thrust, and instants lag behind it."""
+    lags = {}
+    for suite in (LAB, AVERAGE):
+        suite = suite.replace(camera=None).scaled_noise(0.01)
+        batch = FlightBatch(200, sensors=suite, source=Source.TRUTH, run_filter=True)
+        batch.reset(seeds=range(200))
+        worst = 0.0
+        for _ in range(100):
+            batch.step()
+            worst = max(worst, abs((batch.read("v_hat") - batch.read("v"))[:, 2].mean()))
+        lags[suite.imu.samples] = worst
+    assert lags["average"] < 0.5 * lags["instant"]
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-3, 1.0, 3.1])
+def test_the_turn_of_a_tick_may_be_small_or_large(turn):
+    rng = np.random.default_rng(4)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    start = random_state(3) | {"velocity": np.zeros(3)}
+    end = start | {"R_BI": Rotation.from_rotvec(-turn * axis).as_matrix() @ start["R_BI"]}
+    gyro, _ = average_sample(start, end, (0.0, 0.0, 0.0), 0.005)
+    np.testing.assert_allclose(gyro * 0.005, turn * axis, rtol=0.0, atol=1e-13)
+
+
+def test_the_integrator_of_the_batch_is_the_one_that_is_sampled():
+    """A whole tick of the package's own integrator gives the same sample as SciPy's."""
+    start, dt = random_state(8), 0.005
+    voltages = np.full(4, 6.0)
+    flight, params = np.zeros(1, FLIGHT), params_record(VEHICLE, LAB)
+    flight["r"], flight["v"], flight["w"] = (
+        start["position"],
+        start["velocity"],
+        start["body_rates"],
+    )
+    flight["q"], flight["rotor_speeds"] = dcm_to_quaternion(start["R_BI"]), start["rotor_speeds"]
+    flight["voltages"] = voltages
+    integrate_flight(flight, params, 1)
+    ours = {
+        "position": flight["r"][0],
+        "velocity": flight["v"][0],
+        "R_BI": quaternion_to_dcm(flight["q"][0]),
+        "body_rates": flight["w"][0],
+        "rotor_speeds": flight["rotor_speeds"][0],
+    }
+    _, _, end = fly_finely(start, voltages, np.zeros(3), dt)
+    for one, other in zip(
+        average_sample(start, ours, LEVER, dt), average_sample(start, end, LEVER, dt), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-4)
+
+
+def test_samples_must_be_understood_the_same_by_all():
+    with pytest.raises(ValueError, match=r"^ImuParams.samples must be one of instant, average"):
+        LAB.imu.replace(samples="mean")
+    with pytest.raises(ValueError, match=r"^true_sensors must have the IMU samples of sensors"):
+        FlightBatch(1, sensors=LAB, true_sensors=AVERAGE)
+    state = random_state(1)
+    with pytest.raises(ValueError, match=r"^since must be the state one tick ago"):
+        Imu(AVERAGE.imu, np.random.default_rng(1)).measure(state)
+    with pytest.raises(ValueError, match=r"^since must be the state one tick ago"):
+        Imu(LAB.imu, np.random.default_rng(1)).measure(state, since=state)
+    bad = state | {"velocity": np.zeros(2)}
+    with pytest.raises(ValueError, match=r"^since\['velocity'\] must"):
+        Imu(AVERAGE.imu, np.random.default_rng(1)).measure(state, since=bad)
