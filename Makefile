@@ -14,7 +14,7 @@ $(VENV)/.user: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.developer: $(VENV)/.user
-	$(INSTALL) ".[train,plot,dev]"
+	$(INSTALL) ".[train,plot,render,pandas,dev]"
 	touch $@
 
 demo: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle

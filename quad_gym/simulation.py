@@ -134,6 +134,7 @@ class FlightBatch:
             )
         if run_filter is None:
             run_filter = include_covariance or self.source in (Source.ESTIMATE, Source.SENSORS)
+        self.run_filter = run_filter
 
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         world = params_record(true_vehicle, true_sensors, self.gains, self.actions)

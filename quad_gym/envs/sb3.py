@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.single import keys_of
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
@@ -26,23 +27,37 @@ class QuadVecEnv(VecEnv):
         num_envs: Number of flights.
         task: The kind of task.
         threads: Threads to use; None: as many as there are cores.
-        keywords: Those of `QuadEnv`.
+        render_flights: Numbers of the flights that are rendered; None: all of them.
+        keywords: Those of `QuadEnv`; `render_mode` may be "human" or "rgb_array".
 
     Raises:
         ValueError: If a keyword is unknown or makes no sense.
     """
 
     def __init__(
-        self, num_envs: int, task: str, *, threads: int | None = None, **keywords: Any
+        self,
+        num_envs: int,
+        task: str,
+        *,
+        threads: int | None = None,
+        render_mode: str | None = None,
+        **keywords: Any,
     ) -> None:
+        if render_mode not in (None, "human", "rgb_array"):
+            raise ValueError(f"render_mode must be human or rgb_array, got {render_mode!r}")
+        look = rendering_options(keywords)
         self.flights = Flights(task, num_envs, Autoreset.SAME_STEP, threads=threads, **keywords)
-        self.render_mode = None
-        self.metadata: dict[str, Any] = {"render_modes": []}
+        self.render_mode = render_mode
+        self.rendering = rendering_of(self.flights, render_mode, **look)
         self.spec: Any = None
         self._began = time.monotonic()
         self._seeded = False
         self._pending: np.ndarray | None = None
         super().__init__(num_envs, self.flights.space, action_space())
+        self.metadata: dict[str, Any] = {
+            "render_modes": ["human", "rgb_array"],
+            "render_fps": round(self.flights.control_rate),
+        }
 
     def reset(self) -> Any:
         """Begin an episode in every flight, with the seeds and options set before."""
@@ -57,6 +72,8 @@ class QuadVecEnv(VecEnv):
             self._seeded = True
         else:
             observations = batch.reset(**start)
+        if self.rendering is not None:
+            self.rendering.observe(reset=True)
         self.reset_infos = self._infos_of_start()
         self._reset_seeds()
         self._reset_options()
@@ -75,6 +92,8 @@ class QuadVecEnv(VecEnv):
         batch = self.flights.batch
         observations = batch.step(self._pending)
         self._pending = None
+        if self.rendering is not None:
+            self.rendering.observe()
         results = batch.results
         done = (results[:, COLUMN["terminated"]] + results[:, COLUMN["truncated"]]) > 0.0
         infos: list[dict[str, Any]] = [
@@ -120,7 +139,13 @@ class QuadVecEnv(VecEnv):
         return super().seed(seed)
 
     def close(self) -> None:
-        """Nothing is held open; closing twice is fine."""
+        """Close the window, if there is one; closing twice is fine."""
+        if self.rendering is not None:
+            self.rendering.close()
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """With "rgb_array" a picture of all tiles; with "human" a window shows them by itself."""
+        return None if self.render_mode == "human" else super().render(mode)
 
     # ---- the rest of the interface ------------------------------------------------------------
 
@@ -164,8 +189,10 @@ class QuadVecEnv(VecEnv):
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """No flight renders."""
-        return [None for _ in range(self.num_envs)]
+        """A frame of each flight that is rendered."""
+        if self.rendering is None:
+            return [None for _ in range(self.num_envs)]
+        return list(self.rendering.frames())
 
     def _start_values(self) -> dict[str, Any]:
         """The options of all flights as start values."""

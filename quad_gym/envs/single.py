@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
 from quad_gym.simulation import stream_key
@@ -118,6 +119,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
             max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
             `quad_gym.TaskParams`.
+        render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
+        render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.
+        render_size: Width and height of a frame [pixels].
 
     Raises:
         ValueError: If a keyword is unknown or its value makes no sense.
@@ -126,13 +130,16 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     - v0: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's attribute
+    metadata: dict[str, Any] = RENDERING_METADATA
 
-    def __init__(self, task: str = "circle", **keywords: Any) -> None:
-        self.render_mode = keywords.pop("render_mode", None)
-        if self.render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {self.render_mode!r}")
+    def __init__(
+        self, task: str = "circle", *, render_mode: str | None = None, **keywords: Any
+    ) -> None:
+        look = rendering_options(keywords)
         self.flights = Flights(task, 1, Autoreset.DISABLED, threads=1, **keywords)
+        self.render_mode = render_mode
+        self.rendering = rendering_of(self.flights, render_mode, **look)
+        self.metadata = self.metadata | {"render_fps": round(self.flights.control_rate)}
         self.observation_space = self.flights.space
         self.action_space = action_space()
         self._seeded = self._over = False
@@ -162,6 +169,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         else:
             observations = batch.reset(**start)
         self._over = False
+        if self.rendering is not None:
+            self.rendering.observe(reset=True)
         return self.flights.split(observations[0]), {
             "position_error": float(batch.read("position_error")[0]),
             "estimation_error": float(batch.read("estimation_error")[0]),
@@ -194,6 +203,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         row = batch.results[0].tolist()
         terminated, truncated = row[COLUMN["terminated"]] > 0.0, row[COLUMN["truncated"]] > 0.0
         self._over = terminated or truncated
+        if self.rendering is not None:
+            self.rendering.observe()
         return (
             self.flights.split(observations[0]),
             row[COLUMN["reward"]],
@@ -208,8 +219,32 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             },
         )
 
+    def render(self) -> Any:
+        """What `render_mode` asks for.
+
+        Returns:
+            "rgb_array": the present instant as a frame (height, width, 3) of uint8;
+            "rgb_array_list": a list with a frame of every instant since the last call or reset;
+            "human", where a window shows every step by itself, and None: None.
+
+        Raises:
+            gymnasium.error.ResetNeeded: Before the first reset.
+        """
+        if self.rendering is None:
+            gymnasium.logger.warn(
+                "render() needs a render_mode: make(..., render_mode='rgb_array')"
+            )
+            return None
+        if not self._seeded:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        if self.render_mode == "rgb_array_list":
+            return [frame for (frame,) in self.rendering.taken_frames()]
+        return self.rendering.frames()[0] if self.render_mode == "rgb_array" else None
+
     def close(self) -> None:
-        """Nothing is held open; closing twice is fine."""
+        """Close the window, if there is one; closing twice is fine."""
+        if self.rendering is not None:
+            self.rendering.close()
 
 
 def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:

@@ -9,6 +9,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import keys_of, seeds_of
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
@@ -32,6 +33,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         task: The kind of task; `gymnasium.make_vec` fills it in from the id.
         autoreset_mode: "NextStep" (default), "SameStep" or "Disabled", or the enum.
         threads: Threads to use; None: as many as there are cores.
+        render_flights: Numbers of the flights that are rendered; None: all of them.
         keywords: Those of `QuadEnv`.
 
     Raises:
@@ -45,16 +47,20 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
+        render_mode: str | None = None,
         **keywords: Any,
     ) -> None:
-        self.render_mode = keywords.pop("render_mode", None)
-        if self.render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {self.render_mode!r}")
+        look = rendering_options(keywords)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         mode = _MODES[self.autoreset_mode]
         self.flights = Flights(task, num_envs, mode, threads=threads, **keywords)
         self.num_envs = self.flights.batch.count
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.render_mode = render_mode
+        self.rendering = rendering_of(self.flights, render_mode, **look)
+        self.metadata = RENDERING_METADATA | {
+            "render_fps": round(self.flights.control_rate),
+            "autoreset_mode": self.autoreset_mode,
+        }
         self.single_observation_space = self.flights.space
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -103,6 +109,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             if goes_on.any():
                 observations = batch.reset(mask=goes_on, **start)
         self._over[mask] = False
+        if self.rendering is not None:
+            self.rendering.observe(reset=True)
         infos: dict[str, Any] = {
             "position_error": batch.read("position_error"),
             "estimation_error": batch.read("estimation_error"),
@@ -147,6 +155,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             results[:, COLUMN["truncated"]] > 0.0,
         )
         self._over = terminated | truncated
+        if self.rendering is not None:
+            self.rendering.observe()
         infos = self._step_infos(results)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             self._replace_by_start(infos, began)
@@ -161,8 +171,33 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos,
         )
 
+    def render(self) -> Any:
+        """What `render_mode` asks for, of the flights that `render_flights` chose.
+
+        Returns:
+            "rgb_array": a tuple with a frame (height, width, 3) of uint8 per flight, as Gymnasium's
+            wrappers want it (`quad_gym.rendering.tile` makes one picture of them);
+            "rgb_array_list": a list with a picture of all tiles for every instant since the last
+            call or reset; "human", where a window shows the tiles by itself, and None: None.
+
+        Raises:
+            gymnasium.error.ResetNeeded: Before the first reset.
+        """
+        if self.rendering is None:
+            gymnasium.logger.warn(
+                "render() needs a render_mode: make_vec(..., render_mode='rgb_array')"
+            )
+            return None
+        if not self._seeded:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        if self.render_mode == "rgb_array_list":
+            return self.rendering.taken_tiles()
+        return self.rendering.frames() if self.render_mode == "rgb_array" else None
+
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing is held open; closing twice is fine."""
+        """Close the window, if there is one; closing twice is fine."""
+        if self.rendering is not None:
+            self.rendering.close()
 
     def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
         """What the judge says of the step."""

@@ -230,7 +230,7 @@ NONSENSE = [
     {"preview": (-0.1, 0.2)},
     {"true_vehicle": "lab"},
     {"true_sensors": 1},
-    {"render_mode": "human"},
+    {"render_mode": "sketch"},
 ]
 
 

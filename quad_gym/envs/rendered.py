@@ -1,0 +1,45 @@
+"""What the faces of an environment share about rendering; nothing is imported until it is used."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from quad_gym.envs.configuration import Flights
+
+if TYPE_CHECKING:
+    from quad_gym.rendering.live import Rendering
+
+RENDERING_METADATA: dict[str, Any] = {
+    "render_modes": ["human", "rgb_array", "rgb_array_list"],
+    "render_fps": 50,
+}
+"""Gymnasium's metadata; an environment's own has its control rate as the frame rate."""
+
+_OPTIONS = ("render_view", "render_size", "render_flights")
+
+
+def rendering_options(keywords: dict[str, Any]) -> dict[str, Any]:
+    """Take the keywords that say how to render out of those of an environment."""
+    return {name: keywords.pop(name) for name in _OPTIONS if name in keywords}
+
+
+def rendering_of(
+    flights: Flights,
+    render_mode: str | None,
+    *,
+    render_view: str = "fixed",
+    render_size: tuple[int, int] = (640, 480),
+    render_flights: Sequence[int] | None = None,
+) -> "Rendering | None":
+    """What an environment renders with; None where it does not render.
+
+    Raises:
+        ValueError: If an argument makes no sense.
+        ImportError: If it is to render and pygame is not installed.
+    """
+    if render_mode is None:
+        return None
+    from quad_gym.rendering.live import Rendering
+
+    return Rendering(
+        flights.batch, render_mode, flights=render_flights, view=render_view, size=render_size
+    )

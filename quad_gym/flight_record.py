@@ -1,0 +1,374 @@
+"""`Flight`: what happened in one flight, instant by instant, to keep, export, look at and replay.
+
+A flight has one row per control step, the start included; `COLUMNS` says what a row holds. Where
+something was not measured since the last row, or nothing was estimated, a row holds NaN.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.metrics import nees, state_error
+from quad_gym.packing import params_record
+from quad_gym.records import Source
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+from quad_gym.simulation import FlightBatch
+
+if TYPE_CHECKING:
+    import pandas
+
+Floats = NDArray[np.float64]
+
+
+class Column(NamedTuple):
+    """One quantity of a flight."""
+
+    name: str
+    shape: tuple[int, ...]
+    """of one row; FEATURES stands for the number of the camera's features"""
+    unit: str
+    frame: str
+    """I: inertial (east, north, up), B: body, C: image; "-": none"""
+    meaning: str
+
+
+FEATURES = -1
+
+# fmt: off
+COLUMNS = (
+    Column("time", (), "s", "-", "since the start of the episode"),
+    # the truth
+    Column("position", (3,), "m", "I", "true position of the centre of mass"),
+    Column("velocity", (3,), "m/s", "I", "true velocity"),
+    Column("attitude", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
+    Column("body_rates", (3,), "rad/s", "B", "true body rates"),
+    Column("rotor_speeds", (4,), "rad/s", "-", "true rotor speeds"),
+    Column("accel_bias", (3,), "m/s^2", "B", "true accelerometer bias"),
+    Column("gyro_bias", (3,), "rad/s", "B", "true gyro bias"),
+    Column("disturbance", (3,), "N", "I", "external force on the body"),
+    # the filter
+    Column("estimated_position", (3,), "m", "I", "the filter's"),
+    Column("estimated_velocity", (3,), "m/s", "I", "the filter's"),
+    Column("estimated_attitude", (4,), "-", "B to I", "the filter's, as a quaternion"),
+    Column("estimated_accel_bias", (3,), "m/s^2", "B", "the filter's"),
+    Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's"),
+    Column("covariance", (15, 15), "mixed", "mixed", "of position, velocity, attitude error, accelerometer and gyro bias"),
+    Column("filter_status", (), "bits", "-", "failures of the filter so far, see `FilterStatus`"),
+    Column("nees", (), "-", "-", "normalised estimation error squared; 15 on average if the filter is consistent"),
+    Column("nis", (), "-", "-", "normalised innovation squared of the last update"),
+    Column("nis_dimension", (), "-", "-", "measurements in the last update"),
+    # what the controller saw
+    Column("seen_position", (3,), "m", "I", "position that the controller believed in"),
+    Column("seen_attitude", (4,), "-", "B to I", "attitude that the controller believed in"),
+    # the last measurements since the row before
+    Column("gyro", (3,), "rad/s", "B", "angular rate"),
+    Column("accel", (3,), "m/s^2", "B", "specific force"),
+    Column("gnss_position", (3,), "m", "I", "primary antenna"),
+    Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
+    Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's centre"),
+    # the task
+    Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),
+    Column("reference_position", (3,), "m", "I", "where the vehicle should be; on a course, the next gate"),
+    Column("gates_passed", (), "-", "-", "on a course of gates"),
+    Column("reward", (), "-", "-", "of the step that led to this row"),
+    Column("position_error", (), "m", "-", "distance of the true position from the reference"),
+    Column("estimation_error", (), "m", "-", "distance of the seen from the true position"),
+)
+# fmt: on
+
+_DIRECT = {
+    "position": "r",
+    "velocity": "v",
+    "attitude": "q",
+    "body_rates": "w",
+    "rotor_speeds": "rotor_speeds",
+    "accel_bias": "b_a",
+    "gyro_bias": "b_g",
+    "disturbance": "disturbance",
+    "seen_position": "r_seen",
+    "action": "action",
+    "gates_passed": "gate_next",
+    "reward": "reward",
+    "position_error": "position_error",
+    "estimation_error": "estimation_error",
+}
+"""Columns that are fields of a flight's record as they stand."""
+
+_ESTIMATED = {
+    "estimated_position": "r_hat",
+    "estimated_velocity": "v_hat",
+    "estimated_accel_bias": "b_a_hat",
+    "estimated_gyro_bias": "b_g_hat",
+    "filter_status": "filter_status",
+    "nis": "nis",
+    "nis_dimension": "nis_dimension",
+}
+"""Likewise, where a filter runs."""
+
+_WITH_FILTER = (
+    *_ESTIMATED,
+    *("estimated_attitude", "covariance", "nees"),
+    *("gyro", "accel", "gnss_position", "gnss_baseline", "pixels"),
+)
+"""Columns that hold NaN where no filter, and so no sensor, runs."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stage:
+    """Where a flight takes place and what flies: what a picture of it needs besides its rows."""
+
+    task: str
+    """kind of task"""
+    observation: str
+    """what the controller saw: "truth", "estimate", "noisy" or "sensors" """
+    control_rate: float
+    """rows per second [Hz]"""
+    rotor_positions_B: Floats
+    """(4, 3) [m]"""
+    max_rotor_speed: float
+    """[rad/s]"""
+    hover_rotor_speed: float
+    """[rad/s]"""
+    antennas_B: Floats
+    """(2, 3) primary and secondary antenna [m]"""
+    camera_B: Floats
+    """(3,) projection centre [m]; NaN: there is no camera"""
+    R_CB: Floats
+    """(3, 3) body to camera"""
+    focal_length: float
+    """[pixels]"""
+    half_image: Floats
+    """(2,) half the image's width and height [pixels]"""
+    features_I: Floats
+    """(n, 3) [m]"""
+    gates_I: Floats
+    """(n, 3) centres of the course's gates; (0, 3) on other tasks [m]"""
+    gate_radius: float
+    """[m]"""
+    reference_omega: float
+    """fundamental frequency of the reference [rad/s]"""
+    reference_center: Floats
+    """(3,) its constant term [m]"""
+    reference_cos: Floats
+    """(k, 3) its cosine coefficients [m]"""
+    reference_sin: Floats
+    """(k, 3) its sine coefficients [m]"""
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether there is a camera with a feature to see."""
+        return len(self.features_I) > 0
+
+    def reference(self, times: Floats) -> Floats:
+        """Where the reference is at times [s], (n, 3) in I [m]: a Fourier series per axis."""
+        harmonics = np.arange(1, len(self.reference_cos) + 1)
+        angles = self.reference_omega * np.outer(times, harmonics)
+        swing = np.cos(angles) @ self.reference_cos + np.sin(angles) @ self.reference_sin
+        return np.asarray(self.reference_center + swing)
+
+    @property
+    def reference_period(self) -> float:
+        """Time after which the reference repeats [s]; 0: it stands still."""
+        moves = bool(np.any(self.reference_cos) or np.any(self.reference_sin))
+        return 2.0 * np.pi / self.reference_omega if moves else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """One flight; `flight["position"]` is a column, (n, ...) with one row per control step.
+
+    Args:
+        rows: (n,) records with the fields of `COLUMNS`.
+        stage: Where it takes place.
+        about: What else is worth knowing, such as seed and policy; of the types of JSON.
+    """
+
+    rows: NDArray[Any]
+    stage: Stage
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return np.asarray(self.rows[name])
+
+    @property
+    def estimated(self) -> bool:
+        """Whether a filter ran."""
+        return bool(np.isfinite(self.rows["estimated_position"][-1]).all())
+
+    def until(self, time: float) -> "Flight":
+        """The flight up to a time [s], without copying; at least its first row."""
+        count = int(np.searchsorted(self.rows["time"], time + 1e-9, side="right"))
+        return dataclasses.replace(self, rows=self.rows[: max(count, 1)])
+
+    def save(self, path: Path | str) -> Path:
+        """Write a compressed NumPy archive (npz); see `quad_gym.flight_files`."""
+        from quad_gym.flight_files import save_flight
+
+        return save_flight(self, Path(path))
+
+    @classmethod
+    def load(cls, path: Path | str) -> "Flight":
+        """Read what `save` wrote, bit for bit.
+
+        Raises:
+            ValueError: If the file is damaged, of another kind, or of an unknown version.
+        """
+        from quad_gym.flight_files import load_flight
+
+        return load_flight(Path(path))
+
+    def to_csv(self, path: Path | str) -> Path:
+        """Write a table for spreadsheets, with the covariance's standard deviations."""
+        from quad_gym.flight_files import write_flight_csv
+
+        return write_flight_csv(self, Path(path))
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The same table as a pandas DataFrame, indexed by time.
+
+        Raises:
+            ImportError: If pandas is not installed.
+        """
+        from quad_gym.flight_files import flight_frame
+
+        return flight_frame(self)
+
+
+def row_dtype(features: int) -> np.dtype[Any]:
+    """The record of a row, with a camera that knows so many features."""
+    return np.dtype(
+        [(c.name, "f8", tuple(features if n == FEATURES else n for n in c.shape)) for c in COLUMNS]
+    )
+
+
+class FlightRecorder:
+    """Keeps one flight of a batch; it reads the batch and never changes it.
+
+    Args:
+        batch: The flights.
+        flight: Which of them.
+        about: Kept with the flight.
+
+    Raises:
+        ValueError: If there is no such flight.
+    """
+
+    def __init__(
+        self, batch: FlightBatch, flight: int = 0, about: dict[str, Any] | None = None
+    ) -> None:
+        if not 0 <= flight < batch.count:
+            raise ValueError(f"flight must be within 0 and {batch.count - 1}, got {flight}")
+        self._batch, self._which = batch, np.array([flight])
+        self._about = dict(about or {})
+        camera = batch.sensors.camera
+        features = 0 if camera is None else len(camera.features_I)
+        self._rows = np.zeros(256, row_dtype(features))
+        self._count = 0
+        self._stage: Stage | None = None
+        model = params_record(batch.vehicle, batch.sensors)[0]
+        self._R_IG, self._model = model["R_IG"], model
+
+    @property
+    def flight(self) -> Flight:
+        """What was kept since the start of the present episode; it goes on sharing memory.
+
+        Raises:
+            ValueError: If nothing was kept yet.
+        """
+        if self._stage is None:
+            raise ValueError("there is no flight yet: reset the environment first")
+        return Flight(self._rows[: self._count], self._stage, self._about)
+
+    def keep(self) -> None:
+        """Keep the present instant; the first of an episode begins a new flight."""
+        tick = self._read("tick")
+        if tick == 0.0 or self._stage is None:
+            self._rows, self._count = np.zeros_like(self._rows), 0  # earlier flights live on
+            self._stage = self._stage_of_episode()
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._fill(self._rows[self._count], tick)
+        self._count += 1
+
+    def _read(self, name: str) -> Any:
+        return self._batch.read(name, self._which)[0]
+
+    def _fill(self, row: Any, tick: float) -> None:
+        row["time"] = tick * self._batch.sensors.imu.dt
+        for column, name in _DIRECT.items():
+            row[column] = self._read(name)
+        assert self._stage is not None
+        row["reference_position"] = self._stage.reference(row["time"])[0]
+        if self._stage.task == "waypoints":
+            row["reference_position"] = self._read("ref_center")
+        row["seen_attitude"] = _quaternion(self._read("R_seen"))
+        if self._batch.run_filter:
+            self._fill_estimate(row)
+            self._fill_measurements(row)
+        else:
+            for name in _WITH_FILTER:
+                row[name] = np.nan
+
+    def _fill_estimate(self, row: Any) -> None:
+        for column, name in _ESTIMATED.items():
+            row[column] = self._read(name)
+        factor, R_hat = self._read("L"), self._read("R_hat")
+        row["covariance"] = factor @ factor.T
+        row["estimated_attitude"] = _quaternion(R_hat)
+        words = ("position", "velocity", "accel_bias", "gyro_bias")
+        truth = {word: row[word] for word in words}
+        estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
+        try:
+            truth["R_BI"] = quaternion_to_dcm(row["attitude"])
+            row["nees"] = nees(state_error(truth, estimate), row["covariance"])
+        except ValueError:  # a state that is not finite, or a singular covariance: nothing to say
+            row["nees"] = np.nan
+
+    def _fill_measurements(self, row: Any) -> None:
+        row["gyro"], row["accel"] = self._read("gyro"), self._read("accel")
+        for column, flag in (("gnss_position", "position"), ("gnss_baseline", "baseline")):
+            # at the start nothing is "fresh" but everything has been measured
+            measured = self._read(f"{flag}_fresh") + self._read(f"{flag}_valid") > 0.0
+            row[column] = self._R_IG @ self._read(column) if measured else np.nan
+        features = row["pixels"].shape[0]
+        if features:
+            seen = self._read("feature_fresh") + self._read("feature_valid") > 0.0
+            pixels = np.where(seen[:, np.newaxis], self._read("pixels"), np.nan)
+            row["pixels"] = pixels[:features]
+
+    def _stage_of_episode(self) -> Stage:
+        batch, model = self._batch, self._model
+        camera, gnss = batch.sensors.camera, batch.sensors.gnss
+        gate_count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
+        return Stage(
+            task=batch.task.kind,
+            observation=Source(batch.source).name.lower(),
+            control_rate=batch.clocks.control_rate,
+            rotor_positions_B=np.array(batch.vehicle.rotor_positions_B),
+            max_rotor_speed=float(model["motor_gain"] * model["max_voltage"]),
+            hover_rotor_speed=float(model["motor_gain"] * model["hover_voltage"]),
+            antennas_B=np.array([gnss.primary_antenna_B, gnss.secondary_antenna_B]),
+            camera_B=np.array(camera.position_B if camera else [np.nan] * 3),
+            R_CB=np.array(model["R_CB"]),
+            focal_length=float(model["focal_length"]),
+            half_image=np.array(model["half_image"]),
+            features_I=np.array(camera.features_I if camera else np.zeros((0, 3))),
+            gates_I=self._read("gates")[:gate_count],
+            gate_radius=batch.task.gate_radius,
+            reference_omega=float(self._read("ref_omega")),
+            reference_center=self._read("ref_center"),
+            reference_cos=self._read("ref_cos"),
+            reference_sin=self._read("ref_sin"),
+        )
+
+
+def _quaternion(R_BI: Floats) -> Floats:
+    """The quaternion of an attitude, NaN where a flight has left the finite numbers."""
+    return dcm_to_quaternion(R_BI) if np.isfinite(R_BI).all() else np.full(4, np.nan)

@@ -1,0 +1,22 @@
+"""Pictures of flights: live, from a record, as frames and videos, and in a window; on pygame.
+
+`gymnasium.make(..., render_mode="rgb_array")` is the usual way in. Here are the parts: `Renderer`
+draws a `quad_gym.Flight`, `tile` puts frames side by side, `record_flight` flies a policy and keeps
+the flight, `save_video` writes a flight as a video, and `record_video` does both.
+"""
+
+from quad_gym.rendering.live import RENDER_MODES, Rendering
+from quad_gym.rendering.renderer import VIEWS, Renderer, tile
+from quad_gym.rendering.video import flight_of, record_flight, record_video, save_video
+
+__all__ = [
+    "RENDER_MODES",
+    "VIEWS",
+    "Renderer",
+    "Rendering",
+    "flight_of",
+    "record_flight",
+    "record_video",
+    "save_video",
+    "tile",
+]

@@ -1,0 +1,236 @@
+"""A canvas to draw on: smooth lines, translucent areas and text, on pygame's software surfaces.
+
+No window, display or audio device is opened, and no environment variable is needed or set: a
+surface is memory. Lines and areas are drawn twice as large and shrunk, which smooths them; text is
+drawn at its own size, which keeps it sharp.
+"""
+
+import contextlib
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Color = tuple[int, int, int]
+
+WHITE: Color = (255, 255, 255)
+SKY: Color = (250, 251, 253)
+GROUND: Color = (236, 239, 243)
+GRID: Color = (206, 211, 218)
+PALE: Color = (221, 221, 221)
+GREY: Color = (118, 118, 118)
+INK: Color = (34, 34, 34)
+BLUE: Color = (0, 114, 178)
+LIGHT_BLUE: Color = (86, 180, 233)
+VERMILLION: Color = (213, 94, 0)
+GREEN: Color = (0, 138, 100)
+PURPLE: Color = (190, 90, 150)
+PALE_PURPLE: Color = (218, 176, 204)
+"""Those of Okabe and Ito, which people with a colour vision deficiency can tell apart (green and
+purple a little darker than theirs, to stand out from a pale ground)."""
+
+OVERSAMPLING = 2
+_RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
+"""A pixel's bytes in memory: red, green, blue, and one that is not used."""
+_CROSS = np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
+_FAR = 20000.0
+"""Pixels beyond are moved here, as pygame's integers end."""
+
+
+def load_pygame() -> Any:
+    """The module pygame, without its greeting.
+
+    Raises:
+        ImportError: If it is missing; the message says how to install it.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            import pygame
+            import pygame.font
+    except ImportError:
+        raise ImportError(
+            'Rendering needs pygame, which is not installed: pip install "quad-gym[render]"'
+        ) from None
+    return pygame
+
+
+class Canvas:
+    """A picture that is being drawn.
+
+    Args:
+        width: [pixels].
+        height: [pixels].
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self._pygame = load_pygame()
+        self._pygame.font.init()
+        self.width, self.height = width, height
+        n = OVERSAMPLING
+        self._large = self._pygame.Surface((n * width, n * height), 0, 32, _RGBX)
+        self.surface = self._pygame.Surface((width, height), 0, 32, _RGBX)
+        self._packed = self._pygame.Surface((width, height), 0, 24, _RGBX)
+        self._background: Any = None
+        self._fonts: dict[int, Any] = {}
+        self._words: dict[tuple[str, int, Color], Any] = {}
+
+    def __reduce__(self) -> Any:
+        return Canvas, (self.width, self.height)
+
+    # ---- lines and areas ----------------------------------------------------------------------
+
+    def clear(self, color: Color) -> None:
+        """Begin anew, within `inside`."""
+        self._large.fill(color)
+
+    def keep_background(self) -> None:
+        """Remember what has been drawn so far, for pictures that begin alike."""
+        self._background = self._large.copy()
+
+    def show_background(self) -> None:
+        """Begin with what was remembered."""
+        self._large.blit(self._background, (0, 0))
+
+    def line(self, points: Floats, color: Color, width: float = 1.0, closed: bool = False) -> None:
+        """A line through points (n, 2) [pixels]; it is interrupted where they are NaN."""
+        for run in _runs(points):
+            if len(run) > 1:
+                thickness = max(1, round(OVERSAMPLING * width))
+                self._pygame.draw.lines(self._large, color, closed, _large(run), thickness)
+
+    def segments(self, segments: Floats, color: Color, width: float = 1.0) -> None:
+        """Lines (n, 2, 2) from point to point [pixels]."""
+        thickness = max(1, round(OVERSAMPLING * width))
+        for start, end in _large(segments):
+            self._pygame.draw.line(self._large, color, start, end, thickness)
+
+    def dashes(
+        self, points: Floats, color: Color, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
+    ) -> None:
+        """A dashed line through points (n, 2) [pixels]."""
+        for run in _runs(points):
+            if len(run) < 2:
+                continue
+            steps = np.linalg.norm(np.diff(run, axis=0), axis=1)
+            length = np.concatenate([[0.0], np.cumsum(steps)])
+            begin = np.arange(0.0, min(length[-1], 4.0 * _FAR), dash + gap)
+            both = np.stack([begin, np.minimum(begin + dash, length[-1])], axis=1)
+            at = np.stack([np.interp(both, length, run[:, k]) for k in range(2)], axis=-1)
+            self.segments(at, color, width)
+
+    def polygon(self, points: Floats, color: Color, opacity: float = 1.0) -> None:
+        """A filled polygon with corners (n, 2) [pixels]; nothing if one of them is NaN."""
+        if len(points) < 3 or not np.isfinite(points).all():
+            return
+        corners = _large(points)
+        if opacity >= 1.0:
+            self._pygame.draw.polygon(self._large, color, corners)
+            return
+        box = self._large.get_rect()
+        low = np.floor(np.array(corners).min(axis=0)).astype(int)
+        size = np.ceil(np.array(corners).max(axis=0)).astype(int) - low + 1
+        box = box.clip((*low.tolist(), *size.tolist()))
+        if not box.width or not box.height:
+            return
+        layer = self._pygame.Surface(box.size, self._pygame.SRCALPHA, 32)
+        shifted = [(x - box.left, y - box.top) for x, y in corners]
+        self._pygame.draw.polygon(layer, (*color, round(255 * opacity)), shifted)
+        self._large.blit(layer, box)
+
+    def disc(self, at: Floats, radius: float, color: Color, width: float = 0.0) -> None:
+        """A disc, or a ring of a width [pixels], around a point (2,)."""
+        if np.isfinite(at).all():
+            n = OVERSAMPLING
+            (center,) = _large(at[np.newaxis])
+            ring = round(n * width) if width else 0
+            self._pygame.draw.circle(self._large, color, center, max(1.0, n * radius), ring)
+
+    def crosses(self, at: Floats, size: float, color: Color, width: float = 1.5) -> None:
+        """Diagonal crosses at points (n, 2) [pixels]; none where they are NaN."""
+        shown = at[np.isfinite(at).all(axis=1)]
+        self.segments(
+            (shown[:, np.newaxis, np.newaxis] + size * _CROSS).reshape(-1, 2, 2), color, width
+        )
+
+    def box(
+        self, left: float, top: float, width: float, height: float, color: Color, line: float = 0.0
+    ) -> None:
+        """A filled rectangle, or its border [pixels]."""
+        n = OVERSAMPLING
+        rectangle = [round(n * x) for x in (left, top, width, height)]
+        self._pygame.draw.rect(self._large, color, rectangle, round(n * line))
+
+    def inside(self, box: tuple[float, float, float, float] | None) -> None:
+        """Draw nothing outside a rectangle of left, top, width, height from now on; None: all."""
+        n = OVERSAMPLING
+        self._large.set_clip(None if box is None else [round(n * x) for x in box])
+
+    # ---- text ---------------------------------------------------------------------------------
+
+    def finish(self) -> None:
+        """Shrink what has been drawn; after this there is only text to come."""
+        self._pygame.transform.smoothscale(self._large, (self.width, self.height), self.surface)
+
+    def veil(self, left: float, top: float, width: float, height: float) -> None:
+        """Brighten a rectangle of the finished picture, for text to stand out."""
+        layer = self._pygame.Surface((round(width), round(height)), self._pygame.SRCALPHA, 32)
+        layer.fill((*WHITE, 190))
+        self.surface.blit(layer, (round(left), round(top)))
+
+    def text(
+        self, words: str, x: float, y: float, size: int, color: Color = INK, anchor: float = 0.0
+    ) -> int:
+        """Write words with their upper left corner, or `anchor` of their width, at x and y.
+
+        Returns:
+            Their width [pixels].
+        """
+        image = self._word(words, size, color)
+        if np.isfinite(x) and np.isfinite(y):
+            left = min(max(x - anchor * image.get_width(), -_FAR), _FAR)
+            self.surface.blit(image, (round(left), round(min(max(y, -_FAR), _FAR))))
+        return int(image.get_width())
+
+    def width_of(self, words: str, size: int) -> int:
+        """Width of words [pixels]."""
+        return int(self._word(words, size, INK).get_width())
+
+    def line_height(self, size: int) -> int:
+        """Distance between lines of text [pixels]."""
+        return int(self._font(size).get_linesize())
+
+    def _font(self, size: int) -> Any:
+        if size not in self._fonts:
+            self._fonts[size] = self._pygame.font.Font(None, size)
+        return self._fonts[size]
+
+    def _word(self, words: str, size: int, color: Color) -> Any:
+        key = (words, size, color)
+        if key not in self._words:
+            if len(self._words) > 500:
+                self._words.clear()
+            self._words[key] = self._font(size).render(words, True, color)
+        return self._words[key]
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """The finished picture, (height, width, 3): a new array."""
+        self._packed.blit(self.surface, (0, 0))
+        raw = np.frombuffer(self._packed.get_buffer(), np.uint8)
+        rows = raw.reshape(self.height, self._packed.get_pitch())[:, : 3 * self.width]
+        return rows.reshape(self.height, self.width, 3).copy()
+
+
+def _large(points: Floats) -> Any:
+    """Points in the pixels of the large surface."""
+    return np.minimum(np.maximum(OVERSAMPLING * points, -_FAR), _FAR).tolist()
+
+
+def _runs(points: Floats) -> list[Floats]:
+    """The pieces of a line between its NaN."""
+    good = np.isfinite(points).all(axis=-1)
+    if good.all():
+        return [points]
+    edges = np.flatnonzero(np.diff(good)) + 1
+    return [run for run in np.split(points, edges) if np.isfinite(run[0]).all()]

@@ -1,0 +1,196 @@
+"""The geometry of pictures: a viewing camera, outlines of ellipsoids, frusta; NumPy alone.
+
+A viewing camera's axes are x to the right, y down and z into the picture, in pixels from the
+picture's upper left corner.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.flight_record import Flight, Stage
+from quad_gym.rotations import quaternion_to_dcm
+
+Floats = NDArray[np.float64]
+
+NEAR = 0.05
+"""Nothing closer to a viewing camera than this is drawn [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A perspective view of the inertial frame."""
+
+    eye: Floats
+    """(3,) in I [m]"""
+    R_VI: Floats
+    """(3, 3) inertial to viewing axes; rows: right, down, into the picture, in I"""
+    focal: float
+    """focal length [pixels]"""
+    center: Floats
+    """(2,) pixel of the optical axis"""
+
+    def in_view(self, points: Floats) -> Floats:
+        """(..., 3) points of I in viewing axes [m]."""
+        return np.asarray((points - self.eye) @ self.R_VI.T)
+
+    def flatten(self, points_V: Floats) -> Floats:
+        """(..., 2) pixels of points (..., 3) in viewing axes that lie in front of the camera."""
+        return self.center + self.focal * points_V[..., :2] / points_V[..., 2:]
+
+    def project(self, points: Floats) -> tuple[Floats, Floats]:
+        """Pixels (..., 2) and depths (...,) of points (..., 3) in I; NaN where not in front."""
+        points_V = self.in_view(np.asarray(points, np.float64))
+        depth = points_V[..., 2]
+        safe = np.where(depth[..., np.newaxis] > NEAR, points_V, np.nan)
+        return self.flatten(safe), depth
+
+    def segments(self, starts: Floats, ends: Floats) -> Floats:
+        """Pixels (m, 2, 2) of line segments (n, 3), cut off where they come too near."""
+        a, b = self.in_view(starts), self.in_view(ends)
+        visible = (a[:, 2] > NEAR) | (b[:, 2] > NEAR)
+        a, b = a[visible], b[visible]
+        gap = b[:, 2:] - a[:, 2:]
+        cut = np.clip((NEAR * 1.001 - a[:, 2:]) / np.where(np.abs(gap) < 1e-12, 1.0, gap), 0.0, 1.0)
+        at = a + cut * (b - a)
+        a, b = np.where(a[:, 2:] > NEAR, a, at), np.where(b[:, 2:] > NEAR, b, at)
+        return np.stack([self.flatten(a), self.flatten(b)], axis=1)
+
+    def scale_at(self, point: Floats) -> float:
+        """Pixels per metre across the line of sight at a point in I."""
+        return self.focal / max(float(self.in_view(point)[2]), NEAR)
+
+
+def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> View:
+    """The view from `eye` toward `target`, with the vertical upright."""
+    into = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(into, (0.0, 0.0, 1.0))
+    length = np.linalg.norm(right)
+    right = right / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return View(eye, np.stack([right, np.cross(into, right), into]), focal, center)
+
+
+def fit_view(
+    points: Floats, azimuth: float, elevation: float, focal: float, low: Floats, high: Floats
+) -> View:
+    """The closest view from a direction that shows all points within a rectangle of pixels.
+
+    Args:
+        points: (n, 3) in I [m].
+        azimuth: Direction from the points to the eye, from east toward north [rad].
+        elevation: Of that direction above the horizon [rad].
+        focal: Focal length [pixels].
+        low: (2,) upper left corner of the rectangle [pixels].
+        high: (2,) its lower right corner [pixels].
+    """
+    c = np.cos(elevation)
+    backward = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
+    center, half = (low + high) / 2, (high - low) / 2
+    axes = look_at(backward, np.zeros(3), focal, center).R_VI
+    p = points @ axes.T
+    # a point is inside if |x - x0| <= half/focal * depth; all four edges at once per axis
+    eye = np.zeros(3)
+    edges = []
+    for k in range(2):
+        slope = half[k] / focal
+        right, left = (p[:, k] - slope * p[:, 2]).max(), (p[:, k] + slope * p[:, 2]).min()
+        eye[k] = (right + left) / 2  # the eye that sees both edges from the same distance
+        edges.append(-(right - left) / 2 / slope)
+    eye[2] = min(edges)
+    return View(eye @ axes, axes, focal, center)
+
+
+def fixed_view(flight: Flight, width: float, height: float) -> View:
+    """A view that shows the whole reference, the start and what the camera looks at."""
+    stage, start = flight.stage, flight["position"][0]
+    times = np.linspace(0.0, stage.reference_period or 1.0, 64)
+    around = [stage.reference(times), start[np.newaxis], stage.gates_I, stage.features_I]
+    around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # what lies below
+    points = np.concatenate(around)
+    pad = 0.45 * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
+    corners = (points[:, np.newaxis] + pad).reshape(-1, 3)
+    low = np.array([0.03 * width, 0.24 * height])  # legend and inset fill the upper corners
+    high = np.array([0.97 * width, 0.97 * height])
+    azimuth, elevation = np.radians(-62.0), np.radians(24.0)
+    return fit_view(corners, azimuth, elevation, 1.15 * width, low, high)
+
+
+def chase_view(flight: Flight, width: float, height: float) -> View:
+    """A view from behind and above the vehicle, a little to its right, that turns with it gently.
+
+    It depends on the last half second alone, so a replay shows what was seen live.
+    """
+    recent = flight.rows[-max(2, round(0.5 * flight.stage.control_rate)) :]
+    here = np.array(recent["position"][-1])
+    ahead = quaternion_to_dcm(recent["attitude"])[:, 0, :2].mean(axis=0)
+    heading = np.arctan2(ahead[1], ahead[0]) - np.radians(28.0)
+    behind = np.array([np.cos(heading), np.sin(heading), 0.0])
+    eye = here - 2.4 * behind + (0.0, 0.0, 1.15)
+    eye[2] = max(eye[2], 0.25)
+    target = here + 0.3 * behind + (0.0, 0.0, 0.12)
+    return look_at(eye, target, 1.15 * width, np.array([0.5 * width, 0.5 * height]))
+
+
+def ellipsoid_axes(covariance: Floats, sigmas: float) -> Floats:
+    """The half-axes of an ellipsoid of a (3, 3) covariance: eigenvectors times sigmas sqrt(value).
+
+    Returns:
+        (3, 3) one half-axis a row, the shortest first [unit of the covariance's root].
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((sigmas * np.sqrt(np.maximum(values, 0.0)) * vectors).T)
+
+
+def ellipsoid_outline(center: Floats, axes: Floats, view: View, count: int = 48) -> Floats:
+    """The outline of an ellipsoid in perspective, (count, 2) pixels; (0, 2) if it is too near.
+
+    In dual form the ellipsoid is [[A - c c^T, -c], [-c^T, -1]] with A the sum of the outer products
+    of its half-axes; the camera matrix takes it to the dual conic of its outline (R. Hartley, A.
+    Zisserman, Multiple View Geometry, 2003, section 8.3).
+
+    Args:
+        center: (3,) in I [m].
+        axes: (3, 3) half-axes in I, one a row [m].
+        view: The view.
+        count: Points on the outline.
+    """
+    c = view.in_view(center)
+    half = axes @ view.R_VI.T
+    if c[2] - np.sqrt((half[:, 2] ** 2).sum()) < NEAR:
+        return np.zeros((0, 2))
+    dual = half.T @ half - np.outer(c, c)
+    dual = dual / -dual[2, 2]
+    middle = -dual[:2, 2]
+    shape = dual[:2, :2] + np.outer(middle, middle)
+    values, vectors = np.linalg.eigh(shape)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ root.T
+    return np.asarray(view.center + view.focal * (middle + ring))
+
+
+def frustum_corners(stage: Stage, position: Floats, R_BI: Floats, depth: float) -> Floats:
+    """Projection centre and the image's four corners at a depth along the optical axis, in I.
+
+    Returns:
+        (5, 3) [m].
+    """
+    x, y = stage.half_image / stage.focal_length
+    corners_C = depth * np.array([[x, y, 1.0], [-x, y, 1.0], [-x, -y, 1.0], [x, -y, 1.0]])
+    corners_B = stage.camera_B + np.concatenate([np.zeros((1, 3)), corners_C @ stage.R_CB])
+    return np.asarray(position + corners_B @ R_BI)
+
+
+def project_features(stage: Stage, position: Floats, R_BI: Floats) -> Floats:
+    """Where the features are in the image of a camera at a pose, (n, 2) pixels from its centre.
+
+    Returns:
+        NaN for a feature that is behind the camera; those outside the image are not left out.
+    """
+    X_B = (stage.features_I - position) @ R_BI.T
+    X_C = (X_B - stage.camera_B) @ stage.R_CB.T
+    in_front = X_C[:, 2:] > 1e-9
+    return np.where(
+        in_front, stage.focal_length * X_C[:, :2] / np.where(in_front, X_C[:, 2:], 1), np.nan
+    )

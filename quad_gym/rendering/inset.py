@@ -1,0 +1,74 @@
+"""The inset: the image plane of the vehicle's camera, with the features in it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.flight_record import Flight, Stage
+from quad_gym.rendering.canvas import GREY, INK, PALE, VERMILLION, WHITE, Canvas
+from quad_gym.rendering.geometry import project_features
+from quad_gym.rendering.strip import Box
+from quad_gym.rotations import quaternion_to_dcm
+
+Floats = NDArray[np.float64]
+
+
+def place_in_inset(pixels: Floats, stage: Stage, box: Box) -> Floats:
+    """Where pixels of the camera, from its image's centre, are in the inset.
+
+    The image is turned upright: half a turn, where the camera's y axis points up in the body.
+
+    Args:
+        pixels: (..., 2).
+        stage: Of the flight.
+        box: The inset, as wide and high as the image in proportion.
+    """
+    turn = -1.0 if stage.R_CB[1, 2] > 0.0 else 1.0
+    center = np.array([box.left + box.width / 2, box.top + box.height / 2])
+    return np.asarray(center + turn * pixels * box.width / (2.0 * stage.half_image[0]))
+
+
+def inset_box(stage: Stage, right: float, top: float, width: float) -> Box:
+    """A box in the proportions of the image, by its right edge, top and width."""
+    height = width * float(stage.half_image[1] / stage.half_image[0])
+    return Box(right - width, top, width, height)
+
+
+class Inset:
+    """Draws the camera's image for the last row of a flight.
+
+    Args:
+        canvas: To draw on.
+        box: Where.
+        size: Of the text [pixels].
+    """
+
+    def __init__(self, canvas: Canvas, box: Box, size: int) -> None:
+        self._canvas, self._box, self._size = canvas, box, size
+
+    def draw(self, flight: Flight) -> None:
+        """Measured features as crosses, those that the estimate predicts as rings."""
+        canvas, box, stage, now = self._canvas, self._box, flight.stage, flight.rows[-1]
+        canvas.box(box.left, box.top, box.width, box.height, WHITE)
+        x, y = box.left + box.width / 2, box.top + box.height / 2
+        canvas.line(np.array([[box.left, y], [box.left + box.width, y]]), PALE)
+        canvas.line(np.array([[x, box.top], [x, box.top + box.height]]), PALE)
+        canvas.inside((box.left, box.top, box.width, box.height))
+        q = now["estimated_attitude"]
+        if np.isfinite(q).all():
+            predicted = project_features(stage, now["estimated_position"], quaternion_to_dcm(q))
+            for at in place_in_inset(predicted, stage, box):
+                canvas.disc(at, 6.0, VERMILLION, 1.5)
+        canvas.crosses(place_in_inset(now["pixels"], stage, box), 3.2, INK, 1.6)
+        canvas.inside(None)
+        canvas.box(box.left, box.top, box.width, box.height, GREY, 1.0)
+
+    def write(self, flight: Flight) -> None:
+        """Name the features and say what the picture is."""
+        canvas, box, now = self._canvas, self._box, flight.rows[-1]
+        seen = np.isfinite(now["pixels"]).all(axis=1)
+        words = "camera" if seen.any() else "camera: no feature in view"
+        canvas.text(words, box.left + 4.0, box.top + 3.0, self._size, INK if seen.any() else GREY)
+        if len(seen) <= 4:
+            for k in np.flatnonzero(seen):
+                x, y = place_in_inset(now["pixels"][k], flight.stage, box)
+                canvas.text(str(k + 1), x + 8.0, y - 6.0, self._size - 2)

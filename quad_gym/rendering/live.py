@@ -1,0 +1,174 @@
+"""Rendering of environments while they fly: the render modes of Gymnasium, and a window."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym import validation as check
+from quad_gym.flight_record import Flight, FlightRecorder
+from quad_gym.rendering.canvas import load_pygame
+from quad_gym.rendering.renderer import Renderer, tile
+from quad_gym.simulation import FlightBatch
+
+RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
+"""What Gymnasium's `render_mode` may be, besides None."""
+WINDOW_RATE = 50.0
+"""The most pictures a second that a window shows [Hz]."""
+
+
+class Window:
+    """A window on the screen that shows frames at their pace.
+
+    Raises:
+        RuntimeError: If there is no screen to open a window on.
+    """
+
+    def __init__(self, size: tuple[int, int], title: str) -> None:
+        self._pygame = load_pygame()
+        try:
+            self._pygame.display.init()
+            self._screen = self._pygame.display.set_mode(size)
+        except self._pygame.error as error:
+            self._pygame.display.quit()
+            raise RuntimeError(
+                f'render_mode="human" cannot open a window ({error}); use "rgb_array" where there '
+                "is no screen"
+            ) from None
+        self._pygame.display.set_caption(title)
+        self._due = time.monotonic()
+        self.closed = False
+
+    def show(self, frame: NDArray[np.uint8], seconds: float) -> None:
+        """Show a frame, and wait until the one before it has been seen for its time [s]."""
+        if self.closed:
+            return
+        image = self._pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB")
+        self._screen.blit(image, (0, 0))
+        time.sleep(max(0.0, self._due - time.monotonic()))
+        self._pygame.display.flip()
+        self._due = max(self._due, time.monotonic() - 0.1) + seconds  # what is late is not made up
+
+    def keys(self) -> list[str]:
+        """Names of the keys pressed since the last call; a closed window is noticed here too."""
+        pressed: list[str] = []
+        if self.closed:
+            return pressed
+        for event in self._pygame.event.get():
+            if event.type == self._pygame.QUIT:
+                self.close()
+                break
+            if event.type == self._pygame.KEYDOWN:
+                pressed.append(self._pygame.key.name(event.key))
+        return pressed
+
+    def close(self) -> None:
+        """Close the window; closing twice is fine."""
+        if not self.closed:
+            self._pygame.display.quit()
+            self.closed = True
+
+
+class Rendering:
+    """What an environment needs to render: it keeps its flights and draws them when asked.
+
+    It reads the batch and never changes it.
+
+    Args:
+        batch: The environment's flights.
+        mode: One of `RENDER_MODES`.
+        flights: Which flights are shown; None: all of them.
+        view: "fixed" or "chase".
+        size: Width and height of each picture [pixels].
+
+    Raises:
+        ValueError: If an argument makes no sense.
+        ImportError: If pygame is not installed.
+    """
+
+    def __init__(
+        self,
+        batch: FlightBatch,
+        mode: str,
+        *,
+        flights: Sequence[int] | None = None,
+        view: str = "fixed",
+        size: tuple[int, int] = (640, 480),
+    ) -> None:
+        check.choice("render_mode", mode, RENDER_MODES)
+        self.mode = mode
+        chosen = range(batch.count) if flights is None else flights
+        if not len(chosen):
+            raise ValueError("render_flights must choose at least one flight")
+        self._recorders = [
+            FlightRecorder(batch, check.whole("render_flights", i, least=0)) for i in chosen
+        ]
+        self._renderers = [Renderer(view, size) for _ in self._recorders]
+        self.frame_rate = batch.clocks.control_rate
+        self._frames: list[tuple[NDArray[np.uint8], ...]] = []
+        self._window: Window | None = None
+        self._closed = False
+        self._waiting = 0.0
+        self._title = f"quad_gym: {batch.task.kind}"
+
+    def observe(self, *, reset: bool = False) -> None:
+        """Take notice of the present instant, after every reset and every step.
+
+        Args:
+            reset: Whether it follows a reset of the environment.
+        """
+        for recorder in self._recorders:
+            recorder.keep()
+        if self.mode == "rgb_array_list":
+            if reset:
+                self._frames.clear()
+            self._frames.append(self.frames())
+        elif self.mode == "human" and not self._closed:
+            self._show(at_once=reset)
+
+    def frames(self) -> tuple[NDArray[np.uint8], ...]:
+        """Pictures of the present instant, one per flight that is shown.
+
+        Raises:
+            ValueError: If there is no flight yet.
+        """
+        pairs = zip(self._renderers, self._recorders, strict=True)
+        return tuple(renderer.draw(recorder.flight) for renderer, recorder in pairs)
+
+    def taken_frames(self) -> list[tuple[NDArray[np.uint8], ...]]:
+        """Pictures of every instant since the last call or reset, for "rgb_array_list"."""
+        frames, self._frames = self._frames, []
+        return frames
+
+    def taken_tiles(self) -> list[NDArray[np.uint8]]:
+        """Likewise, with the pictures of an instant tiled."""
+        return [tile(list(frames)) for frames in self.taken_frames()]
+
+    @property
+    def flights(self) -> list[Flight]:
+        """What was kept of the flights that are shown, since the start of their episodes."""
+        return [recorder.flight for recorder in self._recorders]
+
+    def close(self) -> None:
+        """Close the window; closing twice is fine."""
+        self._closed = True
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _show(self, at_once: bool) -> None:
+        # fast controllers are shown at a slower rate, but in real time
+        self._waiting += 1.0 / self.frame_rate
+        if self._waiting < 0.999 / WINDOW_RATE and not at_once:
+            return
+        seconds, self._waiting = self._waiting, 0.0
+        picture = tile(list(self.frames()))
+        if self._window is None:
+            self._window = Window((picture.shape[1], picture.shape[0]), self._title)
+        self._window.keys()
+        self._window.show(picture, seconds)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_window": None}  # a copy opens its own

@@ -1,0 +1,198 @@
+"""`Renderer`: from a flight to a picture of its last instant."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym import validation as check
+from quad_gym.flight_record import Flight, Stage
+from quad_gym.records import FilterStatus
+from quad_gym.rendering.canvas import (
+    BLUE,
+    GREEN,
+    INK,
+    PURPLE,
+    VERMILLION,
+    Canvas,
+    Color,
+)
+from quad_gym.rendering.geometry import View, chase_view, fixed_view
+from quad_gym.rendering.inset import Inset, inset_box
+from quad_gym.rendering.scene import Scene, ellipsoid_scale
+from quad_gym.rendering.strip import Box, Strip
+
+VIEWS = ("fixed", "chase")
+"""Where a flight can be looked at from."""
+LEAST_WIDTH, LEAST_HEIGHT = 320, 240
+STALE_FIX = 0.5
+"""Seconds without a fix that are worth a word."""
+
+
+class Renderer:
+    """Draws flights.
+
+    Args:
+        view: "fixed" (the whole reference from outside) or "chase" (from behind the vehicle).
+        size: Width and height [pixels].
+
+    Raises:
+        ValueError: If an argument makes no sense.
+        ImportError: If pygame is not installed.
+    """
+
+    def __init__(self, view: str = "fixed", size: tuple[int, int] = (640, 480)) -> None:
+        self.view = check.choice("render_view", view, VIEWS)
+        self.size = checked_size(size)
+        width, height = self.size
+        self._canvas = Canvas(width, height)
+        scale = min(width / 640, height / 480)
+        self._text = max(14, round(18 * scale))
+        self._scene_height = round(0.765 * height)
+        strip = Box(0.0, self._scene_height, width, height - self._scene_height)
+        self._strip = Strip(self._canvas, strip, self._text)
+        self._stage: Stage | None = None
+        """of the flight that the kept view and background belong to"""
+        self._fixed: View
+
+    def draw(self, flight: Flight) -> NDArray[np.uint8]:
+        """The last instant of a flight; `flight.until(t)` shows it at a time t.
+
+        Args:
+            flight: The flight.
+
+        Returns:
+            (height, width, 3) red, green, blue.
+        """
+        canvas, (width, _), small = self._canvas, self.size, self._text - 2
+        scene = Scene(canvas, flight, self._view_of(flight))
+        self._draw_background(flight, scene)
+        canvas.inside((0.0, 0.0, width, self._scene_height))
+        labels = scene.draw()
+        inset = None
+        if flight.stage.has_camera:
+            box = inset_box(flight.stage, width - 8.0, 8.0, 0.27 * width)
+            inset = Inset(canvas, box, small)
+            inset.draw(flight)
+        canvas.inside(None)
+        self._strip.draw(flight)
+        canvas.finish()
+
+        for words, at, color in labels:
+            if np.isfinite(at).all() and at[1] < self._scene_height - canvas.line_height(small):
+                canvas.text(words, at[0], at[1], small, color, 0.5)
+        if inset is not None:
+            inset.write(flight)
+        self._strip.write(flight)
+        self._write_legend(flight)
+        return canvas.pixels()
+
+    def __reduce__(self) -> Any:
+        return Renderer, (self.view, self.size)
+
+    def _view_of(self, flight: Flight) -> View:
+        width = self.size[0]
+        if self.view == "chase":
+            return chase_view(flight, width, self._scene_height)
+        if self._stage is not flight.stage:
+            self._fixed = fixed_view(flight, width, self._scene_height)
+        return self._fixed
+
+    def _draw_background(self, flight: Flight, scene: Scene) -> None:
+        """What does not change; a fixed view keeps it for the whole flight."""
+        if self.view == "fixed" and self._stage is flight.stage:
+            self._canvas.show_background()
+            return
+        self._canvas.inside((0.0, 0.0, self.size[0], self._scene_height))
+        scene.draw_background()
+        self._canvas.inside(None)
+        self._strip.draw_background(flight.stage.hover_rotor_speed / flight.stage.max_rotor_speed)
+        if self.view == "fixed":
+            self._canvas.keep_background()
+            self._stage = flight.stage
+
+    def _write_legend(self, flight: Flight) -> None:
+        """What, when, what the colours mean, and what is wrong, in the upper left corner."""
+        canvas, stage, now = self._canvas, flight.stage, flight.rows[-1]
+        large, small = self._text + 2, self._text - 1
+        name = stage.task.replace("_", " ")
+        title = f"{name} on {_SEEN[stage.observation]}"
+        aim = "next gate" if len(stage.gates_I) else "reference, next second"
+        entries: list[tuple[str, Color]] = [(aim, GREEN), ("truth", BLUE)]
+        if flight.estimated:
+            scale = f", drawn x {ellipsoid_scale(flight):g}"
+            scale = "" if scale.endswith(" 1") else scale
+            entries.append(("estimate", VERMILLION))
+            entries.append((f"3-sigma ellipsoid, error{scale}", VERMILLION))
+            entries.append(("GNSS fix", PURPLE))
+        elif stage.observation == "noisy":
+            entries.append(("what the controller sees", VERMILLION))
+        warnings = self._warnings(flight)
+        lines = [title, *[words for words, _ in entries], *warnings]
+        width = 26 + max(
+            canvas.width_of(words, large if k == 0 else small) for k, words in enumerate(lines)
+        )
+        step = canvas.line_height(small) + 2
+        clock = f"{now['time']:.2f} s"
+        width = max(width, canvas.width_of(f"{title}   {clock}", large) + 12)
+        canvas.veil(6, 6, width, 8 + canvas.line_height(large) + step * (len(lines) - 1))
+        x, y = 12.0, 9.0
+        canvas.text(title, x, y, large)
+        canvas.text(clock, 6 + width - 6, y, large, INK, 1.0)
+        y += canvas.line_height(large) + 2
+        for words, color in entries:
+            canvas.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
+            canvas.text(words, x + 15, y, small, INK)
+            y += step
+        for words in warnings:
+            canvas.text(words, x, y, small, VERMILLION)
+            y += step
+
+    @staticmethod
+    def _warnings(flight: Flight) -> list[str]:
+        if not flight.estimated:
+            return []
+        rows, now, found = flight.rows, flight.rows[-1], []
+        fixes = np.flatnonzero(np.isfinite(rows["gnss_position"][:, 0]))
+        age = now["time"] - rows["time"][fixes[-1]] if fixes.size else now["time"]
+        if age > STALE_FIX:
+            found.append(f"no GNSS fix for {age:.1f} s")
+        if now["filter_status"] != 0:
+            names = [str(s.name).lower() for s in FilterStatus if s & int(now["filter_status"])]
+            found.append("filter: " + ", ".join(names).replace("_", " "))
+        return found
+
+
+_SEEN = {
+    "truth": "the truth",
+    "estimate": "the estimate",
+    "noisy": "noisy truth",
+    "sensors": "raw sensors",
+}
+
+
+def checked_size(size: tuple[int, int]) -> tuple[int, int]:
+    """A picture's width and height [pixels].
+
+    Raises:
+        ValueError: If they are not whole, too small to be read, or odd, which videos do not take.
+    """
+    if not isinstance(size, (tuple, list)) or len(size) != 2:
+        raise ValueError(f"render_size must be a width and a height, got {size!r}")
+    width = check.whole("render_size[0]", size[0], least=LEAST_WIDTH)
+    height = check.whole("render_size[1]", size[1], least=LEAST_HEIGHT)
+    if width % 2 or height % 2:
+        raise ValueError(f"render_size must be even numbers, got {width} x {height}")
+    return width, height
+
+
+def tile(frames: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Frames of one size side by side, in a grid as square as can be; missing ones are white."""
+    columns = int(np.ceil(np.sqrt(len(frames))))
+    rows = -(-len(frames) // columns)
+    height, width = frames[0].shape[:2]
+    sheet = np.full((rows * height, columns * width, 3), 255, np.uint8)
+    for k, frame in enumerate(frames):
+        i, j = divmod(k, columns)
+        sheet[i * height : (i + 1) * height, j * width : (j + 1) * width] = frame
+    return sheet

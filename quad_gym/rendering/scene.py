@@ -1,0 +1,294 @@
+"""The scene: ground, reference, vehicle, estimate, fixes and features, in perspective."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.flight_record import Flight
+from quad_gym.rendering.canvas import (
+    BLUE,
+    GREEN,
+    GREY,
+    GRID,
+    GROUND,
+    INK,
+    LIGHT_BLUE,
+    PALE,
+    PALE_PURPLE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    WHITE,
+    Canvas,
+)
+from quad_gym.rendering.geometry import (
+    View,
+    ellipsoid_axes,
+    ellipsoid_outline,
+    frustum_corners,
+)
+from quad_gym.rotations import quaternion_to_dcm
+
+Floats = NDArray[np.float64]
+
+TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
+"""How long trails and fixes stay, and how far ahead the reference is drawn boldly."""
+SIGMAS = 3.0
+ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)
+"""How many times its size an ellipsoid may be drawn."""
+ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0
+"""Largest half-axis that is drawn, over so much of the past [m], [s]."""
+ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
+"""[m]"""
+
+_CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
+_RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
+
+Label = tuple[str, Floats, tuple[int, int, int]]
+"""Words, where (2,), colour."""
+
+
+def ellipsoid_scale(flight: Flight) -> float:
+    """How much larger than it is the ellipsoid is drawn, so that it can be seen but fills no room.
+
+    It depends on the largest standard deviation of the last seconds, so it changes seldom.
+    """
+    recent = flight.rows[-max(1, round(SCALE_SECONDS * flight.stage.control_rate)) :]
+    variances = np.diagonal(recent["covariance"][:, :3, :3], axis1=1, axis2=2)
+    variances = variances[np.isfinite(variances)]
+    largest = SIGMAS * np.sqrt(variances.max()) if variances.size else 0.0
+    fitting = [s for s in ELLIPSOID_SCALES if s * largest <= ELLIPSOID_LIMIT]
+    return fitting[0] if fitting else 1.0
+
+
+class Scene:
+    """Draws the last row of a flight, as a view shows it.
+
+    Args:
+        canvas: To draw on.
+        flight: The flight; its last row is the present.
+        view: Where from.
+    """
+
+    def __init__(self, canvas: Canvas, flight: Flight, view: View) -> None:
+        self._canvas, self._flight, self._view = canvas, flight, view
+        self._stage, self._now = flight.stage, flight.rows[-1]
+        self._R_BI = self._attitude("attitude")
+        self.labels: list[Label] = []
+
+    def draw_background(self) -> None:
+        """Draw what stays as it is during a flight: ground, axes, and a path that does not move."""
+        self._ground()
+        stage = self._stage
+        if stage.reference_period and not len(stage.gates_I):
+            self._path(stage.reference(np.linspace(0.0, stage.reference_period, 161)))
+
+    def draw(self) -> list[Label]:
+        """Draw the rest from back to front; return the labels to write when all is drawn."""
+        for tip, name in ((1.15, 0.0, 0.0), "E"), ((0.0, 1.15, 0.0), "N"):
+            self.labels.append((name, self._view.project(np.array(tip))[0], GREY))
+        self._reference()
+        self._gates()
+        self._shadow()
+        self._trails()
+        self._camera()
+        self._fixes()
+        self._estimate()
+        self._vehicle()
+        self._axes()
+        return self.labels
+
+    # ---- the world ----------------------------------------------------------------------------
+
+    def _ground(self) -> None:
+        view, canvas = self._view, self._canvas
+        canvas.clear(SKY)
+        around = np.round(self._now["position"][:2]) if self._is_near() else np.zeros(2)
+        n = 9.0
+        lines = np.arange(-n, n + 0.5)
+        shift = np.array([*around, 0.0])
+        corners = shift + n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        border = view.segments(corners, np.roll(corners, -1, axis=0))
+        if len(border) == 4:
+            canvas.polygon(border[:, 0], GROUND)
+        elif len(border) > 1:  # the square is cut by the near plane
+            canvas.polygon(border.reshape(-1, 2), GROUND)
+        grid = [np.stack([lines, np.full_like(lines, s * n), 0.0 * lines], axis=1) for s in (-1, 1)]
+        grid += [
+            np.stack([np.full_like(lines, s * n), lines, 0.0 * lines], axis=1) for s in (-1, 1)
+        ]
+        for starts, ends in ((grid[0], grid[1]), (grid[2], grid[3])):
+            canvas.segments(view.segments(starts + shift, ends + shift), GRID)
+        origin = np.zeros((2, 3))
+        tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        canvas.segments(view.segments(origin, tips), GREY, 1.6)
+
+    def _is_near(self) -> bool:
+        """Whether the view is so close that the ground must move along."""
+        return bool(np.linalg.norm(self._now["position"] - self._view.eye) < 5.0)
+
+    def _reference(self) -> None:
+        stage, view, canvas = self._stage, self._view, self._canvas
+        now = float(self._now["time"])
+        if len(stage.gates_I):
+            first = int(self._now["gates_passed"])
+            self._path(np.concatenate([self._now["position"][np.newaxis], stage.gates_I[first:]]))
+            return
+        if stage.reference_period:
+            ahead = np.linspace(now, now + AHEAD_SECONDS, 24)
+            canvas.line(view.project(stage.reference(ahead))[0], GREEN, 3.0)
+        at, _ = view.project(self._now["reference_position"])
+        canvas.disc(at, 5.0, WHITE)
+        canvas.disc(at, 5.0, GREEN, 2.0)
+
+    def _path(self, points: Floats) -> None:
+        self._canvas.dashes(self._view.project(points)[0], GREY, 1.2)
+
+    def _gates(self) -> None:
+        view, canvas = self._view, self._canvas
+        passed = int(self._now["gates_passed"])
+        for k, gate in enumerate(self._stage.gates_I):
+            color = PALE if k < passed else GREEN if k == passed else GREY
+            sphere = self._stage.gate_radius * np.eye(3)
+            outline = ellipsoid_outline(gate, sphere, view)
+            foot = np.array([[gate[0], gate[1], 0.0]])
+            top = (gate - (0.0, 0.0, self._stage.gate_radius))[np.newaxis]
+            canvas.segments(view.segments(foot, top), color)
+            if k == passed:
+                canvas.polygon(outline, color, 0.15)
+            canvas.line(outline, color, 2.5 if k == passed else 1.5, closed=True)
+            ink = GREY if k < passed else INK
+            self.labels.append((str(k + 1), view.project(gate)[0] - (0.0, 6.0), ink))
+
+    def _shadow(self) -> None:
+        r_I = np.array(self._now["position"])
+        foot = r_I * (1.0, 1.0, 0.0)
+        if r_I[2] > 0.0:
+            self._canvas.polygon(self._view.project(foot + 0.22 * _RING)[0], GREY, 0.35)
+            self._canvas.segments(self._view.segments(foot[np.newaxis], r_I[np.newaxis]), GREY, 0.7)
+
+    def _recent(self, seconds: float, most: int) -> NDArray[np.void]:
+        """The rows of the last seconds, thinned out evenly to at most about so many."""
+        rows = self._flight.rows[-max(2, round(seconds * self._stage.control_rate)) :]
+        stride = -(-len(rows) // most)
+        # rows are counted from the flight's start, so that a trail does not flicker
+        offset = (len(rows) - len(self._flight.rows)) % stride
+        return np.concatenate([rows[offset::stride], rows[-1:]])
+
+    def _trails(self) -> None:
+        rows = self._recent(TRAIL_SECONDS, 180)
+        if self._flight.estimated:
+            where = self._view.project(rows["estimated_position"])[0]
+            self._canvas.line(where, VERMILLION, 2.6)
+        self._canvas.line(self._view.project(rows["position"])[0], BLUE, 1.5)
+
+    # ---- sensors ------------------------------------------------------------------------------
+
+    def _camera(self) -> None:
+        stage, view, canvas = self._stage, self._view, self._canvas
+        if not stage.has_camera:
+            return
+        r_I = self._now["position"]
+        corners = frustum_corners(stage, r_I, self._R_BI, FRUSTUM_DEPTH)
+        apex = np.repeat(corners[:1], 4, axis=0)
+        image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
+        if len(image) == 4:
+            canvas.polygon(image[:, 0], LIGHT_BLUE, 0.14)
+        canvas.segments(view.segments(apex, corners[1:]), LIGHT_BLUE)
+        canvas.segments(image, LIGHT_BLUE, 1.3)
+        seen = np.isfinite(self._now["pixels"]).all(axis=1)
+        features = stage.features_I
+        if seen.any():
+            eye = np.repeat(corners[:1], seen.sum(), axis=0)
+            canvas.segments(view.segments(eye, features[seen]), LIGHT_BLUE, 1.4)
+        for at, visible in zip(view.project(features)[0], seen, strict=True):
+            if np.isfinite(at).all():
+                x, y = at
+                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, INK if visible else WHITE)
+                canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, INK, 1.2)
+
+    def _fixes(self) -> None:
+        rows = self._flight.rows[-max(1, round(FIX_SECONDS * self._stage.control_rate)) :]
+        rows = rows[np.isfinite(rows["gnss_position"][:, 0])]
+        if not len(rows):
+            return
+        ages = self._now["time"] - rows["time"]
+        places = self._view.project(rows["gnss_position"])[0]
+        stride = -(-len(rows) // 40)
+        old = ages > 0.5 * FIX_SECONDS
+        for faded, which in ((True, old), (False, ~old)):
+            self._canvas.crosses(
+                places[which][::stride], 2.6, PALE_PURPLE if faded else PURPLE, 1.3
+            )
+        self._canvas.crosses(places[-1:], 4.0, PURPLE, 2.0)
+        if ages[-1] < 0.3 and len(rows) < 0.5 * FIX_SECONDS * self._stage.control_rate:
+            radius = 6.0 + 40.0 * float(ages[-1])
+            self._canvas.disc(places[-1], radius, PURPLE, 1.5)  # a ripple, where fixes are few
+
+    # ---- the vehicle and the estimate ---------------------------------------------------------
+
+    def _attitude(self, column: str) -> Floats:
+        q = self._now[column]
+        return quaternion_to_dcm(q) if np.isfinite(q).all() else np.eye(3)
+
+    def _estimate(self) -> None:
+        believed = self._flight["seen_position"][-1]
+        attitude = "seen_attitude"
+        if self._flight.estimated:
+            believed, attitude = self._now["estimated_position"], "estimated_attitude"
+        elif self._stage.observation != "noisy":
+            return
+        if not np.isfinite(believed).all():
+            return
+        view, canvas = self._view, self._canvas
+        if self._flight.estimated:
+            scale = ellipsoid_scale(self._flight)
+            axes = scale * ellipsoid_axes(self._now["covariance"][:3, :3], SIGMAS)
+            outline = ellipsoid_outline(believed, axes, view)
+            canvas.polygon(outline, VERMILLION, 0.16)
+            canvas.line(outline, VERMILLION, 1.2, closed=True)
+            canvas.segments(view.segments(believed - axes, believed + axes), VERMILLION, 0.8)
+        self._body(np.array(believed), self._attitude(attitude), ghost=True)
+        if self._flight.estimated and scale > 1.0:
+            # the error on the scale of the ellipsoid, so that one can see whether it is inside
+            error = believed + scale * (self._now["position"] - believed)
+            canvas.segments(view.segments(believed[np.newaxis], error[np.newaxis]), INK, 1.4)
+            at = view.project(error)[0]
+            canvas.disc(at, 4.0, WHITE)
+            canvas.disc(at, 2.8, INK)
+
+    def _vehicle(self) -> None:
+        self._body(np.array(self._now["position"]), self._R_BI, ghost=False)
+
+    def _body(self, r_I: Floats, R_BI: Floats, ghost: bool) -> None:
+        """Arms and rotors; a ghost is drawn in outline."""
+        view, canvas, stage = self._view, self._canvas, self._stage
+        hubs_B = stage.rotor_positions_B
+        hubs = r_I + hubs_B @ R_BI
+        thickness = float(np.clip(0.035 * view.scale_at(r_I), 1.6, 6.0))
+        color = VERMILLION if ghost else BLUE
+        middle = np.repeat(r_I[np.newaxis], len(hubs), axis=0)
+        arms = view.segments(middle, hubs)
+        if ghost:
+            canvas.segments(arms, color, 1.2)
+        else:
+            canvas.segments(arms, INK, thickness)
+        speeds = np.nan_to_num(self._now["rotor_speeds"]) / stage.max_rotor_speed
+        for hub, hub_B, speed in zip(hubs, hubs_B, speeds, strict=True):
+            disc = view.project(hub + (ROTOR_RADIUS * _RING) @ R_BI)[0]
+            front = hub_B[0] > 1e-9
+            if not ghost:
+                canvas.polygon(disc, BLUE, float(np.clip(0.1 + 0.9 * speed, 0.1, 0.7)))
+            canvas.line(disc, color if ghost or front else INK, 1.2 if ghost else 1.4)
+
+    def _axes(self) -> None:
+        r_I, view = self._now["position"], self._view
+        near = view.scale_at(np.array(r_I)) > 120.0
+        tips = r_I + 0.42 * self._R_BI
+        origin = np.repeat(r_I[np.newaxis], 3, axis=0)
+        self._canvas.segments(view.segments(origin, tips), INK, 1.5)
+        names = zip(r_I + 0.5 * self._R_BI, "xyz", strict=True)
+        self.labels += [
+            (name, view.project(tip)[0] - (0.0, 5.0), INK)
+            for tip, name in names
+            if near or name == "x"
+        ]

@@ -1,0 +1,209 @@
+"""The strip below the scene: errors, the filter's consistency and the rotors over time."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.flight_record import Flight
+from quad_gym.metrics import STATE_DIMENSION, Interval, chi_square_band
+from quad_gym.rendering.canvas import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    PALE,
+    VERMILLION,
+    WHITE,
+    Canvas,
+    Color,
+)
+
+Floats = NDArray[np.float64]
+
+WINDOW_SECONDS = 10.0
+"""How much of the past a plot shows."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangle [pixels]."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot of columns over time, on a logarithmic scale."""
+
+    curves: tuple[tuple[str, str, Color], ...]
+    """column, name and colour of each curve"""
+    low: float
+    high: float
+    ticks: dict[float, str]
+    share: float
+    """of the strip's width"""
+
+
+ERRORS = Plot(
+    (("position_error", "tracking", BLUE), ("estimation_error", "estimation", VERMILLION)),
+    low=3e-4,
+    high=6.0,
+    ticks={1e-3: "1 mm", 1e-2: "1 cm", 1e-1: "10 cm", 1.0: "1 m"},
+    share=0.47,
+)
+CONSISTENCY = Plot(
+    (("nees", "NEES", INK),),
+    low=1.0,
+    high=2000.0,
+    ticks={1.0: "1", 10.0: "10", 100.0: "100", 1e3: "1000"},
+    share=0.34,
+)
+PLOTS = (ERRORS, CONSISTENCY)
+
+
+@cache
+def nees_band() -> Interval:
+    """Where 95 % of a consistent filter's NEES lie."""
+    return chi_square_band(STATE_DIMENSION)
+
+
+def format_length(meters: float) -> str:
+    """A length for people, in millimetres to metres."""
+    if not np.isfinite(meters):
+        return "-"
+    if meters < 0.01:
+        return f"{1e3 * meters:.1f} mm"
+    if meters < 0.995:
+        return f"{1e2 * meters:.1f} cm"
+    return f"{meters:.2f} m"
+
+
+def height_on(plot: Plot, value: Floats | float, box: Box) -> Floats:
+    """Where values stand in a plot's box, between its bottom and its top [pixels]."""
+    logs = np.log10(np.clip(value, plot.low, plot.high))
+    share = (logs - np.log10(plot.low)) / (np.log10(plot.high) - np.log10(plot.low))
+    return np.asarray(box.top + box.height * (1.0 - share))
+
+
+def shows(flight: Flight, column: str) -> bool:
+    """Whether a curve has anything to say: on the truth, nothing is estimated."""
+    return column != "estimation_error" or flight.stage.observation != "truth"
+
+
+class Strip:
+    """Draws the strip for the last row of a flight.
+
+    Args:
+        canvas: To draw on.
+        box: Where.
+        size: Of the text [pixels].
+    """
+
+    def __init__(self, canvas: Canvas, box: Box, size: int) -> None:
+        self._canvas, self._box, self._size = canvas, box, size
+        pad, title = 0.012 * box.width, 1.1 * canvas.line_height(size)
+        self._title_y = box.top + 0.06 * box.height
+        top = self._title_y + title
+        height = box.top + box.height - top - 0.95 * canvas.line_height(size - 2)
+        self._boxes, left = [], box.left
+        for plot in PLOTS:
+            width = plot.share * box.width
+            label = pad + max(canvas.width_of(words, size - 2) for words in plot.ticks.values()) + 5
+            self._boxes.append(Box(left + label, top, width - label - pad, height))
+            left += width
+        self._rotors = Box(left + pad, top, box.left + box.width - left - 2 * pad, height)
+
+    def draw_background(self, hover_share: float) -> None:
+        """Draw boxes, axes and bands; hover_share is the hover speed over the largest speed."""
+        box, canvas = self._box, self._canvas
+        canvas.box(box.left, box.top, box.width, box.height, WHITE)
+        edge = np.array([[box.left, box.top], [box.left + box.width, box.top]])
+        canvas.line(edge, GREY)
+        for plot, place in zip(PLOTS, self._boxes, strict=True):
+            self._draw_axes(plot, place)
+        place = self._rotors
+        for k in range(4):
+            left = place.left + (k + 0.2) * place.width / 4
+            canvas.box(left, place.top, 0.15 * place.width, place.height, (238, 241, 245))
+        y = place.top + place.height * (1.0 - hover_share)
+        hover = np.array([[place.left, y], [place.left + place.width, y]])
+        canvas.dashes(hover, INK, 1.0, 4.0, 3.0)
+
+    def draw(self, flight: Flight) -> None:
+        """Draw the curves and the rotors."""
+        rows = flight.rows[-max(2, round(WINDOW_SECONDS * flight.stage.control_rate)) :]
+        for plot, place in zip(PLOTS, self._boxes, strict=True):
+            self._draw_curves(plot, place, flight, rows)
+        canvas, place = self._canvas, self._rotors
+        speeds = flight.rows["rotor_speeds"][-1] / flight.stage.max_rotor_speed
+        for k, speed in enumerate(np.clip(np.nan_to_num(speeds), 0.0, 1.0)):
+            left, height = place.left + (k + 0.25) * place.width / 4, speed * place.height
+            canvas.box(left, place.top + place.height - height, 0.125 * place.width, height, BLUE)
+
+    def write(self, flight: Flight) -> None:
+        """Write titles, numbers and ticks, after the canvas is finished."""
+        canvas, small, now = self._canvas, self._size - 2, flight.rows[-1]
+        for plot, place in zip(PLOTS, self._boxes, strict=True):
+            x = place.left
+            for column, name, color in plot.curves:
+                value = float(now[column]) if shows(flight, column) else np.nan
+                number = f"{value:.0f}" if plot is CONSISTENCY else format_length(value)
+                words = f"{name} {'-' if np.isnan(value) else number}"
+                if plot is ERRORS and column == "position_error" and len(flight.stage.gates_I):
+                    words = f"to the gate {number}"
+                if plot is ERRORS and column == "estimation_error":
+                    words += " error" if canvas.width_of("0" * 45, small) < place.width else ""
+                x += canvas.text(words, x, self._title_y, self._size, color) + 0.04 * place.width
+            if plot is CONSISTENCY:
+                words = f"({STATE_DIMENSION} if consistent)"
+                if x + canvas.width_of(words, small) < place.left + place.width:
+                    canvas.text(words, x, self._title_y + 1, small, GREY)
+            for tick, words in plot.ticks.items():
+                y = float(height_on(plot, tick, place)) - 0.45 * canvas.line_height(small)
+                canvas.text(words, place.left - 4.0, y, small, GREY, 1.0)
+            self._write_times(place, now["time"], small)
+        place = self._rotors
+        canvas.text("rotor speeds", place.left, self._title_y, self._size)
+        for k in range(4):
+            x = place.left + (k + 0.5) * place.width / 4
+            canvas.text(str(k + 1), x, place.top + place.height + 1.0, small, GREY, 0.5)
+
+    def _write_times(self, place: Box, now: float, size: int) -> None:
+        y = place.top + place.height + 1.0
+        begin = max(0.0, now - WINDOW_SECONDS)
+        self._canvas.text(f"{begin:.0f} s", place.left, y, size, GREY)
+        right = place.left + place.width
+        self._canvas.text(f"{begin + WINDOW_SECONDS:.0f} s", right, y, size, GREY, 1.0)
+
+    def _draw_axes(self, plot: Plot, place: Box) -> None:
+        canvas = self._canvas
+        across = np.array([place.left, place.left + place.width])
+        if plot is CONSISTENCY:
+            low, high = (float(height_on(plot, x, place)) for x in nees_band())
+            canvas.box(place.left, high, place.width, low - high, (214, 236, 229))
+            middle = height_on(plot, float(STATE_DIMENSION), place)
+            canvas.dashes(np.stack([across, np.full(2, middle)], axis=1), GREEN, 0.8)
+        for tick in plot.ticks:
+            y = np.full(2, height_on(plot, tick, place))
+            canvas.line(np.stack([across, y], axis=1), PALE, 0.6)
+        axes = [[across[0], place.top], [across[0], place.top + place.height]]
+        axes.append([across[1], place.top + place.height])
+        canvas.line(np.array(axes), GREY, 0.8)
+
+    def _draw_curves(self, plot: Plot, place: Box, flight: Flight, rows: NDArray[np.void]) -> None:
+        begin = max(0.0, float(rows["time"][-1]) - WINDOW_SECONDS)
+        stride = -(-len(rows) // 240)
+        shown = rows[(len(rows) - 1) % stride :: stride]
+        x = place.left + place.width * (shown["time"] - begin) / WINDOW_SECONDS
+        for column, _, color in reversed(plot.curves):
+            if shows(flight, column):
+                values = shown[column]
+                y = height_on(plot, np.nan_to_num(values, nan=plot.low), place)
+                curve = np.stack([x, np.where(np.isfinite(values), y, np.nan)], axis=1)
+                self._canvas.line(curve[x >= place.left - 1.0], color, 1.4)
+                self._canvas.disc(curve[-1], 2.2, color)

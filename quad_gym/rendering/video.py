@@ -1,0 +1,231 @@
+"""Flights as videos: fly a policy, keep the flight, and write what it looks like."""
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym import validation as check
+from quad_gym.flight_record import Flight, FlightRecorder
+from quad_gym.rendering.renderer import Renderer, checked_size
+
+VIDEO_ENDINGS = (".mp4", ".gif", ".webp")
+"""Kinds of video that can be written."""
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+
+
+def record_flight(
+    policy: Any,
+    env_id: str,
+    *,
+    seed: int = 0,
+    about: dict[str, Any] | None = None,
+    **keywords: Any,
+) -> Flight:
+    """Fly a policy for one episode and keep it.
+
+    Args:
+        policy: Anything with the `predict` of Stable-Baselines3; it acts on a batch of one
+            observation, as in `quad_gym.evaluation.roll_out`.
+        env_id: One of `quad_gym.IDS`.
+        seed: Of the episode.
+        about: Kept with the flight, beside the id and the seed.
+        keywords: Those of the environment.
+
+    Returns:
+        The flight, from its start to the ending of the episode.
+
+    Raises:
+        ValueError: If the episode would have no end, or a keyword makes no sense.
+    """
+    env = gymnasium.make_vec(env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
+    return flight_of(policy, env, seed=seed, about={"env_id": env_id, **(about or {})})
+
+
+def flight_of(
+    policy: Any,
+    env: gymnasium.vector.VectorEnv[Any, Any, Any],
+    *,
+    seed: int = 0,
+    about: dict[str, Any] | None = None,
+) -> Flight:
+    """Fly a policy for one episode of a vector environment of one flight, and keep it.
+
+    Raises:
+        ValueError: If the episode would have no end, or `env` is not such an environment.
+    """
+    flights = getattr(env.unwrapped, "flights", None)
+    if flights is None or env.num_envs != 1:
+        raise ValueError("env must be a QuadGym vector environment of one flight")
+    if flights.batch.max_steps == 0:
+        raise ValueError("env must have a time limit: a duration or max_episode_steps above 0")
+    recorder = FlightRecorder(flights.batch, about={"seed": seed, **(about or {})})
+    observation, _ = env.reset(seed=seed)
+    recorder.keep()
+    state, starts, over = None, np.ones(1, bool), False
+    while not over:
+        action, state = policy.predict(
+            observation, state=state, episode_start=starts, deterministic=True
+        )
+        observation, _, terminated, truncated, _ = env.step(action)
+        starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
+        recorder.keep()
+    return recorder.flight
+
+
+def _times(flight: Flight, fps: float, speed: float) -> NDArray[np.float64]:
+    end = float(flight["time"][-1])
+    return np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
+
+
+def save_video(
+    flight: Flight,
+    path: Path | str,
+    *,
+    view: str = "fixed",
+    size: tuple[int, int] = (640, 480),
+    fps: float = 25.0,
+    speed: float = 1.0,
+    progress: Progress | None = None,
+) -> Path:
+    """Write a flight as MP4 (H.264), or as an animated GIF or WebP, by the file's ending.
+
+    Args:
+        flight: The flight.
+        path: Of the file; missing folders are made.
+        view: "fixed" or "chase".
+        size: Width and height [pixels].
+        fps: Pictures a second.
+        speed: Seconds of flight per second of video: below 1 for slow motion.
+        progress: Wraps the times of the pictures, as `tqdm.tqdm` does.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If an argument makes no sense.
+        ImportError: If a library that writes the file is not installed.
+    """
+    target = checked_video_path(path)
+    check.positive("fps", fps)
+    check.positive("speed", speed)
+    renderer = Renderer(view, checked_size(size))
+    times: Iterable[float] = _times(flight, fps, speed)
+    frames = (renderer.draw(flight.until(t)) for t in (progress(times) if progress else times))
+    write_frames(frames, target, fps=fps)
+    return target
+
+
+def record_video(
+    policy: Any,
+    env_id: str,
+    path: Path | str,
+    *,
+    seed: int = 0,
+    view: str = "fixed",
+    size: tuple[int, int] = (640, 480),
+    fps: float = 25.0,
+    speed: float = 1.0,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> Flight:
+    """Fly a policy for one episode and write a video of it: `record_flight`, then `save_video`.
+
+    Args:
+        policy: As for `record_flight`.
+        env_id: One of `quad_gym.IDS`.
+        path: Of the video (.mp4, .gif or .webp).
+        seed: Of the episode.
+        view: "fixed" or "chase".
+        size: Width and height [pixels].
+        fps: Pictures a second.
+        speed: Seconds of flight per second of video.
+        progress: Wraps the times of the pictures, as `tqdm.tqdm` does.
+        keywords: Those of the environment.
+
+    Returns:
+        The flight, to be saved or looked into.
+
+    Raises:
+        ValueError: If an argument makes no sense.
+        ImportError: If a library that writes the file is not installed.
+    """
+    checked_video_path(path)  # before anything is flown
+    flight = record_flight(policy, env_id, seed=seed, **keywords)
+    save_video(flight, path, view=view, size=size, fps=fps, speed=speed, progress=progress)
+    return flight
+
+
+def checked_video_path(path: Path | str) -> Path:
+    """The path of a video that can be written here.
+
+    Raises:
+        ValueError: If its ending is unknown.
+        ImportError: If the library that writes it is not installed.
+    """
+    target = Path(path)
+    check.choice("the ending of the video's path", target.suffix.lower(), VIDEO_ENDINGS)
+    module = "imageio_ffmpeg" if target.suffix.lower() == ".mp4" else "PIL.Image"
+    try:
+        __import__(module)
+    except ImportError:
+        raise ImportError(
+            f"{target.suffix} videos need {module}, which is not installed: pip install "
+            '"quad-gym[render]"'
+        ) from None
+    return target
+
+
+def write_frames(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> None:
+    """Write pictures (height, width, 3) of one size as a video, by the file's ending."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".mp4":
+        _write_mp4(iter(frames), path, fps)
+    else:
+        _write_animation(frames, path, fps)
+
+
+def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    import imageio_ffmpeg
+
+    first = next(frames)
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        first.shape[1::-1],
+        fps=fps,
+        macro_block_size=2,
+        quality=8,
+        output_params=["-movflags", "+faststart"],
+        ffmpeg_log_level="error",
+    )
+    writer.send(None)
+    try:
+        writer.send(first)
+        for frame in frames:
+            writer.send(frame)
+    finally:
+        writer.close()
+
+
+def _write_animation(frames: Iterable[NDArray[np.uint8]], path: Path, fps: float) -> None:
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if path.suffix.lower() == ".webp":
+        options: dict[str, Any] = {"quality": 70, "method": 4, "minimize_size": False}
+    else:
+        # one palette for all, so that colours do not flicker
+        palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)
+        pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+        options = {"optimize": False}
+    pictures[0].save(
+        path,
+        save_all=True,
+        append_images=pictures[1:],
+        duration=round(1000.0 / fps),
+        loop=0,
+        **options,
+    )

@@ -1,0 +1,322 @@
+"""Every face renders what Gymnasium asks for, and a flight does not notice."""
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo
+
+import quad_gym
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import IDS, actions_of, assert_same
+
+pytest.importorskip("pygame")
+
+SMALL = {"render_size": (320, 240)}
+VIEWS = ("fixed", "chase")
+
+
+def flown(env, steps=3, seed=0):
+    env.reset(seed=seed)
+    for action in actions_of(seed, steps):
+        env.step(action)
+    return env
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_task_has_frames(env_id, view):
+    env = flown(gymnasium.make(env_id, render_mode="rgb_array", render_view=view))
+    frame = env.render()
+    assert frame.shape == (480, 640, 3)
+    assert frame.dtype == np.uint8
+    assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 100  # it is a picture of something
+    assert not np.array_equal(frame[:, ::-1], frame)
+    np.testing.assert_array_equal(frame, env.render())
+    env.step(np.zeros(4, np.float32))
+    assert (frame != env.render()).any()
+
+
+@pytest.mark.parametrize("observation", ["truth", "noisy", "sensors"])
+def test_every_observation_has_frames(observation):
+    env = flown(QuadEnv("circle", observation=observation, render_mode="rgb_array", **SMALL))
+    assert env.render().shape == (240, 320, 3)
+
+
+def test_what_stands_by_is_drawn_without_a_camera():
+    frames = [
+        flown(QuadEnv("hover", camera=camera, render_mode="rgb_array")).render()
+        for camera in (True, False)
+    ]
+    assert (frames[0] != frames[1]).any()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_gymnasiums_checker_is_content(env_id):
+    check_env(gymnasium.make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=False)
+
+
+def test_the_metadata_says_what_there_is():
+    assert QuadEnv.metadata["render_modes"] == ["human", "rgb_array", "rgb_array_list"]
+    env = QuadEnv("hover", control_rate=100.0, render_mode="rgb_array")
+    assert env.metadata["render_fps"] == 100
+    assert QuadEnv.metadata["render_fps"] == 50
+    vector = QuadVectorEnv(2, "hover")
+    assert vector.metadata["render_modes"] == QuadEnv.metadata["render_modes"]
+
+
+def test_a_list_holds_every_instant_since_it_was_taken():
+    env = QuadEnv("hover", render_mode="rgb_array_list", **SMALL)
+    one = QuadEnv("hover", render_mode="rgb_array", **SMALL)
+    env.reset(seed=1), one.reset(seed=1)
+    expected = [one.render()]
+    for action in actions_of(1, 3):
+        env.step(action), one.step(action)
+        expected.append(one.render())
+    assert_same(env.render(), expected)
+    assert env.render() == []
+    env.step(np.zeros(4)), env.reset()
+    assert len(env.render()) == 1
+
+
+def test_without_a_render_mode_there_is_a_warning_and_no_frame(capfd):
+    env = flown(QuadEnv("hover"))
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+
+
+def test_before_the_first_reset_there_is_nothing_to_see():
+    for env in (
+        QuadEnv("hover", render_mode="rgb_array"),
+        QuadVectorEnv(2, "hover", render_mode="rgb_array"),
+    ):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+            env.render()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("render_mode", "ansi"),
+        ("render_view", "side"),
+        ("render_size", (10, 10)),
+        ("render_size", (641, 480)),
+        ("render_size", 640),
+        ("render_size", (640.5, 480)),
+    ],
+)
+def test_nonsense_is_refused_by_name(name, value):
+    keywords = {"render_mode": "rgb_array", name: value}
+    with pytest.raises(ValueError, match=name):
+        QuadEnv("hover", **keywords)
+    with pytest.raises(ValueError, match=name):
+        QuadVectorEnv(2, "hover", **keywords)
+
+
+@pytest.mark.parametrize("flights", [(2,), (-1,), (), (0.5,)])
+def test_flights_that_are_not_there_are_refused(flights):
+    with pytest.raises(ValueError, match="flight"):
+        QuadVectorEnv(2, "hover", render_mode="rgb_array", render_flights=flights)
+
+
+# ---- a flight does not notice --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_rendering_never_changes_a_flight(env_id):
+    plain = gymnasium.make(env_id)
+    rendered = gymnasium.make(env_id, render_mode="rgb_array_list", **SMALL)
+    assert_same(plain.reset(seed=3), rendered.reset(seed=3))
+    for action in actions_of(3, 20):
+        assert_same(plain.step(action), rendered.step(action))
+        rendered.render()
+    ours, theirs = (env.unwrapped.flights.batch.snapshot() for env in (plain, rendered))
+    assert ours.tobytes() == theirs.tobytes()
+
+
+def test_rendering_chosen_flights_changes_no_flight():
+    batches = []
+    for mode in (None, "rgb_array"):
+        env = QuadVectorEnv(9, "hover", render_mode=mode, render_flights=(1, 8), **SMALL)
+        env.reset(seed=3)
+        for k in range(30):
+            env.step(np.stack([actions_of(i, 30)[k] for i in range(9)]))
+            env.render() if mode else None
+        batches.append(env.flights.batch.snapshot().tobytes())
+    assert batches[0] == batches[1]
+
+
+# ---- many flights --------------------------------------------------------------------------------
+
+
+def test_a_vector_environment_renders_what_single_ones_do():
+    env = QuadVectorEnv(4, "circle", render_mode="rgb_array", render_flights=(3, 0), **SMALL)
+    env.reset(seed=5)
+    ones = [QuadEnv("circle", render_mode="rgb_array", **SMALL) for _ in range(2)]
+    for one, seed in zip(ones, (8, 5), strict=True):
+        one.reset(seed=seed)
+    for action in actions_of(0, 5):
+        env.step(np.tile(action, (4, 1)))
+        for one in ones:
+            one.step(action)
+    assert_same(list(env.render()), [one.render() for one in ones])
+
+
+def test_lists_of_a_vector_environment_are_tiled():
+    env = QuadVectorEnv(3, "hover", render_mode="rgb_array_list", **SMALL)
+    env.reset(seed=0)
+    env.step(np.zeros((3, 4)))
+    frames = env.render()
+    assert [frame.shape for frame in frames] == [(480, 640, 3)] * 2
+    assert (frames[0][240:, 320:] == 255).all()  # the place of a fourth flight
+
+
+def test_a_new_episode_begins_a_new_trail():
+    env = QuadVectorEnv(1, "hover", render_mode="rgb_array", max_episode_steps=5, **SMALL)
+    env.reset(seed=0)
+    lengths = []
+    for _ in range(8):
+        env.step(np.zeros((1, 4)))
+        lengths.append(len(env.rendering.flights[0]))
+    assert lengths == [2, 3, 4, 5, 6, 1, 2, 3]
+
+
+def test_stable_baselines_gets_one_picture_of_all_tiles():
+    env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 4, 0, render_mode="rgb_array", **SMALL)
+    env.reset()
+    assert env.render().shape == (480, 640, 3)
+    assert [image.shape for image in env.get_images()] == [(240, 320, 3)] * 4
+    env.close()
+    with pytest.raises(ValueError, match="render_mode"):
+        quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 4, 0, render_mode="rgb_array_list")
+
+
+def test_gymnasium_records_videos(tmp_path):
+    pytest.importorskip("moviepy")
+    env = gymnasium.make("QuadGym/Hover-v0", render_mode="rgb_array", max_episode_steps=5, **SMALL)
+    env = RecordVideo(env, str(tmp_path / "single"), disable_logger=True)
+    flown(env, 5)
+    env.close()
+    vector = gymnasium.make_vec(
+        "QuadGym/Hover-v0", num_envs=2, render_mode="rgb_array", max_episode_steps=5, **SMALL
+    )
+    vector = gymnasium.wrappers.vector.RecordVideo(
+        vector, str(tmp_path / "vector"), disable_logger=True
+    )
+    vector.reset(seed=0)
+    for _ in range(5):
+        vector.step(np.zeros((2, 4)))
+    vector.close()
+    for folder in ("single", "vector"):
+        (video,) = (tmp_path / folder).glob("*.mp4")
+        assert video.stat().st_size > 2000
+
+
+# ---- the company of other software ---------------------------------------------------------------
+
+
+def run_python(code, **environment):
+    clean = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_frames_touch_no_window_no_audio_and_no_environment_variable():
+    done = run_python(
+        """
+import os, gymnasium, numpy as np, quad_gym
+before = dict(os.environ)
+env = gymnasium.make("QuadGym/Hover-v0", render_mode="rgb_array")
+env.reset(seed=0), env.step(np.zeros(4, np.float32))
+assert env.render().shape == (480, 640, 3)
+env.close(), env.close()
+import pygame
+assert not pygame.display.get_init() and not pygame.mixer.get_init()
+assert not pygame.joystick.get_init()
+assert dict(os.environ) == before
+"""
+    )
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+def test_pygame_is_imported_only_when_something_is_drawn():
+    done = run_python(
+        """
+import sys, gymnasium, numpy as np, quad_gym
+from quad_gym.flight_record import FlightRecorder
+import quad_gym.rendering
+env = gymnasium.make("QuadGym/Hover-v0")
+env.reset(seed=0), env.step(np.zeros(4, np.float32))
+assert "pygame" not in sys.modules
+"""
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_missing_pygame_gives_the_install_hint():
+    done = run_python(
+        """
+import sys
+sys.modules["pygame"] = None
+import gymnasium, quad_gym
+try:
+    gymnasium.make("QuadGym/Hover-v0", render_mode="rgb_array")
+except ImportError as error:
+    print(error)
+"""
+    )
+    assert 'pip install "quad-gym[render]"' in done.stdout, done.stderr
+
+
+def test_a_window_shows_the_flight_and_closes_twice():
+    done = run_python(
+        """
+import numpy as np, pygame
+from quad_gym.envs.single import QuadEnv
+env = QuadEnv("hover", render_mode="human", render_size=(320, 240))
+env.reset(seed=0)
+for _ in range(3):
+    env.step(np.zeros(4))
+assert env.render() is None
+assert pygame.display.get_surface().get_size() == (320, 240)
+env.close(), env.close()
+assert not pygame.display.get_init()
+""",
+        SDL_VIDEODRIVER="dummy",
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_window_without_a_screen_is_a_clear_error():
+    done = run_python(
+        """
+from quad_gym.envs.single import QuadEnv
+env = QuadEnv("hover", render_mode="human")
+try:
+    env.reset(seed=0)
+except RuntimeError as error:
+    print(error)
+""",
+        SDL_VIDEODRIVER="x11",
+    )
+    assert "cannot open a window" in done.stdout, done.stderr
+
+
+def test_environments_that_render_can_be_copied():
+    env = flown(QuadEnv("hover", render_mode="rgb_array", **SMALL))
+    frame = env.render()
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        np.testing.assert_array_equal(twin.render(), frame)
+        assert_same(twin.step(np.zeros(4)), copy.deepcopy(env).step(np.zeros(4)))
