@@ -44,6 +44,7 @@ _LAZY = {
     "FlightBatch": "quad_gym.simulation",
     "QuadEnv": "quad_gym.envs.single",
     "QuadVectorEnv": "quad_gym.envs.vector",
+    "ExtendedKalmanFilter": "quad_gym.estimation",
     "UnscentedKalmanFilter": "quad_gym.estimation",
     "observation_layout": "quad_gym.envs.spaces",
 }

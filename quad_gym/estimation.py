@@ -1,4 +1,4 @@
-"""State estimation for one vehicle: Wahba's problem and the unscented Kalman filter."""
+"""State estimation for one vehicle: Wahba's problem, an unscented and an extended Kalman filter."""
 
 import warnings
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym import validation as check
 from quad_gym.kernels import single
-from quad_gym.packing import params_record
+from quad_gym.packing import form_of, params_record
 from quad_gym.params import VehicleParams
 from quad_gym.records import FLIGHT, WORK, FilterStatus
 from quad_gym.sensor_params import SensorSuite
@@ -49,23 +49,10 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
     return R_BI
 
 
-class UnscentedKalmanFilter:
-    """The report's UKF for one vehicle: position, velocity, attitude and IMU biases.
+class _KalmanFilter:
+    """What the filters have in common: their interface, and all but the kind of their kernels."""
 
-    One cycle is: `update` with what was measured at t_k, read the estimate, then `predict` to t_k+1
-        with the
-    IMU sample of t_k. The measurement model is that of the report's section 3.4, with antenna
-    position, baseline direction and feature directions; any of them may be missing at any time.
-
-    A cycle whose result is not finite, or whose covariance would not be positive definite, leaves
-    the estimate as it was, sets `status`, and warns.
-
-    Args:
-        sensors: The sensor suite whose geometry and noise the filter believes in.
-
-    Raises:
-        ValueError: If `sensors` is not a sensor suite.
-    """
+    _kind: str
 
     def __init__(self, sensors: SensorSuite) -> None:
         if not isinstance(sensors, SensorSuite):
@@ -74,6 +61,7 @@ class UnscentedKalmanFilter:
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         self._params = params_record(VehicleParams(), sensors)
         self._params["gravity"] = sensors.estimator.gravity
+        self._form = int(form_of(sensors.estimator.replace(kind=self._kind)))
         self._flight = np.zeros(1, FLIGHT)
         self._work = np.zeros(1, WORK)
         self._running = False
@@ -182,15 +170,16 @@ class UnscentedKalmanFilter:
             f["feature_valid"][0, : self._features] = seen
             f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
         before = self.status
-        single.ukf_update(f, self._params, self._work, self._features)
+        single.ukf_update(f, self._params, self._work, self._features, self._form)
         self._warn_of_news(before)
 
     def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
         """Carry the estimate over one tick.
 
         Args:
-            gyro: (3,) angular rate measured at the start of the tick, in B [rad/s].
-            accel: (3,) specific force measured at the start of the tick, in B [m/s^2].
+            gyro: (3,) angular rate measured at the start of the tick, or its mean over it (see
+                `ImuParams.samples`), in B [rad/s].
+            accel: (3,) specific force, likewise, in B [m/s^2].
 
         Raises:
             ValueError: If an argument has another shape or is not finite; the estimate is unchanged
@@ -202,7 +191,7 @@ class UnscentedKalmanFilter:
         force = check.array("accel", accel, (3,))
         self._flight["gyro"], self._flight["accel"] = rates, force
         before = self.status
-        single.ukf_predict(self._flight, self._params, self._work)
+        single.ukf_predict(self._flight, self._params, self._work, self._form)
         self._warn_of_news(before)
 
     # ---- the estimate -------------------------------------------------------------------------
@@ -270,3 +259,43 @@ class UnscentedKalmanFilter:
             warnings.warn(
                 f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
             )
+
+
+class UnscentedKalmanFilter(_KalmanFilter):
+    """The report's UKF for one vehicle: position, velocity, attitude and IMU biases.
+
+    One cycle is: `update` with what was measured at t_k, read the estimate, then `predict` to t_k+1
+    with the IMU sample of that tick. The measurement model is that of the report's section 3.4,
+    with antenna position, baseline direction and feature directions; any of them may be missing at
+    any time. `FilterParams` tells where the filter may differ from the report's.
+
+    A cycle whose result is not finite, or whose covariance would not be positive definite, leaves
+    the estimate as it was, sets `status`, and warns.
+
+    Args:
+        sensors: The sensor suite whose geometry and noise the filter believes in.
+
+    Raises:
+        ValueError: If `sensors` is not a sensor suite.
+    """
+
+    _kind = "ukf"
+
+
+class ExtendedKalmanFilter(_KalmanFilter):
+    """An error-state EKF for one vehicle: the state, models, noise and use of the UKF.
+
+    Its covariance follows from analytic derivatives of the models at the estimate, which cost less
+    than sigma points and leave out the second order; see `quad_gym.kernels.ekf`.
+
+    Args:
+        sensors: The sensor suite whose geometry and noise the filter believes in.
+
+    Raises:
+        ValueError: If `sensors` is not a sensor suite.
+
+    Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about
+    an estimated attitude.
+    """
+
+    _kind = "ekf"

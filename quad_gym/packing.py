@@ -13,12 +13,13 @@ from quad_gym.records import (
     SETTINGS,
     Autoreset,
     Control,
+    FilterForm,
     Layout,
     Source,
     aligned_zeros,
 )
 from quad_gym.rotations import euler_to_dcm
-from quad_gym.sensor_params import SensorSuite
+from quad_gym.sensor_params import FilterParams, SensorSuite
 
 
 def params_record(
@@ -90,6 +91,18 @@ def params_record(
     return record
 
 
+def form_of(estimator: FilterParams) -> FilterForm:
+    """How a filter differs from the report's, for the kernels."""
+    form = FilterForm(0)
+    if estimator.kind == "ekf":
+        form |= FilterForm.EKF
+    if estimator.integration == "midpoint":
+        form |= FilterForm.MIDPOINT
+    if estimator.covariance_reset == "turn":
+        form |= FilterForm.TURN
+    return form
+
+
 def params_block(record: NDArray[Any]) -> NDArray[Any]:
     """A scalar parameter record repeated for the eight flights of a block, shape (1,)."""
     block = aligned_zeros(1, PARAMS_BLOCK)
@@ -116,6 +129,7 @@ def settings_record(
     s = record[0]
     s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
     s["gnss_ticks"] = clocks.ticks_between("gnss")
+    s["form"] = form_of(sensors.estimator)
     s["imu_averages"] = sensors.imu.samples == "average"
     if sensors.camera is not None:
         s["camera_ticks"] = clocks.ticks_between("camera")

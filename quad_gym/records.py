@@ -33,6 +33,17 @@ class FilterStatus(IntFlag):
     """A measurement update was not finite; the filter kept the state before it."""
 
 
+class FilterForm(IntFlag):
+    """How a filter differs from the report's; 0 is the report's UKF."""
+
+    EKF = 1
+    """derivatives of the models in place of sigma points"""
+    MIDPOINT = 2
+    """prediction turns the attitude exactly and the force with the attitude halfway"""
+    TURN = 4
+    """the covariance turns with the error angles when they are set to zero"""
+
+
 class Source(IntEnum):
     """Where the controller's view of the state comes from."""
 
@@ -282,6 +293,7 @@ SETTINGS_FIELDS = (
     Field("gnss_ticks", (), "ticks", "between GNSS measurements; 0: none", "i8"),
     Field("camera_ticks", (), "ticks", "between camera measurements; 0: none", "i8"),
     Field("feature_count", (), "-", "features in use", "i8"),
+    Field("form", (), "bits", "of the filter, see FilterForm", "i8"),
     Field("imu_averages", (), "0 or 1", "whether IMU samples are averages over the tick", "i8"),
     Field("source", (), "-", "what the controller sees, see Source", "i8"),
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),

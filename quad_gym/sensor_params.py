@@ -145,8 +145,18 @@ class CameraParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class FilterParams(Checked):
-    """The unscented Kalman filter's own choices."""
+    """The Kalman filter's own choices; the defaults are the report's form."""
 
+    kind: str = "ukf"
+    """"ukf", the report's unscented filter, or "ekf", an error-state extended one with the same
+    state, models and noise; the fields of the unscented transform do not concern it"""
+    integration: str = "euler"
+    """how the prediction carries the estimate over a tick: "euler", as if the sample of its start
+    held (report), or "midpoint", turning the attitude exactly and the force with the attitude
+    halfway, which belongs to `ImuParams.samples` "average\""""
+    covariance_reset: str = "none"
+    """what becomes of the covariance when the mean error angles go over into the attitude: "none"
+    (report), or "turn", S^-1 P S^-T, as the error angles are counted from another attitude then"""
     alpha: float = 1e-3
     """spread of the sigma points; laboratory"""
     beta: float = 2.0
@@ -176,6 +186,9 @@ class FilterParams(Checked):
             "gravity",
         )
         self._check(check.number, "beta", least=0.0)
+        self._check(check.choice, "kind", choices=("ukf", "ekf"))
+        self._check(check.choice, "integration", choices=("euler", "midpoint"))
+        self._check(check.choice, "covariance_reset", choices=("none", "turn"))
         self._check(check.choice, "feature_noise_across", choices=("measured", "predicted"))
         self._check(check.number, "kappa", least=-14.0)
 

@@ -123,10 +123,10 @@ def time_filter(args: Args) -> list[Row]:
         work_block = aligned_zeros(1, WORK_BLOCK)
 
         def in_lanes(*arrays: Any, n: int = features) -> None:
-            filter_cycle_of_blocks(*arrays, n)
+            filter_cycle_of_blocks(*arrays, n, 0)
 
         def scalar(*arrays: Any, n: int = features) -> None:
-            filter_cycle_of_flights(*arrays, n)
+            filter_cycle_of_flights(*arrays, n, 0)
 
         def add(name: str, timing: Timing, n: int = measurements) -> None:
             rows.append(report(f"{name}, {n} measurements", timing, kind=name, measurements=n))
@@ -195,7 +195,7 @@ def time_tick(args: Args) -> list[Row]:
         rows.append(report(part.name.lower(), measure(run, args.effort, again).per(args.batch)))
 
     def run_filter() -> None:
-        filter_cycle_of_blocks(blocks, model, work, features)
+        filter_cycle_of_blocks(blocks, model, work, features, 0)
 
     rows.append(report("filter", measure(run_filter, args.effort, again).per(args.batch)))
     total = Timing(sum(row["seconds"] for row in rows[1:]), 0.0)

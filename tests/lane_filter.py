@@ -10,7 +10,7 @@ from quad_gym.kernels.blocks import lanes_of
 from quad_gym.kernels.compilation import entry
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
-from quad_gym.packing import params_block, params_record
+from quad_gym.packing import form_of, params_block, params_record
 from quad_gym.params import VehicleParams
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, WORK_BLOCK, aligned_zeros
 
@@ -23,15 +23,15 @@ def initialize_lanes(blocks, params, work):
 
 
 @entry
-def update_lanes(blocks, params, work, feature_count):
+def update_lanes(blocks, params, work, feature_count, form):
     scratch = lanes_of(work[0])
     chosen = scratch.begins > 0.0
-    update(lanes_of(blocks[0]), lanes_of(params[0]), scratch, feature_count, chosen)
+    update(lanes_of(blocks[0]), lanes_of(params[0]), scratch, feature_count, chosen, form)
 
 
 @entry
-def predict_lanes(blocks, params, work):
-    predict(lanes_of(blocks[0]), lanes_of(params[0]), lanes_of(work[0]))
+def predict_lanes(blocks, params, work, form):
+    predict(lanes_of(blocks[0]), lanes_of(params[0]), lanes_of(work[0]), form)
 
 
 class LaneFilter:
@@ -39,6 +39,7 @@ class LaneFilter:
 
     def __init__(self, sensors):
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
+        self.form = int(form_of(sensors.estimator))
         self.params = params_block(params_record(VehicleParams(), sensors))
         self.block = aligned_zeros(1, FLIGHT_BLOCK)
         self.work = aligned_zeros(1, WORK_BLOCK)
@@ -81,7 +82,7 @@ class LaneFilter:
 
     def update(self, mask=(True,) * WIDTH):
         self.work["begins"][0] = mask
-        update_lanes(self.block, self.params, self.work, self.features)
+        update_lanes(self.block, self.params, self.work, self.features, self.form)
 
     def predict(self):
-        predict_lanes(self.block, self.params, self.work)
+        predict_lanes(self.block, self.params, self.work, self.form)

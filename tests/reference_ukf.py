@@ -7,7 +7,8 @@ filter computes in as many digits as the decimal context has. In float64 it is t
 filter that speeds are compared with.
 
 State (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0 after each step. Prediction noise
-(v_g, v_g2, v_a, v_a2).
+(v_g, v_g2, v_a, v_a2). `PlainEKF` differentiates the same models numerically, which is as good as
+exact in that many digits.
 """
 
 from decimal import Decimal
@@ -60,6 +61,24 @@ def euler_rate_matrix(e):
     rows = [[cf * ct, nought, cf * st], [sf * st, cf, -ct * sf], [-st, nought, ct]]
     S = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     return S / cf[..., np.newaxis, np.newaxis]
+
+
+def turn_by(vector):
+    """exp(-[vector x]) by Rodrigues' formula: a body that turns by `vector` from the identity."""
+    x, y, z = vector
+    cross = np.array([[0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x]])
+    angle = np.sqrt(vector @ vector)
+    eye = np.eye(3).astype(int) + 0 * cross
+    if angle == 0:
+        return eye
+    (cosine,), (sine,) = cos_sin(np.array([angle]))
+    return eye - sine / angle * cross + (1 - cosine) / angle**2 * (cross @ cross)
+
+
+def inverse33(M):
+    """The inverse of a 3 x 3 matrix of any number type, by cross products."""
+    a, b, c = M.T
+    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]) / (a @ np.cross(b, c))
 
 
 def east_north_up(r_G, number=np.float64):
@@ -187,6 +206,10 @@ class PlainUKF:
         self.r, self.v, e, self.b_a, self.b_g = x[:3], x[3:6], x[6:9], x[9:12], x[12:15]
         self.R = rotation_312(e) @ self.R
         self.P = (P + P.T) / 2
+        if self.sensors.estimator.covariance_reset == "turn":
+            turn = eye_of(self.number, 15)
+            turn[6:9, 6:9] = inverse33(euler_rate_matrix(e[np.newaxis])[0])
+            self.P = turn @ self.P @ turn.T
 
     def _state(self):
         return np.concatenate([self.r, self.v, self.zeros[:3], self.b_a, self.b_g])
@@ -210,26 +233,47 @@ class PlainUKF:
         )
 
     def predict(self, gyro, accel):
-        w_B, f_B, dt = self._array(gyro), self._array(accel), self.dt
+        w_B, f_B = self._array(gyro), self._array(accel)
         x0 = np.concatenate([self._state(), self.zeros])
-        points, w_mean, w_cov = self._sigma_points(x0, block_diagonal(self.P, self.Q))
+        mean, P = self._transform(
+            lambda points: self._process(points, w_B, f_B), x0, block_diagonal(self.P, self.Q)
+        )
+        if self.sensors.estimator.integration == "midpoint":
+            self.R = turn_by(self.dt * (w_B - self.b_g)) @ self.R
+        self._inject(mean, P)
+
+    def _transform(self, function, x0, P0):
+        """Mean and covariance of a function of a random vector."""
+        points, w_mean, w_cov = self._sigma_points(x0, P0)
+        after = function(points)
+        mean = w_mean @ after
+        deviations = after - mean
+        return mean, (w_cov * deviations.T) @ deviations
+
+    def _process(self, points, w_B, f_B):
+        """(n, 15) states after a tick, of (n, 27) states with noise before it."""
         r, v, e, b_a, b_g, v_g, v_g2, v_a, v_a2 = np.split(points, 9, axis=1)
-        R_BI = rotation_312(e) @ self.R
-        a_I = ((f_B - b_a - v_a)[:, np.newaxis] @ R_BI)[:, 0] - self.g_I
-        e_rate = (euler_rate_matrix(e) @ (w_B - b_g - v_g)[:, :, np.newaxis])[:, :, 0]
-        after = np.concatenate(
+        dt, R_BI = self.dt, rotation_312(e) @ self.R
+        force = f_B - b_a - v_a
+        if self.sensors.estimator.integration == "midpoint":
+            half = turn_by(dt / 2 * (w_B - self.b_g))
+            error = b_g - self.b_g + v_g
+            force = (force - dt / 2 * np.cross(error, f_B - self.b_a)) @ half
+            e_after = (e @ half.T - dt * error) @ half.T
+        else:
+            rate = (euler_rate_matrix(e) @ (w_B - b_g - v_g)[:, :, np.newaxis])[:, :, 0]
+            e_after = e + dt * rate
+        a_I = (force[:, np.newaxis] @ R_BI)[:, 0] - self.g_I
+        return np.concatenate(
             [
                 r + v * dt + a_I * dt**2 / 2,
                 v + a_I * dt,
-                e + dt * e_rate,
+                e_after,
                 self.decay["accel"] * b_a + v_a2,
                 self.decay["gyro"] * b_g + v_g2,
             ],
             axis=1,
         )
-        mean = w_mean @ after
-        deviations = after - mean
-        self._inject(mean, (w_cov * deviations.T) @ deviations)
 
     def update(self, gnss_position_G=None, gnss_baseline_G=None, pixels=None):
         measured, noises, models = [], [], []
@@ -246,12 +290,17 @@ class PlainUKF:
                 self._add_feature(X_I, pixel, measured, noises, models)
         if not measured:
             return
-        z, noise = np.concatenate(measured), block_diagonal(*noises)
+        self._condition(np.concatenate(measured), block_diagonal(*noises), models)
 
+    def _predicted(self, models, points):
+        """What is measured at states (n, 15 and more), (n, n_z)."""
+        r, R_BI = points[:, :3], rotation_312(points[:, 6:9]) @ self.R
+        return np.concatenate([model(r, R_BI) for model in models], axis=1)
+
+    def _condition(self, z, noise, models):
         x0 = np.concatenate([self._state(), self._array(np.zeros(len(z)))])
         points, w_mean, w_cov = self._sigma_points(x0, block_diagonal(self.P, noise))
-        r, R_BI = points[:, :3], rotation_312(points[:, 6:9]) @ self.R
-        Z = np.concatenate([model(r, R_BI) for model in models], axis=1) + points[:, 15:]
+        Z = self._predicted(models, points) + points[:, 15:]
         z_mean = w_mean @ Z
         x_mean = w_mean @ points[:, :15]
         dX, dZ = points[:, :15] - x_mean, Z - z_mean
@@ -287,3 +336,25 @@ class PlainUKF:
     accel_bias = property(lambda self: self.b_a)
     gyro_bias = property(lambda self: self.b_g)
     covariance = property(lambda self: self.P)
+
+
+class PlainEKF(PlainUKF):
+    """The error-state extended filter of the same models, in the textbook's form."""
+
+    def _differences(self, function, x0):
+        """Value and Jacobian of a function of points (n, k), by central differences."""
+        h = self.number("1e-13") if self.number is Decimal else self.number(1e-6)
+        steps = h * eye_of(self.number, len(x0))
+        center = function(x0[np.newaxis])[0]
+        return center, ((function(x0 + steps) - function(x0 - steps)) / (2 * h)).T
+
+    def _transform(self, function, x0, P0):
+        center, J = self._differences(function, x0)
+        return center, J @ P0 @ J.T
+
+    def _condition(self, z, noise, models):
+        x0 = self._state()
+        center, H = self._differences(lambda points: self._predicted(models, points), x0)
+        P_zz = H @ self.P @ H.T + noise
+        K = solve_positive_definite(P_zz, H @ self.P).T
+        self._inject(x0 + K @ (z - center), self.P - K @ P_zz @ K.T)

@@ -74,6 +74,7 @@ class Flights:
         actions: ActionParams | None = None,
         camera: bool = True,
         feature_noise_across: str | None = None,
+        estimator: str | None = None,
         control_rate: float = 50.0,
         imu_rate: float | None = None,
         gnss_rate: float | None = None,
@@ -104,8 +105,11 @@ class Flights:
         if feature_noise_across is None and isinstance(sensors, str):
             feature_noise_across = "predicted"
         if feature_noise_across is not None:
-            estimator = suite.estimator.replace(feature_noise_across=feature_noise_across)
-            suite = suite.replace(estimator=estimator)
+            choices = suite.estimator.replace(feature_noise_across=feature_noise_across)
+            suite = suite.replace(estimator=choices)
+        if estimator is not None:
+            check.choice("estimator", estimator, ("ukf", "ekf"))
+            suite = suite.replace(estimator=suite.estimator.replace(kind=estimator))
         suite = suite.with_rates(imu=imu_rate, gnss=gnss_rate, camera=camera_rate)
 
         features = 0 if suite.camera is None else len(suite.camera.features_I)

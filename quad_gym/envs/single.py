@@ -106,6 +106,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         feature_noise_across: "predicted" or "measured", see `quad_gym.FilterParams`. None: as a
             given `SensorSuite` has it; for a suite by name "predicted", as the report's own
             "measured" makes some 6 circles in 1,000 crash in their first second.
+        estimator: "ukf" or "ekf", in place of the suite's.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
         imu_rate: In place of the suite's [Hz].
         gnss_rate: In place of the suite's [Hz].

@@ -110,7 +110,7 @@ def sense(flight, world, model, settings, work, mask, starting):
 
         if starting:
             initialize(flight, model, mask)
-        update(flight, model, work, settings.feature_count, mask)
+        update(flight, model, work, settings.feature_count, mask, settings.form)
     _look(flight, model, settings, mask)
 
 
@@ -129,7 +129,7 @@ def tick(flight, world, model, settings, work):
     if settings.run_filter:
         if settings.imu_averages:
             measure_imu_average(flight, world, start, everyone)
-        predict(flight, model, work)
+        predict(flight, model, work, settings.form)
         drift_biases(flight, world)
     flight.tick = flight.tick + 1.0
     sense(flight, world, model, settings, work, everyone, False)

@@ -61,18 +61,18 @@ def run_part(blocks, part, world, model, settings, work, low, high, observations
 
 
 @entry
-def filter_cycle_of_blocks(blocks, model, work, feature_count):
+def filter_cycle_of_blocks(blocks, model, work, feature_count, form):
     """Update and predict the filters of every block, eight flights at a time."""
     believed, scratch = lanes_of(model[0]), lanes_of(work[0])
     for index in range(len(blocks)):
         flight = lanes_of(blocks[index])
-        update(flight, believed, scratch, feature_count, flight.tick >= 0.0)
-        predict(flight, believed, scratch)
+        update(flight, believed, scratch, feature_count, flight.tick >= 0.0, form)
+        predict(flight, believed, scratch, form)
 
 
 @entry
-def filter_cycle_of_flights(flights, model, work, feature_count):
+def filter_cycle_of_flights(flights, model, work, feature_count, form):
     """Update and predict the filter of every flight: the scalar instance of the same kernels."""
     for index in range(len(flights)):
-        update(flights[index], model[0], work[0], feature_count, True)
-        predict(flights[index], model[0], work[0])
+        update(flights[index], model[0], work[0], feature_count, True, form)
+        predict(flights[index], model[0], work[0], form)

@@ -63,6 +63,16 @@ def quaternion_to_dcm(q):
 
 
 @kernel
+def vector_to_dcm(phi):
+    """exp(-[phi x]), the R_BI of a body that has turned by the rotation vector phi [rad] from I."""
+    angle = math.sqrt(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
+    sine, cosine = sin_cos(0.5 * angle)
+    turned = angle > 1e-100
+    per_angle = select(turned, sine / select(turned, angle, 1.0), 0.5)
+    return quaternion_to_dcm((cosine, per_angle * phi[0], per_angle * phi[1], per_angle * phi[2]))
+
+
+@kernel
 def dcm_to_quaternion(R_BI):
     """The unit quaternion of R_BI with the sign that makes its largest component positive.
 

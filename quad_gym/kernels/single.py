@@ -23,15 +23,15 @@ def ukf_initialize(flights, params):
 
 
 @entry
-def ukf_update(flights, params, work, feature_count):
+def ukf_update(flights, params, work, feature_count, form):
     """Condition the filter of flights[0] on its valid measurements."""
-    update(flights[0], params[0], work[0], feature_count, True)
+    update(flights[0], params[0], work[0], feature_count, True, form)
 
 
 @entry
-def ukf_predict(flights, params, work):
+def ukf_predict(flights, params, work, form):
     """Carry the filter of flights[0] over one tick."""
-    predict(flights[0], params[0], work[0])
+    predict(flights[0], params[0], work[0], form)
 
 
 @entry

@@ -26,7 +26,9 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compilation import kernel
+from quad_gym.kernels.ekf import acceleration_column, angle_column
 from quad_gym.kernels.elementary import is_finite
+from quad_gym.kernels.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import (
     add,
@@ -36,10 +38,12 @@ from quad_gym.kernels.linalg import (
     apply,
     apply_transposed,
     cholesky,
+    cross,
     keep3,
     keep33,
     load3,
     load33,
+    load_block,
     load_column3,
     multiply,
     outer,
@@ -51,12 +55,11 @@ from quad_gym.kernels.linalg import (
     sum_of_squares,
     unit_or,
 )
-from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
+from quad_gym.kernels.rotation import euler_to_dcm, split_rotation, vector_to_dcm
 from quad_gym.kernels.wahba import wahba
-from quad_gym.records import FilterStatus
+from quad_gym.records import FilterForm, FilterStatus
 
-R, V, E, BA, BG = 0, 3, 6, 9, 12
-"""First rows of position, velocity, attitude error, accelerometer and gyro bias in the state."""
+_EKF, _MIDPOINT, _TURN = int(FilterForm.EKF), int(FilterForm.MIDPOINT), int(FilterForm.TURN)
 _PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
 
 
@@ -83,75 +86,139 @@ def _euler_rate_parts(parts, w_B, dg):
 
 
 @kernel
-def _propagate_sigma_points(flight, p, work, f_B, w_B):
+def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
+    """Offset of the measured force along c times column j of L, in the frame of the tick's start.
+
+    Halfway through the tick, an offset of the gyro's bias has turned the force by half its angle.
+    """
+    df = scale(c, load_column3(L, BA, j))
+    if midpoint:
+        dg = scale(c, load_column3(L, BG, j))
+        df = apply_transposed(half, add(df, scale(half_dt, cross(dg, f_B))))
+    return df
+
+
+@kernel
+def _propagate_columns(flight, p, work, f_B, w_B, half, form):
     """Fill work.F and work.S with the propagated pairs; return their mean less the centre's."""
     L, F, S = flight.L, work.F, work.S
     R_BI = load33(flight.R_hat)
     dt = p.dt
-    half_dt2 = 0.5 * dt * dt
+    half_dt, half_dt2 = 0.5 * dt, 0.5 * dt * dt
+    midpoint, extended = (form & _MIDPOINT) != 0, (form & _EKF) != 0
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 27.0)
     inverse_c = 1.0 / c
     zero = 0.0 * c
-    mean_a, mean_e = (zero, zero, zero), (zero, zero, zero)
+    nothing = (zero, zero, zero)
+    mean_a, mean_e = nothing, nothing
+    f_start, full = f_B, half
+    if midpoint:
+        f_start, full = apply_transposed(half, f_B), multiply(half, half)
 
     for j in range(9):
-        d = scale(c, load_column3(L, E, j))
-        df, dg = scale(c, load_column3(L, BA, j)), scale(c, load_column3(L, BG, j))
-        even, odd, parts = split_rotation(d)
-        # a_I = R^T R(e)^T (f - b_a) - g: its part odd in the offset, its even part less the centre
-        odd_B = sub(sub(apply_transposed(odd, f_B), df), apply_transposed(even, df))
-        even_B = sub(apply_transposed(even, f_B), apply_transposed(odd, df))
-        a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
-        a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
-        rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
+        if extended:
+            df = _force_offset(L, j, 1.0, f_B, half, half_dt, midpoint)
+            a_odd, a_even = acceleration_column(L, j, R_BI, f_start, df), nothing
+            e_odd, e_even = angle_column(L, j, w_B, dt), nothing
+        else:
+            d, dg = scale(c, load_column3(L, E, j)), scale(c, load_column3(L, BG, j))
+            df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
+            even, odd, parts = split_rotation(d)
+            # a_I = R^T R(e)^T (f - b_a) - g: its odd part in the offset, its even less the centre
+            odd_B = sub(sub(apply_transposed(odd, f_start), df), apply_transposed(even, df))
+            even_B = sub(apply_transposed(even, f_start), apply_transposed(odd, df))
+            a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
+            a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
+            rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
+            e_odd = scale(inverse_c, add(d, scale(dt, rate_odd)))
+            e_even = scale(dt * inverse_c, rate_even)
+        if midpoint:
+            e_odd, e_even = _turned_angles(L, j, full, half, dt), nothing
 
         v_j = load_column3(L, V, j)
         r_j = add(load_column3(L, R, j), scale(dt, v_j))
-        e_even = scale(dt * inverse_c, rate_even)
         for i in range(3):
             F[R + i, j] = r_j[i] + half_dt2 * a_odd[i]
             F[V + i, j] = v_j[i] + dt * a_odd[i]
-            F[E + i, j] = inverse_c * (d[i] + dt * rate_odd[i])
+            F[E + i, j] = e_odd[i]
             S[R + i, j] = half_dt2 * a_even[i]
             S[V + i, j] = dt * a_even[i]
             S[E + i, j] = e_even[i]
-        mean_a = add(mean_a, a_even)
-        mean_e = add(mean_e, e_even)
+        mean_a, mean_e = add(mean_a, a_even), add(mean_e, e_even)
 
     for j in range(9, 15):  # offsets of the biases alone: linear
-        a_odd = apply_transposed(R_BI, scale(-1.0, load_column3(L, BA, j)))
+        df = _force_offset(L, j, -1.0, f_B, half, half_dt, midpoint)
+        a_odd, e_odd = apply_transposed(R_BI, df), scale(-dt, load_column3(L, BG, j))
+        if midpoint:
+            e_odd = apply(half, e_odd)
         for i in range(3):
             F[R + i, j] = half_dt2 * a_odd[i]
             F[V + i, j] = dt * a_odd[i]
-            F[E + i, j] = -dt * L[BG + i, j]
+            F[E + i, j] = e_odd[i]
 
     mean_a = scale(inverse_c, mean_a)
     return scale(half_dt2, mean_a), scale(dt, mean_a), scale(inverse_c, mean_e)
 
 
 @kernel
-def _sum_moments(flight, p, work, mean_r, mean_v, mean_e):
-    """Fill the lower triangle of work.P from the propagated pairs and the process noise."""
+def _turned_angles(L, j, full, half, dt):
+    """Column j of the error angles about the new R_hat, R_half (R_half e - dt b_g)."""
+    turned = apply(full, load_column3(L, E, j))
+    return sub(turned, scale(dt, apply(half, load_column3(L, BG, j))))
+
+
+@kernel
+def _add_gyro_noise(P, p, R_BI, f_B, half):
+    """Add the gyro's white noise to P; half of the angle by which it errs turns the force."""
+    dt, sigma = p.dt, p.gyro_sigma
+    zero = 0.0 * dt
+    axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
+    for axis in axes:
+        dv = apply_transposed(R_BI, apply_transposed(half, cross(f_B, axis)))
+        dv = scale(0.5 * dt * dt, dv)
+        dr, de = scale(0.5 * dt, dv), scale(-dt, apply(half, axis))
+        store_block(P, R, R, add_outer(load_block(P, R, R), dr, dr))
+        store_block(P, V, R, add_outer(load_block(P, V, R), dv, dr))
+        store_block(P, V, V, add_outer(load_block(P, V, V), dv, dv))
+        store_block(P, E, R, add_outer(load_block(P, E, R), de, dr))
+        store_block(P, E, V, add_outer(load_block(P, E, V), de, dv))
+        store_block(P, E, E, add_outer(load_block(P, E, E), de, de))
+
+
+@kernel
+def _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form):
+    """Fill the lower triangle of work.P from the propagated pairs and the process noise.
+
+    The gyro's noise is added here only where it enters through the tick's start.
+    """
     L, F, S, P = flight.L, work.F, work.S, work.P
     dt = p.dt
     half_dt2 = 0.5 * dt * dt
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
     accel_variance = p.accel_sigma * p.accel_sigma
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
+    extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
+    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
 
     for i in range(0, 9, 3):
         mean_i = mean_r if i == R else (mean_v if i == V else mean_e)
-        block = add33(sum_of_squares(F, i, 15), sum_of_squares(S, i, 9))
-        store_block(P, i, i, add_outer(block, scale(excess, mean_i), mean_i))
+        block = sum_of_squares(F, i, 15)
+        if not extended:
+            block = add33(block, sum_of_squares(S, i, 9))
+            block = add_outer(block, scale(excess, mean_i), mean_i)
+        store_block(P, i, i, block)
         for j in range(0, i, 3):
             mean_j = mean_r if j == R else mean_v
-            block = add33(sum_of_outers(F, i, F, j, 15), sum_of_outers(S, i, S, j, 9))
-            store_block(P, i, j, add_outer(block, scale(excess, mean_i), mean_j))
+            block = sum_of_outers(F, i, F, j, 15)
+            if not extended:
+                block = add33(block, sum_of_outers(S, i, S, j, 9))
+                block = add_outer(block, scale(excess, mean_i), mean_j)
+            store_block(P, i, j, block)
     for i in range(3):
         P[R + i, R + i] += half_dt2 * half_dt2 * accel_variance
         P[V + i, R + i] += half_dt2 * dt * accel_variance
         P[V + i, V + i] += dt * dt * accel_variance
-        P[E + i, E + i] += (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
+        P[E + i, E + i] += gyro_variance
 
     # the biases are linear: their rows of the propagated columns are those of L times the decay
     for j in range(0, 9, 3):
@@ -169,11 +236,20 @@ def _sum_moments(flight, p, work, mean_r, mean_v, mean_e):
 
 
 @kernel
-def predict(flight, p, work):
-    """Carry the estimate over one tick with the IMU sample at its start.
+def predict(flight, p, work, form=0):
+    """Carry the estimate over one tick with its IMU sample.
 
+    The report's form, with the sample as of the tick's start:
     `a = R^T (f_meas - b_a - v_a) - g e3`, `r+ = r + v dt + a dt^2/2`, `v+ = v + a dt`,
-    `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`.
+    `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`, where R_hat turns by R(mean e+).
+
+    With MIDPOINT, the sample as of the whole tick: R_hat turns by exp(-[dt w x]), and R in `a` is
+    the attitude halfway. The error angles count from the new R_hat at once: with R_half =
+    exp(-[dt w x] / 2), `e+ = R_half (R_half e - dt (b_g + v_g))`, and the force turns by half of
+    what the gyro's error turns the attitude.
+
+    With TURN, the covariance turns with the reset of e, see `error_state.py`; with EKF, derivatives
+    take the place of sigma points, see `ekf.py`.
 
     A lane whose predicted covariance is not positive definite keeps its state and sets
     PREDICTION_FAILED.
@@ -182,13 +258,26 @@ def predict(flight, p, work):
         flight: Record; reads gyro and accel, changes the estimate.
         p: Parameters as the filter believes them.
         work: Workspace.
+        form: A `FilterForm`.
     """
     dt = p.dt
+    midpoint = (form & _MIDPOINT) != 0
     w_B = sub(load3(flight.gyro), load3(flight.b_g_hat))
     f_B = sub(load3(flight.accel), load3(flight.b_a_hat))
     R_BI = load33(flight.R_hat)
-    mean_r, mean_v, mean_e = _propagate_sigma_points(flight, p, work, f_B, w_B)
-    _sum_moments(flight, p, work, mean_r, mean_v, mean_e)
+    half = R_BI  # not read but with MIDPOINT
+    if midpoint:
+        half = vector_to_dcm(scale(0.5 * dt, w_B))
+    mean_r, mean_v, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form)
+    _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form)
+    turn = add(scale(dt, w_B), mean_e)
+    if midpoint:
+        _add_gyro_noise(work.P, p, R_BI, f_B, half)
+        R_pred, f_B = multiply(half, multiply(half, R_BI)), apply_transposed(half, f_B)
+    else:
+        R_pred = multiply(euler_to_dcm(turn), R_BI)
+        if (form & _TURN) != 0:
+            turn_covariance(work.P, reset_matrix(turn))
     ok = cholesky(work.P, 15, work.inverse_diagonal) > 0.0
 
     a_I = apply_transposed(R_BI, f_B)
@@ -196,7 +285,6 @@ def predict(flight, p, work):
     r, v = load3(flight.r_hat), load3(flight.v_hat)
     r_pred = add(add(add(r, scale(dt, v)), scale(0.5 * dt * dt, a_I)), mean_r)
     v_pred = add(add(v, scale(dt, a_I)), mean_v)
-    R_pred = multiply(euler_to_dcm(add(scale(dt, w_B), mean_e)), R_BI)
     ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
 
     keep3(flight.r_hat, ok, r_pred)

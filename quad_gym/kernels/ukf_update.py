@@ -12,7 +12,9 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compilation import kernel
+from quad_gym.kernels.ekf import measure_columns
 from quad_gym.kernels.elementary import is_finite
+from quad_gym.kernels.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.lanes import any_of, logical_not, select
 from quad_gym.kernels.linalg import (
     add,
@@ -42,9 +44,9 @@ from quad_gym.kernels.linalg import (
     sum_of_squares,
 )
 from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
-from quad_gym.kernels.ukf import BA, BG, E, R, V
-from quad_gym.records import FilterStatus
+from quad_gym.records import FilterForm, FilterStatus
 
+_EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -237,7 +239,7 @@ def _sum_noise(p, work, n, c):
 
 
 @kernel
-def update(flight, p, work, feature_count, mask):
+def update(flight, p, work, feature_count, mask, form=0):
     """Condition the estimate on the valid measurements of the present instant, where `mask`.
 
     A lane whose result is not finite keeps its state bit for bit and sets UPDATE_FAILED.
@@ -248,6 +250,7 @@ def update(flight, p, work, feature_count, mask):
         work: Workspace.
         feature_count: Features in use.
         mask: Which lanes.
+        form: A `FilterForm`.
     """
     use_position = any_of(flight.position_valid > 0.0)
     use_baseline = any_of(flight.baseline_valid > 0.0)
@@ -258,7 +261,10 @@ def update(flight, p, work, feature_count, mask):
     for i in range(feature_count):
         measured = measured + 3.0 * flight.feature_valid[i]
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 15.0 + measured)
-    _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c)
+    if (form & _EKF) != 0:
+        measure_columns(flight, p, work, n, feature_count, use_position, use_baseline)
+    else:
+        _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c)
     _sum_noise(p, work, n, c)
 
     # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
@@ -302,6 +308,8 @@ def update(flight, p, work, feature_count, mask):
             shift = shift + L9[i, j] * t[j]
         dx[i] = shift
         total = total + shift
+    if (form & _TURN) != 0:
+        turn_factor(L9, reset_matrix((dx[E], dx[E + 1], dx[E + 2])))
     wanted = mask & (measured > 0.0)
     ok = wanted & (pivot > 0.0) & is_finite(total)
     keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))

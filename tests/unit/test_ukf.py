@@ -24,7 +24,9 @@ def distance(value, truth):
     return float(abs(array_of(Decimal, value) - truth).max())
 
 
-def compare(sensors, ticks, seed, *, present=0.8, filter_class=UnscentedKalmanFilter):
+def compare(
+    sensors, ticks, seed, *, present=0.8, filter_class=UnscentedKalmanFilter, plain_class=PlainUKF
+):
     """The largest deviations from the reference over a flight with measurements coming and going.
 
     Returns:
@@ -37,7 +39,7 @@ def compare(sensors, ticks, seed, *, present=0.8, filter_class=UnscentedKalmanFi
     worst = dict.fromkeys((*QUANTITIES, "covariance"), 0.0)
     with decimal.localcontext() as context:
         context.prec = 40
-        reference = PlainUKF(sensors, Decimal)
+        reference = plain_class(sensors, Decimal)
         for ukf in (ours, reference):
             ukf.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
         for k in range(ticks):
@@ -94,6 +96,9 @@ def test_the_filter_equals_the_plain_filter_over_a_thousand_cycles():
         {"feature_noise_across": "predicted"},
         {"direction_variance_floor": 1e-6, "initial_velocity_variance": 0.5, "initial_scale": 5.0},
         {"gravity": 9.81},
+        {"integration": "midpoint"},
+        {"covariance_reset": "turn"},
+        {"integration": "midpoint", "covariance_reset": "turn", "alpha": 0.7},
     ],
     ids=str,
 )

@@ -66,12 +66,12 @@ def test_eight_different_flights_equal_the_scalar_filter_to_the_last_bits():
         scalars = [lanes.flight(lane) for lane in range(8)]  # both start each half-cycle alike
         lanes.update()
         for lane, flight in enumerate(scalars):
-            single.ukf_update(flight, params, work, features)
+            single.ukf_update(flight, params, work, features, 0)
             assert_close(lanes, lane, flight)
         scalars = [lanes.flight(lane) for lane in range(8)]
         lanes.predict()
         for lane, flight in enumerate(scalars):
-            single.ukf_predict(flight, params, work)
+            single.ukf_predict(flight, params, work, 0)
             assert_close(lanes, lane, flight)
     assert (lanes.get("filter_status") == 0).all()
 
@@ -99,7 +99,7 @@ def test_a_lane_that_misses_a_measurement_has_exactly_the_update_without_it():
             lanes.measure(3, RECORDINGS[3], 1, position=position, baseline=baseline, camera=False)
             flight = lanes.flight(3)
             lanes.update()
-            single.ukf_update(flight, params, work, lanes.features)
+            single.ukf_update(flight, params, work, lanes.features, 0)
             assert_close(lanes, 3, flight)
             assert lanes.get("filter_status")[3] == 0
             if not (position or baseline):
