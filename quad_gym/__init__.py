@@ -41,7 +41,9 @@ def __getattr__(name: str) -> Any:
 
 
 _LAZY = {
+    "Flight": "quad_gym.flight_record",
     "FlightBatch": "quad_gym.simulation",
+    "FlightRecorder": "quad_gym.flight_record",
     "QuadEnv": "quad_gym.envs.single",
     "QuadVectorEnv": "quad_gym.envs.vector",
     "ExtendedKalmanFilter": "quad_gym.estimation",

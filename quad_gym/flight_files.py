@@ -72,9 +72,10 @@ def load_flight(path: Path) -> Flight:
         ValueError: If it is damaged, of another kind, or of an unknown version.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError(f"{path} is not a flight: it is a single array")
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError(f"{path} is not a flight: it is a single array")
+        with archive:
             entries = {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise

@@ -345,7 +345,7 @@ class FlightRecorder:
 
     def _stage_of_episode(self) -> Stage:
         batch, model = self._batch, self._model
-        camera, gnss = batch.sensors.camera, batch.sensors.gnss
+        camera = batch.sensors.camera
         gate_count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
         return Stage(
             task=batch.task.kind,
@@ -354,7 +354,7 @@ class FlightRecorder:
             rotor_positions_B=np.array(batch.vehicle.rotor_positions_B),
             max_rotor_speed=float(model["motor_gain"] * model["max_voltage"]),
             hover_rotor_speed=float(model["motor_gain"] * model["hover_voltage"]),
-            antennas_B=np.array([gnss.primary_antenna_B, gnss.secondary_antenna_B]),
+            antennas_B=np.array([model["antenna"], model["antenna"] + model["baseline"]]),
             camera_B=np.array(camera.position_B if camera else [np.nan] * 3),
             R_CB=np.array(model["R_CB"]),
             focal_length=float(model["focal_length"]),

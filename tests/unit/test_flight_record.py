@@ -1,0 +1,307 @@
+"""A flight's record says what happened, and its files give it back."""
+
+import csv
+import dataclasses
+import json
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym import Flight, FlightRecorder
+from quad_gym.envs.single import QuadEnv
+from quad_gym.flight_files import table
+from quad_gym.flight_record import COLUMNS, Stage
+from quad_gym.frames import ecef_to_enu
+from quad_gym.rendering import record_flight
+from quad_gym.rotations import quaternion_to_dcm
+
+
+def recorded(task="circle", steps=12, seed=2, **keywords):
+    """(environment, its flight, observations of each row)."""
+    env = QuadEnv(task, **keywords)
+    recorder = FlightRecorder(env.flights.batch, about={"seed": seed})
+    observations = [env.reset(seed=seed)[0]]
+    recorder.keep()
+    for action in np.random.default_rng(seed).uniform(-0.3, 0.3, (steps, 4)):
+        observations.append(env.step(action)[0])
+        recorder.keep()
+    return env, recorder.flight, np.array(observations)
+
+
+def assert_same_flights(ours, theirs):
+    assert ours.rows.dtype == theirs.rows.dtype
+    for column in COLUMNS:
+        assert ours[column.name].tobytes() == theirs[column.name].tobytes(), column.name
+    for field in dataclasses.fields(Stage):
+        a, b = getattr(ours.stage, field.name), getattr(theirs.stage, field.name)
+        np.testing.assert_array_equal(a, b)
+    assert ours.about == theirs.about
+
+
+# ---- what is kept --------------------------------------------------------------------------------
+
+
+def test_rows_are_control_steps_from_the_start():
+    _, flight, _ = recorded(steps=12, control_rate=100.0)
+    assert len(flight) == 13
+    np.testing.assert_allclose(flight["time"], np.arange(13) / 100.0, atol=1e-12)
+    assert len(flight.until(0.05)) == 6
+    assert len(flight.until(-1.0)) == 1
+
+
+def test_estimate_and_reference_are_those_that_the_controller_observed():
+    _, flight, observed = recorded(layout="absolute")
+    part = {f.name: f.slice for f in quad_gym.observation_layout(layout="absolute")}
+    for name, column in (
+        ("position", "estimated_position"),
+        ("velocity", "estimated_velocity"),
+        ("accel_bias", "estimated_accel_bias"),
+        ("reference_position", "reference_position"),
+        ("last_action", "action"),
+    ):
+        np.testing.assert_allclose(observed[:, part[name]], flight[column], atol=1e-6)
+    R_hat = quaternion_to_dcm(flight["estimated_attitude"]).reshape(-1, 9)
+    np.testing.assert_allclose(observed[:, part["R_BI"]], R_hat, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["hover", "lemniscate", "random_trajectory", "waypoints"])
+def test_errors_are_distances_between_columns(task):
+    _, flight, _ = recorded(task)
+    gap = np.linalg.norm(flight["position"] - flight["reference_position"], axis=1)
+    np.testing.assert_allclose(gap, flight["position_error"], atol=1e-12)
+    gap = np.linalg.norm(flight["position"] - flight["seen_position"], axis=1)
+    np.testing.assert_allclose(gap, flight["estimation_error"], atol=1e-12)
+    start = flight["position"][0] - flight.stage.reference(np.zeros(1))[0]
+    if task != "waypoints":
+        assert np.linalg.norm(start) == pytest.approx(flight["position_error"][0])
+
+
+def test_nees_is_that_of_the_error_and_the_covariance():
+    _, flight, _ = recorded("hover", steps=25)
+    row = flight.rows[-1]
+    P = row["covariance"]
+    error = np.zeros(15)
+    for k, word in enumerate(("position", "velocity", None, "accel_bias", "gyro_bias")):
+        if word is not None:
+            error[3 * k : 3 * k + 3] = row[word] - row[f"estimated_{word}"]
+    # small angles: R(e) is nearly I - [e x]
+    R = quaternion_to_dcm(row["attitude"]) @ quaternion_to_dcm(row["estimated_attitude"]).T
+    error[6:9] = (R[1, 2] - R[2, 1]) / 2, (R[2, 0] - R[0, 2]) / 2, (R[0, 1] - R[1, 0]) / 2
+    assert row["nees"] == pytest.approx(error @ np.linalg.solve(P, error), rel=0.02)
+    np.testing.assert_array_equal(P, P.T)
+    assert (np.linalg.eigvalsh(P) > 0.0).all()
+
+
+def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
+    env, flight, _ = recorded("hover", steps=100, gnss_rate=5.0, control_rate=50.0)
+    measured = np.isfinite(flight["gnss_position"]).all(axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(measured), np.arange(0, 101, 10))
+    lever = quad_gym.sensor_suite("lab").gnss.primary_antenna_B
+    antenna = flight["position"] + lever @ quaternion_to_dcm(flight["attitude"])
+    miss = flight["gnss_position"][measured] - antenna[measured]
+    assert (abs(miss) < 6 * np.array([0.006, 0.006, 0.012])).all()
+    G = env.flights.batch.read("gnss_position")[0]
+    enu = ecef_to_enu(quad_gym.sensor_suite("lab").gnss.reference_antenna_G) @ G
+    np.testing.assert_allclose(enu, flight["gnss_position"][-1], atol=1e-9)
+
+
+def test_without_a_filter_nothing_is_estimated():
+    _, flight, _ = recorded(observation="truth")
+    assert not flight.estimated
+    for name in ("estimated_position", "covariance", "nees", "gnss_position", "pixels", "gyro"):
+        assert np.isnan(flight[name]).all(), name
+    assert np.isfinite(flight["position"]).all()
+    assert recorded()[1].estimated
+
+
+def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
+    env, first, _ = recorded(steps=5)
+    recorder = FlightRecorder(env.flights.batch)
+    env.reset(seed=1)
+    recorder.keep()
+    before = recorder.flight
+    position = before["position"].copy()
+    env.reset(seed=2)
+    recorder.keep()
+    np.testing.assert_array_equal(before["position"], position)
+    assert len(recorder.flight) == 1
+    np.testing.assert_array_equal(recorder.flight["position"], first["position"][:1])
+
+
+def test_long_flights_have_room():
+    _, flight, _ = recorded(
+        "hover", steps=600, duration=0.0, out_of_bounds=1e6, ground=-1e6, max_tilt=np.pi
+    )
+    assert len(flight) == 601
+    assert (np.diff(flight["time"]) > 0.0).all()
+
+
+def test_a_flight_that_is_not_there_is_refused():
+    env = QuadEnv("hover")
+    with pytest.raises(ValueError, match="flight must be within"):
+        FlightRecorder(env.flights.batch, 1)
+    with pytest.raises(ValueError, match="reset"):
+        _ = FlightRecorder(env.flights.batch).flight
+
+
+def test_a_recorded_policy_flies_what_it_flies_unrecorded():
+    keywords = {"observation": "estimate", "sensors": "lab"}
+    env = gymnasium.make("QuadGym/Waypoints-v0", **keywords)
+    policy = PDPolicy(env)
+    flight = record_flight(policy, "QuadGym/Waypoints-v0", seed=6, about={"by": "pd"}, **keywords)
+    observation, _ = env.reset(seed=6)
+    errors, over = [], False
+    while not over:
+        observation, _, terminated, truncated, info = env.step(policy.predict(observation)[0])
+        errors.append(info["position_error"])
+        over = terminated or truncated
+    np.testing.assert_array_equal(flight["position_error"][1:], errors)
+    assert flight.about == {"seed": 6, "env_id": "QuadGym/Waypoints-v0", "by": "pd"}
+    with pytest.raises(ValueError, match="time limit"):
+        record_flight(policy, "QuadGym/Waypoints-v0", duration=0.0)
+
+
+# ---- files ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {},
+        {"task": "waypoints"},
+        {"observation": "truth"},
+        {"camera": False},
+        {"gnss_rate": 10.0, "camera_rate": 20.0},
+    ],
+    ids=str,
+)
+def test_a_saved_flight_loads_bit_for_bit(tmp_path, keywords):
+    _, flight, _ = recorded(**keywords)
+    file = flight.save(tmp_path / "new" / "flight.npz")
+    assert [f.name for f in file.parent.iterdir()] == ["flight.npz"]
+    assert_same_flights(Flight.load(file), flight)
+
+
+def test_a_file_can_be_read_with_numpy_alone(tmp_path):
+    _, flight, _ = recorded()
+    with np.load(flight.save(tmp_path / "flight.npz")) as archive:
+        header = json.loads(str(archive["header"]))
+        assert (header["format"], header["version"]) == ("quad_gym flight", 1)
+        np.testing.assert_array_equal(archive["columns/position"], flight["position"])
+
+
+def changed_file(flight, path, change):
+    """The file of a flight after a change of its entries."""
+    with np.load(flight.save(path)) as archive:
+        entries = {name: archive[name] for name in archive.files}
+    change(entries)
+    np.savez_compressed(path, **entries)
+    return path
+
+
+def with_header(**changes):
+    def change(entries):
+        entries["header"] = np.array(json.dumps(json.loads(str(entries["header"])) | changes))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_header(version=2), "version 2"),
+        (with_header(version=None), "version None"),
+        (with_header(format="other"), "not a flight"),
+        (lambda e: e.pop("header"), "not a flight"),
+        (lambda e: e.pop("columns/position"), "columns/position"),
+        (lambda e: e.pop("stage/R_CB"), "R_CB"),
+        (lambda e: e.update({"columns/nees": np.zeros(3)}), "column nees"),
+        (lambda e: e.update({"columns/time": np.zeros(0)}), "no rows"),
+        (lambda e: e.update({"columns/position": np.zeros((13, 3), "f4")}), "float64"),
+    ],
+)
+def test_files_of_another_kind_are_clear_errors(tmp_path, change, message):
+    file = changed_file(recorded()[1], tmp_path / "flight.npz", change)
+    with pytest.raises(ValueError, match=message) as caught:
+        Flight.load(file)
+    assert "flight.npz" in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_truncated_files_are_clear_errors(tmp_path, share):
+    file = recorded()[1].save(tmp_path / "flight.npz")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"flight\.npz"):
+        Flight.load(file)
+
+
+def test_damaged_bytes_are_noticed(tmp_path):
+    file = recorded()[1].save(tmp_path / "flight.npz")
+    whole = bytearray(file.read_bytes())
+    whole[len(whole) // 2] ^= 0xFF
+    file.write_bytes(bytes(whole))
+    with pytest.raises(ValueError, match=r"flight\.npz"):
+        Flight.load(file)
+
+
+def test_other_files_are_clear_errors(tmp_path):
+    np.save(tmp_path / "array.npz.npy", np.zeros(3))
+    (tmp_path / "array.npz.npy").rename(tmp_path / "array.npz")
+    (tmp_path / "text.npz").write_text("hello")
+    for name in ("array", "text"):
+        with pytest.raises(ValueError, match=rf"{name}\.npz"):
+            Flight.load(tmp_path / f"{name}.npz")
+    with pytest.raises(FileNotFoundError):
+        Flight.load(tmp_path / "nowhere.npz")
+
+
+def test_an_interrupted_save_leaves_the_old_file(tmp_path):
+    _, flight, _ = recorded()
+    file = flight.save(tmp_path / "flight.npz")
+    before = file.read_bytes()
+    with pytest.raises(TypeError):
+        dataclasses.replace(flight, about={"bad": object()}).save(file)
+    assert file.read_bytes() == before
+    assert [f.name for f in tmp_path.iterdir()] == ["flight.npz"]
+
+
+def test_csv_keeps_every_number(tmp_path):
+    _, flight, _ = recorded(gnss_rate=10.0)
+    with flight.to_csv(tmp_path / "flight.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(flight)
+    for name, values in table(flight).items():
+        read = np.array([float(row[name] or "nan") for row in rows])
+        np.testing.assert_array_equal(read, values, err_msg=name)
+    assert rows[1]["gnss_position_x"] == ""
+
+
+def test_the_table_names_every_number_once():
+    _, flight, _ = recorded()
+    columns = table(flight)
+    numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
+    assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
+    np.testing.assert_array_equal(columns["attitude_w"], flight["attitude"][:, 0])
+    np.testing.assert_array_equal(columns["rotor_speeds_4"], flight["rotor_speeds"][:, 3])
+    np.testing.assert_array_equal(columns["pixels_2_y"], flight["pixels"][:, 1, 1])
+    sigma = np.sqrt(flight["covariance"][:, 4, 4])
+    np.testing.assert_array_equal(columns["sigma_velocity_y"], sigma)
+
+
+def test_pandas_gets_the_same_table(monkeypatch):
+    pytest.importorskip("pandas")
+    _, flight, _ = recorded()
+    frame = flight.to_pandas()
+    assert frame.index.name == "time"
+    np.testing.assert_array_equal(frame.index, flight["time"])
+    for name, values in table(flight).items():
+        if name != "time":
+            np.testing.assert_array_equal(frame[name], values)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"quad-gym\[pandas\]"):
+        flight.to_pandas()

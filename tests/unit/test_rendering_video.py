@@ -1,0 +1,173 @@
+"""Videos of flights, and frames that show what they should."""
+
+import numpy as np
+import pytest
+
+from quad_gym.rendering import Renderer, record_flight, record_video, save_video, tile
+from quad_gym.rendering import canvas as colors
+from quad_gym.rendering.geometry import fixed_view
+from quad_gym.rendering.inset import inset_box, place_in_inset
+from quad_gym.rendering.scene import ELLIPSOID_LIMIT, ELLIPSOID_SCALES, ellipsoid_scale
+from quad_gym.rendering.strip import CONSISTENCY, Box, format_length, height_on
+
+pygame = pytest.importorskip("pygame")
+
+
+class Still:
+    """Does nothing."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 4)), None
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return record_flight(Still(), "QuadGym/Hover-v0", seed=1, max_episode_steps=30)
+
+
+def colour_near(frame, at, radius, color):
+    """Whether a colour is found within a distance of a pixel."""
+    x, y = np.round(at).astype(int)
+    part = frame[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
+    return bool((abs(part.astype(int) - color) < 40).all(axis=-1).any())
+
+
+def test_features_and_reference_are_drawn_where_the_view_projects_them(flight):
+    frame = Renderer("fixed", (640, 480)).draw(flight)
+    view = fixed_view(flight, 640, round(0.765 * 480))
+    for feature in flight.stage.features_I:
+        assert colour_near(frame, view.project(feature)[0], 3, colors.INK)
+    assert colour_near(frame, view.project(flight["position"][-1])[0], 25, colors.BLUE)
+    start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m below it
+    frame = Renderer("fixed", (640, 480)).draw(start)
+    at = fixed_view(start, 640, round(0.765 * 480)).project(start["reference_position"][-1])[0]
+    assert colour_near(frame, at, 8, colors.GREEN)
+
+
+def test_the_inset_is_drawn_where_the_camera_measured(flight):
+    frame = Renderer("fixed", (640, 480)).draw(flight)
+    box = inset_box(flight.stage, 632.0, 8.0, 0.27 * 640)
+    seen = flight["pixels"][-1][np.isfinite(flight["pixels"][-1]).all(axis=1)]
+    assert len(seen)
+    for pixel in seen:
+        assert colour_near(frame, place_in_inset(pixel, flight.stage, box), 2, colors.INK)
+
+
+def test_a_replay_shows_what_was_seen_live(flight):
+    import gymnasium
+
+    for view in ("fixed", "chase"):
+        env = gymnasium.make_vec(
+            "QuadGym/Hover-v0",
+            num_envs=1,
+            render_mode="rgb_array",
+            render_view=view,
+            max_episode_steps=30,
+        )
+        env.reset(seed=1)
+        replayed = Renderer(view)
+        for k in range(30):
+            (live,) = env.render()
+            time = flight["time"][k]
+            np.testing.assert_array_equal(replayed.draw(flight.until(time)), live)
+            env.step(np.zeros((1, 4)))
+
+
+def test_the_order_of_pictures_does_not_matter(flight):
+    renderer = Renderer("fixed", (320, 240))
+    forward = [renderer.draw(flight.until(t)) for t in (0.0, 0.2, 0.4)]
+    backward = [renderer.draw(flight.until(t)) for t in (0.4, 0.2, 0.0)][::-1]
+    np.testing.assert_array_equal(forward, backward)
+
+
+def test_the_ellipsoid_is_drawn_as_large_as_fits(flight):
+    scale = ellipsoid_scale(flight)
+    assert scale in ELLIPSOID_SCALES
+    sigma = np.sqrt(np.diagonal(flight["covariance"][:, :3, :3], axis1=1, axis2=2).max())
+    assert 3.0 * sigma * scale <= ELLIPSOID_LIMIT
+    larger = [s for s in ELLIPSOID_SCALES if s > scale]
+    assert all(3.0 * sigma * s > ELLIPSOID_LIMIT for s in larger)
+
+
+def test_logarithmic_plots_place_values_between_their_ends():
+    box = Box(0.0, 10.0, 100.0, 60.0)
+    middle = np.sqrt(CONSISTENCY.low * CONSISTENCY.high)
+    found = height_on(CONSISTENCY, np.array([CONSISTENCY.low, middle, CONSISTENCY.high]), box)
+    np.testing.assert_allclose(found, [70.0, 40.0, 10.0])
+    assert height_on(CONSISTENCY, 1e9, box) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("meters", "words"),
+    [(0.0032, "3.2 mm"), (0.874, "87.4 cm"), (0.999, "1.00 m"), (2.52, "2.52 m"), (np.nan, "-")],
+)
+def test_lengths_are_for_people(meters, words):
+    assert format_length(meters) == words
+
+
+def test_tiles_fill_a_grid():
+    frames = [np.full((2, 3, 3), k, np.uint8) for k in range(5)]
+    sheet = tile(frames)
+    assert sheet.shape == (4, 9, 3)
+    assert (sheet[:2, 3:6] == 1).all()
+    assert (sheet[2:, 3:6] == 4).all()
+    assert (sheet[2:, 6:] == 255).all()
+
+
+# ---- files ---------------------------------------------------------------------------------------
+
+
+def test_an_mp4_has_the_frames_of_the_flight(flight, tmp_path):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    file = save_video(flight, tmp_path / "new" / "hover.mp4", size=(320, 240), fps=20.0)
+    reader = imageio_ffmpeg.read_frames(str(file))
+    about = next(reader)
+    frames = [np.frombuffer(raw, np.uint8).reshape(240, 320, 3) for raw in reader]
+    assert about["size"] == (320, 240)
+    assert about["fps"] == pytest.approx(20.0)
+    assert len(frames) == round(20.0 * flight["time"][-1]) + 1
+    drawn = Renderer("fixed", (320, 240)).draw(flight)
+    assert abs(frames[-1].astype(int) - drawn).mean() < 6.0  # but for the compression
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp"])
+def test_animations_have_the_frames_of_the_flight(flight, tmp_path, ending):
+    image = pytest.importorskip("PIL.Image")
+    file = save_video(flight, tmp_path / f"hover.{ending}", size=(320, 240), fps=10.0, speed=0.5)
+    with image.open(file) as picture:
+        assert picture.n_frames == round(10.0 * flight["time"][-1] / 0.5) + 1
+        assert picture.size == (320, 240)
+        picture.seek(picture.n_frames - 1)
+        last = np.asarray(picture.convert("RGB")).astype(int)
+    assert abs(last - Renderer("fixed", (320, 240)).draw(flight)).mean() < 6.0
+
+
+def test_a_policy_is_flown_and_filmed_in_one_call(tmp_path):
+    flown = record_video(
+        Still(),
+        "QuadGym/Hover-v0",
+        tmp_path / "hover.gif",
+        seed=1,
+        size=(320, 240),
+        fps=10.0,
+        max_episode_steps=10,
+    )
+    assert len(flown) == 11
+    assert (tmp_path / "hover.gif").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("name", "keywords"),
+    [
+        ("ending", {"path": "hover.avi"}),
+        ("fps", {"fps": 0.0}),
+        ("speed", {"speed": -1.0}),
+        ("render_view", {"view": "top"}),
+        ("render_size", {"size": (321, 240)}),
+    ],
+)
+def test_nonsense_is_refused_before_anything_is_written(flight, tmp_path, name, keywords):
+    path = tmp_path / "folder" / keywords.pop("path", "hover.gif")
+    with pytest.raises(ValueError, match=name):
+        save_video(flight, path, **keywords)
+    assert not path.parent.exists()
