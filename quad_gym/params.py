@@ -23,7 +23,7 @@ MAX_GATES = 8
 TASKS = ("hover", "circle", "lemniscate", "random_trajectory", "waypoints")
 """Kinds of task, in the order of `records.Task`."""
 
-STARTS = ("ground", "hover")
+STARTS = ("ground", "hover", "mixed")
 """How episodes begin, in the order of `records.Start`."""
 
 
@@ -234,7 +234,7 @@ class TaskParams(Checked):
     """of the reference [m]; report section 4.2"""
     start: str = "ground"
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
-    "hover": hovering at rest within some decimetres of the reference"""
+    "hover": hovering at rest within some decimetres of the reference; "mixed": either, by a coin"""
     randomize: bool = False
     """draw phase, radius, period and sense of the reference anew each episode"""
     duration: float = 10.0

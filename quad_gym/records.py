@@ -82,6 +82,8 @@ class Start(IntEnum):
     """At rest below the reference at height 0, rotors stopped: the report's."""
     HOVER = 1
     """Hovering, at rest, within some decimetres of the reference."""
+    MIXED = 2
+    """Either, by a coin: for training, as a policy that has learned to hover learns to take off."""
 
 
 class Layout(IntEnum):

@@ -5,7 +5,7 @@ import math
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import atan2, clip, maximum, minimum, sin_cos
 from quad_gym.kernels.lanes import select
-from quad_gym.kernels.linalg import keep3, load3, multiply
+from quad_gym.kernels.linalg import keep3, load3, multiply, scale
 from quad_gym.kernels.random import normal_pair, uniform_pair
 from quad_gym.kernels.reference import evaluate_reference
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm
@@ -17,6 +17,8 @@ DRAW_COURSE, DRAW_START, DRAW_SERIES = DRAW_RESET, DRAW_RESET + 2, DRAW_RESET + 
 """Numbers of the draws of an episode's first instant."""
 START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
 """Spread of a hovering start: [m], [rad], [rad], [m/s]."""
+GROUND_SHARE = 0.5
+"""Share of the mixed starts that are on the ground."""
 HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY = 0.0, 1.0, 2.0
 
 
@@ -143,26 +145,31 @@ def draw_start(flight, p, model, settings, stream, mask):
     zero = 0.0 * yaw
     v_I = (zero, zero, zero)
     roll, pitch, rotor_speed = zero, zero, zero
-    if settings.start == Start.GROUND:
-        z = zero
-    else:
+    on_ground = mask
+    if settings.start != Start.GROUND:
         n_r, n_v = six_normals(stream, DRAW_START)
         n_roll, n_pitch = normal_pair(stream, DRAW_START + 3)
         n_yaw, _ = normal_pair(stream, DRAW_START + 4)
+        u_ground, _ = uniform_pair(stream, DRAW_START + 8)
+        share = GROUND_SHARE if settings.start == Start.MIXED else 0.0
+        on_ground = u_ground < share
         if settings.task == Task.WAYPOINTS:
             x, y, z = load3(flight.gates[0])
             x, y, z = 0.25 * x, 0.25 * y, zero + settings.height
-        x = x + START_POSITION_SIGMA * clip(n_r[0], -3.0, 3.0)
-        y = y + START_POSITION_SIGMA * clip(n_r[1], -3.0, 3.0)
-        z = maximum(z + START_POSITION_SIGMA * clip(n_r[2], -3.0, 3.0), 0.1)
-        v_I = (
-            START_VELOCITY_SIGMA * n_v[0],
-            START_VELOCITY_SIGMA * n_v[1],
-            START_VELOCITY_SIGMA * n_v[2],
+        r_I = (
+            x + START_POSITION_SIGMA * clip(n_r[0], -3.0, 3.0),
+            y + START_POSITION_SIGMA * clip(n_r[1], -3.0, 3.0),
+            maximum(z + START_POSITION_SIGMA * clip(n_r[2], -3.0, 3.0), 0.1),
         )
-        roll, pitch = START_TILT_SIGMA * n_roll, START_TILT_SIGMA * n_pitch
-        yaw = yaw + START_YAW_SIGMA * n_yaw
-        rotor_speed = model.motor_gain * model.hover_voltage
+        x, y = select(on_ground, x, r_I[0]), select(on_ground, y, r_I[1])
+        z = r_I[2]
+        hovering = select(on_ground, 0.0, 1.0)
+        v_I = scale(hovering * START_VELOCITY_SIGMA, n_v)
+        roll = hovering * START_TILT_SIGMA * n_roll
+        pitch = hovering * START_TILT_SIGMA * n_pitch
+        yaw = yaw + hovering * START_YAW_SIGMA * n_yaw
+        rotor_speed = hovering * model.motor_gain * model.hover_voltage
+    z = select(on_ground, 0.0, z)
     given = flight.start_given
     x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
     v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
