@@ -13,6 +13,7 @@ Wrong options end the program with one line on stderr and exit code 2, as is the
 """
 
 import argparse
+import ast
 import dataclasses
 import sys
 import types
@@ -27,15 +28,19 @@ USAGE_ERROR = 2
 _Args = TypeVar("_Args")
 
 
-def option(default: Any, text: str, *, group: str | None = None) -> Any:
+def option(default: Any, text: str, *, group: str | None = None, positional: bool = False) -> Any:
     """A field of a dataclass that is an option of the command line.
 
     Args:
         default: Value where the option is not given; None: the help text says what happens then.
         text: What the option does, with its unit.
         group: Heading in the help above this option and those after it.
+        positional: Whether it is given by its place, without its name; it may still be left out.
     """
-    return dataclasses.field(default=default, metadata={"text": text, "group": group})
+    metadata = {"text": text, "group": group, "positional": positional}
+    if isinstance(default, dict):
+        return dataclasses.field(default_factory=lambda: dict(default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -51,7 +56,8 @@ def parser_of(
     """An argument parser with one option for every field of a dataclass.
 
     Types may be int, float, str, bool (an option and its `--no-` twin), a path, a Literal (a
-    choice), a tuple of fixed length, or one of these or None.
+    choice), a tuple of fixed or, with an ellipsis, any length, a dict (`key=value` pairs), or one
+    of these or None.
     """
     parser = _Parser(
         prog=program,
@@ -66,11 +72,13 @@ def parser_of(
     for field in dataclasses.fields(kind):
         if field.metadata.get("group"):
             group = parser.add_argument_group(field.metadata["group"])
+        how = _how_to_parse(hints[field.name])
+        name = "--" + field.name.replace("_", "-")
+        if field.metadata.get("positional"):
+            name, how = field.name, {**how, "nargs": "?", "metavar": field.name.upper()}
+        empty = field.default_factory is not dataclasses.MISSING
         group.add_argument(
-            "--" + field.name.replace("_", "-"),
-            default=field.default,
-            help=_help_of(field),
-            **_how_to_parse(hints[field.name]),
+            name, default={} if empty else field.default, help=_help_of(field), **how
         )
     return parser
 
@@ -118,7 +126,7 @@ def _help_of(field: "dataclasses.Field[Any]") -> str:
     if isinstance(default, bool):
         default = "--" + ("" if default else "no-") + field.name.replace("_", "-")
     elif isinstance(default, tuple):
-        default = " ".join(str(value) for value in default)
+        default = " ".join(str(value) for value in default) or "none"
     return f"{text} (default: {default})"
 
 
@@ -132,12 +140,14 @@ def _how_to_parse(hint: Any) -> dict[str, Any]:
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if hint is bool:
         return {"action": argparse.BooleanOptionalAction}
+    if origin is dict:
+        return {"nargs": "+", "type": _pair, "metavar": "KEY=VALUE", "action": _Pairs}
     if origin is typing.Literal:
         return {"choices": parts, "type": type(parts[0])}
     if origin is tuple:
         placeholder = _PLACEHOLDERS.get(parts[0], "PATH")
         return {
-            "nargs": len(parts),
+            "nargs": "+" if parts[-1] is Ellipsis else len(parts),
             "type": parts[0],
             "metavar": placeholder,
             "action": _Tuple,
@@ -156,3 +166,31 @@ class _Tuple(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         setattr(namespace, self.dest, tuple(values))
+
+
+def _pair(text: str) -> tuple[str, Any]:
+    """`key=value`, with the value as Python writes numbers, tuples, True and None; else a text."""
+    key, equals, value = text.partition("=")
+    if not (equals and key.isidentifier()):
+        raise argparse.ArgumentTypeError(f"expected KEY=VALUE, got {text!r}")
+    try:
+        return key, ast.literal_eval(_WORDS.get(value, value))
+    except (ValueError, SyntaxError):
+        return key, value
+
+
+_WORDS = {"true": "True", "false": "False", "none": "None"}
+
+
+class _Pairs(argparse.Action):
+    """Keeps pairs as a dict; the option may be given more than once."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        before = getattr(namespace, self.dest) or {}
+        setattr(namespace, self.dest, {**before, **dict(values)})

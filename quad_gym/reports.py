@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import platform
+import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,6 +28,23 @@ def versions(*packages: str) -> dict[str, str | None]:
         except PackageNotFoundError:
             found[package] = None
     return found
+
+
+def require_writable(option: str, folder: Path) -> None:
+    """Make a folder if it is missing, and see that files can be written there.
+
+    Args:
+        option: What named it, such as "--output", for the message.
+        folder: The folder.
+
+    Raises:
+        OSError: If nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise OSError(f"cannot write to {option} {folder}: {error.strerror}") from None
 
 
 def as_json(value: Any) -> Any:

@@ -53,7 +53,7 @@ class Args:
     quick: bool = option(False, "2 short repeats: to see that it runs", group="how to measure")
     repeats: int = option(7, "repeats of each measurement, of which the best counts")
     seconds: float = option(0.3, "length of a repeat [s]")
-    output: Path = option(  # noqa: RUF009
+    output: Path = option(
         Path("results/benchmark"), "folder for benchmark.json; made if it is missing"
     )
 

@@ -11,7 +11,6 @@ summary with the whole configuration (summary.json).
 """
 
 import math
-import tempfile
 import textwrap
 import time
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from quad_gym.metrics import (
 )
 from quad_gym.recording import Recording, record_flights
 from quad_gym.records import Source
-from quad_gym.reports import text_table, versions, write_csv, write_json
+from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.simulation import FlightBatch
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
@@ -48,7 +47,7 @@ class Args:
     seeds: int = option(1000, "flights in each case", group="experiment")
     first_seed: int = option(0, "seed of the first flight; the others follow it")
     duration: float = option(10.0, "length of a flight [s]")
-    output: Path = option(  # noqa: RUF009
+    output: Path = option(
         Path("results/circle"), "folder for figures and numbers; made if it is missing"
     )
     threads: int | None = option(
@@ -146,11 +145,7 @@ def configure(args: Args) -> Setup:
     plots.require_matplotlib()
     import tqdm  # noqa: F401
 
-    try:
-        args.output.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=args.output).close()
-    except OSError as error:
-        raise OSError(f"cannot write to --output {args.output}: {error.strerror}") from None
+    require_writable("--output", args.output)
     return Setup(
         cases=cases,
         gains=gains,

@@ -16,7 +16,7 @@ class Args:
     gains: tuple[float, float] = option((1.0, 2.0), "gains")
     camera: bool = option(True, "see", group="things")
     kind: Literal["a", "b"] = option("a", "kind")
-    output: Path | None = option(None, "folder")  # noqa: RUF009
+    output: Path | None = option(None, "folder")
 
     def __post_init__(self):
         if self.seeds < 1:
