@@ -1,5 +1,6 @@
 """Rolling out a policy, and what comes of it episode by episode."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 import quad_gym
 from quad_gym import validation as check
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.simulation import FlightBatch
 
 
 class Policy(Protocol):
@@ -59,8 +61,16 @@ class Episodes(NamedTuple):
         }
 
 
+Watch = Callable[[int, FlightBatch, NDArray[np.bool_]], None]
+"""Called at the start (step 0) and after every step, with the flights and which still count."""
+
+
 def roll_out(
-    policy: Policy, env: gymnasium.vector.VectorEnv[Any, Any, Any], *, seed: int = 0
+    policy: Policy,
+    env: gymnasium.vector.VectorEnv[Any, Any, Any],
+    *,
+    seed: int = 0,
+    watch: Watch | None = None,
 ) -> Episodes:
     """Fly one episode in every flight of a vector environment; episode i is seeded with seed + i.
 
@@ -68,6 +78,7 @@ def roll_out(
         policy: Acts on batches of observations, deterministically.
         env: A `QuadVectorEnv`.
         seed: Of the first episode.
+        watch: Called at the start and after every step, such as `recording.Tracer.add`.
 
     Returns:
         One number per episode. Errors are against the true position.
@@ -89,6 +100,8 @@ def roll_out(
 
     observation, _ = env.reset(seed=seed)
     state, starts = None, np.ones(count, bool)
+    if watch is not None:
+        watch(0, quads.flights.batch, flying)
     for step in range(1, limit + 1):
         action, state = policy.predict(
             observation, state=state, episode_start=starts, deterministic=True
@@ -108,6 +121,8 @@ def roll_out(
         crashed |= over & terminated & (info["ending"] != "last_gate")
         gates[over] = info["gates_passed"][over]
         flying &= ~over
+        if watch is not None:
+            watch(step, quads.flights.batch, flying | (over & (lengths == limit)))
         if not flying.any():
             break
     complete = (lengths == limit) & ~crashed
@@ -135,7 +150,13 @@ def _info_of_step(info: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluate(
-    policy: Policy, env_id: str, *, episodes: int = 100, seed: int = 0, **keywords: Any
+    policy: Policy,
+    env_id: str,
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    watch: Watch | None = None,
+    **keywords: Any,
 ) -> Episodes:
     """Fly a policy for some episodes of an environment.
 
@@ -144,6 +165,7 @@ def evaluate(
         env_id: One of `quad_gym.IDS`.
         episodes: How many.
         seed: Of the first episode; episode i has seed + i.
+        watch: Called at the start and after every step, such as `recording.Tracer.add`.
         keywords: Those of the environment.
 
     Returns:
@@ -156,4 +178,4 @@ def evaluate(
         raise ValueError(f"env_id must be one of {', '.join(quad_gym.IDS)}, got {env_id!r}")
     count = check.whole("episodes", episodes)
     env = gymnasium.make_vec(env_id, num_envs=count, **keywords)
-    return roll_out(policy, env, seed=seed)
+    return roll_out(policy, env, seed=seed, watch=watch)

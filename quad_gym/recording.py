@@ -141,6 +141,65 @@ def record_flights(
     )
 
 
+class Tracer:
+    """Keeps how episodes go on over time: the error of all, the paths of the first few.
+
+    Hand its `add` to `evaluation.roll_out` as `watch`, of an environment that does not begin new
+    episodes within a step. Arrays have an entry for each instant, the start first.
+
+    Args:
+        paths: Flights whose path is kept.
+    """
+
+    def __init__(self, paths: int = 1) -> None:
+        self._paths = paths
+        self._errors: list[Floats] = []
+        self._positions: list[Floats] = []
+        self._headings: list[Floats] = []
+        self._references: Floats | None = None
+        self.control_rate = 0.0
+
+    def add(self, step: int, batch: FlightBatch, flying: NDArray[np.bool_]) -> None:
+        """Keep the present instant of flights that are still flying."""
+        first = np.arange(min(self._paths, batch.count))
+        if step == 0:
+            self.control_rate = batch.clocks.control_rate
+            times = np.arange(batch.max_steps + 1) / self.control_rate
+            gates = batch.read("gates", first)[:, : batch.task.gate_count]
+            course = batch.task.kind == "waypoints"
+            paths = [reference_of_flight(batch, int(i), times) for i in first]
+            self._references = gates if course else np.stack(paths)
+        here = flying[first, np.newaxis]
+        self._errors.append(np.where(flying, batch.read("position_error"), np.nan))
+        self._positions.append(np.where(here, batch.read("r", first), np.nan))
+        R_BI = quaternion_to_dcm(batch.read("q", first))
+        self._headings.append(np.where(here, R_BI[:, 0, :2], np.nan))
+
+    @property
+    def time(self) -> Floats:
+        """(k,) instants [s]."""
+        return np.arange(len(self._errors)) / self.control_rate
+
+    @property
+    def errors(self) -> Floats:
+        """(k, n) true position error [m]; NaN after an episode's end."""
+        return np.stack(self._errors)
+
+    def trace(self, flight: int) -> Trace:
+        """The path of one of the first flights, up to its end."""
+        position = np.stack(self._positions)[:, flight]
+        shown = np.isfinite(position[:, 0])
+        assert self._references is not None
+        reference = self._references[flight]
+        return Trace(
+            time=self.time[shown],
+            position=position[shown],
+            heading=np.stack(self._headings)[shown, flight],
+            reference=reference[: len(shown)][shown] if len(reference) >= len(shown) else reference,
+            error=self.errors[shown, flight],
+        )
+
+
 def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
     """Normalised estimation error squared of the chosen flights at the present instant, (m,)."""
     names = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}

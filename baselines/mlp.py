@@ -1,0 +1,144 @@
+"""`MlpPolicy`: a trained network as plain arrays, flown with NumPy alone.
+
+A policy that ships needs no torch and no unpickling: it is a file of weights with its training
+record in it.
+"""
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = "quad_gym policy 1"
+"""What a file of ours says it is."""
+
+_ACTIVATIONS: dict[str, Any] = {
+    "relu": lambda x: np.maximum(x, 0.0),
+    "tanh": np.tanh,
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+    "none": lambda x: x,
+}
+
+
+class MlpPolicy:
+    """Layers of a network: x <- activation(W x + b) each, the last one clipped to [-1, 1].
+
+    Args:
+        weights: (outputs, inputs) of each layer.
+        biases: (outputs,) of each layer.
+        activations: "relu", "tanh", "elu" or "none", for each layer.
+        record: How it was trained, and for what: the plan and its results.
+
+    Raises:
+        ValueError: If the layers do not fit each other.
+    """
+
+    def __init__(
+        self,
+        weights: Sequence[NDArray[np.float32]],
+        biases: Sequence[NDArray[np.float32]],
+        activations: Sequence[str],
+        record: Mapping[str, Any],
+    ) -> None:
+        shapes = [w.shape for w in weights]
+        chained = all(a[0] == b[1] for a, b in pairwise(shapes))
+        fitting = all(b.shape == (w.shape[0],) for w, b in zip(weights, biases, strict=True))
+        if not (chained and fitting and len(activations) == len(weights)):
+            raise ValueError(f"weights, biases and activations must fit each other, got {shapes}")
+        unknown = sorted(set(activations) - set(_ACTIVATIONS))
+        if unknown:
+            raise ValueError(f"activations must be among {', '.join(_ACTIVATIONS)}, got {unknown}")
+        self.weights, self.biases = tuple(weights), tuple(biases)
+        self.activations, self.record = tuple(activations), dict(record)
+
+    @property
+    def inputs(self) -> int:
+        """Numbers in an observation."""
+        return int(self.weights[0].shape[1])
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], None]:
+        """Actions for observations (..., n); always deterministic.
+
+        Raises:
+            ValueError: If the observations have another length.
+        """
+        x = np.asarray(observation, np.float32)
+        if x.shape[-1:] != (self.inputs,):
+            raise ValueError(f"observation must be (..., {self.inputs}), got shape {x.shape}")
+        for W, b, activation in zip(self.weights, self.biases, self.activations, strict=True):
+            x = _ACTIVATIONS[activation](x @ W.T + b)
+        return np.clip(x, -1.0, 1.0).astype(np.float32), None
+
+    def save(self, file: Path) -> None:
+        """Write the policy and its record to one file."""
+        layers: dict[str, Any] = {f"W{i}": W for i, W in enumerate(self.weights)}
+        layers |= {f"b{i}": b for i, b in enumerate(self.biases)}
+        about = {"format": FORMAT, "activations": self.activations, "record": self.record}
+        np.savez_compressed(file, about=np.array(json.dumps(about)), **layers)
+
+    @classmethod
+    def load(cls, file: Path) -> "MlpPolicy":
+        """Read a policy.
+
+        Raises:
+            ValueError: If there is no such file, or it holds no policy of ours.
+        """
+        if not file.exists():
+            raise ValueError(f"there is no policy {file}")
+        try:
+            with np.load(file, allow_pickle=False) as stored:
+                about = json.loads(str(stored["about"]))
+                count = len(about["activations"])
+                weights = [stored[f"W{i}"] for i in range(count)]
+                biases = [stored[f"b{i}"] for i in range(count)]
+        except (zipfile.BadZipFile, OSError, EOFError, KeyError, ValueError, TypeError):
+            raise ValueError(f"{file} is no policy: it is damaged or something else") from None
+        if about.get("format") != FORMAT:
+            raise ValueError(f"{file} must be a {FORMAT!r}, got {about.get('format')!r}")
+        return cls(weights, biases, about["activations"], about["record"])
+
+
+def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
+    """The deterministic actor of a Stable-Baselines3 model.
+
+    Args:
+        model: PPO, SAC, TD3 or TQC with an "MlpPolicy".
+        record: How it was trained.
+
+    Raises:
+        ValueError: If the model's actor is no plain network.
+    """
+    from torch import nn
+
+    policy = model.policy
+    if hasattr(policy, "lstm_actor"):
+        raise ValueError("model must have no memory to become an MlpPolicy")
+    if hasattr(policy, "action_net"):
+        modules = [*policy.mlp_extractor.policy_net, policy.action_net]
+    elif hasattr(policy.actor, "latent_pi"):
+        modules = [*policy.actor.latent_pi, policy.actor.mu, nn.Tanh()]
+    else:
+        modules = [*policy.actor.mu]
+    names = {nn.ReLU: "relu", nn.Tanh: "tanh", nn.ELU: "elu"}
+    weights, biases, activations = [], [], []
+    for module in modules:
+        if isinstance(module, nn.Linear):
+            weights.append(module.weight.detach().numpy().copy())
+            biases.append(module.bias.detach().numpy().copy())
+            activations.append("none")
+        elif type(module) in names:
+            activations[-1] = names[type(module)]
+        else:
+            raise ValueError(f"model must be made of plain layers, got {type(module).__name__}")
+    return MlpPolicy(weights, biases, activations, record)

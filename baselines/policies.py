@@ -1,0 +1,142 @@
+"""Policies by name or file, checked against the environment that they are to fly in."""
+
+import json
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from baselines.mlp import MlpPolicy
+from baselines.pd import PDPolicy
+from quad_gym import IDS
+from quad_gym.evaluation import Policy
+
+PRETRAINED = Path(__file__).resolve().parent / "pretrained"
+"""Folder of the policies that ship."""
+
+_ALGORITHM_OF_MODULE = {
+    "stable_baselines3.common.policies": "ppo",
+    "stable_baselines3.sac.policies": "sac",
+    "stable_baselines3.td3.policies": "td3",
+    "sb3_contrib.tqc.policies": "tqc",
+    "sb3_contrib.common.recurrent.policies": "recurrent_ppo",
+}
+
+
+def interface_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> dict[str, Any]:
+    """What observations and actions of an environment mean to a policy.
+
+    Its source is left out: what has learned on the truth may fly on the estimate.
+    """
+    flights = env.unwrapped.flights  # type: ignore[attr-defined]
+    return {
+        "observation": [field.name for field in flights.table],
+        "action": flights.action,
+        "control_rate": flights.control_rate,
+    }
+
+
+def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Policy:
+    """A policy, ready to fly in an environment.
+
+    Args:
+        name: "pd" (tuned gains), "pd:lab" (the report's), "pretrained" (the policy that ships for
+            the environment's task), or a file: `.npz` as `MlpPolicy` saves it, or `.zip` as
+            Stable-Baselines3 does. A `.zip` can run code while it is loaded: open only those that
+            you trust.
+        env: A `QuadVectorEnv`.
+
+    Raises:
+        ValueError: If there is no such policy, or it does not fit the environment.
+        ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
+    """
+    if name in ("pd", "pd:tuned", "pd:lab"):
+        return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
+    file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
+    if file.suffix == ".npz":
+        policy: Any = MlpPolicy.load(file)
+        _require_agreement(file, policy.record, env)
+        _require_size(file, policy.inputs, env)
+        return policy  # type: ignore[no-any-return]
+    if file.suffix != ".zip":
+        raise ValueError(
+            f"policy must be pd, pd:lab, pretrained, or a .npz or .zip file, got {name!r}"
+        )
+    return _stable_baselines_policy(file, env)
+
+
+def pretrained_file(env_id: str) -> Path:
+    """The file of the policy that ships for a task.
+
+    Raises:
+        ValueError: If none ships for it.
+    """
+    file = PRETRAINED / f"{IDS[env_id]}.npz"
+    if not file.exists():
+        known = sorted(f.stem for f in PRETRAINED.glob("*.npz"))
+        raise ValueError(
+            f"no policy ships for {env_id}; there are some for {', '.join(known) or 'no task'}"
+        )
+    return file
+
+
+def task_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> str:
+    """The id of an environment."""
+    kind = env.unwrapped.flights.task.kind  # type: ignore[attr-defined]
+    return next(env_id for env_id, task in IDS.items() if task == kind)
+
+
+def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Policy:
+    if not file.exists():
+        raise ValueError(f"there is no policy {file}")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            module = json.loads(archive.read("data"))["policy_class"]["__module__"]
+    except (zipfile.BadZipFile, KeyError, json.JSONDecodeError):
+        raise ValueError(f"{file} is no policy of Stable-Baselines3, or it is damaged") from None
+    if module not in _ALGORITHM_OF_MODULE:
+        raise ValueError(f"{file} holds a policy of an unknown algorithm ({module})")
+    record = file.parent / "training.json"
+    if record.exists():
+        _require_agreement(file, json.loads(record.read_text(encoding="utf-8")), env)
+    try:
+        from baselines.training import algorithm_class
+    except ImportError as error:
+        raise ImportError(
+            f'{file} needs Stable-Baselines3: pip install "quad-gym[train]"'
+        ) from error
+    try:
+        model = algorithm_class(_ALGORITHM_OF_MODULE[module]).load(file, device="cpu")
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
+        raise ValueError(f"{file} cannot be loaded: {error}") from None
+    space = env.single_observation_space
+    if model.observation_space != space:
+        size = gymnasium.spaces.flatdim(model.observation_space)
+        _require_size(file, size, env)
+        raise ValueError(f"{file} expects observations {model.observation_space}, not {space}")
+    return model
+
+
+def _require_size(file: Path, size: int, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+    here = gymnasium.spaces.flatdim(env.single_observation_space)
+    if size != here:
+        raise ValueError(
+            f"{file} expects observations of {size} numbers, and the environment gives {here}: "
+            "make it with the keywords that the policy was trained with"
+        )
+
+
+def _require_agreement(
+    file: Path, record: Mapping[str, Any], env: gymnasium.vector.VectorEnv[Any, Any, Any]
+) -> None:
+    """Refuse a policy whose actions or observations mean something else here."""
+    trained, here = record.get("interface", {}), interface_of(env)
+    for name in trained:
+        if trained[name] != here[name]:
+            raise ValueError(
+                f"{file} was trained with {name} {trained[name]}, and the environment has "
+                f"{here[name]}"
+            )

@@ -1,0 +1,132 @@
+"""Recipes: how each algorithm is trained on each task, all hyper-parameters in one place.
+
+A recipe is data. `scripts/train.py` and `scripts/compare.py` read it, and their options override
+it. The judged task is always that of the environment's id; `flights` says how the flights in
+training differ from it, such as a start that is easier to learn from.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from quad_gym import IDS
+from quad_gym import validation as check
+from quad_gym.validation import Checked
+
+ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
+"""Those of Stable-Baselines3 and its contributions that fit continuous actions in many flights."""
+
+ACTIVATIONS = ("relu", "tanh", "elu")
+"""Between the layers of a policy."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Checked):
+    """How a policy is trained."""
+
+    algorithm: str = "ppo"
+    """one of ALGORITHMS"""
+    steps: int = 2_000_000
+    """environment steps, over all flights"""
+    n_envs: int = 256
+    """flights at a time"""
+    learning_rate: tuple[float, float] = (1e-3, 1e-4)
+    """at the beginning and at the end; linear in between"""
+    layers: tuple[int, ...] = (64, 64)
+    """units of each hidden layer, of the policy and of the value function"""
+    activation: str = "relu"
+    """one of ACTIVATIONS"""
+    reward_scale: float = 10.0
+    """the algorithm sees the reward times this; returns of about 100 are what its losses expect"""
+    flights: Mapping[str, Any] = field(default_factory=lambda: {"start": "mixed"})
+    """keywords of the environment that hold in training alone"""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """further arguments of the algorithm's class"""
+    policy: Mapping[str, Any] = field(default_factory=dict)
+    """further arguments of its policy's class"""
+
+    def __post_init__(self) -> None:
+        self._check(check.choice, "algorithm", choices=ALGORITHMS)
+        self._check(check.choice, "activation", choices=ACTIVATIONS)
+        self._check(check.whole, "steps", "n_envs")
+        self._check(check.positive, "reward_scale")
+        self._check(check.vector, "learning_rate", length=2)
+        if min(self.learning_rate) <= 0.0:
+            raise ValueError(
+                f"Recipe.learning_rate must be greater than 0, got {self.learning_rate}"
+            )
+        if not self.layers or any(isinstance(n, bool) or n < 1 for n in self.layers):
+            raise ValueError(f"Recipe.layers must be positive whole numbers, got {self.layers}")
+        self._set("layers", tuple(check.whole("Recipe.layers", n) for n in self.layers))
+        for name in ("flights", "parameters", "policy"):
+            self._set(name, MappingProxyType(dict(getattr(self, name))))
+
+
+_PPO = Recipe(
+    algorithm="ppo",
+    parameters={
+        "n_steps": 32,
+        "batch_size": 2048,
+        "n_epochs": 5,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "clip_range": 0.2,
+        "ent_coef": 0.0,
+    },
+    policy={"log_std_init": -1.0},
+    flights={"start": "mixed", "randomize": True},
+)
+"""From a search over learning rates, reward scales, activations and batch shapes on the circle."""
+
+_RECURRENT_PPO = _PPO.replace(
+    algorithm="recurrent_ppo",
+    parameters={**_PPO.parameters, "batch_size": 1024},
+    policy={**_PPO.policy, "lstm_hidden_size": 64},
+)
+
+_OFF_POLICY = {
+    "batch_size": 512,
+    "buffer_size": 500_000,
+    "learning_starts": 10_000,
+    "train_freq": 1,
+    "gradient_steps": 8,
+    "gamma": 0.98,
+}
+_SAC = Recipe(
+    algorithm="sac",
+    steps=1_000_000,
+    n_envs=64,
+    learning_rate=(1e-3, 1e-4),
+    layers=(128, 128),
+    reward_scale=10.0,
+    flights={"start": "mixed", "randomize": True},
+    parameters=_OFF_POLICY,
+)
+
+_DEFAULTS = {
+    "ppo": _PPO,
+    "recurrent_ppo": _RECURRENT_PPO,
+    "sac": _SAC,
+    "td3": _SAC.replace(algorithm="td3", parameters={**_OFF_POLICY, "policy_delay": 2}),
+    "tqc": _SAC.replace(algorithm="tqc"),
+}
+"""One for each algorithm, made for the circle."""
+
+_SPECIAL: dict[tuple[str, str], Recipe] = {}
+"""Where a task needs another one, by id and algorithm."""
+
+
+def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
+    """The shipped recipe for a task and an algorithm.
+
+    Args:
+        env_id: One of `quad_gym.IDS`.
+        algorithm: One of ALGORITHMS.
+
+    Raises:
+        ValueError: If either is unknown.
+    """
+    check.choice("env_id", env_id, tuple(IDS))
+    check.choice("algorithm", algorithm, ALGORITHMS)
+    return _SPECIAL.get((env_id, algorithm), _DEFAULTS[algorithm])

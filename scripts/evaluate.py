@@ -1,0 +1,200 @@
+"""Fly policies on what they see, and measure how well by the true state.
+
+    python scripts/evaluate.py QuadGym/Circle-v0 --policy pd pretrained
+    python scripts/evaluate.py --policy results/train/circle/ppo_seed_0/best.zip --sensors rtk
+
+Every policy flies the same episodes (the same seeds) on every observation. Prints a table, and
+writes episodes.csv (one row per episode), summary.json (all numbers, and what they were found
+with), and figures of paths and errors over time (PNG and SVG).
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from baselines.policies import load_policy, task_of
+from quad_gym import IDS, plots
+from quad_gym.cli import option, parse, usage_errors
+from quad_gym.comparison_plots import error_over_time_figure, paths_figure
+from quad_gym.evaluation import Episodes, Policy, roll_out
+from quad_gym.metrics import bootstrap_interval
+from quad_gym.recording import Tracer
+from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the evaluation."""
+
+    env_id: str = option("QuadGym/Circle-v0", f"what to fly: {', '.join(IDS)}", positional=True)
+    policy: tuple[str, ...] = option(
+        ("pd", "pretrained"),
+        "policies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for "
+        "the task), or files of scripts/train.py (.zip or .npz)",
+        group="what to fly",
+    )
+    observation: tuple[str, ...] = option(
+        ("truth", "estimate"), "what to fly on: estimate, truth, noisy"
+    )
+    sensors: str = option("lab", "sensor suite")
+    env: dict[str, Any] = option(
+        {}, "further keywords of the environment, such as camera=false gnss_rate=10"
+    )
+    episodes: int = option(1000, "flown in each case", group="how to measure")
+    seed: int = option(0, "of the first episode; the others follow it")
+    threads: int | None = option(None, "threads; if not given, one per core")
+    output: Path | None = option(
+        None, "folder for figures and numbers; if not given, results/evaluate/TASK"
+    )
+
+
+Case = tuple[str, str]
+"""A policy and an observation."""
+
+
+def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
+    """Check all options, and make every policy with its environment.
+
+    Raises:
+        ValueError: If an option makes no sense or a policy does not fit.
+        OSError: If nothing can be written to the folder.
+        ImportError: If a package is missing.
+    """
+    if args.env_id not in IDS:
+        raise ValueError(f"ENV_ID must be one of {', '.join(IDS)}, got {args.env_id!r}")
+    for name, least in (("episodes", 1), ("seed", 0)):
+        if getattr(args, name) < least:
+            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    plots.require_matplotlib()
+    folder = args.output or Path("results/evaluate") / IDS[args.env_id]
+    cases: dict[Case, tuple[Policy, Any]] = {}
+    for observation in args.observation:
+        for name in args.policy:
+            env = gymnasium.make_vec(
+                args.env_id,
+                num_envs=args.episodes,
+                observation=observation,
+                sensors=args.sensors,
+                threads=args.threads,
+                **args.env,
+            )
+            cases[name, observation] = (load_policy(name, env), env)
+    require_writable("--output", folder)
+    return cases, folder
+
+
+def table(results: dict[Case, Episodes], env: Any) -> str:
+    """Errors and endings of each case, for people."""
+    gates = env.unwrapped.flights.task.gate_count
+    course = task_of(env) == "QuadGym/Waypoints-v0"
+    rows = []
+    for (name, observation), episodes in results.items():
+        found = episodes.summary()
+        row = [f"{_short(name)} on {observation}"]
+        if course:
+            done = episodes.ending == "last_gate"
+            seconds = episodes.lengths[done].mean() / env.unwrapped.flights.control_rate
+            row += [
+                f"{found['gates_passed'] / gates:.1%}",
+                f"{seconds:.2f} s" if any(done) else "-",
+            ]
+        else:
+            row += [_with_interval(episodes.mean_error), f"{1e3 * found['late_error']:.1f}"]
+        rows.append(
+            [
+                *row,
+                f"{1e3 * found['estimation_error']:.1f}",
+                f"{found['crash_rate']:.1%}",
+                f"{found['return']:.2f}",
+            ]
+        )
+    tracking = (
+        {"course": ["gates passed", "time"]}
+        if course
+        else {"tracking error [mm]": ["whole episode", "second half"]}
+    )
+    return text_table(
+        {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
+    )
+
+
+def _with_interval(values: Any) -> str:
+    if len(values) < 2:
+        return f"{1e3 * values.mean():.1f}"
+    low, high = bootstrap_interval(values)
+    return f"{1e3 * values.mean():.1f} [{1e3 * low:.1f}, {1e3 * high:.1f}]"
+
+
+def _short(name: str) -> str:
+    """A policy's name for the table: of a file, its folder and its name."""
+    path = Path(name)
+    return f"{path.parent.name}/{path.stem}" if path.suffix else name
+
+
+def write(
+    results: dict[Case, Episodes], tracers: dict[Case, Tracer], args: Args, folder: Path
+) -> list[Path]:
+    """Numbers and figures."""
+    columns: dict[str, list[Any]] = {}
+    for (name, observation), episodes in results.items():
+        block = {
+            "policy": [name] * args.episodes,
+            "observation": [observation] * args.episodes,
+            "seed": range(args.seed, args.seed + args.episodes),
+            **{field: getattr(episodes, field) for field in Episodes._fields},
+        }
+        for field, values in block.items():
+            columns.setdefault(field, []).extend(values)
+    summary = {
+        "cases": [
+            {"policy": name, "observation": observation, **episodes.summary()}
+            for (name, observation), episodes in results.items()
+        ],
+        "units": {"errors": "m", "rates": "share of episodes"},
+        "arguments": args,
+        "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
+    }
+    written = [
+        write_csv(folder / "episodes.csv", columns),
+        write_json(folder / "summary.json", summary),
+    ]
+    labels = {case: f"{_short(case[0])} on {case[1]}" for case in results}
+    figures = {
+        "paths": paths_figure({labels[c]: t.trace(0) for c, t in tracers.items()}),
+        "errors": error_over_time_figure(
+            {labels[c]: (t.time, t.errors) for c, t in tracers.items()}
+        ),
+    }
+    for name, figure in figures.items():
+        written += plots.save_figure(figure, folder / name)
+    return written
+
+
+def main(args: Args) -> None:
+    """Evaluate."""
+    from tqdm import tqdm
+
+    with usage_errors():
+        cases, folder = configure(args)
+    began = time.perf_counter()
+    results, tracers = {}, {}
+    for case in tqdm(cases, desc="flying", unit=" cases"):
+        policy, env = cases[case]
+        tracers[case] = Tracer()
+        results[case] = roll_out(policy, env, seed=args.seed, watch=tracers[case].add)
+    print(
+        f"\n{args.env_id}, sensors {args.sensors}; {args.episodes:,} episodes in each case, "
+        f"from seed {args.seed}.\n"
+    )
+    print(table(results, next(iter(cases.values()))[1]))
+    if args.episodes > 1:
+        print("In brackets: bootstrap 95 % interval of the mean over episodes.")
+    written = write(results, tracers, args, folder)
+    print(f"\nWrote {len(written)} files to {folder} after {time.perf_counter() - began:.1f} s.")
+
+
+if __name__ == "__main__":
+    main(parse(Args, description=__doc__))
