@@ -27,7 +27,7 @@ class Recipe(Checked):
 
     algorithm: str = "ppo"
     """one of ALGORITHMS"""
-    steps: int = 2_000_000
+    steps: int = 1_800_000
     """environment steps, over all flights"""
     n_envs: int = 256
     """flights at a time"""
@@ -67,9 +67,9 @@ _PPO = Recipe(
     algorithm="ppo",
     parameters={
         "n_steps": 32,
-        "batch_size": 2048,
+        "batch_size": 1024,
         "n_epochs": 5,
-        "gamma": 0.99,
+        "gamma": 0.97,
         "gae_lambda": 0.95,
         "clip_range": 0.2,
         "ent_coef": 0.0,
@@ -81,7 +81,6 @@ _PPO = Recipe(
 
 _RECURRENT_PPO = _PPO.replace(
     algorithm="recurrent_ppo",
-    parameters={**_PPO.parameters, "batch_size": 1024},
     policy={**_PPO.policy, "lstm_hidden_size": 64},
 )
 

@@ -40,7 +40,8 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
     """Errors over time: the median over episodes, and the middle nine tenths as a band.
 
     Args:
-        curves: Instants (k,) [s] and errors (k, n) [m] of each curve, by its label; NaN: not flown.
+        curves: Instants (k,) [s] and (3, k) 5th, 50th and 95th percentile [m] of each curve, by its
+            label; NaN: not flown.
         title: Of the figure.
 
     Returns:
@@ -48,13 +49,11 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
     """
     with house_style():
         figure, axes = _figure((7.0, 3.8), title)
-        for (label, (time, errors)), (color, dashes) in zip(
+        for (label, (time, (low, middle, high))), (color, dashes) in zip(
             curves.items(), _cycle(len(curves)), strict=True
         ):
-            flown = np.isfinite(errors).any(axis=1)
-            low, middle, high = np.nanpercentile(errors[flown], (5.0, 50.0, 95.0), axis=1)
-            axes.fill_between(time[flown], low, high, color=color, alpha=0.15, linewidth=0)
-            axes.plot(time[flown], middle, color=color, linestyle=dashes, label=label)
+            axes.fill_between(time, low, high, color=color, alpha=0.15, linewidth=0)
+            axes.plot(time, middle, color=color, linestyle=dashes, label=label)
         axes.set_yscale("log")
         _plain_numbers(axes.yaxis)
         axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))

@@ -185,6 +185,15 @@ class Tracer:
         """(k, n) true position error [m]; NaN after an episode's end."""
         return np.stack(self._errors)
 
+    @property
+    def percentiles(self) -> Floats:
+        """(3, k) 5th, 50th and 95th percentile of the error of the episodes not yet ended [m]."""
+        errors = self.errors
+        found = np.full((3, len(errors)), np.nan)
+        flown = np.isfinite(errors).any(axis=1)
+        found[:, flown] = np.nanpercentile(errors[flown], (5.0, 50.0, 95.0), axis=1)
+        return found
+
     def trace(self, flight: int) -> Trace:
         """The path of one of the first flights, up to its end."""
         position = np.stack(self._positions)[:, flight]

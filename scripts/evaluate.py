@@ -165,7 +165,7 @@ def write(
     figures = {
         "paths": paths_figure({labels[c]: t.trace(0) for c, t in tracers.items()}),
         "errors": error_over_time_figure(
-            {labels[c]: (t.time, t.errors) for c, t in tracers.items()}
+            {labels[c]: (t.time, t.percentiles) for c, t in tracers.items()}
         ),
     }
     for name, figure in figures.items():

@@ -1,0 +1,265 @@
+"""What does a controller lose on the estimate, and does training on the estimate win it back?
+
+    python scripts/compare.py                         # the circle, 5 seeds
+    python scripts/compare.py --quick                 # one seed, a few minutes
+    python scripts/compare.py --sensors lab rtk --seeds 5
+
+For every seed, PPO is trained on the true state, on the true state with independent noise (what
+other packages offer as sensor noise), and on the filter's estimate. Each policy then flies the same
+episodes on the truth and on the estimate, and so does PD control with tuned gains. Prints the
+matrix of tracking errors and crash rates with 95 % intervals, says what they allow one to conclude,
+and writes figures, numbers and a report (report.html) that opens without a network.
+
+A comparison that was stopped goes on where it stopped when it is started again.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from compare_flights import Floats, Flown, fly
+from compare_report import Comparison, Setting, conclusions, matrix_text, write_figures, write_page
+
+from quad_gym import IDS, plots
+from quad_gym.cli import option, parse, usage_errors
+from quad_gym.reports import as_json, require_writable, versions, write_csv, write_json
+
+QUICK_SEEDS, QUICK_EPISODES = 1, 200
+FLOWN_ON = ("truth", "estimate")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the comparison."""
+
+    env_id: str = option(
+        "QuadGym/Circle-v0",
+        f"what to fly: {', '.join(i for i in IDS if 'Way' not in i)}",
+        positional=True,
+    )
+    sensors: tuple[str, ...] = option(("lab",), "sensor suites", group="what to compare")
+    train_on: tuple[str, ...] = option(("truth", "noisy", "estimate"), "what to train on")
+    seeds: int = option(5, "training seeds")
+    quick: bool = option(
+        False,
+        f"{QUICK_SEEDS} seed and {QUICK_EPISODES} episodes: shows that it works, proves nothing",
+    )
+
+    algorithm: Literal["ppo", "sac", "td3", "tqc"] = option("ppo", "how to learn", group="training")
+    steps: int | None = option(None, "environment steps of each training; if not given, the recipe's")
+    env: dict[str, Any] = option({}, "keywords of the environment, such as control_rate=100")
+    threads: int | None = option(None, "threads; if not given, one per core")
+
+    episodes: int = option(1000, "flown with each policy on each observation", group="flights")
+    seed: int = option(0, "of the first episode, and of the first training")
+    output: Path | None = option(
+        None, "folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"
+    )
+
+
+def configure(args: Args) -> Setting:
+    """Check all options before anything is trained.
+
+    Raises:
+        ValueError: If an option makes no sense, or the folder holds another comparison.
+        OSError: If nothing can be written to the folder.
+        ImportError: If a package is missing.
+    """
+    from baselines.recipes import recipe
+
+    try:
+        from baselines.training import Plan, make_model
+    except ImportError as error:
+        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
+    plots.require_matplotlib()
+    if args.env_id not in IDS or IDS[args.env_id] == "waypoints":
+        raise ValueError(f"ENV_ID must be a task of tracking, got {args.env_id!r}")
+    for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
+        if getattr(args, name) < least:
+            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    if {"observation", "sensors"} & set(args.env):
+        raise ValueError("--env must leave observation and sensors to --train-on and --sensors")
+    chosen = recipe(args.env_id, args.algorithm)
+    if args.steps is not None:
+        chosen = chosen.replace(steps=args.steps)
+    seeds = QUICK_SEEDS if args.quick else args.seeds
+    plans = {}
+    for seed in range(args.seed, args.seed + seeds):  # the first seed is complete first
+        for suite in args.sensors:
+            for source in args.train_on:
+                environment = {**args.env, "observation": source, "sensors": suite}
+                plan = Plan(
+                    env_id=args.env_id,
+                    environment=environment,
+                    recipe=chosen,
+                    seed=seed,
+                    threads=args.threads,
+                )
+                if seed == args.seed:
+                    make_model(plan, plan.make_flights())
+                    plan.make_judge().close()
+                plans[suite, source, seed] = plan
+    task = IDS[args.env_id]
+    folder = args.output or Path("results/compare") / (f"{task}_quick" if args.quick else task)
+    require_writable("--output", folder)
+    setting = Setting(
+        env_id=args.env_id,
+        algorithm=args.algorithm,
+        steps=chosen.steps,
+        suites=args.sensors,
+        sources=args.train_on,
+        seeds=tuple(range(args.seed, args.seed + seeds)),
+        episodes=QUICK_EPISODES if args.quick else args.episodes,
+        first_episode=args.seed,
+        environment=dict(args.env),
+        plans=plans,
+        folder=folder,
+    )
+    _require_same(setting)
+    return setting
+
+
+def _require_same(setting: Setting) -> None:
+    """Refuse a folder that holds another comparison; note this one where there is none."""
+    import json
+
+    file = setting.folder / "comparison.json"
+    described = as_json(setting.description())
+    if not file.exists():
+        write_json(file, described)
+        return
+    before = json.loads(file.read_text(encoding="utf-8"))
+    differing = [k for k in described if before.get(k) != described[k]]
+    if differing:
+        raise ValueError(
+            f"folder {setting.folder} holds another comparison ({', '.join(differing)} differ): "
+            "choose another --output"
+        )
+
+
+def train_all(setting: Setting) -> dict[Any, Any]:
+    """Train every policy that is not trained yet; what came of each, by suite, source and seed."""
+    from baselines.training import train
+
+    done = {}
+    for number, (key, plan) in enumerate(setting.plans.items(), start=1):
+        suite, source, seed = key
+        print(f"[{number}/{len(setting.plans)}] train on {source}, sensors {suite}, seed {seed}")
+        folder = setting.run_folder(key)
+        training = train(plan, folder, resume=True, tensorboard=False)
+        if not training.finished:
+            raise KeyboardInterrupt
+        done[key] = training
+    return done
+
+
+def fly_all(setting: Setting, args: Args) -> Comparison:
+    """Fly every policy on every observation, unless it was flown before."""
+    from tqdm import tqdm
+
+    from baselines.policies import load_policy
+
+    flown: dict[Any, Flown] = {}
+    cases: list[Any] = [(suite, "PD", None) for suite in setting.suites]
+    cases += list(setting.plans)
+    for key in tqdm(cases, desc="flying", unit=" policies"):
+        suite, source, _ = key
+        name = "pd" if source == "PD" else str(setting.run_folder(key) / "best.zip")
+        for observation in FLOWN_ON:
+            file = setting.run_folder(key) / f"flown_on_{observation}.npz"
+            if not file.exists():
+                env = gymnasium.make_vec(
+                    setting.env_id,
+                    num_envs=setting.episodes,
+                    observation=observation,
+                    sensors=suite,
+                    threads=args.threads,
+                    **setting.environment,
+                )
+                file.parent.mkdir(parents=True, exist_ok=True)
+                fly(load_policy(name, env), env, setting.first_episode).save(file)
+            flown[(*key, observation)] = Flown.load(file)
+    return Comparison(setting, flown, {k: _curve(setting, k) for k in setting.plans})
+
+
+def _curve(setting: Setting, key: Any) -> tuple[Floats, Floats]:
+    """Steps, and mean errors, of the evaluations while training."""
+    rows = np.genfromtxt(
+        setting.run_folder(key) / "evaluations.csv", delimiter=",", names=True, dtype=np.float64
+    )
+    return rows["steps"], rows["mean_error"]
+
+
+def write_numbers(comparison: Comparison, trainings: dict[Any, Any]) -> list[Path]:
+    """All numbers as CSV, and the summary as JSON."""
+    setting = comparison.setting
+    columns: dict[str, list[Any]] = {}
+    for (suite, source, seed, observation), flown in comparison.flown.items():
+        row = {
+            "sensors": suite,
+            "trained_on": source,
+            "training_seed": seed,
+            "flown_on": observation,
+            **flown.episodes.summary(),
+            "training_seconds": getattr(trainings.get((suite, source, seed)), "seconds", None),
+        }
+        for name, value in row.items():
+            columns.setdefault(name, []).append(value)
+    summary = {
+        **setting.description(),
+        "matrix": [
+            {
+                "sensors": suite,
+                "trained_on": source,
+                "flown_on": observation,
+                **comparison.cell(suite, source, observation).description(),
+            }
+            for suite in setting.suites
+            for source in ("PD", *setting.sources)
+            for observation in FLOWN_ON
+        ],
+        "conclusions": conclusions(comparison),
+        "versions": versions("numpy", "numba", "scipy", "torch", "stable_baselines3"),
+    }
+    return [
+        write_csv(setting.folder / "policies.csv", columns),
+        write_json(setting.folder / "summary.json", summary),
+    ]
+
+
+def main(args: Args) -> None:
+    """Compare."""
+    began = time.perf_counter()
+    with usage_errors():
+        setting = configure(args)
+    print(
+        f"{setting.env_id}: {len(setting.plans)} trainings of {setting.steps:,} steps, "
+        f"{setting.episodes:,} episodes with each policy; into {setting.folder}."
+    )
+    try:
+        trainings = train_all(setting)
+    except KeyboardInterrupt:
+        print("\nStopped. Start the same command again to go on from here.")
+        raise SystemExit(130) from None
+    comparison = fly_all(setting, args)
+    for suite in setting.suites:
+        print(f"\nSensors {suite}\n\n{matrix_text(comparison, suite)}")
+    print()
+    for sentence in conclusions(comparison):
+        print(sentence)
+    written = write_numbers(comparison, trainings)
+    figures = write_figures(comparison)
+    written += [file for pair in figures.values() for file in pair]
+    seconds = sum(training.seconds for training in trainings.values())
+    written.append(write_page(comparison, figures, seconds))
+    print(
+        f"\nWrote {len(written)} files to {setting.folder} after "
+        f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."
+    )
+
+
+if __name__ == "__main__":
+    main(parse(Args, description=__doc__))
