@@ -49,7 +49,9 @@ class Args:
     )
 
     algorithm: Literal["ppo", "sac", "td3", "tqc"] = option("ppo", "how to learn", group="training")
-    steps: int | None = option(None, "environment steps of each training; if not given, the recipe's")
+    steps: int | None = option(
+        None, "environment steps of each training; if not given, the recipe's"
+    )
     env: dict[str, Any] = option({}, "keywords of the environment, such as control_rate=100")
     threads: int | None = option(None, "threads; if not given, one per core")
 
@@ -187,7 +189,7 @@ def fly_all(setting: Setting, args: Args) -> Comparison:
 
 def _curve(setting: Setting, key: Any) -> tuple[Floats, Floats]:
     """Steps, and mean errors, of the evaluations while training."""
-    rows = np.genfromtxt(
+    rows: Any = np.genfromtxt(
         setting.run_folder(key) / "evaluations.csv", delimiter=",", names=True, dtype=np.float64
     )
     return rows["steps"], rows["mean_error"]
