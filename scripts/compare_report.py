@@ -179,8 +179,8 @@ def conclusions(comparison: Comparison) -> list[str]:
         crashes = {s: max(comparison.cell(suite, s, "estimate").crash_rates) for s in sources}
         for source in (s for s in sources if crashes[s] > MANY_CRASHES):
             sentences.append(
-                f"{where}up to {crashes[source]:.0%} of the episodes {NAMES[source]} crashed on the "
-                "estimate: their errors end with them, and do not compare."
+                f"{where}up to {crashes[source]:.0%} of the episodes {NAMES[source]} crashed on "
+                "the estimate: their errors end with them, and do not compare."
             )
     if len(comparison.setting.seeds) == 1:
         sentences.append(ONE_SEED)

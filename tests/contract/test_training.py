@@ -1,0 +1,227 @@
+"""Training: repeatable, resumable after any death, and refusing nonsense before it begins."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym  # noqa: F401 - registers the environments
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+
+from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
+from baselines.policies import load_policy  # noqa: E402
+from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
+from baselines.training import Plan, algorithm_class, make_model, train  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[2]
+CIRCLE = "QuadGym/Circle-v0"
+
+
+def small_plan(algorithm="ppo", **changes):
+    """A training of seconds."""
+    shipped = recipe(CIRCLE, algorithm)
+    if algorithm in ("ppo", "recurrent_ppo"):
+        parameters = {"n_steps": 16, "batch_size": 128, "n_epochs": 2}
+        small = {"steps": 2560, "n_envs": 16}
+    else:
+        parameters = {
+            "batch_size": 32,
+            "learning_starts": 200,
+            "buffer_size": 2000,
+            "gradient_steps": 1,
+        }
+        small = {"steps": 1600, "n_envs": 16}
+    small["parameters"] = {**shipped.parameters, **parameters}
+    options = {
+        "recipe": shipped.replace(**small),
+        "environment": {"duration": 1.0},
+        "threads": 1,
+        "evaluations": 5,
+        "episodes": 8,
+    }
+    return Plan(**{**options, **changes})
+
+
+def weights(folder, algorithm="ppo"):
+    model = algorithm_class(algorithm).load(folder / "last.zip", device="cpu")
+    return {k: v.numpy() for k, v in model.policy.state_dict().items()}
+
+
+def assert_same(first, second):
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
+
+
+def test_the_same_seed_gives_the_same_policy_and_another_one_does_not(tmp_path):
+    for name in "ab":
+        assert train(small_plan(), tmp_path / name, quiet=True, tensorboard=False).finished
+    train(small_plan(seed=1), tmp_path / "c", quiet=True, tensorboard=False)
+    assert_same(weights(tmp_path / "a"), weights(tmp_path / "b"))
+    other = weights(tmp_path / "c")["action_net.weight"]
+    assert not np.array_equal(weights(tmp_path / "a")["action_net.weight"], other)
+
+
+@pytest.mark.parametrize(("algorithm", "steps"), [("ppo", 70), ("ppo", 20), ("sac", 75)])
+def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, algorithm, steps):
+    plan = small_plan(algorithm)
+    train(plan, tmp_path / "whole", quiet=True, tensorboard=False)
+    from baselines.checkpoints import Keeper
+
+    calls = iter(range(10_000))
+
+    def die(self):
+        if next(calls) == steps:
+            raise RuntimeError("died")
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Keeper, "_on_step", die)
+        with pytest.raises(RuntimeError, match="died"):
+            train(plan, tmp_path / "cut", quiet=True, tensorboard=False)
+    done = train(plan, tmp_path / "cut", resume=True, quiet=True, tensorboard=False)
+    assert done.finished
+    assert_same(weights(tmp_path / "whole", algorithm), weights(tmp_path / "cut", algorithm))
+
+
+def script(folder, *more):
+    line = [sys.executable, str(ROOT / "scripts/train.py"), CIRCLE, "--output", str(folder)]
+    line += ["--no-progress", "--no-tensorboard", "--threads", "1", "--episodes", "4"]
+    line += ["--env", "duration=1.0", "--n-envs", "16", "--set", "n_steps=16", "batch_size=128"]
+    return [*line, *more]
+
+
+def rows(folder):
+    file = folder / "evaluations.csv"
+    return len(file.read_text().splitlines()) - 1 if file.exists() else 0
+
+
+def wait_for(condition, process, seconds=240.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
+    folder = tmp_path / "run"
+    line = script(folder, "--steps", "500000", "--evaluations", "400")
+    process = subprocess.Popen(
+        line, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    wait_for(lambda: rows(folder) >= 3, process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == (130 if number == signal.SIGINT else -signal.SIGKILL), err
+    if number == signal.SIGINT:
+        assert "--resume" in err
+    kept = rows(folder)
+    model = algorithm_class("ppo").load(folder / "last.zip", device="cpu")
+    assert model.num_timesteps >= (kept - 1) * 1250 - 256  # the row may be a moment younger
+    steps = str(int(model.num_timesteps) + 1024)
+    finished = train_again(folder, steps, tmp_path)
+    assert "goes on" not in finished.stderr
+    assert finished.returncode == 2  # another number of steps is another plan
+    assert "recipe differ" in finished.stderr
+
+
+def train_again(folder, steps, where):
+    line = script(folder, "--steps", steps, "--evaluations", "400", "--resume")
+    return subprocess.run(line, cwd=where, capture_output=True, text=True, timeout=240, check=False)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--algorithm", "alphago"], "invalid choice"),
+        (["--env", "radius=-1"], "radius must be greater than 0"),
+        (["--env", "colour=red"], "colour is not a keyword"),
+        (["--set", "momentum=1"], "momentum"),
+        (["--steps", "0"], "steps must be at least 1"),
+        (["--evaluations", "0"], "evaluations must be at least 1"),
+        (["--export", "policy.txt"], "must end in .npz"),
+        (["--output", "/dev/null/run"], "cannot write to --output"),
+    ],
+)
+def test_nonsense_is_refused_before_anything_is_trained(tmp_path, more, message):
+    line = script(tmp_path / "run", *more)
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "run" / "last.zip").exists()
+
+
+def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
+    train(small_plan(), tmp_path, quiet=True, tensorboard=False)
+    with pytest.raises(ValueError, match="holds a run already"):
+        train(small_plan(), tmp_path, quiet=True, tensorboard=False)
+    with pytest.raises(ValueError, match="another plan: seed"):
+        train(small_plan(seed=3), tmp_path, resume=True, quiet=True, tensorboard=False)
+    record = json.loads((tmp_path / "training.json").read_text())
+    assert record["finished"]
+    assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize": True}
+    assert os.path.getsize(tmp_path / "evaluations.csv") > 0
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3", "tqc"])
+def test_plain_weights_act_as_the_model_does(tmp_path, algorithm):
+    plan = small_plan(algorithm)
+    model = make_model(plan, plan.make_flights())
+    policy = mlp_of(model, {"interface": {}})
+    policy.save(tmp_path / "p.npz")
+    loaded = MlpPolicy.load(tmp_path / "p.npz")
+    observations = np.random.default_rng(0).normal(size=(50, 28)).astype(np.float32)
+    want, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_allclose(loaded.predict(observations)[0], want, atol=2e-6)
+
+
+def test_policies_that_do_not_fit_are_refused(tmp_path):
+    train(small_plan(), tmp_path, quiet=True, tensorboard=False)
+
+    def env(**keywords):
+        return gymnasium.make_vec(CIRCLE, num_envs=2, **keywords)
+
+    assert load_policy(str(tmp_path / "best.zip"), env()) is not None
+    with pytest.raises(ValueError, match="trained with action ctbr"):
+        load_policy(str(tmp_path / "best.zip"), env(action="motor"))
+    with pytest.raises(ValueError, match="trained with observation"):
+        load_policy(str(tmp_path / "best.zip"), env(layout="absolute"))
+    with pytest.raises(ValueError, match="there is no policy"):
+        load_policy(str(tmp_path / "none.zip"), env())
+    (tmp_path / "broken.zip").write_bytes(b"PK nonsense")
+    with pytest.raises(ValueError, match="no policy of Stable-Baselines3"):
+        load_policy(str(tmp_path / "broken.zip"), env())
+    (tmp_path / "broken.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(ValueError, match="is no policy"):
+        load_policy(str(tmp_path / "broken.npz"), env())
+    with pytest.raises(ValueError, match="policy must be"):
+        load_policy("ppo", env())
+
+
+def test_every_task_and_algorithm_has_a_recipe():
+    for env_id in quad_gym.IDS:
+        for algorithm in ALGORITHMS:
+            assert recipe(env_id, algorithm).algorithm == algorithm
+    with pytest.raises(ValueError, match="learning_rate"):
+        Recipe(learning_rate=(1e-3, 0.0))
+    with pytest.raises(ValueError, match="algorithm must be one of"):
+        recipe(CIRCLE, "dqn")
+
+
+@pytest.mark.parametrize("algorithm", ["recurrent_ppo", "td3", "tqc"])
+def test_every_algorithm_runs(tmp_path, algorithm):
+    done = train(small_plan(algorithm), tmp_path, quiet=True, tensorboard=False)
+    assert done.finished
+    assert done.best_policy.exists()
