@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import quad_gym  # noqa: F401 - registers the environments
+import quad_gym
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
