@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo test test-slow soak lint benchmark clean
+.PHONY: setup demo circle compare test test-slow soak lint benchmark clean
 
 setup: $(VENV)/.developer
 
@@ -13,12 +13,22 @@ $(VENV)/.user: pyproject.toml constraints.txt
 	$(INSTALL) ".[plot]"
 	touch $@
 
+$(VENV)/.trainer: $(VENV)/.user
+	$(INSTALL) ".[train,plot]"
+	touch $@
+
 $(VENV)/.developer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render,pandas,dev]"
 	touch $@
 
-demo: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
+demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each, and compare: some minutes
+	$(BIN)/python scripts/compare.py --quick
+
+circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
 	$(BIN)/python scripts/circle_experiment.py --output results/circle
+
+compare: $(VENV)/.trainer  ## the comparison with 5 training seeds
+	$(BIN)/python scripts/compare.py
 
 test: setup  ## the tests, without the slow statistical and soak ones
 	$(BIN)/python -m pytest -m "not slow"

@@ -11,7 +11,7 @@ with), and figures of paths and errors over time (PNG and SVG).
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 
@@ -22,6 +22,7 @@ from quad_gym.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.metrics import bootstrap_interval
 from quad_gym.recording import Tracer
+from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
 
 
@@ -46,6 +47,9 @@ class Args:
     episodes: int = option(1000, "flown in each case", group="how to measure")
     seed: int = option(0, "of the first episode; the others follow it")
     threads: int | None = option(None, "threads; if not given, one per core")
+    video: Literal["none", "mp4", "gif", "webp"] = option(
+        "none", "also write a video of the first episode of each case, of this kind"
+    )
     output: Path | None = option(
         None, "folder for figures and numbers; if not given, results/evaluate/TASK"
     )
@@ -73,17 +77,39 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     cases: dict[Case, tuple[Policy, Any]] = {}
     for observation in args.observation:
         for name in args.policy:
-            env = gymnasium.make_vec(
-                args.env_id,
-                num_envs=args.episodes,
-                observation=observation,
-                sensors=args.sensors,
-                threads=args.threads,
-                **args.env,
-            )
+            env = make_flights(args, observation, args.episodes)
             cases[name, observation] = (load_policy(name, env), env)
     require_writable("--output", folder)
+    if args.video != "none":
+        checked_video_path(folder / f"video.{args.video}")
     return cases, folder
+
+
+def make_flights(args: Args, observation: str, count: int) -> Any:
+    """The environment of an observation."""
+    return gymnasium.make_vec(
+        args.env_id,
+        num_envs=count,
+        observation=observation,
+        sensors=args.sensors,
+        threads=args.threads,
+        **args.env,
+    )
+
+
+def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
+    """A video of the first episode of each case."""
+    from tqdm import tqdm
+
+    files = []
+    for name, observation in tqdm(cases, desc="filming", unit=" videos"):
+        env = make_flights(args, observation, 1)
+        about = {"env_id": args.env_id, "policy": name, "observation": observation}
+        flight = flight_of(load_policy(name, env), env, seed=args.seed, about=about)
+        stem = _short(name).replace("/", "_").replace(":", "_")
+        files.append(folder / f"video_{stem}_{observation}.{args.video}")
+        save_video(flight, files[-1])
+    return files
 
 
 def table(results: dict[Case, Episodes], env: Any) -> str:
@@ -193,6 +219,8 @@ def main(args: Args) -> None:
     if args.episodes > 1:
         print("In brackets: bootstrap 95 % interval of the mean over episodes.")
     written = write(results, tracers, args, folder)
+    if args.video != "none":
+        written += write_videos(cases, args, folder)
     print(f"\nWrote {len(written)} files to {folder} after {time.perf_counter() - began:.1f} s.")
 
 

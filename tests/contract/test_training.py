@@ -122,7 +122,7 @@ def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     )
     wait_for(lambda: rows(folder) >= 3, process)
     process.send_signal(number)
-    out, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=120)
     assert process.returncode == (130 if number == signal.SIGINT else -signal.SIGKILL), err
     if number == signal.SIGINT:
         assert "--resume" in err
