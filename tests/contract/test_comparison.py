@@ -1,0 +1,111 @@
+"""Evaluating and comparing, as a user does it from the command line."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("matplotlib")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(script, *more, where):
+    line = [sys.executable, str(ROOT / "scripts" / script), *map(str, more)]
+    return subprocess.run(line, cwd=where, capture_output=True, text=True, check=False)
+
+
+def read_csv(file):
+    with file.open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_evaluate_writes_what_it_prints(tmp_path):
+    done = run(
+        "evaluate.py",
+        *("--policy", "pd", "pd:lab", "pretrained", "--episodes", 20, "--output", tmp_path / "out"),
+        where=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    rows = read_csv(tmp_path / "out/episodes.csv")
+    assert len(rows) == 3 * 2 * 20
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert len(summary["cases"]) == 6
+    for case in summary["cases"]:
+        mine = [
+            float(row["mean_error"])
+            for row in rows
+            if (row["policy"], row["observation"]) == (case["policy"], case["observation"])
+        ]
+        assert np.mean(mine) == pytest.approx(case["mean_error"])
+        assert f"{1e3 * case['mean_error']:.1f}" in done.stdout
+    found = {(c["policy"], c["observation"]): c["mean_error"] for c in summary["cases"]}
+    assert found["pd", "estimate"] < found["pd:lab", "estimate"]
+    assert found["pretrained", "estimate"] < found["pd", "estimate"]
+    for name in ("paths", "errors"):
+        for ending in ("png", "svg"):
+            assert (tmp_path / f"out/{name}.{ending}").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["QuadGym/Square-v0"], "ENV_ID must be one of"),
+        (["--policy", "nobody"], "policy must be pd"),
+        (["--policy", "missing.zip"], "there is no policy"),
+        (["--observation", "guess"], "observation must be one of"),
+        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--policy", "pretrained", "--env", "action=motor"], "trained with action ctbr"),
+        (["QuadGym/Hover-v0", "--policy", "pretrained", "--env", "wings=2"], "wings is not"),
+        (["--output", "/dev/null/x"], "cannot write to --output"),
+    ],
+)
+def test_evaluate_refuses_nonsense(tmp_path, more, message):
+    done = run("evaluate.py", *more, where=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def compare(where, *more):
+    line = ["--quick", "--steps", 8192, "--output", where / "out", "--env", "duration=1.0"]
+    return run("compare.py", *line, *more, where=where)
+
+
+def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
+    done = compare(tmp_path)
+    assert done.returncode == 0, done.stderr
+    for part in ("trained on the estimate", "PD, tuned", "One training seed proves nothing"):
+        assert part in done.stdout
+    policies = read_csv(tmp_path / "out/policies.csv")
+    assert len(policies) == (1 + 3) * 2
+    page = (tmp_path / "out/report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    assert "http" not in page
+    kept = tmp_path / "out/runs/lab/truth/seed_0/best.zip"
+    (tmp_path / "out/runs/lab/truth/seed_0/flown_on_truth.npz").unlink()
+    before = kept.stat().st_mtime_ns
+    again = compare(tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert kept.stat().st_mtime_ns == before
+    assert read_csv(tmp_path / "out/policies.csv") == policies
+    other = compare(tmp_path, "--env", "duration=0.5")
+    assert other.returncode == 2
+    assert "holds another comparison" in other.stderr
+
+
+def test_compare_refuses_nonsense(tmp_path):
+    for more, message in (
+        (["QuadGym/Waypoints-v0"], "task of tracking"),
+        (["--sensors", "sonar"], "sensors must be one of"),
+        (["--seeds", "0"], "--seeds must be at least 1"),
+        (["--env", "observation=truth"], "leave observation"),
+    ):
+        done = run("compare.py", *more, "--output", tmp_path / "x", where=tmp_path)
+        assert done.returncode == 2, more
+        assert message in done.stderr
