@@ -160,7 +160,7 @@ def paths_figure(traces: Mapping[str, Trace], title: str = "") -> Any:
     with house_style():
         from matplotlib.figure import Figure
 
-        columns = min(len(traces), 3)
+        columns = 2 if len(traces) == 4 else min(len(traces), 3)
         rows = -(-len(traces) // columns)
         figure = Figure(figsize=(3.6 * columns, 3.7 * rows), layout="constrained")
         figure.suptitle(title)
