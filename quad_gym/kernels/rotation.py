@@ -121,8 +121,12 @@ def normalize_quaternion(q):
 
 @kernel
 def mean_quaternion(a, b):
-    """The attitude halfway from a to b, two unit quaternions less than half a turn apart."""
-    return normalize_quaternion((a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]))
+    """The attitude halfway from a to b, two attitudes less than half a turn apart."""
+    # b and -b are the same attitude; halfway is meant along the shorter way
+    near = select(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0.0, -1.0, 1.0)
+    return normalize_quaternion(
+        (a[0] + near * b[0], a[1] + near * b[1], a[2] + near * b[2], a[3] + near * b[3])
+    )
 
 
 @kernel
@@ -135,9 +139,10 @@ def rotation_between(a, b):
     x = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
     y = a[0] * b[2] - a[2] * b[0] - a[3] * b[1] + a[1] * b[3]
     z = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1]
+    near = select(w < 0.0, -1.0, 1.0)  # b and -b are the same attitude
     sine = math.sqrt(x * x + y * y + z * z)
     turned = sine > 1e-100
-    per_sine = select(turned, atan2(sine, w) / select(turned, sine, 1.0), 1.0)
+    per_sine = near * select(turned, atan2(sine, near * w) / select(turned, sine, 1.0), 1.0)
     return (2.0 * per_sine * x, 2.0 * per_sine * y, 2.0 * per_sine * z)
 
 

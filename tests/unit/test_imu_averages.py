@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -78,6 +78,7 @@ def instant_force(state, force, lever):
 
 
 @given(st.integers(0, 2**32 - 1))
+@example(500)  # the quaternions of its start and end have opposite signs
 def test_a_sample_is_the_mean_of_what_is_felt_over_the_tick(seed):
     """Seen from the attitude halfway; SciPy integrates, the IMU's instants give what is felt."""
     start, rng, dt = random_state(seed), np.random.default_rng(seed), 0.005
