@@ -22,9 +22,10 @@ from quad_gym.sensor_params import (
     GnssParams,
     ImuParams,
     NoisyObservationParams,
+    PlacementParams,
     SensorSuite,
-    sensor_suite,
 )
+from quad_gym.sensor_suites import sensor_suite
 
 __version__ = "0.1.0"
 
@@ -61,6 +62,7 @@ __all__ = [
     "ImuParams",
     "NoisyObservationParams",
     "PDGains",
+    "PlacementParams",
     "SensorSuite",
     "TaskParams",
     "VehicleParams",

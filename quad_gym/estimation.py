@@ -61,7 +61,8 @@ class _KalmanFilter:
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         self._params = params_record(VehicleParams(), sensors)
         self._params["gravity"] = sensors.estimator.gravity
-        self._form = int(form_of(sensors.estimator.replace(kind=self._kind)))
+        form = form_of(sensors.estimator.replace(kind=self._kind), innovations=True)
+        self._form = int(form)
         self._flight = np.zeros(1, FLIGHT)
         self._work = np.zeros(1, WORK)
         self._running = False
@@ -76,8 +77,10 @@ class _KalmanFilter:
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
 
         Raises:
-            ValueError: If an argument has another shape, is not finite, or the baseline is zero.
+            ValueError: If an argument has another shape, is not finite, or the baseline is zero; or
+                the suite has no GNSS.
         """
+        self._require_gnss("initialize: start with set_state() instead")
         position = check.array("gnss_position_G", gnss_position_G, (3,))
         baseline = self._checked_baseline(gnss_baseline_G)
         self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
@@ -135,6 +138,7 @@ class _KalmanFilter:
         gnss_position_G: ArrayLike | None = None,
         gnss_baseline_G: ArrayLike | None = None,
         pixels: ArrayLike | None = None,
+        gnss_velocity_G: ArrayLike | None = None,
     ) -> None:
         """Condition the estimate on measurements of one instant; None: not measured.
 
@@ -143,15 +147,19 @@ class _KalmanFilter:
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
             pixels: (n_features, 2) feature projections [pixels]; a row with a NaN is a feature not
                 seen.
+            gnss_velocity_G: (3,) velocity of the primary antenna, in G [m/s]; for suites whose GNSS
+                measures it. Its lever arm is turned with the last `gyro` predicted with.
 
         Raises:
-            ValueError: If an argument has another shape or is not finite; the estimate is unchanged
-                then.
+            ValueError: If an argument has another shape or is not finite, or the suite has no GNSS
+                but its measurement is given; the estimate is unchanged then.
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
         f = self._flight
-        position = baseline = image = None
+        if gnss_position_G is not None or gnss_baseline_G is not None:
+            self._require_gnss("update")
+        position = baseline = velocity = image = None
         if gnss_position_G is not None:
             position = check.array("gnss_position_G", gnss_position_G, (3,))
         if gnss_baseline_G is not None:
@@ -159,12 +167,20 @@ class _KalmanFilter:
         if pixels is not None:
             image = check.array("pixels", pixels, (self._features, 2), allow_nan=True)
 
+        if gnss_velocity_G is not None:
+            if self.sensors.gnss is None or self.sensors.gnss.velocity_sigma is None:
+                raise ValueError("the sensor suite has no GNSS velocity to update with")
+            velocity = check.array("gnss_velocity_G", gnss_velocity_G, (3,))
+
         f["position_valid"], f["baseline_valid"] = position is not None, baseline is not None
+        f["velocity_valid"] = velocity is not None
         f["feature_valid"] = 0.0
         if position is not None:
             f["gnss_position"] = position
         if baseline is not None:
             f["gnss_baseline"] = baseline
+        if velocity is not None:
+            f["gnss_velocity"] = velocity
         if image is not None:
             seen = np.asarray(~np.isnan(image).any(axis=1))
             f["feature_valid"][0, : self._features] = seen
@@ -244,6 +260,10 @@ class _KalmanFilter:
     def _require_start(self) -> None:
         if not self._running:
             raise RuntimeError("call initialize() or set_state() before using the filter")
+
+    def _require_gnss(self, what: str) -> None:
+        if self.sensors.gnss is None:
+            raise ValueError(f"the sensor suite has no GNSS to {what}")
 
     def _checked_baseline(self, gnss_baseline_G: ArrayLike) -> NDArray[np.float64]:
         baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))

@@ -4,12 +4,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import STARTS, TASKS, ActionParams, Clocks, PDGains, TaskParams, VehicleParams
 from quad_gym.records import (
+    BASELINE_BLOCK,
+    FREEDOMS,
     PARAMS,
     PARAMS_BLOCK,
+    POSITION_BLOCK,
     SETTINGS,
     Autoreset,
     Control,
@@ -67,10 +71,20 @@ def params_record(
         p[f"{sensor}_bias_decay"] = np.exp(-imu.dt / tau)
         p[f"{sensor}_bias_drive"] = sigma * np.sqrt(-np.expm1(-2.0 * imu.dt / tau))
 
-    p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
-    p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
-    p["baseline_length"] = np.linalg.norm(gnss.baseline_B)
-    p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
+    if gnss is not None:
+        p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
+        p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
+        p["baseline_length"] = np.linalg.norm(gnss.baseline_B)
+        p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
+        p["position_sigma"], p["velocity_sigma"] = gnss.believed_sigma_I, gnss.velocity_sigma or 0.0
+        period = 1.0 / (gnss.rate * gnss.drift_tau)
+        p["drift_decay"] = np.exp(-period)
+        p["drift_drive"] = np.array(gnss.drift_sigma_I) * np.sqrt(-np.expm1(-2.0 * period))
+    else:  # the place of the start, as if its centre and its x axis had been measured
+        p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
+        p["gnss_sigma"] = sensors.placement.position_sigma
+        p["position_sigma"] = sensors.placement.position_sigma
+        p["baseline_sigma"] = sensors.placement.heading_sigma
 
     if sensors.camera is not None:
         camera = sensors.camera
@@ -86,21 +100,33 @@ def params_record(
     p["noise_at_prediction"] = estimator.feature_noise_across == "predicted"
     p["initial_velocity_variance"] = estimator.initial_velocity_variance
     p["initial_scale"] = estimator.initial_scale
+    p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
+    alarm = estimator.gate_false_alarm
+    p["gate_position"] = special.chdtri(FREEDOMS[POSITION_BLOCK], alarm)
+    p["gate_direction"] = special.chdtri(FREEDOMS[BASELINE_BLOCK], alarm)
+    p["gate_patience"] = estimator.gate_patience
     noisy = sensors.noisy
     p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
     return record
 
 
-def form_of(estimator: FilterParams) -> FilterForm:
-    """How a filter differs from the report's, for the kernels."""
-    form = FilterForm(0)
+def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
+    """How a filter differs from the report's, and what it keeps, for the kernels."""
+    form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
     if estimator.kind == "ekf":
         form |= FilterForm.EKF
     if estimator.integration == "midpoint":
         form |= FilterForm.MIDPOINT
     if estimator.covariance_reset == "turn":
         form |= FilterForm.TURN
+    if estimator.gate_false_alarm > 0.0:
+        form |= FilterForm.GATE
     return form
+
+
+def _phase_ticks(phase: float | None, period: int) -> int:
+    """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
+    return -1 if phase is None else min(round(phase * period), period - 1)
 
 
 def params_block(record: NDArray[Any]) -> NDArray[Any]:
@@ -123,16 +149,24 @@ def settings_record(
     privileged: bool,
     autoreset: Autoreset,
     run_filter: bool,
+    innovations: bool = False,
+    gnss_drifts: bool = False,
 ) -> NDArray[Any]:
     """What a batch does, as one scalar record, shape (1,)."""
     record = np.zeros(1, SETTINGS)
     s = record[0]
     s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
-    s["gnss_ticks"] = clocks.ticks_between("gnss")
-    s["form"] = form_of(sensors.estimator)
+    s["form"] = form_of(sensors.estimator, innovations)
     s["imu_averages"] = sensors.imu.samples == "average"
+    if sensors.gnss is not None:
+        s["gnss_ticks"] = clocks.ticks_between("gnss")
+        s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
+        s["gnss_phase"] = _phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
+    s["gnss_drifts"] = gnss_drifts
+    s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
     if sensors.camera is not None:
         s["camera_ticks"] = clocks.ticks_between("camera")
+        s["camera_phase"] = _phase_ticks(sensors.camera.phase, s["camera_ticks"])
         s["feature_count"] = len(sensors.camera.features_I)
     s["source"], s["control"], s["layout"] = source, control, layout
     s["include_covariance"], s["privileged"] = include_covariance, privileged

@@ -210,7 +210,7 @@ class Clocks(Checked):
         return cls(
             imu_rate=sensors.imu.rate,
             control_rate=control_rate,
-            gnss_rate=sensors.gnss.rate,
+            gnss_rate=sensors.gnss.rate if sensors.gnss is not None else sensors.imu.rate,
             camera_rate=camera.rate if camera is not None else sensors.imu.rate,
             substeps=substeps,
         )

@@ -18,8 +18,14 @@ WIDTH = 8
 """Flights in a block."""
 MAX_HARMONICS = 6
 """Terms of the Fourier series of a reference."""
-MAX_MEASUREMENTS = 6 + 3 * MAX_FEATURES
-"""Length of the stacked measurement: antenna position, baseline direction, feature directions."""
+MAX_BLOCKS = 3 + MAX_FEATURES
+"""Blocks of the stacked measurement: antenna position, baseline, velocity, features."""
+MAX_MEASUREMENTS = 3 * MAX_BLOCKS
+"""Length of the stacked measurement; a direction has three numbers."""
+POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = 0, 1, 2, 3
+"""Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
+FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES)
+"""Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 160
 """Numbers that an observation can hold."""
 
@@ -34,7 +40,7 @@ class FilterStatus(IntFlag):
 
 
 class FilterForm(IntFlag):
-    """How a filter differs from the report's; 0 is the report's UKF."""
+    """How a filter differs from the report's, and what it keeps; 0 is the report's UKF."""
 
     EKF = 1
     """derivatives of the models in place of sigma points"""
@@ -42,6 +48,19 @@ class FilterForm(IntFlag):
     """prediction turns the attitude exactly and the force with the attitude halfway"""
     TURN = 4
     """the covariance turns with the error angles when they are set to zero"""
+    INNOVATIONS = 8
+    """updates keep the innovations, their predicted deviations and their NIS, block by block"""
+    GATE = 16
+    """updates leave out blocks whose NIS is beyond the gate, and keep all of these, too"""
+
+
+class Gate(IntEnum):
+    """What became of a block of the last measurement."""
+
+    NONE = 0
+    """not measured since the start of the episode"""
+    ACCEPTED = 1
+    REJECTED = 2
 
 
 class Source(IntEnum):
@@ -143,15 +162,18 @@ FLIGHT_FIELDS = (
     Field("disturbance", (3,), "N", "external force d_I on the body"),
     Field("b_a", (3,), "m/s^2", "accelerometer bias"),
     Field("b_g", (3,), "rad/s", "gyro bias"),
+    Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
     # the last measurements
     Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
     Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
     Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
     Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
     Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
+    Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
     Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
     Field("position_valid", (), "0 or 1", "whether gnss_position was measured at the present instant"),
     Field("baseline_valid", (), "0 or 1", "whether gnss_baseline was measured at the present instant"),
+    Field("velocity_valid", (), "0 or 1", "whether gnss_velocity was measured at the present instant"),
     Field("feature_valid", (MAX_FEATURES,), "0 or 1", "whether the camera saw a feature at the present instant"),
     Field("position_fresh", (), "0 or 1", "whether gnss_position was measured since the last step"),
     Field("baseline_fresh", (), "0 or 1", "whether gnss_baseline was measured since the last step"),
@@ -166,6 +188,14 @@ FLIGHT_FIELDS = (
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
     Field("nis", (), "-", "normalised innovation squared of the last update"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
+    # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
+    Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B)"),
+    Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
+    Field("block_nis", (MAX_BLOCKS,), "-", "normalised innovation squared of each block, with FREEDOMS; NaN: none yet"),
+    Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
+    Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
+    Field("rejected_in_row", (4,), "-", "positions, baselines, velocities, images wholly rejected since the last accepted one"),
+    Field("reopened", (4,), "-", "times that the gate of each of these was reopened in this episode"),
     # what the controller sees
     Field("r_seen", (3,), "m", "position in I from the controller's source"),
     Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),
@@ -246,8 +276,12 @@ PARAMS_FIELDS = (
     Field("antenna", (3,), "m", "primary antenna in B"),
     Field("baseline", (3,), "m", "primary to secondary antenna in B"),
     Field("baseline_length", (), "m", "its length"),
-    Field("gnss_sigma", (3,), "m", "position noise in I"),
+    Field("gnss_sigma", (3,), "m", "white position noise in I; of the placement where there is no GNSS"),
+    Field("position_sigma", (3,), "m", "position noise that the filter takes for white, in I"),
+    Field("drift_decay", (), "-", "of the slow position error between two measurements"),
+    Field("drift_drive", (3,), "m", "sigma of its driving noise"),
     Field("baseline_sigma", (), "rad", "direction noise of the baseline"),
+    Field("velocity_sigma", (), "m/s", "velocity noise per axis; 0: not measured"),
     Field("camera", (3,), "m", "projection centre in B"),
     Field("R_CB", (3, 3), "-", "body to camera"),
     Field("pixel_size", (), "m", "pixel"),
@@ -262,6 +296,10 @@ PARAMS_FIELDS = (
     Field("noise_at_prediction", (), "0 or 1", "a feature's noise lies across its predicted, not its measured, direction"),
     Field("initial_velocity_variance", (), "m^2/s^2", "of the filter's start"),
     Field("initial_scale", (), "-", "factor on the first fix's covariance"),
+    Field("initial_tilt_sigma", (), "rad", "of roll and pitch at a level start; 0: attitude by Wahba's problem"),
+    Field("gate_position", (), "-", "largest accepted NIS of a position"),
+    Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
+    Field("gate_patience", (), "-", "rejections in a row that reopen the gate"),
     Field("noisy_sigma", (4,), "mixed", "of a noisy observation: position, velocity, attitude, body rates"),
 )
 
@@ -294,6 +332,11 @@ SETTINGS_FIELDS = (
     Field("ticks_per_step", (), "ticks", "in a control period", "i8"),
     Field("gnss_ticks", (), "ticks", "between GNSS measurements; 0: none", "i8"),
     Field("camera_ticks", (), "ticks", "between camera measurements; 0: none", "i8"),
+    Field("gnss_phase", (), "ticks", "from the start to the first GNSS measurement; -1: at random", "i8"),
+    Field("camera_phase", (), "ticks", "from the start to the first image; -1: at random", "i8"),
+    Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
+    Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),
+    Field("reuse_first_fix", (), "0 or 1", "whether the fix that starts the filter is its first measurement, too", "i8"),
     Field("feature_count", (), "-", "features in use", "i8"),
     Field("form", (), "bits", "of the filter, see FilterForm", "i8"),
     Field("imu_averages", (), "0 or 1", "whether IMU samples are averages over the tick", "i8"),

@@ -75,9 +75,29 @@ class GnssParams(Checked):
     """(3,) standard deviation east, north, up [m]; laboratory (RTK)"""
     baseline_sigma: float = 0.05
     """standard deviation of the baseline's direction [rad]; laboratory"""
+    velocity_sigma: float | None = None
+    """standard deviation of the velocity by Doppler shifts, per axis [m/s]; None: not measured, as
+    in the laboratory"""
+    phase: float | None = 0.0
+    """when the first measurement after the start comes, as a share of the period in [0, 1), in
+    whole ticks; None: at random in each episode"""
+    drift_sigma_I: Vector = (0.0, 0.0, 0.0)
+    """(3,) slow position error east, north, up, beside the white one: stationary standard deviation
+    of a first-order Gauss-Markov process that is zero at the start of an episode, for positions are
+    relative to the place of the start [m]"""
+    drift_tau: float = 60.0
+    """its correlation time [s]"""
 
     def __post_init__(self) -> None:
-        self._check(check.positive, "rate", "baseline_sigma")
+        self._check(check.positive, "rate", "baseline_sigma", "drift_tau")
+        self._check(check.phase, "phase")
+        if self.velocity_sigma is not None:
+            self._check(check.positive, "velocity_sigma")
+        self._check(check.vector, "drift_sigma_I", length=3)
+        if min(self.drift_sigma_I) < 0.0:
+            raise ValueError(
+                f"GnssParams.drift_sigma_I must be at least 0, got {self.drift_sigma_I}"
+            )
         self._check(
             check.vector,
             "primary_antenna_B",
@@ -103,6 +123,20 @@ class GnssParams(Checked):
         """(3,) from the primary to the secondary antenna, in B [m]."""
         return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
 
+    @property
+    def believed_sigma_I(self) -> np.ndarray:
+        """(3,) standard deviation of a position that the filter takes for white [m].
+
+        The slow error is counted as white noise of the same spectral density at frequency zero,
+        `sigma^2 (1 + a) / (1 - a)` with `a = exp(-1 / (rate tau))`. That is its sum over time as a
+        filter that averages for longer than tau meets it; for any shorter memory it is more than
+        there is, so that the filter errs on the side of doubt (R. G. Brown and P. Y. C. Hwang,
+        Introduction to Random Signals and Applied Kalman Filtering, on coloured measurement noise).
+        """
+        a = math.exp(-1.0 / (self.rate * self.drift_tau))
+        slow = np.square(self.drift_sigma_I) * (1.0 + a) / (1.0 - a)
+        return np.sqrt(np.square(self.position_sigma_I) + slow)
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraParams(Checked):
@@ -124,8 +158,12 @@ class CameraParams(Checked):
     """standard deviation per axis [pixels]; laboratory"""
     features_I: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
     """(n, 3) known points in I, at most MAX_FEATURES [m]; laboratory"""
+    phase: float | None = 0.0
+    """when the first image after the start comes, as a share of the period in [0, 1), in whole
+    ticks; None: at random in each episode"""
 
     def __post_init__(self) -> None:
+        self._check(check.phase, "phase")
         self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
         self._check(check.vector, "position_B", "attitude", length=3)
         self._check(check.vector, "image_size", length=2)
@@ -141,6 +179,23 @@ class CameraParams(Checked):
                 f"CameraParams.features_I must hold at most {MAX_FEATURES} features, "
                 f"got {len(self.features_I)}"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacementParams(Checked):
+    """How well the place of the start is known where there is no GNSS to measure it.
+
+    The vehicle is put down on a marked spot; the filter starts from where the spot is and whither
+    the vehicle looks, with these errors, and takes the vehicle for level.
+    """
+
+    position_sigma: float = 0.05
+    """per axis [m]; a vehicle put on its mark by hand"""
+    heading_sigma: float = 0.05
+    """[rad]; a vehicle lined up by eye, some 3 degrees"""
+
+    def __post_init__(self) -> None:
+        self._check(check.positive, "position_sigma", "heading_sigma")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +228,22 @@ class FilterParams(Checked):
     """[m^2/s^2]; laboratory"""
     initial_scale: float = 2.0
     """factor on the first fix's covariance; laboratory"""
+    initial_tilt_sigma: float | None = None
+    """how level the start is, per axis [rad]: the filter starts level, looking as the baseline
+    says; None: the attitude solves Wahba's problem for the baseline and the vertical, with the
+    baseline's noise about every axis, as in the laboratory"""
+    reuse_first_fix: bool = True
+    """whether the fix that starts the filter is also its first measurement, as in the laboratory;
+    that counts it twice, so suites other than "lab" do not"""
+    gate_false_alarm: float = 0.0
+    """probability that a sound measurement is rejected: a position, a baseline or a feature whose
+    normalised innovation squared exceeds the chi-square quantile of this alarm level is left out of
+    the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking
+    and Navigation, section 5.4); 0: everything is taken"""
+    gate_patience: int = 10
+    """positions, baselines or images rejected in a row after which the filter rather doubts itself:
+    it adds the square of the innovation to the covariance of what the sensor measures, and takes
+    the next one"""
     gravity: float = GRAVITY
     """[m/s^2] that the filter subtracts"""
 
@@ -190,6 +261,15 @@ class FilterParams(Checked):
         self._check(check.choice, "integration", choices=("euler", "midpoint"))
         self._check(check.choice, "covariance_reset", choices=("none", "turn"))
         self._check(check.choice, "feature_noise_across", choices=("measured", "predicted"))
+        self._check(check.flag, "reuse_first_fix")
+        if self.initial_tilt_sigma is not None:
+            self._check(check.positive, "initial_tilt_sigma")
+        self._check(check.whole, "gate_patience")
+        self._check(check.number, "gate_false_alarm", least=0.0)
+        if self.gate_false_alarm >= 0.5:
+            raise ValueError(
+                f"FilterParams.gate_false_alarm must be below 0.5, got {self.gate_false_alarm}"
+            )
         self._check(check.number, "kappa", least=-14.0)
 
 
@@ -215,24 +295,27 @@ class SensorSuite(Checked):
     """All sensors of a vehicle and the filter that fuses them."""
 
     imu: ImuParams = field(default_factory=ImuParams)
-    gnss: GnssParams = field(default_factory=GnssParams)
+    gnss: GnssParams | None = field(default_factory=GnssParams)
+    """None: no GNSS; the filter then starts from `placement`"""
     camera: CameraParams | None = field(default_factory=CameraParams)
     """None: no camera"""
+    placement: PlacementParams = field(default_factory=PlacementParams)
     estimator: FilterParams = field(default_factory=FilterParams)
     noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
 
     def __post_init__(self) -> None:
         for name, kind in (
             ("imu", ImuParams),
-            ("gnss", GnssParams),
+            ("placement", PlacementParams),
             ("estimator", FilterParams),
             ("noisy", NoisyObservationParams),
         ):
             check.instance(f"SensorSuite.{name}", getattr(self, name), kind)
+        if self.gnss is not None:
+            check.instance("SensorSuite.gnss", self.gnss, GnssParams)
+            check.ticks("GnssParams.rate", self.gnss.rate, self.imu.rate)
         if self.camera is not None:
             check.instance("SensorSuite.camera", self.camera, CameraParams)
-        check.ticks("GnssParams.rate", self.gnss.rate, self.imu.rate)
-        if self.camera is not None:
             check.ticks("CameraParams.rate", self.camera.rate, self.imu.rate)
 
     def with_rates(
@@ -247,7 +330,8 @@ class SensorSuite(Checked):
         A new IMU rate changes the tick: sensors that measured at every tick keep doing so.
 
         Raises:
-            ValueError: If a rate is not positive or not a whole division of the IMU's.
+            ValueError: If a rate is not positive or not a whole division of the IMU's, or there is
+                no GNSS that could have the rate given for it.
         """
         imu_rate = self.imu.rate if imu is None else check.positive("imu_rate", imu)
 
@@ -257,42 +341,37 @@ class SensorSuite(Checked):
             check.ticks(name, rate, imu_rate)
             return rate
 
-        gnss_params = self.gnss.replace(rate=rate_of("gnss_rate", gnss, self.gnss.rate))
+        gnss_params = self.gnss
+        if gnss_params is not None:
+            gnss_params = gnss_params.replace(rate=rate_of("gnss_rate", gnss, gnss_params.rate))
+        elif gnss is not None:
+            raise ValueError(f"gnss_rate must not be given without GNSS, got {gnss} Hz")
         camera_params = self.camera
         if camera_params is not None:
             camera_params = camera_params.replace(
                 rate=rate_of("camera_rate", camera, camera_params.rate)
             )
-        return SensorSuite(
-            imu=self.imu.replace(rate=imu_rate),
-            gnss=gnss_params,
-            camera=camera_params,
-            estimator=self.estimator,
-            noisy=self.noisy,
+        return self.replace(  # type: ignore[no-any-return]
+            imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params
         )
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """A copy whose white noise is `factor` times as large; the filter knows of it."""
         check.positive("factor", factor)
-        camera = self.camera
+        gnss, camera = self.gnss, self.camera
         if camera is not None:
             camera = camera.replace(pixel_sigma=factor * camera.pixel_sigma)
+        if gnss is not None:
+            gnss = gnss.replace(
+                position_sigma_I=tuple(factor * s for s in gnss.position_sigma_I),
+                baseline_sigma=factor * gnss.baseline_sigma,
+                velocity_sigma=gnss.velocity_sigma and factor * gnss.velocity_sigma,
+            )
         return self.replace(  # type: ignore[no-any-return]
             imu=self.imu.replace(
                 accel_noise_density=factor * self.imu.accel_noise_density,
                 gyro_noise_density=factor * self.imu.gyro_noise_density,
             ),
-            gnss=self.gnss.replace(
-                position_sigma_I=tuple(factor * s for s in self.gnss.position_sigma_I),
-                baseline_sigma=factor * self.gnss.baseline_sigma,
-            ),
+            gnss=gnss,
             camera=camera,
         )
-
-
-_SUITES = {"lab": SensorSuite()}
-
-
-def sensor_suite(name: str) -> SensorSuite:
-    """The sensor suite called `name`: "lab", the report's."""
-    return _SUITES[check.choice("sensors", name, tuple(_SUITES))]

@@ -47,6 +47,7 @@ class GnssReceiver(_Sensor):
     def __init__(self, params: GnssParams, rng: np.random.Generator) -> None:
         imu = ImuParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
+        self._drifts = any(params.drift_sigma_I)
 
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike
@@ -64,6 +65,8 @@ class GnssReceiver(_Sensor):
             ValueError: If an argument has another shape or is not finite.
         """
         self._place(position, R_BI)
+        if self._drifts:
+            single.step_gnss_drift(self._flight, self._params)
         single.sense_gnss(self._flight, self._params)
         return self._flight["gnss_position"][0].copy(), self._flight["gnss_baseline"][0].copy()
 

@@ -31,7 +31,8 @@ from quad_gym.records import (
     aligned_zeros,
     field_of_flights,
 )
-from quad_gym.sensor_params import SensorSuite, sensor_suite
+from quad_gym.sensor_params import SensorSuite
+from quad_gym.sensor_suites import sensor_suite
 from quad_gym.threads import resolve_threads, run_ranges
 
 _NO_BOUNDS = np.zeros(0)
@@ -71,6 +72,8 @@ class FlightBatch:
         bounds: (low, high) of the observation, each (n,); None: the batch observes nothing.
         autoreset: When a flight whose episode is over begins the next one.
         run_filter: Whether sensors and filter run; None: where something needs them.
+        innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
+            "innovation_sigma", "block_nis"; a gate keeps them anyway.
         threads: Threads to use; None: as many as there are cores.
         true_vehicle: The vehicle as it is, where it differs from the nominal one that the
             controller knows.
@@ -99,6 +102,7 @@ class FlightBatch:
         bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         autoreset: Autoreset = Autoreset.DISABLED,
         run_filter: bool | None = None,
+        innovations: bool = False,
         threads: int | None = None,
         true_vehicle: VehicleParams | None = None,
         true_sensors: SensorSuite | None = None,
@@ -132,8 +136,13 @@ class FlightBatch:
                 "true_sensors must have the IMU samples of sensors, as they order the tick: "
                 f"{true_sensors.imu.samples!r} is not {self.sensors.imu.samples!r}"
             )
+        for name in ("gnss", "camera"):
+            if (getattr(true_sensors, name) is None) != (getattr(self.sensors, name) is None):
+                raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
+        check.flag("innovations", innovations)
         if run_filter is None:
-            run_filter = include_covariance or self.source in (Source.ESTIMATE, Source.SENSORS)
+            needed = include_covariance or innovations
+            run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = run_filter
 
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
@@ -150,6 +159,8 @@ class FlightBatch:
             privileged=privileged,
             autoreset=Autoreset(autoreset),
             run_filter=run_filter,
+            innovations=innovations,
+            gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
         )
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)

@@ -44,6 +44,16 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def phase(name: str, value: Any) -> float | None:
+    """`value` as a share of a period in [0, 1), or None."""
+    if value is None:
+        return None
+    share = number(name, value, least=0.0)
+    if share >= 1.0:
+        raise ValueError(f"{name} must be less than 1, got {value!r}")
+    return share
+
+
 def instance(name: str, value: Any, kind: type) -> None:
     """Refuse a `value` that is not a `kind`."""
     if not isinstance(value, kind):

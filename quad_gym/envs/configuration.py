@@ -19,7 +19,8 @@ from quad_gym.envs.spaces import (
 )
 from quad_gym.params import ActionParams, TaskParams, VehicleParams
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
-from quad_gym.sensor_params import SensorSuite, sensor_suite
+from quad_gym.sensor_params import SensorSuite
+from quad_gym.sensor_suites import sensor_suite
 from quad_gym.simulation import FlightBatch
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
@@ -81,6 +82,7 @@ class Flights:
         camera_rate: float | None = None,
         substeps: int = 1,
         max_episode_steps: int | None = None,
+        innovations: bool = False,
         threads: int | None = None,
         true_vehicle: VehicleParams | None = None,
         true_sensors: SensorSuite | None = None,
@@ -139,6 +141,7 @@ class Flights:
             privileged=privileged,
             bounds=layout_bounds(self.table),
             autoreset=autoreset,
+            innovations=innovations,
             threads=threads,
             true_vehicle=true_vehicle,
             true_sensors=true_sensors,

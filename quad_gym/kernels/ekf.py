@@ -7,12 +7,13 @@ half-sums less the centre, which carry the second order, are zero. With `R(e) = 
 
 * `a = R_hat^T R(e)^T (f - b_a) - g e3`:  da = R_hat^T (de x f - db_a)
 * `e+ = e + dt S(e) (w - b_g)`:  de+ = de + dt ((de_th w_z, -de_phi w_z, -de_th w_x) - db_g)
-* position:  dz = dr + R_hat^T (de x l_p);  baseline:  dz = R_hat^T (de x u_B)
+* position:  dz = dr + R_hat^T (de x l_p);  baseline:  dz = R_hat^T (de x u_B);
+  velocity:  dz = dv
 * feature at X_B, seen at distance s along u_B:  dz = (I - u u^T) (X_B x de - R_hat dr) / s
 """
 
 from quad_gym.kernels.compilation import kernel
-from quad_gym.kernels.error_state import BG, E, R
+from quad_gym.kernels.error_state import BG, E, R, V
 from quad_gym.kernels.lanes import any_of
 from quad_gym.kernels.linalg import (
     add,
@@ -52,7 +53,7 @@ def _put(row, k, has, values):
 
 
 @kernel
-def measure_columns(flight, p, work, n, feature_count, use_position, use_baseline):
+def measure_columns(flight, p, work, n, feature_count, use_position, use_baseline, use_velocity):
     """Fill work.A with the derivatives of the measurement along the nine columns of L that matter.
 
     Column j of L is row 8 - j; work.E becomes zero. Reads work.X_B, work.inverse_distance and
@@ -74,6 +75,9 @@ def measure_columns(flight, p, work, n, feature_count, use_position, use_baselin
         if use_baseline:
             has = flight.baseline_valid > 0.0
             _put(A, k, has, apply_transposed(R_BI, cross(d, unit_baseline)))
+            k += 3
+        if use_velocity:
+            _put(A, k, flight.velocity_valid > 0.0, load_column3(L, V, j))
             k += 3
         dr_B = apply(R_BI, dr)
         for i in range(feature_count):

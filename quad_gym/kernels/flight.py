@@ -9,6 +9,7 @@ import numpy as np
 
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.control import act
+from quad_gym.kernels.innovations import forget_innovations
 from quad_gym.kernels.lanes import any_of, select
 from quad_gym.kernels.linalg import (
     add,
@@ -21,13 +22,17 @@ from quad_gym.kernels.linalg import (
     scale,
     sub,
 )
+from quad_gym.kernels.random import uniform_pair
 from quad_gym.kernels.reference import evaluate_reference
 from quad_gym.kernels.rotation import euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.sensors import (
     DRAW_NOISY,
+    DRAW_PHASE,
     drift_biases,
+    drift_gnss,
     measure_features,
     measure_gnss,
+    measure_gnss_velocity,
     measure_imu,
     measure_imu_average,
     six_normals,
@@ -37,9 +42,10 @@ from quad_gym.kernels.task import draw_reference, draw_start
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
 from quad_gym.kernels.vehicle import integrate, load4, load_state
-from quad_gym.records import Control, Source
+from quad_gym.records import Control, FilterForm, Source
 
 _ONE = np.uint64(1)
+_WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 
 
 @kernel
@@ -68,6 +74,42 @@ def _look(flight, model, settings, mask):
 
 
 @kernel
+def _sense_gnss(flight, world, settings, mask, starting):
+    """Measure by GNSS where it is due, and the place of the start for the filter to start from."""
+    due = mask & (flight.gnss_wait <= 0.0) & (settings.gnss_ticks > 0)
+    if settings.gnss_drifts > 0 and not starting and any_of(due):
+        drift_gnss(flight, world, due)
+    measured = mask if starting else due
+    if any_of(measured):
+        measure_gnss(flight, world, measured)
+        if settings.gnss_velocity > 0:
+            measure_gnss_velocity(flight, world, measured)
+    wait = select(due, 1.0 * settings.gnss_ticks, flight.gnss_wait) - 1.0
+    flight.gnss_wait = select(mask, wait, flight.gnss_wait)
+    fresh = measured & (settings.gnss_ticks > 0)
+    flight.position_fresh = select(fresh, 1.0, flight.position_fresh)
+    flight.baseline_fresh = select(fresh, 1.0, flight.baseline_fresh)
+    if starting and settings.reuse_first_fix == 0:
+        due = due & (settings.gnss_ticks < 0)
+    valid = select(due, 1.0, 0.0)
+    flight.position_valid = select(mask, valid, flight.position_valid)
+    flight.baseline_valid = select(mask, valid, flight.baseline_valid)
+    if settings.gnss_velocity > 0:
+        flight.velocity_valid = select(mask, valid, flight.velocity_valid)
+
+
+@kernel
+def _first_wait(phase, period, share):
+    """Ticks to a sensor's first measurement: its phase, or at random within its period."""
+    ticks = 0.0 * share
+    for k in range(1, period):
+        ticks = ticks + select(share * period >= 1.0 * k, 1.0, 0.0)
+    if phase >= 0:
+        ticks = 0.0 * share + phase
+    return ticks
+
+
+@kernel
 def sense(flight, world, model, settings, work, mask, starting):
     """Measure at the present instant, update the filter and look, where `mask`.
 
@@ -83,17 +125,7 @@ def sense(flight, world, model, settings, work, mask, starting):
     if settings.run_filter:
         if starting or not settings.imu_averages:  # at its start an average has nothing behind it
             measure_imu(flight, world, mask)
-        period = 1.0 * settings.gnss_ticks
-        due = mask & (flight.gnss_wait <= 0.0)
-        if any_of(due):
-            measure_gnss(flight, world, due)
-        valid = select(due, 1.0, 0.0)
-        flight.position_valid = select(mask, valid, flight.position_valid)
-        flight.baseline_valid = select(mask, valid, flight.baseline_valid)
-        wait = select(due, period, flight.gnss_wait) - 1.0
-        flight.gnss_wait = select(mask, wait, flight.gnss_wait)
-        flight.position_fresh = select(due, 1.0, flight.position_fresh)
-        flight.baseline_fresh = select(due, 1.0, flight.baseline_fresh)
+        _sense_gnss(flight, world, settings, mask, starting)
 
         if settings.camera_ticks > 0:
             period = 1.0 * settings.camera_ticks
@@ -140,8 +172,14 @@ def begin_episode(flight, world, model, settings, work, mask):
     """Begin a new episode, where `mask`: reference, true state, first measurements, filter."""
     flight.instant = select(mask, flight.instant + _ONE, flight.instant)
     flight.tick = select(mask, 0.0, flight.tick)
-    flight.gnss_wait = select(mask, 0.0, flight.gnss_wait)
-    flight.camera_wait = select(mask, 0.0, flight.camera_wait)
+    gnss_share, camera_share = uniform_pair(stream_of(flight), DRAW_PHASE)
+    wait = _first_wait(settings.gnss_phase, settings.gnss_ticks, gnss_share)
+    flight.gnss_wait = select(mask, wait, flight.gnss_wait)
+    wait = _first_wait(settings.camera_phase, settings.camera_ticks, camera_share)
+    flight.camera_wait = select(mask, wait, flight.camera_wait)
+    keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    if (settings.form & _WATCH) != 0:
+        forget_innovations(flight, settings.feature_count, mask)
     flight.position_fresh = select(mask, 0.0, flight.position_fresh)
     flight.baseline_fresh = select(mask, 0.0, flight.baseline_fresh)
     for i in range(settings.feature_count):

@@ -95,6 +95,12 @@ def select3(mask, a, b):
     return (select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
 
 
+@kernel
+def select33(mask, a, b):
+    """The matrix `a` where `mask`, else `b`."""
+    return (select3(mask, a[0], b[0]), select3(mask, a[1], b[1]), select3(mask, a[2], b[2]))
+
+
 # ---- matrices of three rows ------------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ from quad_gym.kernels.linalg import (
     add,
     apply,
     apply_transposed,
+    cross,
     dot,
     keep3,
     load3,
@@ -32,6 +33,7 @@ from quad_gym.kernels.vehicle import (
 
 # numbers of the draws (of two normals each) within an instant
 DRAW_BIAS, DRAW_IMU, DRAW_GNSS, DRAW_NOISY, DRAW_FEATURE, DRAW_RESET = 0, 3, 6, 9, 16, 64
+DRAW_DRIFT, DRAW_PHASE, DRAW_VELOCITY = 512, 515, 516
 
 
 @kernel
@@ -133,6 +135,15 @@ def noisy_baseline(r_b, normals, sigma_b, floor, length):
 
 
 @kernel
+def drift_gnss(flight, p, mask):
+    """Step the slow error of GNSS positions from one measurement to the next, where `mask`."""
+    n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
+    d, s = load3(flight.gnss_drift), load3(p.drift_drive)
+    drive = (s[0] * n[0], s[1] * n[1], s[2] * n[2])
+    keep3(flight.gnss_drift, mask, add(scale(p.drift_decay, d), drive))
+
+
+@kernel
 def measure_gnss(flight, p, mask):
     """Measure antenna position and baseline in G, where `mask`."""
     R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
@@ -140,12 +151,23 @@ def measure_gnss(flight, p, mask):
     s = load3(p.gnss_sigma)
     antenna_I = add(load3(flight.r), apply_transposed(R_BI, load3(p.antenna)))
     noise_I = (s[0] * n_p[0], s[1] * n_p[1], s[2] * n_p[2])
+    noise_I = add(noise_I, load3(flight.gnss_drift))
     keep3(flight.gnss_position, mask, apply_transposed(R_IG, add(antenna_I, noise_I)))
     baseline_G = apply_transposed(R_IG, apply_transposed(R_BI, load3(p.baseline)))
     measured = noisy_baseline(
         baseline_G, n_b, p.baseline_sigma, p.direction_floor, p.baseline_length
     )
     keep3(flight.gnss_baseline, mask, measured)
+
+
+@kernel
+def measure_gnss_velocity(flight, p, mask):
+    """Measure the velocity of the antenna in G, where `mask`."""
+    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+    n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
+    lever_B = cross(load3(flight.w), load3(p.antenna))
+    v_I = add(load3(flight.v), apply_transposed(R_BI, lever_B))
+    keep3(flight.gnss_velocity, mask, apply_transposed(R_IG, add(v_I, scale(p.velocity_sigma, n))))
 
 
 @kernel

@@ -5,6 +5,7 @@ from quad_gym.kernels.linalg import add_outer, load3, load33, scale, scale33, st
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.sensors import (
     drift_biases,
+    drift_gnss,
     measure_features,
     measure_gnss,
     measure_imu,
@@ -50,6 +51,12 @@ def sense_imu_average(flights, params, starts):
 def sense_gnss(flights, params):
     """Measure flights[0] by GNSS."""
     measure_gnss(flights[0], params[0], True)
+
+
+@entry
+def step_gnss_drift(flights, params):
+    """Step the slow position error of flights[0] to the next measurement."""
+    drift_gnss(flights[0], params[0], True)
 
 
 @entry

@@ -49,6 +49,7 @@ from quad_gym.kernels.linalg import (
     outer,
     scale,
     scale33,
+    select33,
     store_block,
     sub,
     sum_of_outers,
@@ -301,11 +302,23 @@ def predict(flight, p, work, form=0):
 
 
 @kernel
+def _level_attitude(baseline_B, baseline_I):
+    """The level attitude R_BI in which a baseline has the heading it is seen to have."""
+    zero = 0.0 * baseline_B[0]
+    east = (zero + 1.0, zero, zero)
+    b = unit_or((baseline_B[0], baseline_B[1], zero), east)
+    i = unit_or((baseline_I[0], baseline_I[1], zero), east)
+    c, s = b[0] * i[0] + b[1] * i[1], b[0] * i[1] - b[1] * i[0]
+    return ((c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0))
+
+
+@kernel
 def initialize(flight, p, mask):
     """Start the filter from the first fix, where `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
-    with equal weights; position from the antenna; velocity and biases zero.
+    with equal weights, or level with the baseline's heading; position from the antenna; velocity
+    and biases zero.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
@@ -318,6 +331,8 @@ def initialize(flight, p, mask):
     profile = outer(baseline_B, baseline_I)
     profile = (profile[0], profile[1], (profile[2][0], profile[2][1], profile[2][2] + 1.0))
     R_BI, _ = wahba(profile)
+    level = p.initial_tilt_sigma > 0.0
+    R_BI = select33(level, _level_attitude(baseline_B, baseline_I), R_BI)
     antenna_I = apply(R_IG, load3(flight.gnss_position))
     keep33(flight.R_hat, mask, R_BI)
     keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
@@ -334,6 +349,7 @@ def initialize(flight, p, mask):
     for i in range(3):
         L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
         L[V + i, V + i] = select(mask, math.sqrt(p.initial_velocity_variance), L[V + i, V + i])
-        L[E + i, E + i] = select(mask, inflation * p.baseline_sigma, L[E + i, E + i])
+        tilt = select(level & (i < 2), p.initial_tilt_sigma, inflation * p.baseline_sigma)
+        L[E + i, E + i] = select(mask, tilt, L[E + i, E + i])
         L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
         L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])

@@ -1,10 +1,10 @@
 """The filter's update: antenna position, baseline direction and feature directions at once.
 
 See `ukf.py` for the form of the unscented transform and of the update. The stacked measurement is
-made of triples, all in I or B: r + R^T l_p, unit(R^T l_b), and for each feature unit(R (X - r) -
-l_c), for a direction in the camera frame differs from one in B by a fixed rotation only. A triple
-that a lane lacks is masked: its deviations and innovation are zero and its noise is one, which
-gives exactly the update without it. Triples that every lane lacks are left out.
+made of triples, all in I or B: r + R^T l_p, unit(R^T l_b), v + R^T (w x l_p), and for each feature
+unit(R (X - r) - l_c), for a direction in the camera frame differs from one in B by a fixed rotation
+only. A triple that a lane lacks is masked: its deviations and innovation are zero and its noise is
+one, which gives exactly the update without it. Triples that every lane lacks are left out.
 """
 
 import math
@@ -15,6 +15,7 @@ from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.ekf import measure_columns
 from quad_gym.kernels.elementary import is_finite
 from quad_gym.kernels.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
+from quad_gym.kernels.innovations import judge_innovations, reopen_gates
 from quad_gym.kernels.lanes import any_of, logical_not, select
 from quad_gym.kernels.linalg import (
     add,
@@ -23,6 +24,7 @@ from quad_gym.kernels.linalg import (
     apply,
     apply_transposed,
     cholesky,
+    cross,
     dot,
     keep3,
     keep33,
@@ -47,6 +49,7 @@ from quad_gym.kernels.rotation import euler_to_dcm, split_rotation
 from quad_gym.records import FilterForm, FilterStatus
 
 _EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
+_GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -80,7 +83,7 @@ def _has_feature(flight, k):
 
 
 @kernel
-def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
+def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, use_velocity):
     """Fill work.h (centre), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
     h, z, Rz = work.h, work.z, work.Rz
     R_IG, R_BI, R_CB = load33(p.R_IG), load33(flight.R_hat), load33(p.R_CB)
@@ -90,7 +93,7 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
         has = flight.position_valid > 0.0
         _set_triple(h, k, has, add(r, apply_transposed(R_BI, load3(p.antenna))))
         _set_triple(z, k, has, apply(R_IG, load3(flight.gnss_position)))
-        s = load3(p.gnss_sigma)
+        s = load3(p.position_sigma)
         zero = 0.0 * s[0]
         noise = ((s[0] * s[0], zero, zero), (zero, s[1] * s[1], zero), (zero, zero, s[2] * s[2]))
         _set_noise(Rz, k, has, noise)
@@ -103,6 +106,18 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline):
         _set_triple(z, k, has, scale(1.0 / norm(measured), measured))
         variance = p.baseline_sigma * p.baseline_sigma
         _set_noise(Rz, k, has, _direction_noise(u_I, variance, p.direction_floor))
+        k += 3
+    if use_velocity:
+        has = flight.velocity_valid > 0.0
+        w_B = sub(load3(flight.gyro), load3(flight.b_g_hat))
+        lever_B = cross(w_B, load3(p.antenna))
+        _set_triple(h, k, has, add(load3(flight.v_hat), apply_transposed(R_BI, lever_B)))
+        _set_triple(z, k, has, apply(R_IG, load3(flight.gnss_velocity)))
+        variance = p.velocity_sigma * p.velocity_sigma
+        zero = 0.0 * variance
+        nothing = (zero, zero, zero)
+        noise = add_to_diagonal((nothing, nothing, nothing), variance)
+        _set_noise(Rz, k, has, noise)
         k += 3
     for i in range(feature_count):
         has = _has_feature(flight, i)
@@ -175,7 +190,9 @@ def _direction_pair(v, inverse_norm, v_even, v_odd):
 
 
 @kernel
-def _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c):
+def _measure_sigma_points(
+    flight, p, work, feature_count, use_position, use_baseline, use_velocity, c
+):
     """Fill work.A and work.E with the measured pairs; column j of L is their row 8 - j."""
     L = flight.L
     R_BI = load33(flight.R_hat)
@@ -201,6 +218,12 @@ def _measure_sigma_points(flight, p, work, feature_count, use_position, use_base
             _set_triple(A, k, has, apply_transposed(R_BI, baseline_odd))
             _set_triple(S, k, has, apply_transposed(R_BI, baseline_even))
             k += 3
+        if use_velocity:  # that the lever arm's share turns with e is neglected
+            has = flight.velocity_valid > 0.0
+            dv = load_column3(L, V, j)
+            _set_triple(A, k, has, dv)
+            _set_triple(S, k, has, scale(0.0, dv))
+            k += 3
         dr_B = apply(R_BI, scale(c, dr))
         for i in range(feature_count):
             has = _has_feature(flight, i)
@@ -217,8 +240,8 @@ def _measure_sigma_points(flight, p, work, feature_count, use_position, use_base
 
 
 @kernel
-def _sum_noise(p, work, n, c):
-    """Turn work.z into the innovation and add the even parts' share to work.Rz."""
+def _innovate(work, n, c):
+    """Turn work.z into the innovation: what was measured less what the sigma points expect."""
     S, mu = work.E, work.mu
     for k in range(n):
         total = S[0, k]
@@ -226,6 +249,12 @@ def _sum_noise(p, work, n, c):
             total = total + S[j, k]
         mu[k] = total / c
         work.z[k] = work.z[k] - work.h[k] - mu[k]
+
+
+@kernel
+def _sum_noise(p, work, n):
+    """Add the even parts' share to work.Rz."""
+    S, mu = work.E, work.mu
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     for i in range(0, n, 3):
         mu_i = scale(excess, (mu[i], mu[i + 1], mu[i + 2]))
@@ -242,7 +271,9 @@ def _sum_noise(p, work, n, c):
 def update(flight, p, work, feature_count, mask, form=0):
     """Condition the estimate on the valid measurements of the present instant, where `mask`.
 
-    A lane whose result is not finite keeps its state bit for bit and sets UPDATE_FAILED.
+    A lane whose result is not finite keeps its state bit for bit and sets UPDATE_FAILED. The gate
+    masks after the spread c of the sigma points was chosen for all measurements; c enters the
+    moments in their fourth order only.
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
@@ -254,18 +285,26 @@ def update(flight, p, work, feature_count, mask, form=0):
     """
     use_position = any_of(flight.position_valid > 0.0)
     use_baseline = any_of(flight.baseline_valid > 0.0)
-    n = _compare_centre(flight, p, work, feature_count, use_position, use_baseline)
+    use_velocity = any_of(flight.velocity_valid > 0.0)
+    n = _compare_centre(flight, p, work, feature_count, use_position, use_baseline, use_velocity)
     if n == 0:
         return
-    measured = 3.0 * (flight.position_valid + flight.baseline_valid)
+    measured = 3.0 * (flight.position_valid + flight.baseline_valid + flight.velocity_valid)
     for i in range(feature_count):
         measured = measured + 3.0 * flight.feature_valid[i]
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 15.0 + measured)
     if (form & _EKF) != 0:
-        measure_columns(flight, p, work, n, feature_count, use_position, use_baseline)
+        measure_columns(flight, p, work, n, feature_count, use_position, use_baseline, use_velocity)
     else:
-        _measure_sigma_points(flight, p, work, feature_count, use_position, use_baseline, c)
-    _sum_noise(p, work, n, c)
+        _measure_sigma_points(
+            flight, p, work, feature_count, use_position, use_baseline, use_velocity, c
+        )
+    _innovate(work, n, c)
+    if (form & _WATCH) != 0:
+        measured = measured - judge_innovations(
+            flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask
+        )
+    _sum_noise(p, work, n)
 
     # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
     A, z, N, t, L9 = work.A, work.z, work.N, work.t, work.L9
@@ -327,3 +366,5 @@ def update(flight, p, work, feature_count, mask, form=0):
     flight.filter_status = select(
         failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
     )
+    if (form & _GATE) != 0:
+        reopen_gates(flight, p, work, feature_count, mask)
