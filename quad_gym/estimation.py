@@ -10,7 +10,7 @@ from quad_gym import validation as check
 from quad_gym.kernels import single
 from quad_gym.packing import form_of, params_record
 from quad_gym.params import VehicleParams
-from quad_gym.records import FLIGHT, WORK, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterStatus
 from quad_gym.sensor_params import SensorSuite
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
@@ -64,6 +64,7 @@ class _KalmanFilter:
         form = form_of(sensors.estimator.replace(kind=self._kind), innovations=True)
         self._form = int(form)
         self._flight = np.zeros(1, FLIGHT)
+        self._flight["block_nis"] = np.nan
         self._work = np.zeros(1, WORK)
         self._running = False
 
@@ -252,6 +253,20 @@ class _KalmanFilter:
     def nis(self) -> tuple[float, int]:
         """Normalised innovation squared of the last update, and how many measurements it had."""
         return float(self._flight["nis"][0]), int(self._flight["nis_dimension"][0])
+
+    @property
+    def block_nis(self) -> NDArray[np.float64]:
+        """(n,) normalised innovation squared of the last position, baseline, velocity and features.
+
+        In a filter that is right they are chi-square with 3, 2, 3 and 2 degrees of freedom; NaN:
+        not measured yet.
+        """
+        return self._read("block_nis")[: FEATURE_BLOCKS + self._features]
+
+    @property
+    def gate_decisions(self) -> NDArray[np.int64]:
+        """(n,) what became of each of these, see `quad_gym.records.Gate`."""
+        return self._read("gate")[: FEATURE_BLOCKS + self._features].astype(np.int64)
 
     def _read(self, name: str) -> NDArray[Any]:
         self._require_start()

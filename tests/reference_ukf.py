@@ -305,6 +305,7 @@ class PlainUKF:
         x_mean = w_mean @ points[:, :15]
         dX, dZ = points[:, :15] - x_mean, Z - z_mean
         P_zz, P_xz = (w_cov * dZ.T) @ dZ, (w_cov * dX.T) @ dZ
+        self.innovation, self.innovation_covariance, self.prediction = z - z_mean, P_zz, Z[0]
         K = solve_positive_definite(P_zz, np.ascontiguousarray(P_xz.T)).T
         self._inject(x_mean + K @ (z - z_mean), self.P - K @ P_zz @ K.T)
 

@@ -157,7 +157,7 @@ def _judge_direction(flight, p, work, k, s, has, gating):
 
 @kernel
 def judge_innovations(
-    flight, p, work, feature_count, use_position, use_baseline, use_velocity, watch, mask
+    flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask
 ):
     """Keep the innovations of the present measurements and mask those beyond the gate.
 

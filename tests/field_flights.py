@@ -1,0 +1,72 @@
+"""Flights whose filters are judged: errors in the filter's coordinates, and their size."""
+
+import numpy as np
+
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.records import Control
+from quad_gym.simulation import FlightBatch
+
+
+def fly(sensors, count=200, *, task="random_trajectory", seed=0, **keywords):
+    """A batch under PD control on its estimate that goes on whatever happens."""
+    params = TASK_DEFAULTS[task].replace(
+        duration=0.0, out_of_bounds=1e6, max_tilt=np.pi, ground=-1e6
+    )
+    batch = FlightBatch(
+        count,
+        sensors=sensors,
+        task=params,
+        gains="tuned",
+        control=Control.PD,
+        innovations=True,
+        **keywords,
+    )
+    batch.reset(seeds=range(seed, seed + count))
+    return batch
+
+
+def steps(batch, seconds):
+    for _ in range(round(seconds * batch.sensors.imu.rate)):
+        batch.step()
+
+
+def small_euler_angles(R):
+    """The 3-1-2 angles (n, 3) of rotations (n, 3, 3) near the identity."""
+    yaw, pitch = np.arctan2(-R[:, 1, 0], R[:, 1, 1]), np.arctan2(-R[:, 0, 2], R[:, 2, 2])
+    return np.stack([np.arcsin(R[:, 1, 2]), pitch, yaw], axis=-1)
+
+
+def attitudes(q):
+    """R_BI (n, 3, 3) of unit quaternions (w, x, y, z), by Rodrigues' formula."""
+    w, v = q[:, 0, None, None], q[:, 1:]
+    K = np.zeros((len(q), 3, 3))
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = v[:, 2], -v[:, 1], v[:, 0]
+    K -= K.transpose(0, 2, 1)
+    return np.eye(3) + 2 * w * K + 2 * K @ K
+
+
+def state_errors(batch):
+    """(n, 15) truth less estimate, in the order r, v, e, b_a, b_g."""
+    R_error = attitudes(batch.read("q")) @ batch.read("R_hat").transpose(0, 2, 1)
+    return np.concatenate(
+        [
+            batch.read("r") - batch.read("r_hat"),
+            batch.read("v") - batch.read("v_hat"),
+            small_euler_angles(R_error),
+            batch.read("b_a") - batch.read("b_a_hat"),
+            batch.read("b_g") - batch.read("b_g_hat"),
+        ],
+        axis=1,
+    )
+
+
+def nees(batch, block=slice(0, 15)):
+    """(n,) normalised estimation error squared of all 15 states, or of some."""
+    x, P = state_errors(batch)[:, block], batch.covariance()[:, block, block]
+    return np.einsum("ni,ni->n", x, np.linalg.solve(P, x[..., np.newaxis])[..., 0])
+
+
+def measured_now(batch):
+    """(n, blocks): which blocks were measured at the present instant."""
+    flags = [batch.read(f"{name}_valid") for name in ("position", "baseline", "velocity")]
+    return np.column_stack([*flags, batch.read("feature_valid")]) > 0.0

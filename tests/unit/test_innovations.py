@@ -1,0 +1,282 @@
+"""Innovations block by block against a plain filter; the gate, and its way back."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym.estimation import UnscentedKalmanFilter
+from quad_gym.packing import params_record
+from quad_gym.records import (
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
+    POSITION_BLOCK,
+    FilterForm,
+    FilterStatus,
+    Gate,
+)
+from tests.circle_flight import record_circle
+from tests.field_flights import fly, measured_now, state_errors, steps
+from tests.lane_filter import STATE, LaneFilter
+from tests.reference_ukf import PlainUKF
+
+LAB = quad_gym.sensor_suite("lab")
+HONEST = LAB.replace(estimator=LAB.estimator.replace(feature_noise_across="predicted"))
+GATED = LAB.replace(
+    estimator=LAB.estimator.replace(
+        feature_noise_across="predicted", gate_false_alarm=1e-4, gate_patience=5
+    )
+)
+RECORDING = record_circle(HONEST, 400, 11)
+FIX = slice(0, 3)
+FIELD = GATED.replace(
+    estimator=GATED.estimator.replace(integration="midpoint", covariance_reset="turn")
+)
+
+
+def warm(sensors, ticks=300):
+    """A filter that has flown the recording for a while."""
+    ukf = UnscentedKalmanFilter(sensors)
+    ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    for k in range(ticks):
+        cycle(ukf, k)
+    return ukf
+
+
+def cycle(ukf, k, **changes):
+    measurements = {
+        "gnss_position_G": RECORDING.gnss_position[k],
+        "gnss_baseline_G": RECORDING.gnss_baseline[k],
+        "pixels": RECORDING.pixels[k],
+    }
+    ukf.update(**{**measurements, **changes})
+    ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
+
+
+class InnovatingUKF(PlainUKF):
+    """The plain filter, which also says what the stacked innovation was and its covariance."""
+
+    def update(self, *measurements):
+        super().update(*measurements)
+        z, S, self.nis = self.innovation, self.innovation_covariance, []
+        names = ["position", "baseline"] + ["feature"] * (len(z) // 3 - 2)
+        for k, name in enumerate(names):
+            nu, block = z[3 * k : 3 * k + 3], S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+            if name != "position":  # across the predicted direction
+                u = self.prediction[3 * k : 3 * k + 3]
+                across = np.linalg.svd(u[np.newaxis])[2][1:]
+                nu, block = across @ nu, across @ block @ across.T
+            self.nis.append(nu @ np.linalg.solve(block, nu))
+
+
+def test_the_nis_of_each_block_is_that_of_a_plain_filter():
+    ours, plain = UnscentedKalmanFilter(HONEST), InnovatingUKF(HONEST)
+    for ukf in (ours, plain):
+        ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    for k in range(60):
+        seen = np.flatnonzero(np.isfinite(RECORDING.pixels[k][:, 0]))
+        fix = RECORDING.gnss_position[k], RECORDING.gnss_baseline[k], RECORDING.pixels[k]
+        for ukf in (ours, plain):
+            ukf.update(*fix)
+        blocks = [POSITION_BLOCK, BASELINE_BLOCK, *(FEATURE_BLOCKS + seen)]
+        np.testing.assert_allclose(ours.block_nis[blocks], plain.nis, rtol=1e-4, atol=1e-4)
+        assert (ours.gate_decisions[blocks] == Gate.ACCEPTED).all()
+        for ukf in (ours, plain):
+            ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
+
+
+def test_without_a_measurement_there_is_no_nis():
+    ukf = UnscentedKalmanFilter(HONEST)
+    ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
+    assert np.isnan(ukf.block_nis).all()
+    ukf.update(RECORDING.gnss_position[0])
+    assert np.isfinite(ukf.block_nis[POSITION_BLOCK])
+    assert np.isnan(ukf.block_nis[BASELINE_BLOCK:]).all()
+    assert ukf.gate_decisions[BASELINE_BLOCK] == Gate.NONE
+
+
+@pytest.mark.parametrize("wrong", ["gnss_position_G", "gnss_baseline_G", "pixels"])
+def test_a_rejected_block_is_as_good_as_not_measured(wrong):
+    gated, without = warm(GATED), warm(HONEST)
+    k = 300
+    value = {
+        "gnss_position_G": RECORDING.gnss_position[k] + 0.5,
+        "gnss_baseline_G": RECORDING.gnss_baseline[k] @ np.diag([-1.0, -1.0, 1.0]),
+        "pixels": RECORDING.pixels[k] + np.array([[600.0, 0.0], [0.0, 0.0]]),
+    }[wrong]
+    lacking = {
+        "gnss_position_G": None,
+        "gnss_baseline_G": None,
+        "pixels": np.where([[True], [False]], np.nan, RECORDING.pixels[k]),
+    }[wrong]
+    assert np.isfinite(RECORDING.pixels[k]).all()
+    cycle(gated, k, **{wrong: value})
+    cycle(without, k, **{wrong: lacking})
+    block = {
+        "gnss_position_G": POSITION_BLOCK,
+        "gnss_baseline_G": BASELINE_BLOCK,
+        "pixels": FEATURE_BLOCKS,
+    }[wrong]
+    assert gated.gate_decisions[block] == Gate.REJECTED
+    assert (gated.gate_decisions == Gate.REJECTED).sum() == 1
+    assert gated.status == FilterStatus(0)
+    np.testing.assert_allclose(gated.position, without.position, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(gated.R_BI, without.R_BI, rtol=0.0, atol=1e-9)
+    sigma = np.sqrt(np.diag(without.covariance))
+    gap = (gated.covariance - without.covariance) / np.outer(sigma, sigma)
+    assert abs(gap).max() < 1e-6
+
+
+def test_the_gate_is_the_chi_square_quantile_of_its_false_alarm():
+    record = params_record(quad_gym.VehicleParams(), GATED)
+    assert record["gate_position"][0] == pytest.approx(stats.chi2.isf(1e-4, 3), rel=1e-12)
+    assert record["gate_direction"][0] == pytest.approx(stats.chi2.isf(1e-4, 2), rel=1e-12)
+    assert params_record(quad_gym.VehicleParams(), LAB)["gate_position"][0] == np.inf
+
+
+@pytest.mark.parametrize("value", [-0.1, 0.5, np.nan])
+def test_a_false_alarm_that_is_no_probability_is_refused(value):
+    with pytest.raises(ValueError, match="gate_false_alarm"):
+        LAB.estimator.replace(gate_false_alarm=value)
+
+
+def test_a_lane_gates_for_itself():
+    """The neighbours of a flight with a wild position update as they would without a gate."""
+    filters, free = LaneFilter(GATED), LaneFilter(HONEST)
+    for lanes in (filters, free):
+        for lane in range(8):
+            lanes.measure(lane, RECORDING, 0)
+        lanes.initialize()
+        if lanes is filters:
+            lanes.put(3, gnss_position=RECORDING.gnss_position[0] + 5.0)
+        lanes.update()
+    others = [0, 1, 2, 4, 5, 6, 7]
+    for name in STATE:
+        np.testing.assert_array_equal(filters.get(name)[others], free.get(name)[others])
+    np.testing.assert_array_equal(filters.get("gate")[:, POSITION_BLOCK], [1, 1, 1, 2, 1, 1, 1, 1])
+
+
+# ---- measurements that fail ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sensors", "form"),
+    [(LAB, 0), (HONEST, FilterForm.INNOVATIONS), (GATED, FilterForm.GATE), (FIELD, FilterForm.EKF)],
+    ids=["lab", "watched", "gated", "ekf"],
+)
+@pytest.mark.parametrize(
+    "field", ["gnss_position", "gnss_baseline", "pixels", "position_sigma", "L"]
+)
+def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, sensors, form):
+    """Not finite, or singular: the flight keeps its estimate and says so; others do not notice."""
+    filters, free = LaneFilter(sensors), LaneFilter(sensors)
+    for lanes in (filters, free):
+        lanes.form |= int(form)
+        for lane in range(8):
+            lanes.measure(lane, RECORDING, 0)
+        lanes.initialize()
+    if field == "position_sigma":  # neither prior nor measurement have any noise: singular
+        filters.params["position_sigma"][0, :, 2] = 0.0
+        filters.block["L"][0, :, :, 2] = 0.0
+    elif field == "L":
+        filters.block["L"][0, 4, 4, 2] = np.nan
+    else:
+        filters.block[field][0, ..., 2] = np.nan
+    before = {name: filters.get(name) for name in STATE}
+    for lanes in (filters, free):
+        lanes.update()
+    after = {name: filters.get(name) for name in STATE}
+    for name in STATE:
+        np.testing.assert_array_equal(after[name][2], before[name][2])
+        np.testing.assert_array_equal(np.delete(after[name], 2, 0), np.delete(free.get(name), 2, 0))
+    status = filters.get("filter_status")
+    assert status[2] == FilterStatus.UPDATE_FAILED
+    assert not np.delete(status, 2).any()
+
+
+# ---- many flights ----------------------------------------------------------------------------
+
+
+def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
+    suite = quad_gym.sensor_suite("consumer")
+    suite = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=0.01))
+    batch = fly(suite, 400, task="hover")
+    steps(batch, 5.0)  # until the start's larger uncertainty is over
+    before, taken = batch.read("rejections").sum(axis=0), 0
+    for _ in range(1000):
+        batch.step()
+        taken = taken + measured_now(batch).sum(axis=0)
+    share = (batch.read("rejections").sum(axis=0) - before) / np.maximum(taken, 1)
+    assert taken[BASELINE_BLOCK] == 400 * 50
+    # independent in time, so a binomial's sigma is 0.0007
+    assert 0.006 < share[BASELINE_BLOCK] < 0.014
+
+
+def test_innovations_have_the_size_that_the_filter_expects():
+    batch = fly("rtk", 400)
+    steps(batch, 5.0)
+    scores, nis = [], []
+    for _ in range(400):
+        batch.step()
+        now = measured_now(batch)[:, POSITION_BLOCK]
+        scores.append((batch.read("innovation") / batch.read("innovation_sigma"))[now, 0])
+        nis.append(batch.read("block_nis")[now, 0])
+    scores, nis = np.concatenate(scores), np.concatenate(nis)
+    assert scores.shape == (400 * 20, 3)
+    np.testing.assert_allclose(scores.std(axis=0), 1.0, atol=0.06)
+    assert nis.mean() == pytest.approx(3.0, abs=0.15)
+
+
+def shifted(batch, **changes):
+    """Move the estimate, as if the filter had been led astray."""
+    flights = batch.snapshot()
+    for name, change in changes.items():
+        flights[name] = change(flights[name])
+    batch.restore(flights)
+
+
+@pytest.mark.parametrize("name", ["rtk", "consumer"])
+def test_a_jump_does_not_lock_the_filter_out_for_ever(name):
+    suite = quad_gym.sensor_suite(name)
+    if name == "consumer":  # one that trusts its fixes, or the jump is within its doubts
+        suite = suite.replace(gnss=suite.gnss.replace(drift_sigma_I=(0.0, 0.0, 0.0)))
+    batch = fly(suite.replace(camera=None), 200, task="hover")
+    steps(batch, 5.0)
+    jump = np.array([4.0, -3.0, 2.0])[np.newaxis, :, np.newaxis]
+    shifted(batch, r_hat=lambda r: r + jump)
+    steps(batch, 3.0)
+    errors = np.linalg.norm(state_errors(batch)[:, FIX], axis=1)
+    assert errors.max() < 1.0
+    np.testing.assert_array_equal(batch.read("reopened")[:, 0], 1.0)
+    assert not batch.read("filter_status").any()
+    sigma = np.sqrt(np.einsum("nii->ni", batch.covariance()))[:, FIX]
+    assert (abs(state_errors(batch)[:, FIX]) < 5 * sigma).all()
+
+
+def test_a_wrong_heading_does_not_lock_the_baseline_out_for_ever():
+    suite = quad_gym.sensor_suite("rtk").replace(camera=None)
+    batch = fly(suite, 200, task="hover")
+    steps(batch, 5.0)
+    c, s = np.cos(0.7), np.sin(0.7)
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    shifted(batch, R_hat=lambda R: np.einsum("nijl,jk->nikl", R, turn))
+    steps(batch, 10.0)
+    yaw = np.degrees(abs(state_errors(batch)[:, 8]))
+    assert (batch.read("reopened")[:, 1] >= 1.0).all()
+    assert np.quantile(yaw, 0.99) < 5.0
+
+
+def test_one_wrong_feature_stays_out_while_the_others_agree():
+    batch = fly("rtk", 50, task="hover")
+    steps(batch, 3.0)
+    flights = batch.snapshot()
+    before = flights["rejections"].copy()
+    batch.restore(flights)
+    batch._model["features"][0, 1] += 0.5  # the filter's map is wrong by half a metre
+    steps(batch, 2.0)
+    more = batch.read("rejections") - before.transpose(0, 2, 1).reshape(-1, before.shape[1])[:50]
+    seen = batch.read("gate")[:, FEATURE_BLOCKS + 1] > 0
+    assert seen.any()
+    assert (more[seen, FEATURE_BLOCKS + 1] > 10).all()
+    assert more[:, POSITION_BLOCK].max() <= 2
+    assert (np.linalg.norm(state_errors(batch)[:, FIX], axis=1) < 0.05).all()

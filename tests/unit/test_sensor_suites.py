@@ -1,0 +1,205 @@
+"""Sensor suites: rates and phases, GNSS that drifts, velocity, flights without GNSS."""
+
+import numpy as np
+import pytest
+from scipy import signal, stats
+
+import quad_gym
+from quad_gym.sensor_suites import SUITES
+from quad_gym.sensors import GnssReceiver
+from tests.field_flights import attitudes, fly, nees, steps
+from tests.reference_ukf import east_north_up
+from tests.unit.alarms import ALARM, assert_normal
+
+FIELD = [name for name in SUITES if name != "lab"]
+RTK, CONSUMER = quad_gym.sensor_suite("rtk"), quad_gym.sensor_suite("consumer")
+
+
+def test_the_suites_have_names():
+    assert SUITES == ("lab", "rtk", "consumer", "indoor")
+    with pytest.raises(ValueError, match="lab, rtk, consumer, indoor"):
+        quad_gym.sensor_suite("laboratory")
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_a_suite_of_the_field_is_honest_by_its_settings(name):
+    suite = quad_gym.sensor_suite(name)
+    assert suite.imu.samples == "average"
+    assert suite.estimator.feature_noise_across == "predicted"
+    assert not suite.estimator.reuse_first_fix
+    assert 0.0 < suite.estimator.gate_false_alarm < 0.01
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_the_filter_starts_with_errors_as_large_as_it_believes(name):
+    batch = fly(quad_gym.sensor_suite(name), 1000, task="hover")
+    mean = nees(batch).mean()
+    # a level start is surer of the antenna's place than its noise alone: a few per cent
+    assert 14.0 < mean < 16.5
+
+
+# ---- rates and phases ------------------------------------------------------------------------
+
+
+def ticks_of_fixes(suite, count, ticks):
+    batch = fly(suite, count, task="hover")
+    rows = [batch.read("position_valid")]
+    for _ in range(ticks):
+        batch.step()
+        rows.append(batch.read("position_valid"))
+    return np.array(rows) > 0.0
+
+
+def test_sensors_measure_at_their_phase_and_rate():
+    suite = RTK.replace(
+        gnss=RTK.gnss.replace(phase=0.25), camera=RTK.camera.replace(rate=50.0, phase=0.5)
+    )
+    batch = fly(suite, 3, task="hover")
+    fixes, images = [], []
+    for tick in range(1, 101):
+        batch.step()
+        if batch.read("position_valid").all():
+            fixes.append(tick)
+        if batch.read("feature_valid").any():
+            images.append(tick)
+    assert fixes == list(range(5, 101, 20))
+    assert images == list(range(2, 101, 4))
+
+
+def test_random_phases_are_uniform_and_new_in_each_episode():
+    flags = ticks_of_fixes(RTK, 2000, 40)
+    assert not flags[0].any()  # the fix that starts the filter is no measurement
+    first = flags[1:].argmax(axis=0) + 1
+    assert set(first) <= set(range(1, 21))
+    np.testing.assert_array_equal(flags[1:21].sum(axis=0), 1)  # one in every period
+    counts = np.bincount(first % 20, minlength=20)
+    assert stats.chisquare(counts).pvalue > ALARM
+
+
+@pytest.mark.parametrize("phase", [-0.1, 1.0, np.nan, "soon"])
+def test_a_phase_outside_of_the_period_is_refused(phase):
+    with pytest.raises(ValueError, match=r"GnssParams\.phase"):
+        RTK.gnss.replace(phase=phase)
+    with pytest.raises(ValueError, match=r"CameraParams\.phase"):
+        RTK.camera.replace(phase=phase)
+
+
+# ---- GNSS whose error drifts -----------------------------------------------------------------
+
+
+def test_the_slow_error_grows_as_a_gauss_markov_process():
+    gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=2.0, phase=0.0)
+    batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
+    np.testing.assert_array_equal(batch.read("gnss_drift"), 0.0)
+    steps(batch, 1.0)
+    early = batch.read("gnss_drift")
+    steps(batch, 1.5)
+    late = batch.read("gnss_drift")
+    variance = np.square([0.6, 0.3, 1.0])
+    v_1, v_2 = (variance * -np.expm1(-2.0 * t / 2.0) for t in (1.0, 2.5))
+    between = v_1 * np.exp(-1.5 / 2.0)
+    covariance = np.block([[np.diag(v_1), np.diag(between)], [np.diag(between), np.diag(v_2)]])
+    assert_normal(np.hstack([early, late]), np.zeros(6), covariance)
+
+
+def test_a_receiver_measures_white_noise_and_the_slow_error():
+    gnss = CONSUMER.gnss.replace(drift_tau=1.0)
+    receiver = GnssReceiver(gnss, np.random.default_rng(5))
+    R_IG = east_north_up(gnss.reference_antenna_G)
+    fixes = np.array([receiver.measure(np.zeros(3), np.eye(3))[0] for _ in range(20_000)])
+    errors = fixes @ R_IG.T - gnss.primary_antenna_B
+    expected = np.hypot(gnss.position_sigma_I, gnss.drift_sigma_I)
+    np.testing.assert_allclose(errors[100:].std(axis=0), expected, rtol=0.1)
+    lag = (errors[100:-10] * errors[110:]).mean(axis=0)  # a second later the white part is gone
+    np.testing.assert_allclose(lag, np.square(gnss.drift_sigma_I) * np.exp(-1.0), rtol=0.3)
+
+
+def test_the_filter_counts_the_slow_error_as_white_noise_of_its_density():
+    gnss = CONSUMER.gnss
+    a = np.exp(-1.0 / (gnss.rate * gnss.drift_tau))
+    n = 200_000
+    response = signal.lfilter([1.0], [1.0, -a], np.ones(n))  # of the sum of n to each drive
+    slow = (1.0 - a * a) * np.sum(np.square(response)) / n * np.square(gnss.drift_sigma_I)
+    expected = np.sqrt(np.square(gnss.position_sigma_I) + slow)
+    np.testing.assert_allclose(gnss.believed_sigma_I, expected, rtol=0.01)
+    np.testing.assert_array_equal(RTK.gnss.believed_sigma_I, RTK.gnss.position_sigma_I)
+
+
+# ---- velocity --------------------------------------------------------------------------------
+
+
+def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
+    gnss = RTK.gnss.replace(rate=200.0, phase=0.0, primary_antenna_B=(0.3, 0.0, 0.1))
+    batch = fly(RTK.replace(gnss=gnss), 500, task="hover")
+    steps(batch, 0.2)
+    R_BI = attitudes(batch.read("q"))
+    lever = np.cross(batch.read("w"), gnss.primary_antenna_B)
+    truth = batch.read("v") + np.einsum("nji,nj->ni", R_BI, lever)
+    assert np.abs(lever).max() > 0.05
+    measured = batch.read("gnss_velocity") @ east_north_up(gnss.reference_antenna_G).T
+    assert_normal(measured - truth, np.zeros(3), np.eye(3) * gnss.velocity_sigma**2)
+
+
+def test_velocity_is_measured_by_suites_that_have_it_only():
+    assert fly("rtk", 2, task="hover").read("velocity_valid").shape == (2,)
+    lab = fly("lab", 2, task="hover")
+    steps(lab, 0.1)
+    assert not lab.read("velocity_valid").any()
+    ukf = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("lab"))
+    ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="velocity"):
+        ukf.update(gnss_velocity_G=(0.0, 0.0, 0.0))
+
+
+def test_velocity_updates_the_friendly_filter():
+    ukf = quad_gym.UnscentedKalmanFilter(CONSUMER)
+    ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    before = ukf.covariance
+    ukf.update(gnss_velocity_G=(0.0, 0.0, 0.02))
+    R = CONSUMER.gnss.velocity_sigma**2
+    after = before[3, 3] * R / (before[3, 3] + R)
+    np.testing.assert_allclose(np.diag(ukf.covariance)[3:6], after, rtol=1e-9)
+
+
+# ---- flying without GNSS ---------------------------------------------------------------------
+
+
+def test_indoors_the_filter_starts_from_its_mark_and_never_has_a_fix():
+    batch = fly("indoor", 2000, task="hover")
+    off = batch.read("r_hat") - batch.read("r")
+    assert_normal(off, np.zeros(3), np.eye(3) * 0.05**2)
+    for _ in range(50):
+        batch.step()
+        assert not batch.read("position_valid").any()
+        assert not batch.read("baseline_valid").any()
+
+
+def test_the_friendly_filter_takes_no_fix_without_gnss():
+    ukf = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("indoor"))
+    with pytest.raises(ValueError, match="set_state"):
+        ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    ukf.set_state(
+        position=np.zeros(3),
+        velocity=np.zeros(3),
+        R_BI=np.eye(3),
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=np.eye(15) * 1e-2,
+    )
+    with pytest.raises(ValueError, match="GNSS"):
+        ukf.update(gnss_position_G=(0.0, 0.0, 0.0))
+
+
+def test_without_gnss_a_rate_for_it_is_refused():
+    with pytest.raises(ValueError, match="gnss_rate"):
+        quad_gym.sensor_suite("indoor").with_rates(gnss=10.0)
+    with pytest.raises(ValueError, match="gnss"):
+        fly("indoor", 1, true_sensors=quad_gym.sensor_suite("rtk"))
+
+
+def test_sensors_are_observed_as_they_measure():
+    env = quad_gym.QuadEnv("hover", observation="sensors", sensors="indoor")
+    observation, _ = env.reset(seed=3)
+    table = {field.name: field.slice for field in env.flights.table}
+    assert observation[table["gnss_position_valid"]] == 0.0
+    assert not observation[table["gnss_position"]].any()
