@@ -97,7 +97,8 @@ def params_record(
     p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
     p["sigma_kappa"] = estimator.kappa
     p["direction_floor"] = estimator.direction_variance_floor
-    p["noise_at_prediction"] = estimator.feature_noise_across == "predicted"
+    p["noise_at_prediction"] = estimator.feature_noise_across != "measured"
+    p["noise_projected"] = estimator.feature_noise_across == "projected"
     p["initial_velocity_variance"] = estimator.initial_velocity_variance
     p["initial_scale"] = estimator.initial_scale
     p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0

@@ -189,7 +189,7 @@ FLIGHT_FIELDS = (
     Field("nis", (), "-", "normalised innovation squared of the last update"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
     # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
-    Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B)"),
+    Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
     Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
     Field("block_nis", (MAX_BLOCKS,), "-", "normalised innovation squared of each block, with FREEDOMS; NaN: none yet"),
     Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
@@ -293,6 +293,7 @@ PARAMS_FIELDS = (
     Field("sigma_beta", (), "-", "beta of the unscented transform"),
     Field("sigma_kappa", (), "-", "kappa of the unscented transform"),
     Field("direction_floor", (), "-", "variance added to every direction's diagonal"),
+    Field("noise_projected", (), "0 or 1", "a feature's noise is that of its pixel seen under its angle"),
     Field("noise_at_prediction", (), "0 or 1", "a feature's noise lies across its predicted, not its measured, direction"),
     Field("initial_velocity_variance", (), "m^2/s^2", "of the filter's start"),
     Field("initial_scale", (), "-", "factor on the first fix's covariance"),

@@ -223,7 +223,9 @@ class FilterParams(Checked):
     feature_noise_across: str = "measured"
     """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
     across the "predicted" one, as the baseline's does. The first takes the angle between the two,
-    tens of milliradians in the first second, for information that it trusts to 0.1 mrad."""
+    tens of milliradians in the first second, for information that it trusts to 0.1 mrad.
+    "projected": across the predicted one, and less toward the image's centre, as pixels far out
+    subtend smaller angles there; the report takes the noise for equal about both axes"""
     initial_velocity_variance: float = 1e-3
     """[m^2/s^2]; laboratory"""
     initial_scale: float = 2.0
@@ -260,7 +262,9 @@ class FilterParams(Checked):
         self._check(check.choice, "kind", choices=("ukf", "ekf"))
         self._check(check.choice, "integration", choices=("euler", "midpoint"))
         self._check(check.choice, "covariance_reset", choices=("none", "turn"))
-        self._check(check.choice, "feature_noise_across", choices=("measured", "predicted"))
+        self._check(
+            check.choice, "feature_noise_across", choices=("measured", "predicted", "projected")
+        )
         self._check(check.flag, "reuse_first_fix")
         if self.initial_tilt_sigma is not None:
             self._check(check.positive, "initial_tilt_sigma")

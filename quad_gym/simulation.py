@@ -167,7 +167,8 @@ class FlightBatch:
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
         self._blocks["idle"] = lanes >= self.count
         self._blocks["needs_reset"] = 1.0
-        self._blocks["start_given"] = np.nan
+        for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
+            self._blocks[name] = np.nan
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._actions = np.zeros((self.count, 4))
         self._resets = np.zeros(self.count, np.uint8)

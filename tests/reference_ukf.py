@@ -320,10 +320,15 @@ class PlainUKF:
 
         variance = (self.number(camera.pixel_sigma) * size) ** 2 / (v @ v)
         across = unit(v)
-        if self.sensors.estimator.feature_noise_across == "predicted":
+        if self.sensors.estimator.feature_noise_across != "measured":
             across = direction(self.r, self.R)
+        noise = self._direction_noise(across, variance)
+        if self.sensors.estimator.feature_noise_across == "projected":
+            projector = eye_of(self.number) - np.outer(across, across)
+            in_image = self._array(np.diag([1.0, 1.0, 0.0]))
+            noise = variance * projector @ in_image @ projector + self.floor
         measured.append(unit(v))
-        noises.append(self._direction_noise(across, variance))
+        noises.append(noise)
         models.append(direction)
 
     def _direction_noise(self, u, variance):

@@ -104,7 +104,7 @@ class Flights:
             raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")
         if not camera:
             suite = suite.replace(camera=None)
-        if feature_noise_across is None and isinstance(sensors, str):
+        if feature_noise_across is None and sensors == "lab":
             feature_noise_across = "predicted"
         if feature_noise_across is not None:
             choices = suite.estimator.replace(feature_noise_across=feature_noise_across)

@@ -100,12 +100,15 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: A preset by name, or a `SensorSuite`.
+        sensors: "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or a
+            `SensorSuite`.
+        innovations: Whether `flights.batch.read` has the innovations of the filter block by block;
+            a suite whose filter gates keeps them anyway.
         vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
-        feature_noise_across: "predicted" or "measured", see `quad_gym.FilterParams`. None: as a
-            given `SensorSuite` has it; for a suite by name "predicted", as the report's own
+        feature_noise_across: "predicted", "projected" or "measured", see `quad_gym.FilterParams`.
+            None: as the suite has it; but for "lab" by name "predicted", as the report's own
             "measured" makes some 6 circles in 1,000 crash in their first second.
         estimator: "ukf" or "ekf", in place of the suite's.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].

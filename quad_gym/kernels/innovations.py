@@ -149,9 +149,9 @@ def _judge_direction(flight, p, work, k, s, has, gating):
     nu, S2 = _across(u, S, (work.z[k], work.z[k + 1], work.z[k + 2]))
     nis = _nis_of_direction(S2, nu)
     rejected = has & (nis > p.gate_direction) & gating
-    zero = 0.0 * nis
-    sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), zero)
-    _keep_block(flight, s, has, (nu[0], nu[1], zero), sigma, nis, rejected)
+    none = np.nan + 0.0 * nis
+    sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), none)
+    _keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected)
     return rejected
 
 

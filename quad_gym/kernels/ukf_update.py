@@ -139,7 +139,11 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, 
             sigma = p.pixel_sigma * pixel / length
             predicted = scale(work.inverse_distance[i], to_feature)
             u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
-            _set_noise(Rz, k, has, _direction_noise(u_B, sigma * sigma, p.direction_floor))
+            noise = _direction_noise(u_B, sigma * sigma, p.direction_floor)
+            # a pixel does not move along the optical axis c: less c c^T, across u
+            across = sub(R_CB[2], scale(dot(R_CB[2], u_B), u_B))
+            less = scale(-p.noise_projected * sigma * sigma, across)
+            _set_noise(Rz, k, has, add_outer(noise, less, across))
             k += 3
     return k
 

@@ -16,6 +16,7 @@ CLASSES = [
     quad_gym.GnssParams,
     quad_gym.CameraParams,
     quad_gym.FilterParams,
+    quad_gym.PlacementParams,
     quad_gym.NoisyObservationParams,
     quad_gym.SensorSuite,
     quad_gym.PDGains,
@@ -26,6 +27,7 @@ CLASSES = [
 NO_NUMBERS = ["fast", None, float("nan"), float("inf"), [1.0, 2.0]]
 BELOW_ZERO = [-1.0, *NO_NUMBERS]
 NOT_POSITIVE = [0.0, *BELOW_ZERO]
+NO_PHASES = [-0.1, 1.0, "soon", float("nan")]
 NO_VECTORS = [(1.0, 2.0), 1.0, "abc", None, (1.0, 2.0, float("nan")), (1.0, 2.0, 3.0, 4.0)]
 NO_MATRICES = [np.zeros((3, 2)), np.zeros(3), "abc", None, np.full((3, 3), np.nan)]
 
@@ -69,6 +71,11 @@ BAD_VALUES = {
     ("GnssParams", "reference_antenna_G"): [*NO_VECTORS, (0.0, 0.0, 0.0), (30.29, -97.74, 100.0)],
     ("GnssParams", "position_sigma_I"): [*NO_VECTORS, (0.01, 0.01, 0.0), (0.01, -0.01, 0.01)],
     ("GnssParams", "baseline_sigma"): NOT_POSITIVE,
+    ("GnssParams", "velocity_sigma"): [0.0, -1.0, "fast", float("nan")],
+    ("GnssParams", "phase"): NO_PHASES,
+    ("GnssParams", "drift_sigma_I"): [*NO_VECTORS, (0.1, -0.1, 0.1)],
+    ("GnssParams", "drift_tau"): NOT_POSITIVE,
+    ("CameraParams", "phase"): NO_PHASES,
     ("CameraParams", "rate"): NOT_POSITIVE,
     ("CameraParams", "position_B"): NO_VECTORS,
     ("CameraParams", "attitude"): NO_VECTORS,
@@ -95,6 +102,11 @@ BAD_VALUES = {
     ("FilterParams", "feature_noise_across"): ["sideways", None, 1],
     ("FilterParams", "initial_velocity_variance"): NOT_POSITIVE,
     ("FilterParams", "initial_scale"): NOT_POSITIVE,
+    ("FilterParams", "initial_tilt_sigma"): [0.0, -1.0, "fast", float("nan")],
+    ("FilterParams", "gate_false_alarm"): [0.5, 1.0, *BELOW_ZERO],
+    ("FilterParams", "gate_patience"): [0, -1, 1.5, True, *NO_NUMBERS],
+    ("PlacementParams", "position_sigma"): NOT_POSITIVE,
+    ("PlacementParams", "heading_sigma"): NOT_POSITIVE,
     ("FilterParams", "gravity"): NOT_POSITIVE,
     ("NoisyObservationParams", "position"): BELOW_ZERO,
     ("NoisyObservationParams", "velocity"): BELOW_ZERO,

@@ -25,7 +25,7 @@ def test_the_suites_have_names():
 def test_a_suite_of_the_field_is_honest_by_its_settings(name):
     suite = quad_gym.sensor_suite(name)
     assert suite.imu.samples == "average"
-    assert suite.estimator.feature_noise_across == "predicted"
+    assert suite.estimator.feature_noise_across == "projected"
     assert not suite.estimator.reuse_first_fix
     assert 0.0 < suite.estimator.gate_false_alarm < 0.01
 
