@@ -1,0 +1,94 @@
+"""Figures of consistency: mean squares in their bands, errors beside the claimed deviations."""
+
+from typing import Any
+
+import numpy as np
+
+from quad_gym.consistency import PARTS, Floats, MeanSquare
+from quad_gym.plots import BLUE, GREY, INK, PALE, VERMILLION, require_matplotlib
+
+_TITLES = {
+    "state": "whole state",
+    "position": "position",
+    "velocity": "velocity",
+    "attitude": "attitude",
+    "accel_bias": "accelerometer bias",
+    "gyro_bias": "gyro bias",
+}
+_UNITS = {
+    "position": ("mm", 1e3),
+    "velocity": ("mm/s", 1e3),
+    "attitude": ("mrad", 1e3),
+    "accel_bias": ("mm/s²", 1e3),
+    "gyro_bias": ("deg/h", np.degrees(3600.0)),
+}
+
+
+def _grid(count: int, title: str, height: float = 2.1) -> tuple[Any, Any]:
+    """A figure of `count` pictures, three in a row."""
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    rows = -(-count // 3)
+    figure = Figure(figsize=(10.0, 0.6 + height * rows), layout="constrained")
+    axes = figure.subplots(rows, 3, squeeze=False).ravel()
+    for spare in axes[count:]:
+        spare.set_visible(False)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0)
+    for axis in axes[max(0, count - 3) : count]:
+        axis.set_xlabel("time [s]")
+    return figure, axes[:count]
+
+
+def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
+    """Draw a mean square over time with its band, and how often it lies inside.
+
+    Args:
+        axes: Where to.
+        part: The mean square.
+        settle: Instants before do not count for the share in the title [s].
+    """
+    axes.fill_between(part.time, part.low, part.high, color=PALE, linewidth=0.0)
+    axes.axhline(part.dimension, color=GREY, linewidth=0.8)
+    axes.plot(part.time, part.mean, color=BLUE, linewidth=1.2)
+    if settle > 0.0:
+        axes.axvline(settle, color=VERMILLION, linewidth=0.8, linestyle=":")
+    counted = part.since(settle)
+    title = _TITLES.get(part.name, part.name)
+    axes.set_title(f"{title}: {counted.overall:.2f}, inside {100 * counted.share_inside:.0f} %")
+    reach = 3.0 * (part.high - part.low).max()
+    gaps = np.abs(counted.mean - part.dimension)
+    limit = max(reach, 1.15 * float(np.percentile(gaps, 98.0)))  # not for the sake of one instant
+    axes.set_ylim(max(0.0, part.dimension - limit), part.dimension + limit)
+    axes.set_xlim(0.0, part.time[-1])
+
+
+def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
+    """NEES of the state and its blocks over time, each in its band."""
+    text = f"{title}\nMean NEES over flights (blue), in the 95 % band of an honest filter (grey)"
+    figure, axes = _grid(len(parts), text)
+    for axis, part in zip(axes, parts.values(), strict=True):
+        draw_mean_square(axis, part, settle)
+    return figure
+
+
+def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
+    """Root mean square errors (t, 15) over flights, and the deviations that the filter claims."""
+    text = (
+        f"{title}\nError (blue) and what the filter claims (dashed), root mean square over flights"
+    )
+    blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
+    figure, axes = _grid(len(blocks), text)
+    for axis, (name, part) in zip(axes, blocks.items(), strict=True):
+        unit, factor = _UNITS[name]
+        for values, style in ((errors, {"color": BLUE}), (sigmas, {"color": INK})):
+            size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
+            dashed = (0, (4, 3)) if values is sigmas else "-"
+            axis.plot(time, size, linestyle=dashed, linewidth=1.3, **style)
+        axis.set_title(f"{_TITLES[name]} [{unit}]")
+        axis.set_yscale("log")
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.tick_params(axis="y", which="minor", labelsize=7.0)
+        axis.set_xlim(0.0, time[-1])
+    return figure

@@ -1,0 +1,51 @@
+"""The consistency script: what it writes, and that it finds fault where there is fault."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "consistency.py"
+
+
+def run(output, *options):
+    common = ("--flights", "64", "--duration", "1", "--output", str(output), "--no-camera")
+    return subprocess.run(
+        [sys.executable, str(SCRIPT), *common, *options],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
+    done = run(tmp_path, "--estimator", "ekf")
+    assert done.returncode == 0, done.stderr
+    assert "NEES" in done.stdout
+    assert "Filters that failed in a cycle: 0." in done.stdout
+    for name in ("nees.png", "nees.svg", "errors.png", "errors.svg"):
+        assert (tmp_path / name).stat().st_size > 5000
+    found = json.loads((tmp_path / "consistency.json").read_text())
+    assert found["seeds"] == [0, 63]
+    assert found["configuration"]["flights"] == 64
+    assert found["sensors"]["estimator"]["kind"] == "ekf"
+    assert found["sensors"]["imu"]["samples"] == "average"
+    assert set(found["nees"]) == set(found["verdicts"]) == set(found["overall"])
+    assert len(found["nees"]["state"]["mean"]) == len(found["rms_errors"]) == 21
+
+
+def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path):
+    assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
+    found = json.loads((tmp_path / "consistency.json").read_text())
+    assert not found["honest"]
+    assert "overconfident" in found["verdicts"]["state"]
+    assert run(tmp_path, "--noise-factor", "0.7").returncode == 0
+    found = json.loads((tmp_path / "consistency.json").read_text())
+    assert "too cautious" in found["verdicts"]["state"]
+
+
+def test_wrong_options_are_refused_in_a_line(tmp_path):
+    for options in (("--flights", "1"), ("--settle", "5"), ("--suite", "none")):
+        done = run(tmp_path, *options)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1, done.stderr
