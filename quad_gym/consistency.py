@@ -2,7 +2,8 @@
 
 If the covariance P is right, the normalised estimation error squared (NEES) e^T P^-1 e is
 chi-square with the number of its coordinates, so that its mean over n independent flights lies in a
-known band 95 times in 100, at each instant. The error e is truth minus estimate in the filter's
+known band 95 times in 100, at each instant. So is the innovation squared (NIS) of a measurement,
+and innovations are white. The error e is truth minus estimate in the filter's
 error coordinates, with the truth from the simulator, not from the filter's model.
 
 Source: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
@@ -15,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.metrics import STATE_DIMENSION, nees, state_error
-from quad_gym.records import WIDTH
+from quad_gym.records import (
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
+    FREEDOMS,
+    MAX_BLOCKS,
+    POSITION_BLOCK,
+    VELOCITY_BLOCK,
+    WIDTH,
+)
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from quad_gym.simulation import FlightBatch
 
@@ -31,6 +40,9 @@ PARTS = {
 
 HONEST_SHARE = 0.9
 """Share of instants in the 95 % band from which a filter is called honest."""
+
+NEGLIGIBLE_CORRELATION = 0.02
+"""Of innovations: it does not matter, even where flights enough can tell it from zero."""
 
 Floats = NDArray[np.float64]
 
@@ -206,3 +218,109 @@ class NeesRecorder:
     def errors(self) -> tuple[Floats, Floats]:
         """(t, 15) root mean square errors over flights, and deviations that the filter claims."""
         return np.array(self._errors), np.array(self._sigmas)
+
+
+SENSOR_BLOCKS = {
+    "position": (POSITION_BLOCK,),
+    "baseline": (BASELINE_BLOCK,),
+    "velocity": (VELOCITY_BLOCK,),
+    "feature": tuple(range(FEATURE_BLOCKS, MAX_BLOCKS)),
+}
+"""Blocks of the measurement by sensor. Features share an attitude and a position, so that only the
+first one seen is taken of each image: what is taken at one instant is independent then."""
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Autocorrelation of a sensor's innovations, each divided by its expected deviation."""
+
+    name: str
+    correlation: Floats
+    """(lags,) at 1, 2, ... measurements apart [-]"""
+    band: Floats
+    """(lags,) half width of the 95 % band of white innovations"""
+
+    @property
+    def largest(self) -> float:
+        """The correlation farthest from zero."""
+        return float(self.correlation[np.abs(self.correlation).argmax()])
+
+    @property
+    def white(self) -> bool:
+        """Whether no correlation is beyond its band by more than `NEGLIGIBLE_CORRELATION`."""
+        return bool((np.abs(self.correlation) <= self.band + NEGLIGIBLE_CORRELATION).all())
+
+
+class InnovationRecorder:
+    """Normalised innovations squared (NIS) over time and their autocorrelation, sensor by sensor.
+
+    Args:
+        batch: The flights, which keep their innovations.
+        bins: (k + 1,) ends of the spans of time over which NIS is averaged [s].
+        settle: Innovations before do not count for the autocorrelation [s].
+        lags: Up to how many measurements apart correlations are taken.
+    """
+
+    def __init__(
+        self, batch: FlightBatch, bins: ArrayLike, settle: float = 0.0, lags: int = 20
+    ) -> None:
+        self._bins, self._settle = np.asarray(bins, np.float64), settle
+        size = self._bins.size - 1
+        self._sums = {name: np.zeros(size) for name in SENSOR_BLOCKS}
+        self._counts = {name: np.zeros(size) for name in SENSOR_BLOCKS}
+        shape = (lags, batch.count, 3)
+        self._past = {name: np.full(shape, np.nan) for name in SENSOR_BLOCKS}
+        self._products = {name: np.zeros(lags) for name in SENSOR_BLOCKS}
+        self._pairs = {name: np.zeros(lags) for name in SENSOR_BLOCKS}
+        self._squares = {name: np.zeros(2) for name in SENSOR_BLOCKS}
+
+    def add(self, batch: FlightBatch, time: float) -> None:
+        """Take in what was measured at the present instant, `time` after the start [s]."""
+        names = ("position_valid", "baseline_valid", "velocity_valid")
+        valid = np.column_stack([*map(batch.read, names), batch.read("feature_valid")]) > 0.0
+        if not valid.any():
+            return
+        nis, innovation = batch.read("block_nis"), batch.read("innovation")
+        white = innovation / batch.read("innovation_sigma")
+        span = min(int(np.searchsorted(self._bins, time - 1e-9, "right")), self._bins.size - 1) - 1
+        for name, blocks in SENSOR_BLOCKS.items():
+            seen = valid[:, blocks]
+            flights = np.flatnonzero(seen.any(axis=1))
+            if flights.size:
+                taken = np.array(blocks)[seen[flights].argmax(axis=1)]
+                self._sums[name][span] += nis[flights, taken].sum()
+                self._counts[name][span] += flights.size
+                if time >= self._settle:
+                    self._correlate(name, flights, white[flights, taken])
+
+    def _correlate(self, name: str, flights: NDArray[np.intp], white: Floats) -> None:
+        """Multiply innovations with those of the same flights before them."""
+        past = self._past[name][:, flights]
+        products = past * white
+        self._products[name] += np.nansum(products, axis=(1, 2))
+        self._pairs[name] += np.isfinite(products).sum(axis=(1, 2))
+        self._squares[name] += np.nansum(white**2), np.isfinite(white).sum()
+        self._past[name][1:, flights] = past[:-1]
+        self._past[name][0, flights] = white
+
+    def nis(self) -> dict[str, MeanSquare]:
+        """NIS over time, of the sensors that measured anything."""
+        middle, found = 0.5 * (self._bins[1:] + self._bins[:-1]), {}
+        for name, blocks in SENSOR_BLOCKS.items():
+            some = self._counts[name] > 0
+            if some.any():
+                counts, dimension = self._counts[name][some], FREEDOMS[blocks[0]]
+                mean = self._sums[name][some] / counts
+                low, high = mean_band(dimension, counts)
+                found[name] = MeanSquare(name, dimension, middle[some], mean, low, high)
+        return found
+
+    def whiteness(self) -> dict[str, Whiteness]:
+        """Autocorrelation of the innovations, of the sensors that measured often enough."""
+        found = {}
+        for name in SENSOR_BLOCKS:
+            pairs, (total, number) = self._pairs[name], self._squares[name]
+            if pairs.min() > 0:
+                correlation = self._products[name] / pairs * number / total
+                found[name] = Whiteness(name, correlation, 1.96 / np.sqrt(pairs))
+        return found

@@ -1,10 +1,10 @@
-"""Figures of consistency: mean squares in their bands, errors beside the claimed deviations."""
+"""Figures of consistency: mean squares in their bands, errors beside claims, autocorrelations."""
 
 from typing import Any
 
 import numpy as np
 
-from quad_gym.consistency import PARTS, Floats, MeanSquare
+from quad_gym.consistency import NEGLIGIBLE_CORRELATION, PARTS, Floats, MeanSquare, Whiteness
 from quad_gym.plots import BLUE, GREY, INK, PALE, VERMILLION, require_matplotlib
 
 _TITLES = {
@@ -91,4 +91,30 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
         axis.set_xlim(0.0, time[-1])
+    return figure
+
+
+def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
+    """NIS of the sensors over time, each in its band."""
+    text = f"{title}\nMean NIS over flights (blue), in the 95 % band of an honest filter (grey)"
+    figure, axes = _grid(len(parts), text)
+    for axis, part in zip(axes, parts.values(), strict=True):
+        draw_mean_square(axis, part, settle)
+    return figure
+
+
+def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
+    """Autocorrelation of the innovations of each sensor, with the band of white ones."""
+    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white ones (grey)"
+    figure, axes = _grid(len(found), text)
+    for axis, part in zip(axes, found.values(), strict=True):
+        lags = np.arange(1, part.correlation.size + 1)
+        axis.fill_between(lags, -part.band, part.band, color=PALE, linewidth=0.0)
+        axis.axhline(0.0, color=GREY, linewidth=0.8)
+        axis.vlines(lags, 0.0, part.correlation, color=BLUE, linewidth=1.6)
+        axis.plot(lags, part.correlation, color=BLUE, marker="o", markersize=3.0, linestyle="none")
+        limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
+        axis.set_ylim(-limit, limit)
+        axis.set_title(f"{_TITLES.get(part.name, part.name)}: at most {part.largest:+.3f}")
+        axis.set_xlabel("measurements apart")
     return figure

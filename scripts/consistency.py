@@ -1,8 +1,9 @@
 """Is the filter honest? Compare its errors with the covariance that it claims, over many flights.
 
 Flies random trajectories (or another task) by PD control and takes the normalised estimation error
-squared (NEES) of the 15 states and of each block of three, over time. If the covariance is right,
-the mean over flights lies in a known band at 95 % of the instants. The truth is the simulator's.
+squared (NEES) of the 15 states and of each block of three, over time, and the normalised innovation
+squared (NIS) of each sensor. If the covariance is right, means over flights lie in known bands at
+95 % of the instants, and innovations are white. The truth is the simulator's.
 
 Prints a table and a verdict, and writes figures (PNG and SVG) and all numbers with the whole
 configuration and the seeds (consistency.json). For example:
@@ -21,10 +22,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from quad_gym import SensorSuite, sensor_suite, vehicle_params
 from quad_gym.cli import option, parse, usage_errors
-from quad_gym.consistency import HONEST_SHARE, MeanSquare, NeesRecorder, start_matched, verdict
-from quad_gym.consistency_plots import errors_figure, nees_figure
+from quad_gym.consistency import (
+    HONEST_SHARE,
+    InnovationRecorder,
+    MeanSquare,
+    NeesRecorder,
+    Whiteness,
+    start_matched,
+    verdict,
+)
+from quad_gym.consistency_plots import errors_figure, nees_figure, nis_figure, whiteness_figure
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.plots import house_style, require_matplotlib, save_figure
 from quad_gym.records import Source
@@ -35,7 +46,7 @@ MENDS = {
     "samples": ("instant", "average"),
     "integration": ("euler", "midpoint"),
     "covariance_reset": ("none", "turn"),
-    "feature_noise_across": ("measured", "predicted"),
+    "feature_noise_across": ("measured", "projected"),
 }
 """What each mend is in the report's form, and mended."""
 
@@ -58,7 +69,7 @@ class Args:
     )
     every: float = option(0.05, "time between two looks at the errors [s]")
     settle: float = option(0.0, "time at the start that does not count [s]")
-    output: Path = option(  # noqa: RUF009
+    output: Path = option(
         Path("results/consistency"), "folder for figures and numbers; made if it is missing"
     )
     threads: int | None = option(
@@ -72,7 +83,7 @@ class Args:
     samples: Literal["instant", "average"] | None = option(None, "in place of the form's")
     integration: Literal["euler", "midpoint"] | None = option(None, "in place of the form's")
     covariance_reset: Literal["none", "turn"] | None = option(None, "in place of the form's")
-    feature_noise_across: Literal["measured", "predicted"] | None = option(
+    feature_noise_across: Literal["measured", "predicted", "projected"] | None = option(
         None, "in place of the form's"
     )
     estimator: Literal["ukf", "ekf"] | None = option(None, "in place of the suite's")
@@ -130,18 +141,20 @@ def batch_of(args: Args) -> FlightBatch:
         gains="tuned",
         task=TASK_DEFAULTS[args.task].replace(**endless),
         source=Source.ESTIMATE if args.fly_on == "estimate" else Source.TRUTH,
-        run_filter=True,
+        innovations=True,
         threads=args.threads,
         true_vehicle=vehicle.replace(mass=args.mass_factor * vehicle.mass),
         true_sensors=suite.scaled_noise(args.noise_factor),
     )
 
 
-def fly(args: Args, batch: FlightBatch) -> NeesRecorder:
+def fly(args: Args, batch: FlightBatch) -> tuple[NeesRecorder, InnovationRecorder]:
     """Fly all flights to their end, looking at the errors on the way."""
     dt = batch.sensors.imu.dt
     ticks, stride = round(args.duration / dt), max(1, round(args.every / dt))
     recorder = NeesRecorder()
+    bins = dt * stride * np.arange(ticks // stride + 1)
+    innovations = InnovationRecorder(batch, bins, args.settle)
     batch.reset(seeds=range(args.first_seed, args.first_seed + args.flights))
     if args.start == "matched":
         start_matched(batch, args.first_seed)
@@ -149,12 +162,13 @@ def fly(args: Args, batch: FlightBatch) -> NeesRecorder:
     shown = time.monotonic()
     for tick in range(1, ticks + 1):
         batch.step()
+        innovations.add(batch, tick * dt)
         if tick % stride == 0:
             recorder.add(batch, tick * dt)
         if time.monotonic() > shown + 2.0:
             shown = time.monotonic()
             print(f"  {tick * dt:.1f} of {args.duration:g} s flown", file=sys.stderr, flush=True)
-    return recorder
+    return recorder, innovations
 
 
 def title_of(batch: FlightBatch, args: Args) -> str:
@@ -172,7 +186,7 @@ def title_of(batch: FlightBatch, args: Args) -> str:
     return ", ".join(parts)
 
 
-def table_of(parts: dict[str, MeanSquare]) -> str:
+def table_of(quantity: str, parts: dict[str, MeanSquare]) -> str:
     """Mean squares, for the screen."""
     rows = [
         (
@@ -184,8 +198,50 @@ def table_of(parts: dict[str, MeanSquare]) -> str:
         )
         for part in parts.values()
     ]
-    groups = {"NEES": ["of"], "mean over flights": ["over time", "at the end", "band", "inside"]}
-    return text_table(groups, rows)
+    columns = ["over time", "at the end", "band", "inside"]
+    return text_table({quantity: ["of"], "mean over flights": columns}, rows)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found about a filter, from the instant on that counts."""
+
+    nees: dict[str, MeanSquare]
+    nis: dict[str, MeanSquare]
+    whiteness: dict[str, Whiteness]
+    failed: int
+    """filters that failed in a cycle"""
+
+    @property
+    def honest(self) -> bool:
+        """Whether everything is as an honest filter's."""
+        squares = (*self.nees.values(), *self.nis.values())
+        white = all(part.white for part in self.whiteness.values())
+        return self.failed == 0 and white and all(part.honest for part in squares)
+
+    def sentences(self) -> dict[str, str]:
+        """Verdicts in plain English, by what they are on."""
+        said = {f"nees_{name}": f"NEES of the {verdict(part)}" for name, part in self.nees.items()}
+        said |= {f"nis_{name}": f"NIS of the {verdict(part)}" for name, part in self.nis.items()}
+        for name, part in self.whiteness.items():
+            judged = "white" if part.white else "not white"
+            text = (
+                f"Innovations of the {name}: autocorrelation at most {part.largest:+.3f}: {judged}."
+            )
+            said[f"innovations_{name}"] = text
+        return said
+
+    def report(self) -> str:
+        """Tables and the verdict, for the screen."""
+        tables = [table_of("NEES", self.nees)]
+        if self.nis:
+            tables.append(table_of("NIS", self.nis))
+        lines = [
+            "The filter is honest." if self.honest else "The filter is not honest in everything:",
+            *(f"  {text}" for text in self.sentences().values()),
+            f"  Filters that failed in a cycle: {self.failed}.",
+        ]
+        return "\n\n".join([*tables, "\n".join(lines)])
 
 
 def main(args: Args) -> None:
@@ -196,39 +252,47 @@ def main(args: Args) -> None:
         args.output.mkdir(parents=True, exist_ok=True)
     began, title = time.monotonic(), title_of(batch, args)
     print(f"{title}; {args.flights:,} flights of {args.duration:g} s, {args.task}.\n")
-    recorder = fly(args, batch)
-    whole = recorder.nees()
-    counted = {name: part.since(args.settle) for name, part in whole.items()}
-    failed = int((batch.read("filter_status") != 0).sum())
+    recorder, innovations = fly(args, batch)
+    nees, nis = recorder.nees(), innovations.nis()
     errors, sigmas = recorder.errors()
-    print(table_of(counted), end="\n\n")
-    print(f"The {verdict(counted['state'])}")
-    for name, part in counted.items():
-        if name != "state" and not part.honest:
-            print(f"  {verdict(part)}")
-    print(f"Filters that failed in a cycle: {failed}.")
+    findings = Findings(
+        nees={name: part.since(args.settle) for name, part in nees.items()},
+        nis={name: part.since(args.settle) for name, part in nis.items()},
+        whiteness=innovations.whiteness(),
+        failed=int((batch.read("filter_status") != 0).sum()),
+    )
+    print(findings.report())
 
     files = []
     with house_style():
-        figure = nees_figure(whole, title, args.settle)
-        files += save_figure(figure, args.output / "nees")
-        figure = errors_figure(whole["state"].time, errors, sigmas, title)
-        files += save_figure(figure, args.output / "errors")
+        figures = {
+            "nees": nees_figure(nees, title, args.settle),
+            "errors": errors_figure(nees["state"].time, errors, sigmas, title),
+        }
+        if nis:
+            figures["nis"] = nis_figure(nis, title, args.settle)
+        if findings.whiteness:
+            figures["whiteness"] = whiteness_figure(findings.whiteness, title)
+        for name, figure in figures.items():
+            files += save_figure(figure, args.output / name)
+    squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
     found = {
-        "honest": all(part.honest for part in counted.values()),
+        "honest": findings.honest,
         "honest_share": HONEST_SHARE,
-        "verdicts": {name: verdict(part) for name, part in counted.items()},
-        "share_inside": {name: part.share_inside for name, part in counted.items()},
-        "overall": {name: part.overall for name, part in counted.items()},
-        "nees": whole,
-        "rms_errors": errors,
-        "rms_claimed": sigmas,
-        "filters_failed": failed,
+        "verdicts": findings.sentences(),
+        "share_inside": {name: part.share_inside for name, part in squares.items()},
+        "overall": {name: part.overall for name, part in squares.items()},
+        "filters_failed": findings.failed,
         "configuration": args,
         "sensors": batch.sensors,
         "vehicle": batch.vehicle,
         "seeds": [args.first_seed, args.first_seed + args.flights - 1],
         "versions": versions("numpy", "numba", "scipy"),
+        "nees": nees,
+        "nis": nis,
+        "whiteness": findings.whiteness,
+        "rms_errors": errors,
+        "rms_claimed": sigmas,
     }
     files.append(write_json(args.output / "consistency.json", found))
     seconds = time.monotonic() - began

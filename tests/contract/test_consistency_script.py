@@ -23,14 +23,15 @@ def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "NEES" in done.stdout
     assert "Filters that failed in a cycle: 0." in done.stdout
-    for name in ("nees.png", "nees.svg", "errors.png", "errors.svg"):
+    for name in ("nees.png", "nees.svg", "errors.png", "nis.svg", "whiteness.png"):
         assert (tmp_path / name).stat().st_size > 5000
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert found["seeds"] == [0, 63]
     assert found["configuration"]["flights"] == 64
     assert found["sensors"]["estimator"]["kind"] == "ekf"
     assert found["sensors"]["imu"]["samples"] == "average"
-    assert set(found["nees"]) == set(found["verdicts"]) == set(found["overall"])
+    assert set(found["nees"]) < set(found["overall"])
+    assert set(found["nis"]) == {"position", "baseline"} == set(found["whiteness"])
     assert len(found["nees"]["state"]["mean"]) == len(found["rms_errors"]) == 21
 
 
@@ -38,10 +39,10 @@ def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path):
     assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert not found["honest"]
-    assert "overconfident" in found["verdicts"]["state"]
+    assert "overconfident" in found["verdicts"]["nees_state"]
     assert run(tmp_path, "--noise-factor", "0.7").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
-    assert "too cautious" in found["verdicts"]["state"]
+    assert "too cautious" in found["verdicts"]["nees_state"]
 
 
 def test_wrong_options_are_refused_in_a_line(tmp_path):

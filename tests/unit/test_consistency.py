@@ -6,6 +6,7 @@ from scipy import stats
 
 from quad_gym import FilterParams, sensor_suite
 from quad_gym.consistency import (
+    InnovationRecorder,
     MeanSquare,
     NeesRecorder,
     flight_errors,
@@ -13,6 +14,7 @@ from quad_gym.consistency import (
     start_matched,
     verdict,
 )
+from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK
 from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import assert_normal
 
@@ -101,3 +103,93 @@ def test_a_matched_start_has_errors_as_claimed_and_leaves_the_flights_alone():
 def test_the_defaults_are_the_reports_form():
     report = FilterParams()
     assert (report.kind, report.integration, report.covariance_reset) == ("ukf", "euler", "none")
+
+
+class Measured:
+    """What a recorder reads of a batch: innovations that were put there."""
+
+    count = 300
+
+    def __init__(self, innovations, nis, seen):
+        blocks = (self.count, MAX_BLOCKS)
+        self.fields = {
+            "position_valid": seen[:, POSITION_BLOCK],
+            "baseline_valid": np.zeros(self.count),
+            "velocity_valid": np.zeros(self.count),
+            "feature_valid": seen[:, FEATURE_BLOCKS:],
+            "innovation": np.repeat(innovations[:, np.newaxis], MAX_BLOCKS, axis=1),
+            "innovation_sigma": np.full((*blocks, 3), 2.0),
+            "block_nis": np.repeat(nis[:, np.newaxis], MAX_BLOCKS, axis=1),
+        }
+
+    def read(self, name):
+        return self.fields[name]
+
+
+def recorded(memory, factor=1.0, instants=200):
+    """Innovations whose successive ones are correlated by `memory`, in flights that skip some."""
+    rng = np.random.default_rng(5)
+    seen = np.zeros((Measured.count, MAX_BLOCKS))
+    recorder = None
+    now = rng.normal(size=(Measured.count, 3))
+    for k in range(1, instants + 1):
+        fresh = rng.normal(size=now.shape)
+        has = rng.random(Measured.count) < 0.7
+        following = memory * now + np.sqrt(1.0 - memory**2) * fresh
+        now = np.where(has[:, np.newaxis], following, now)
+        seen[:, POSITION_BLOCK] = has
+        batch = Measured(2.0 * factor * now, factor**2 * (now**2).sum(axis=1), seen)
+        recorder = recorder or InnovationRecorder(batch, np.linspace(0.0, 10.0, 21), lags=5)
+        recorder.add(batch, 0.05 * k)
+    return recorder
+
+
+def test_white_innovations_are_called_white_and_their_nis_honest():
+    recorder = recorded(0.0)
+    assert set(recorder.nis()) == set(recorder.whiteness()) == {"position"}
+    white = recorder.whiteness()["position"]
+    assert white.white
+    assert (np.abs(white.correlation) < 3.0 * white.band).all()
+    # 300 flights, 70 % of 200 instants, 3 components, less the first lags
+    assert white.band[0] == pytest.approx(1.96 / np.sqrt(300 * 0.7 * 200 * 3), rel=0.02)
+    nis = recorder.nis()["position"]
+    assert nis.time[0] == pytest.approx(0.25)
+    assert nis.honest
+
+
+def test_innovations_with_memory_are_not_white_by_as_much_as_they_remember():
+    white = recorded(0.3).whiteness()["position"]
+    assert not white.white
+    np.testing.assert_allclose(white.correlation, 0.3 ** np.arange(1, 6), atol=0.02)
+    assert white.largest == white.correlation[0]
+
+
+def test_innovations_larger_than_expected_show_in_the_nis_and_not_in_the_correlation():
+    recorder = recorded(0.0, factor=1.2)
+    assert recorder.nis()["position"].overall == pytest.approx(1.44 * 3.0, rel=0.02)
+    assert not recorder.nis()["position"].honest
+    assert recorder.whiteness()["position"].white
+
+
+def test_of_an_image_the_first_feature_seen_counts():
+    seen = np.zeros((Measured.count, MAX_BLOCKS))
+    seen[:, FEATURE_BLOCKS + 2 : FEATURE_BLOCKS + 5] = 1.0
+    batch = Measured(np.ones((Measured.count, 3)), np.ones(Measured.count), seen)
+    batch.fields["block_nis"] = np.tile(np.arange(MAX_BLOCKS, dtype=float), (Measured.count, 1))
+    recorder = InnovationRecorder(batch, [0.0, 1.0])
+    recorder.add(batch, 0.5)
+    nis = recorder.nis()["feature"]
+    assert nis.dimension == 2
+    assert nis.overall == FEATURE_BLOCKS + 2
+
+
+def test_a_batch_hands_its_innovations_to_a_recorder():
+    batch = FlightBatch(64, sensors="rtk", innovations=True)
+    batch.reset(seeds=range(64))
+    recorder = InnovationRecorder(batch, [0.0, 0.5, 1.0])
+    for tick in range(1, 201):
+        batch.step()
+        recorder.add(batch, tick / 200)
+    assert set(recorder.nis()) == {"position", "baseline", "velocity", "feature"}
+    for part in recorder.nis().values():
+        assert 0.5 * part.dimension < part.overall < 2.0 * part.dimension
