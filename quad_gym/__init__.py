@@ -7,6 +7,7 @@ compiled or loaded from their cache, when the first environment is made.
 from typing import Any
 
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all
+from quad_gym.distributions import LogUniform, Normal, Uniform
 from quad_gym.params import (
     ActionParams,
     Clocks,
@@ -16,6 +17,7 @@ from quad_gym.params import (
     pd_gains,
     vehicle_params,
 )
+from quad_gym.randomization import Randomization
 from quad_gym.sensor_params import (
     CameraParams,
     FilterParams,
@@ -26,6 +28,7 @@ from quad_gym.sensor_params import (
     SensorSuite,
 )
 from quad_gym.sensor_suites import sensor_suite
+from quad_gym.world_params import BatteryParams, WorldParams, world_params
 
 __version__ = "0.1.0"
 
@@ -55,20 +58,27 @@ _LAZY = {
 __all__ = [
     "IDS",
     "ActionParams",
+    "BatteryParams",
     "CameraParams",
     "Clocks",
     "FilterParams",
     "GnssParams",
     "ImuParams",
+    "LogUniform",
     "NoisyObservationParams",
+    "Normal",
     "PDGains",
     "PlacementParams",
+    "Randomization",
     "SensorSuite",
     "TaskParams",
+    "Uniform",
     "VehicleParams",
+    "WorldParams",
     "__version__",
     "make_sb3_vec_env",
     "pd_gains",
     "sensor_suite",
     "vehicle_params",
+    "world_params",
 ]

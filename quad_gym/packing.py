@@ -24,6 +24,8 @@ from quad_gym.records import (
 )
 from quad_gym.rotations import euler_to_dcm
 from quad_gym.sensor_params import FilterParams, SensorSuite
+from quad_gym.world_packing import pack_world
+from quad_gym.world_params import WorldParams
 
 
 def params_record(
@@ -31,8 +33,9 @@ def params_record(
     sensors: SensorSuite,
     gains: PDGains | None = None,
     actions: ActionParams | None = None,
+    world: WorldParams | None = None,
 ) -> NDArray[Any]:
-    """The numbers of a vehicle, its sensors and its gains as one scalar record, shape (1,)."""
+    """The numbers of a vehicle, its sensors, gains and world as one scalar record, shape (1,)."""
     gains = PDGains() if gains is None else gains
     actions = ActionParams() if actions is None else actions
     imu, gnss, estimator = sensors.imu, sensors.gnss, sensors.estimator
@@ -48,6 +51,7 @@ def params_record(
     p["motor_tau"], p["motor_gain"] = vehicle.motor_time_constant, vehicle.motor_speed_per_volt
     p["max_voltage"], p["max_rotor_force"] = vehicle.max_voltage, vehicle.max_rotor_force
     p["hover_voltage"] = vehicle.hover_voltage
+    pack_world(p, vehicle, WorldParams() if world is None else world)
     p["gain_k"], p["gain_kd"] = gains.position, gains.velocity
     p["gain_K"], p["gain_Kd"] = gains.attitude, gains.body_rates
 

@@ -1,6 +1,6 @@
 """`FlightBatch`: many flights of one configuration, flown together."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from quad_gym.params import (
     pd_gains,
     vehicle_params,
 )
+from quad_gym.randomization import COLUMNS, DrawingTable, Given, Randomization
 from quad_gym.records import (
     FLIGHT_BLOCK,
     RESULTS,
@@ -34,6 +35,8 @@ from quad_gym.records import (
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
 from quad_gym.threads import resolve_threads, run_ranges
+from quad_gym.world_packing import pack_options
+from quad_gym.world_params import WorldParams, world_params
 
 _NO_BOUNDS = np.zeros(0)
 
@@ -78,6 +81,9 @@ class FlightBatch:
         true_vehicle: The vehicle as it is, where it differs from the nominal one that the
             controller knows.
         true_sensors: The sensors as they are, where they differ from what the filter believes.
+        world: Wind, gusts, drag, ground and battery, or the name of a preset.
+        randomization: What is drawn anew for every episode, around `true_vehicle`, `true_sensors`
+            and `world`: a `Randomization`, or distributions by name.
 
     Raises:
         ValueError: If an argument makes no sense; nothing is allocated then.
@@ -106,6 +112,8 @@ class FlightBatch:
         threads: int | None = None,
         true_vehicle: VehicleParams | None = None,
         true_sensors: SensorSuite | None = None,
+        world: WorldParams | str = "calm",
+        randomization: Randomization | Mapping[str, Given] | None = None,
     ) -> None:
         self.count = check.whole("count", count)
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
@@ -113,6 +121,8 @@ class FlightBatch:
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
         self.actions = ActionParams() if actions is None else actions
         self.task = TaskParams() if task is None else task
+        self.world = world_params(world) if isinstance(world, str) else world
+        self.randomization = Randomization.of(randomization)
         for name, value, kind in (
             ("vehicle", self.vehicle, VehicleParams),
             ("sensors", self.sensors, SensorSuite),
@@ -121,6 +131,7 @@ class FlightBatch:
             ("task", self.task, TaskParams),
             ("true_vehicle", true_vehicle or self.vehicle, VehicleParams),
             ("true_sensors", true_sensors or self.sensors, SensorSuite),
+            ("world", self.world, WorldParams),
         ):
             check.instance(name, value, kind)
         self.source, self.control = Source(source), Control(control)
@@ -145,9 +156,11 @@ class FlightBatch:
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = run_filter
 
+        draws = DrawingTable(self.randomization, true_vehicle, true_sensors, self.world)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
-        world = params_record(true_vehicle, true_sensors, self.gains, self.actions)
-        self._model, self._world = params_block(model), params_block(world)
+        true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
+        self._model, self._world = params_block(model), params_block(true)
+        self._own = [self._world.copy() for _ in range(self.threads)]
         self._settings = settings_record(
             self.task,
             self.clocks,
@@ -162,6 +175,13 @@ class FlightBatch:
             innovations=innovations,
             gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
         )
+        pack_options(
+            self._settings[0],
+            self.world,
+            draws,
+            known=self.randomization.known,
+            limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
+        )
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
@@ -169,6 +189,8 @@ class FlightBatch:
         self._blocks["needs_reset"] = 1.0
         for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
             self._blocks[name] = np.nan
+        self._blocks["start_given"] = np.nan
+        self._blocks["drawn"] = draws.low[:, np.newaxis]  # as it stays where nothing is drawn
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._actions = np.zeros((self.count, 4))
         self._resets = np.zeros(self.count, np.uint8)
@@ -256,6 +278,7 @@ class FlightBatch:
                 int(command),
                 self._resets,
                 self._world,
+                self._own[number],
                 self._model,
                 self._settings,
                 self._work[number],
@@ -282,17 +305,25 @@ class FlightBatch:
     # ---- reading ------------------------------------------------------------------------------
 
     def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """One field, such as "r" or "b_a_hat", as a new array (n, ...).
+        """One field, such as "r" or "b_a_hat", or one drawn parameter, as a new array (n, ...).
 
         Args:
-            name: The field.
+            name: The field; or what is drawn for every episode, such as "mass".
             flights: Whose, by their numbers; None: all flights'.
 
         Raises:
-            ValueError: If there is no such field; see `records.FLIGHT_FIELDS`.
+            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
         """
+        if name in self.randomization.names:
+            columns = COLUMNS[name]
+            drawn = self.read("drawn", flights)[:, columns]
+            return drawn[:, 0] if columns.stop - columns.start == 1 else drawn
         if name not in (FLIGHT_BLOCK.names or ()):
-            raise ValueError(f"name must be a field of a flight, got {name!r}")
+            drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
+            raise ValueError(
+                f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
+                f"got {name!r}"
+            )
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
@@ -300,6 +331,10 @@ class FlightBatch:
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
         return self.results[:, RESULTS.index(name)].copy()
+
+    def drawn(self) -> dict[str, NDArray[np.float64]]:
+        """What the present episodes have drawn, by name: (count,) or (count, components)."""
+        return {name: self.read(name) for name in self.randomization.names}
 
     def covariance(self) -> NDArray[np.float64]:
         """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""

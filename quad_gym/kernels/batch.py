@@ -2,6 +2,7 @@
 
 from quad_gym.kernels.blocks import lanes_of
 from quad_gym.kernels.compilation import entry, kernel
+from quad_gym.kernels.draws import impose
 from quad_gym.kernels.flight import begin_episode, tick
 from quad_gym.kernels.judge import judge
 from quad_gym.kernels.lanes import any_of, logical_not, select
@@ -79,6 +80,7 @@ def fly(
     command,
     resets,
     world,
+    own,
     model,
     settings,
     work,
@@ -96,7 +98,9 @@ def fly(
         first_block, last_block: The range, without its end.
         command: A `Command`.
         resets: (n,) uint8; for RESET, which flights begin an episode.
-        world: (1,) or (n_blocks,) PARAMS_BLOCK: parameters as they are.
+        world: (1,) PARAMS_BLOCK: parameters as they are.
+        own: (1,) PARAMS_BLOCK, used by no other thread: a copy of `world`, where the parameters of
+            the flights at hand are put together if they draw some.
         model: (1,) PARAMS_BLOCK: parameters as the filter and the controller believe them.
         settings: (1,) SETTINGS.
         work: (1,) WORK_BLOCK, used by no other thread.
@@ -107,11 +111,14 @@ def fly(
             step.
         results: (n, 11), written in a STEP: see `quad_gym.records.RESULTS`.
     """
-    scratch, believed, todo = lanes_of(work[0]), lanes_of(model[0]), settings[0]
+    scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
+    true = lanes_of(own[0]) if todo.randomized else nominal
+    believed = true if todo.known else lanes_of(model[0])
     observing = observations.shape[1] > 0
     for index in range(first_block, last_block):
         block, flight = blocks[index], lanes_of(blocks[index])
-        true = lanes_of(world[index % world.shape[0]])
+        if todo.randomized:
+            impose(flight, nominal, true, todo)
         if command == Command.RESET:
             for lane in range(WIDTH):
                 known = index * WIDTH + lane < resets.shape[0]
@@ -129,7 +136,7 @@ def fly(
                 )
         beginning = any_of(begins)
         if beginning:
-            begin_episode(flight, true, believed, todo, scratch, begins)
+            begin_episode(flight, nominal, true, believed, todo, scratch, begins)
         if observing:
             if beginning or command == Command.RESET:
                 observe(flight, believed, todo, scratch.observation)

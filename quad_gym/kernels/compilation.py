@@ -44,7 +44,13 @@ def sources_digest() -> str:
     """A digest of every file that shapes the compiled code."""
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256()
-    constants = ("records.py", "params.py", "sensor_params.py")
+    constants = (
+        "records.py",
+        "params.py",
+        "sensor_params.py",
+        "distributions.py",
+        "randomization.py",
+    )
     for path in (*sorted(package.glob("*.py")), *(package.parent / name for name in constants)):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()

@@ -7,8 +7,10 @@ biases evolve, then measure and update at its end.
 
 import numpy as np
 
+from quad_gym.kernels.air import begin_world, fly_through_air, supply
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.control import act
+from quad_gym.kernels.draws import draw_parameters, impose
 from quad_gym.kernels.innovations import forget_innovations
 from quad_gym.kernels.lanes import any_of, select
 from quad_gym.kernels.linalg import (
@@ -42,7 +44,7 @@ from quad_gym.kernels.task import draw_reference, draw_start
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
 from quad_gym.kernels.vehicle import integrate, load4, load_state
-from quad_gym.records import Control, FilterForm, Source
+from quad_gym.records import Control, FilterForm, Source, Supply
 
 _ONE = np.uint64(1)
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
@@ -154,10 +156,15 @@ def tick(flight, world, model, settings, work):
     if settings.control == Control.PD:
         reference = evaluate_reference(flight, flight.tick * model.dt)
     act(flight, model, settings.control, reference)
+    if settings.supply != Supply.NOMINAL:
+        supply(flight, world, settings)
     flight.instant = flight.instant + _ONE
     everyone = flight.tick >= 0.0
     start = load_state(flight)
-    integrate(flight, world, settings.substeps)
+    if settings.air:
+        fly_through_air(flight, world, settings)
+    else:
+        integrate(flight, world, settings.substeps)
     if settings.run_filter:
         if settings.imu_averages:
             measure_imu_average(flight, world, start, everyone)
@@ -168,8 +175,12 @@ def tick(flight, world, model, settings, work):
 
 
 @kernel
-def begin_episode(flight, world, model, settings, work, mask):
-    """Begin a new episode, where `mask`: reference, true state, first measurements, filter."""
+def begin_episode(flight, nominal, world, model, settings, work, mask):
+    """Begin a new episode, where `mask`: reference, true state, first measurements, filter.
+
+    The flights' own parameters, in `world`, are drawn from what the `nominal` ones and the settings
+    say.
+    """
     flight.instant = select(mask, flight.instant + _ONE, flight.instant)
     flight.tick = select(mask, 0.0, flight.tick)
     gnss_share, camera_share = uniform_pair(stream_of(flight), DRAW_PHASE)
@@ -185,8 +196,12 @@ def begin_episode(flight, world, model, settings, work, mask):
     for i in range(settings.feature_count):
         flight.feature_fresh[i] = select(mask, 0.0, flight.feature_fresh[i])
     stream = stream_of(flight)
+    if settings.randomized:
+        draw_parameters(flight, settings, stream, mask)
+        impose(flight, nominal, world, settings)
     draw_reference(flight, settings, stream, mask)
     draw_start(flight, world, model, settings, stream, mask)
+    begin_world(flight, world, settings, stream, mask)
     sense(flight, world, model, settings, work, mask, True)
 
     flight.step = select(mask, 0.0, flight.step)

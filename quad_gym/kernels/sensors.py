@@ -64,9 +64,10 @@ def drift_biases(flight, p):
 def specific_force(flight, p, R_BI):
     """f_B = R (a_I + g e3) at the accelerometer, without bias and noise (report equation 4)."""
     w_B = load3(flight.w)
-    a_I, dw_B = accelerations(
-        R_BI, load3(flight.v), w_B, load4(flight.rotor_speeds), load3(flight.disturbance), p
-    )
+    v_air_I = sub(load3(flight.v), load3(flight.wind))
+    d_I = add(load3(flight.disturbance), load3(flight.air_force))
+    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, load4(flight.rotor_speeds), d_I, p)
+    dw_B = add(dw_B, apply(load33(p.inertia_inverse), load3(flight.air_torque)))
     a_I = imu_point_acceleration(R_BI, a_I, w_B, dw_B, load3(p.imu_lever_arm))
     return apply(R_BI, (a_I[0], a_I[1], a_I[2] + p.gravity))
 

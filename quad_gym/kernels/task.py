@@ -5,12 +5,13 @@ import math
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import atan2, clip, maximum, minimum, sin_cos
 from quad_gym.kernels.lanes import select
-from quad_gym.kernels.linalg import keep3, load3, multiply, scale
+from quad_gym.kernels.linalg import add, keep3, load3, multiply, scale
 from quad_gym.kernels.random import normal_pair, uniform_pair
 from quad_gym.kernels.reference import evaluate_reference
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm
 from quad_gym.kernels.sensors import DRAW_RESET, six_normals
 from quad_gym.params import MAX_GATES
+from quad_gym.randomization import COLUMNS
 from quad_gym.records import MAX_HARMONICS, Start, Task
 
 DRAW_COURSE, DRAW_START, DRAW_SERIES = DRAW_RESET, DRAW_RESET + 2, DRAW_RESET + 16
@@ -19,6 +20,9 @@ START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 
 """Spread of a hovering start: [m], [rad], [rad], [m/s]."""
 GROUND_SHARE = 0.5
 """Share of the mixed starts that are on the ground."""
+_POSITION, _VELOCITY = COLUMNS["start_position_I"].start, COLUMNS["start_velocity_I"].start
+_RATES, _YAW = COLUMNS["start_body_rates"].start, COLUMNS["start_yaw"].start
+_ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start
 HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY = 0.0, 1.0, 2.0
 
 
@@ -170,13 +174,20 @@ def draw_start(flight, p, model, settings, stream, mask):
         yaw = yaw + hovering * START_YAW_SIGMA * n_yaw
         rotor_speed = hovering * model.motor_gain * model.hover_voltage
     z = select(on_ground, 0.0, z)
+    w_B = (zero, zero, zero)
+    if settings.randomized:
+        drawn = flight.drawn
+        x, y, z = x + drawn[_POSITION], y + drawn[_POSITION + 1], z + drawn[_POSITION + 2]
+        v_I = add(v_I, (drawn[_VELOCITY], drawn[_VELOCITY + 1], drawn[_VELOCITY + 2]))
+        w_B = (drawn[_RATES], drawn[_RATES + 1], drawn[_RATES + 2])
+        roll, pitch, yaw = roll + drawn[_ROLL], pitch + drawn[_PITCH], yaw + drawn[_YAW]
     given = flight.start_given
     x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
     v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
     yaw = _given_or(given[6], yaw)
     keep3(flight.r, mask, (x, y, z))
     keep3(flight.v, mask, v_I)
-    keep3(flight.w, mask, (zero, zero, zero))
+    keep3(flight.w, mask, w_B)
     keep3(flight.disturbance, mask, (zero, zero, zero))
     q = dcm_to_quaternion(
         multiply(euler_to_dcm((roll, pitch, zero)), euler_to_dcm((zero, zero, yaw)))

@@ -60,7 +60,8 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     """Acceleration of the centre of mass in I and angular acceleration in B.
 
     `m dv/dt = -m g e3 + z_I sum(F_i) + d - 0.5 Cd Ad rho |z_I . v| v` with `F_i = kF W_i^2`, and
-    `J dw/dt = N - w x J w` with `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`.
+    `J dw/dt = N - w x J w` with `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`; where the air moves, v is
+    the velocity relative to it.
     """
     W = rotor_speeds
     forces = (p.kF * W[0] * W[0], p.kF * W[1] * W[1], p.kF * W[2] * W[2], p.kF * W[3] * W[3])
@@ -78,18 +79,23 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
 
 
 @kernel
-def derivative(state, voltages, d_I, p):
-    """The time derivative of a state under motor voltages [V] and a disturbance force [N]."""
-    _, v_I, q, w_B, W = state
-    a_I, dw_B = accelerations(quaternion_to_dcm(q), v_I, w_B, W, d_I, p)
+def rotor_lag(W, voltages, p):
+    """dW_i/dt = (cm ea_i - W_i) / taum [rad/s^2]."""
     lag, gain = 1.0 / p.motor_tau, p.motor_gain
-    dW = (
+    return (
         lag * (gain * voltages[0] - W[0]),
         lag * (gain * voltages[1] - W[1]),
         lag * (gain * voltages[2] - W[2]),
         lag * (gain * voltages[3] - W[3]),
     )
-    return v_I, a_I, quaternion_rate(q, w_B), dw_B, dW
+
+
+@kernel
+def derivative(state, voltages, d_I, p):
+    """The time derivative of a state under motor voltages [V] and a disturbance force [N]."""
+    _, v_I, q, w_B, W = state
+    a_I, dw_B = accelerations(quaternion_to_dcm(q), v_I, w_B, W, d_I, p)
+    return v_I, a_I, quaternion_rate(q, w_B), dw_B, rotor_lag(W, voltages, p)
 
 
 @kernel

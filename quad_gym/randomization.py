@@ -1,0 +1,309 @@
+"""Domain randomisation: which parameters can be drawn anew for every episode, and from what.
+
+Draws happen inside the kernel from each flight's own random stream, so the parameters of an episode
+depend on its flight's seed alone.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym import validation as check
+from quad_gym.distributions import Distribution
+from quad_gym.params import VehicleParams
+from quad_gym.sensor_params import SensorSuite
+from quad_gym.world_params import BatteryParams, WorldParams
+
+class Drawable(NamedTuple):
+    """A parameter that can be drawn."""
+
+    name: str
+    size: int
+    unit: str
+    meaning: str
+    least: float = -math.inf
+    """smallest value that makes sense"""
+    above: float = -math.inf
+    """value that it has to exceed"""
+    most: float = math.inf
+    """largest value that makes sense"""
+
+
+# fmt: off
+DRAWABLES = (
+    # the vehicle
+    Drawable("mass", 1, "kg", "mass", above=0.0),
+    Drawable("inertia", 3, "kg m^2", "diagonal of the inertia; products of inertia follow it", above=0.0),
+    Drawable("center_of_mass_B", 3, "m", "true centre of mass, from where it is believed to be"),
+    Drawable("thrust_coefficient", 1, "N/(rad/s)^2", "kF", above=0.0),
+    Drawable("torque_coefficient", 1, "N m/(rad/s)^2", "kN", above=0.0),
+    Drawable("rotor_efficiency", 4, "-", "thrust and torque of each rotor over those of its coefficients", above=0.0),
+    Drawable("motor_time_constant", 1, "s", "lag of the rotor speed", above=0.0),
+    Drawable("motor_speed_per_volt", 1, "rad/s/V", "steady rotor speed per volt", above=0.0),
+    Drawable("max_voltage", 1, "V", "largest voltage of the motors", above=0.0),
+    Drawable("drag_coefficient", 1, "-", "of the drag disc", least=0.0),
+    # the world
+    Drawable("wind_east", 1, "m/s", "steady wind"),
+    Drawable("wind_north", 1, "m/s", "steady wind"),
+    Drawable("wind_up", 1, "m/s", "steady wind"),
+    Drawable("wind_speed", 1, "m/s", "horizontal speed of the steady wind", least=0.0),
+    Drawable("wind_direction", 1, "rad", "where the steady wind blows to, from east toward north"),
+    Drawable("gust_wind_speed", 1, "m/s", "W20, the strength of gusts", least=0.0),
+    Drawable("linear_drag_B", 3, "N s/m", "linear drag", least=0.0),
+    Drawable("rotor_drag_B", 3, "N s/m per rad/s", "linear drag per rotor speed", least=0.0),
+    Drawable("battery_charge", 1, "-", "charge at the start", above=0.0, most=1.0),
+    Drawable("battery_resistance", 1, "ohm", "resistance of the battery", least=0.0),
+    # sensors as they are
+    Drawable("accel_noise_density", 1, "m/s^2/sqrt(Hz)", "white noise", least=0.0),
+    Drawable("gyro_noise_density", 1, "rad/s/sqrt(Hz)", "white noise", least=0.0),
+    Drawable("accel_bias_sigma", 1, "m/s^2", "of the stationary bias", least=0.0),
+    Drawable("gyro_bias_sigma", 1, "rad/s", "of the stationary bias", least=0.0),
+    Drawable("accel_bias_tau", 1, "s", "correlation time", above=0.0),
+    Drawable("gyro_bias_tau", 1, "s", "correlation time", above=0.0),
+    Drawable("position_sigma_I", 3, "m", "noise of the GNSS position", least=0.0),
+    Drawable("baseline_sigma", 1, "rad", "noise of the GNSS baseline's direction", least=0.0),
+    Drawable("pixel_sigma", 1, "pixels", "noise of the camera", least=0.0),
+    # how they are mounted
+    Drawable("lever_arm_B", 3, "m", "accelerometer"),
+    Drawable("primary_antenna_B", 3, "m", "primary GNSS antenna"),
+    Drawable("secondary_antenna_B", 3, "m", "secondary GNSS antenna"),
+    Drawable("camera_position_B", 3, "m", "projection centre"),
+    Drawable("camera_rotation", 3, "rad", "error e of the camera's attitude, R(e) R_CB"),
+    Drawable("focal_length", 1, "pixels", "of the camera", above=0.0),
+    # the start, on top of the task's own; what a caller gives to a reset stays as it was given
+    Drawable("start_position_I", 3, "m", "added to the start's position"),
+    Drawable("start_velocity_I", 3, "m/s", "added to the start's velocity"),
+    Drawable("start_body_rates", 3, "rad/s", "body rates at the start"),
+    Drawable("start_roll", 1, "rad", "added to the start's roll"),
+    Drawable("start_pitch", 1, "rad", "added to the start's pitch"),
+    Drawable("start_yaw", 1, "rad", "added to the start's yaw"),
+)
+# fmt: on
+"""Every parameter that can be drawn; the columns of a flight's field `drawn`, in this order."""
+
+COLUMNS: dict[str, slice] = {}
+for _drawable in DRAWABLES:
+    _first = max((columns.stop for columns in COLUMNS.values()), default=0)
+    COLUMNS[_drawable.name] = slice(_first, _first + _drawable.size)
+DRAWN_SIZE = sum(drawable.size for drawable in DRAWABLES)
+"""Numbers that can be drawn."""
+
+Given = Distribution | Sequence[Distribution | None]
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """Which parameters are drawn anew for every episode, and from what distributions.
+
+    The names are those of `quad_gym.randomization.DRAWABLES`. Of a parameter with several
+    components each is drawn by itself, from the same distribution or from those of a sequence,
+    where None keeps a component.
+
+    Args:
+        parameters: Distributions by name.
+        known: Whether the filter and the controller know the world as it is, draws included. By
+            default they believe the nominal parameters.
+
+    Raises:
+        ValueError: If a name is unknown, or something is no distribution.
+
+    Example:
+        `Randomization({"mass": Uniform(0.8, 1.2, relative=True), "wind_speed": Uniform(0.0, 5.0),
+        "wind_direction": Uniform(-math.pi, math.pi)})`
+    """
+
+    parameters: Mapping[str, Given]
+    known: bool = False
+
+    def __post_init__(self) -> None:
+        check.flag("Randomization.known", self.known)
+        if not isinstance(self.parameters, Mapping):
+            raise ValueError(
+                f"Randomization.parameters must be distributions by name, got {self.parameters!r}"
+            )
+        unknown = sorted(set(self.parameters) - set(COLUMNS), key=str)
+        if unknown:
+            raise ValueError(
+                f"randomization of {unknown[0]!r} is unknown; what can be drawn is "
+                f"{', '.join(COLUMNS)}"
+            )
+        if {"wind_speed", "wind_direction"} & set(self.parameters) and {
+            "wind_east",
+            "wind_north",
+        } & set(self.parameters):
+            raise ValueError(
+                "randomization must draw the wind by wind_speed and wind_direction or by wind_east "
+                "and wind_north, not by both"
+            )
+        for drawable in DRAWABLES:
+            if drawable.name in self.parameters:
+                self.distributions(drawable.name)
+
+    @classmethod
+    def of(cls, given: "Randomization | Mapping[str, Given] | None") -> "Randomization":
+        """What a keyword may hold: a randomisation, distributions by name, or None for nothing."""
+        return given if isinstance(given, Randomization) else cls({} if given is None else given)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is drawn, in the order of `DRAWABLES`."""
+        return tuple(name for name in COLUMNS if name in self.parameters)
+
+    def distributions(self, name: str) -> tuple[Distribution | None, ...]:
+        """The distribution of each component of a parameter; None: it is not drawn."""
+        size = COLUMNS[name].stop - COLUMNS[name].start
+        given = self.parameters.get(name)
+        if given is None or isinstance(given, Distribution):
+            if name in self.parameters and given is None:
+                raise ValueError(f"randomization of {name!r} must be a distribution, got None")
+            return (given,) * size
+        if not isinstance(given, (tuple, list)) or len(given) != size:
+            wanted = "a distribution" if size == 1 else f"a distribution or {size} of them"
+            raise ValueError(f"randomization of {name!r} must be {wanted}, got {given!r}")
+        for part in given:
+            if not (part is None or isinstance(part, Distribution)):
+                raise ValueError(f"randomization of {name!r} must hold distributions, got {part!r}")
+        return tuple(given)
+
+
+class DrawingTable:
+    """A randomisation in numbers: how each column of a flight's field `drawn` is drawn.
+
+    Args:
+        randomization: What is drawn.
+        vehicle: The vehicle without draws.
+        sensors: The sensors without draws.
+        world: The world without draws.
+
+    Raises:
+        ValueError: If a range holds values that make no sense, such as a vehicle too heavy to
+            hover.
+    """
+
+    def __init__(
+        self,
+        randomization: Randomization,
+        vehicle: VehicleParams,
+        sensors: SensorSuite,
+        world: WorldParams,
+    ) -> None:
+        self.names = randomization.names
+        self.kind = np.zeros(DRAWN_SIZE, np.int64)
+        self.a, self.b, self.c, self.d = np.zeros((4, DRAWN_SIZE))
+        nominal = nominal_values(vehicle, sensors, world)
+        self.low, self.high = nominal.copy(), nominal.copy()
+        self.center, self.spread = np.zeros(DRAWN_SIZE), np.ones(DRAWN_SIZE)
+        for drawable in DRAWABLES:
+            parts = randomization.distributions(drawable.name)
+            for column, part in zip(
+                range(*COLUMNS[drawable.name].indices(DRAWN_SIZE)), parts, strict=True
+            ):
+                if part is not None:
+                    self._fill(drawable, column, part, nominal[column])
+        _check_hovering(self, vehicle, world)
+
+    def _fill(
+        self, drawable: Drawable, column: int, part: Distribution, nominal: float
+    ) -> None:
+        name = drawable.name
+        if np.isnan(nominal):
+            raise ValueError(f"randomization of {name!r} needs a {_MISSING[name]}, there is none")
+        if part.relative and nominal == 0.0:
+            raise ValueError(
+                f"randomization of {name!r} must not be relative: its nominal value is 0"
+            )
+        factor, shift = (nominal, 0.0) if part.relative else (1.0, nominal * part.offset)
+        low, high = sorted(factor * bound + shift for bound in part.support)
+        too_low = low < drawable.least or (low <= drawable.above > -math.inf)
+        if too_low or high > drawable.most:
+            raise ValueError(
+                f"randomization of {name!r} must stay {_range_in_words(drawable)}, got "
+                f"{part!r}, which reaches from {low:g} to {high:g}"
+            )
+        self.kind[column], self.a[column], self.b[column], self.c[column], self.d[column] = (
+            part.placed(factor, shift)
+        )
+        self.low[column], self.high[column] = low, high
+        center, spread = part.center_and_spread
+        self.center[column] = factor * center + shift
+        self.spread[column] = abs(factor * spread) or 1.0
+
+
+def _range_in_words(drawable: Drawable) -> str:
+    words = []
+    if drawable.above > -math.inf:
+        words.append(f"above {drawable.above:g}")
+    if drawable.least > -math.inf:
+        words.append(f"at least {drawable.least:g}")
+    if drawable.most < math.inf:
+        words.append(f"at most {drawable.most:g}")
+    return f"{' and '.join(words)} {'' if drawable.unit == '-' else drawable.unit}".strip()
+
+
+_CAMERA = ("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length")
+_MISSING = dict.fromkeys(_CAMERA, "camera") | dict.fromkeys(
+    ("battery_charge", "battery_resistance"), "battery (WorldParams.battery)"
+)
+
+
+def nominal_values(
+    vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
+) -> NDArray[np.float64]:
+    """(DRAWN_SIZE,) what the columns of `drawn` are without draws; NaN: there is no such part."""
+    imu, gnss, camera, battery = sensors.imu, sensors.gnss, sensors.camera, world.battery
+    east, north, up = world.wind_I
+    known: dict[str, Any] = {
+        "inertia": np.diag(vehicle.inertia),
+        "rotor_efficiency": 1.0,
+        "wind_east": east,
+        "wind_north": north,
+        "wind_up": up,
+        "wind_speed": math.hypot(east, north),
+        "wind_direction": math.atan2(north, east),
+        "battery_charge": math.nan if battery is None else battery.charge,
+        "battery_resistance": math.nan if battery is None else battery.resistance,
+        "camera_position_B": math.nan if camera is None else camera.position_B,
+        "camera_rotation": math.nan if camera is None else 0.0,
+        "pixel_sigma": math.nan if camera is None else camera.pixel_sigma,
+        "focal_length": math.nan if camera is None else camera.focal_length,
+    }
+    values = np.zeros(DRAWN_SIZE)
+    for drawable in DRAWABLES:
+        for part in (known, vehicle, world, imu, gnss):
+            if isinstance(part, dict):
+                found = part.get(drawable.name)
+            else:
+                found = getattr(part, drawable.name, None)
+            if found is not None:
+                values[COLUMNS[drawable.name]] = found
+                break
+    return values
+
+
+def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldParams) -> None:
+    """Refuse a randomisation whose worst case cannot carry its weight."""
+
+    def least(name: str) -> float:
+        return float(table.low[COLUMNS[name]].min())
+
+    mass = float(table.high[COLUMNS["mass"]][0])
+    full = least("max_voltage")
+    if world.battery is not None:
+        full *= _open_circuit(world.battery, least("battery_charge"))
+    speed = least("motor_speed_per_volt") * full
+    thrust = 4.0 * least("thrust_coefficient") * least("rotor_efficiency") * speed**2
+    if mass * vehicle.gravity >= thrust:
+        raise ValueError(
+            f"randomization must leave the vehicle able to hover: at worst it weighs "
+            f"{mass * vehicle.gravity:.1f} N and its rotors lift {thrust:.1f} N; limit mass, "
+            "max_voltage, motor_speed_per_volt, thrust_coefficient or rotor_efficiency"
+        )
+
+
+def _open_circuit(battery: BatteryParams, charge: float) -> float:
+    """Voltage of an unloaded battery over that of a full one."""
+    return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge
