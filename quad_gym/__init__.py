@@ -6,8 +6,8 @@ compiled or loaded from their cache, when the first environment is made.
 
 from typing import Any
 
-from quad_gym.envs import IDS, make_sb3_vec_env, register_all
 from quad_gym.distributions import LogUniform, Normal, Uniform
+from quad_gym.envs import IDS, make_sb3_vec_env, register_all
 from quad_gym.params import (
     ActionParams,
     Clocks,

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import validation as check
-from quad_gym.distributions import Distribution
+from quad_gym.distributions import Distribution, Uniform
 from quad_gym.params import VehicleParams
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.world_params import BatteryParams, WorldParams
+
 
 class Drawable(NamedTuple):
     """A parameter that can be drawn."""
@@ -37,11 +38,11 @@ class Drawable(NamedTuple):
 DRAWABLES = (
     # the vehicle
     Drawable("mass", 1, "kg", "mass", above=0.0),
-    Drawable("inertia", 3, "kg m^2", "diagonal of the inertia; products of inertia follow it", above=0.0),
+    Drawable("inertia", 3, "kg m^2", "its diagonal; the rest follows", above=0.0),
     Drawable("center_of_mass_B", 3, "m", "true centre of mass, from where it is believed to be"),
     Drawable("thrust_coefficient", 1, "N/(rad/s)^2", "kF", above=0.0),
     Drawable("torque_coefficient", 1, "N m/(rad/s)^2", "kN", above=0.0),
-    Drawable("rotor_efficiency", 4, "-", "thrust and torque of each rotor over those of its coefficients", above=0.0),
+    Drawable("rotor_efficiency", 4, "-", "of each rotor: of its thrust and torque", above=0.0),
     Drawable("motor_time_constant", 1, "s", "lag of the rotor speed", above=0.0),
     Drawable("motor_speed_per_volt", 1, "rad/s/V", "steady rotor speed per volt", above=0.0),
     Drawable("max_voltage", 1, "V", "largest voltage of the motors", above=0.0),
@@ -198,20 +199,20 @@ class DrawingTable:
         self.low, self.high = nominal.copy(), nominal.copy()
         self.center, self.spread = np.zeros(DRAWN_SIZE), np.ones(DRAWN_SIZE)
         for drawable in DRAWABLES:
-            parts = randomization.distributions(drawable.name)
-            for column, part in zip(
-                range(*COLUMNS[drawable.name].indices(DRAWN_SIZE)), parts, strict=True
-            ):
-                if part is not None:
-                    self._fill(drawable, column, part, nominal[column])
+            if drawable.name in self.names:
+                first = COLUMNS[drawable.name].start
+                for k, part in enumerate(randomization.distributions(drawable.name)):
+                    self._fill(drawable, first + k, part, nominal[first + k])
         _check_hovering(self, vehicle, world)
 
     def _fill(
-        self, drawable: Drawable, column: int, part: Distribution, nominal: float
+        self, drawable: Drawable, column: int, part: Distribution | None, nominal: float
     ) -> None:
         name = drawable.name
         if np.isnan(nominal):
             raise ValueError(f"randomization of {name!r} needs a {_MISSING[name]}, there is none")
+        if part is None:  # a component that stays among others that are drawn
+            part = Uniform(nominal, nominal)
         if part.relative and nominal == 0.0:
             raise ValueError(
                 f"randomization of {name!r} must not be relative: its nominal value is 0"

@@ -404,6 +404,7 @@ SETTINGS_FIELDS = (
     Field("ground_effect", (), "0 or 1", "whether there is ground effect", "i8"),
     Field("supply", (), "-", "what limits the motor voltages, see Supply", "i8"),
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
+    Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),
     Field("known", (), "0 or 1", "whether filter and controller know the world as it is", "i8"),
     Field("draw_kind", (DRAWN_SIZE,), "-", "how a column is drawn, see `quad_gym.distributions`", "i8"),
     Field("draw_a", (DRAWN_SIZE,), "mixed", "of the distribution"),

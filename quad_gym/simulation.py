@@ -315,9 +315,8 @@ class FlightBatch:
             ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
         """
         if name in self.randomization.names:
-            columns = COLUMNS[name]
-            drawn = self.read("drawn", flights)[:, columns]
-            return drawn[:, 0] if columns.stop - columns.start == 1 else drawn
+            values = self.drawn()[name]
+            return values if flights is None else values[flights]
         if name not in (FLIGHT_BLOCK.names or ()):
             drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
             raise ValueError(
@@ -334,7 +333,12 @@ class FlightBatch:
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """What the present episodes have drawn, by name: (count,) or (count, components)."""
-        return {name: self.read(name) for name in self.randomization.names}
+        found = {}
+        for name in self.randomization.names:
+            values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
+            values = values.reshape(-1, values.shape[-1])[: self.count].copy()
+            found[name] = values[:, 0] if values.shape[1] == 1 else values
+        return found
 
     def covariance(self) -> NDArray[np.float64]:
         """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""

@@ -10,6 +10,8 @@ from quad_gym.kernels import single
 from quad_gym.packing import params_record
 from quad_gym.params import VehicleParams
 from quad_gym.sensor_params import SensorSuite
+from quad_gym.world_packing import world_settings
+from quad_gym.world_params import WorldParams
 
 State = Mapping[str, ArrayLike]
 STATE_SHAPES: dict[str, tuple[int, ...]] = {
@@ -37,7 +39,11 @@ def checked_state(state: State, name: str = "state") -> dict[str, NDArray[np.flo
 
 
 def state_derivative(
-    state: State, voltages: ArrayLike, disturbance_I: ArrayLike, params: VehicleParams
+    state: State,
+    voltages: ArrayLike,
+    disturbance_I: ArrayLike,
+    params: VehicleParams,
+    world: WorldParams | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """The time derivative of a quadrotor's state.
 
@@ -51,6 +57,8 @@ def state_derivative(
         voltages: (4,) motor voltages [V], between 0 and the vehicle's largest.
         disturbance_I: (3,) external force in I [N].
         params: The vehicle.
+        world: Its steady wind, drag and ground effect act too: v is then relative to the air, and
+            the forces of `quad_gym.WorldParams` are added.
 
     Returns:
         The derivative under the same keys, per second.
@@ -64,16 +72,13 @@ def state_derivative(
     if (ea < 0.0).any() or (ea > params.max_voltage).any():
         raise ValueError(f"voltages must be within [0, {params.max_voltage:g}] V, got {ea}")
     a_I, dw_B = np.empty(3), np.empty(3)
-    single.body_accelerations(
-        s["R_BI"],
-        s["velocity"],
-        s["body_rates"],
-        s["rotor_speeds"],
-        d_I,
-        params_record(params, SensorSuite()),
-        a_I,
-        dw_B,
-    )
+    motion = (s["R_BI"], s["velocity"], s["body_rates"], s["rotor_speeds"], d_I)
+    record = params_record(params, SensorSuite(), world=world)
+    if world is None:
+        single.body_accelerations(*motion, record, a_I, dw_B)
+    else:
+        settings = world_settings(world)
+        single.body_accelerations_in_air(s["position"], *motion, record, settings, a_I, dw_B)
     lag = params.motor_speed_per_volt * ea - s["rotor_speeds"]
     return {
         "position": s["velocity"],

@@ -4,10 +4,12 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quad_gym.params import VehicleParams
-from quad_gym.randomization import COLUMNS, DrawingTable
-from quad_gym.records import Supply
+from quad_gym.randomization import COLUMNS, DrawingTable, Randomization
+from quad_gym.records import SETTINGS, Supply
+from quad_gym.sensor_params import SensorSuite
 from quad_gym.world_params import BatteryParams, WorldParams
 
 
@@ -54,6 +56,15 @@ def pack_options(
     s["supply"] = Supply.LIMIT if limited or present("max_voltage") else Supply.NOMINAL
     if world.battery is not None:
         s["supply"] = Supply.BATTERY
+    s["observe_world"] = s["privileged"] and (world != WorldParams() or bool(draws.names))
     s["randomized"], s["known"] = bool(draws.names), known
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))
+
+
+def world_settings(world: WorldParams) -> NDArray[Any]:
+    """A settings record that holds a world's options alone, shape (1,)."""
+    settings = np.zeros(1, SETTINGS)
+    draws = DrawingTable(Randomization({}), VehicleParams(), SensorSuite(), world)
+    pack_options(settings[0], world, draws, known=False, limited=False)
+    return settings

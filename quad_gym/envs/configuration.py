@@ -1,5 +1,6 @@
 """From the keywords of an environment to its flights: the same for all three faces."""
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -18,10 +19,12 @@ from quad_gym.envs.spaces import (
     policy_size,
 )
 from quad_gym.params import ActionParams, TaskParams, VehicleParams
+from quad_gym.randomization import Given, Randomization
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
 from quad_gym.simulation import FlightBatch
+from quad_gym.world_params import WorldParams, world_params
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
     "hover": TaskParams(kind="hover", start="hover"),
@@ -86,6 +89,8 @@ class Flights:
         threads: int | None = None,
         true_vehicle: VehicleParams | None = None,
         true_sensors: SensorSuite | None = None,
+        world: WorldParams | str = "calm",
+        randomization: Randomization | Mapping[str, Given] | None = None,
         **unknown: Any,
     ) -> None:
         if unknown:
@@ -114,6 +119,8 @@ class Flights:
             suite = suite.replace(estimator=suite.estimator.replace(kind=estimator))
         suite = suite.with_rates(imu=imu_rate, gnss=gnss_rate, camera=camera_rate)
 
+        drawn = Randomization.of(randomization)
+        place = world_params(world) if isinstance(world, str) else world
         features = 0 if suite.camera is None else len(suite.camera.features_I)
         self.table: tuple[ObservationField, ...] = observation_layout(
             observation,
@@ -121,6 +128,7 @@ class Flights:
             include_covariance=include_covariance,
             privileged=privileged,
             feature_count=features,
+            drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
         self.space = observation_space(self.table)
         self._split = policy_size(self.table) if privileged else None
@@ -145,6 +153,8 @@ class Flights:
             threads=threads,
             true_vehicle=true_vehicle,
             true_sensors=true_sensors,
+            world=place,
+            randomization=drawn,
         )
         if max_episode_steps is not None:
             steps = check.whole("max_episode_steps", max_episode_steps)
@@ -208,6 +218,13 @@ def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"options may hold {', '.join(known)}, got {unknown[0]!r}")
     return chosen
+
+
+def drawn_info(drawn: dict[str, NDArray[np.float64]], flight: int) -> dict[str, Any]:
+    """What `info` says of one flight's draws: "drawn", by name; nothing where nothing is drawn."""
+    values = {name: flights[flight] for name, flights in drawn.items()}
+    numbers = {name: float(v) if v.ndim == 0 else v for name, v in values.items()}
+    return {"drawn": numbers} if numbers else {}
 
 
 ENDINGS = tuple(ending.name.lower() for ending in Ending)

@@ -9,7 +9,14 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.configuration import (
+    COLUMN,
+    ENDINGS,
+    Flights,
+    checked_actions,
+    drawn_info,
+    start_options,
+)
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.single import keys_of
 from quad_gym.envs.spaces import action_space
@@ -21,7 +28,8 @@ class QuadVecEnv(VecEnv):
 
     An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with
     the return "r", the length "l", the time "t" since construction [s] and the mean true position
-    error "e" [m].
+    error "e" [m]. With `randomization` it also holds `drawn`, the parameters of that episode; so
+    do `reset_infos`.
 
     Args:
         num_envs: Number of flights.
@@ -90,6 +98,7 @@ class QuadVecEnv(VecEnv):
         if self._pending is None:
             raise RuntimeError("call step_async() before step_wait()")
         batch = self.flights.batch
+        flown_with = batch.drawn()
         observations = batch.step(self._pending)
         self._pending = None
         if self.rendering is not None:
@@ -110,7 +119,7 @@ class QuadVecEnv(VecEnv):
             )
         ]
         for i in np.flatnonzero(done).tolist():
-            infos[i] |= self._episode_end(i, results[i])
+            infos[i] |= self._episode_end(i, results[i]) | drawn_info(flown_with, i)
         rewards = results[:, COLUMN["reward"]].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
 
@@ -211,4 +220,8 @@ class QuadVecEnv(VecEnv):
             batch.read("estimation_error").tolist(),
             strict=True,
         )
-        return [{"position_error": p, "estimation_error": e} for p, e in errors]
+        drawn = batch.drawn()
+        return [
+            {"position_error": p, "estimation_error": e, **drawn_info(drawn, i)}
+            for i, (p, e) in enumerate(errors)
+        ]

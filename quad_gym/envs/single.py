@@ -6,7 +6,14 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 
-from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.configuration import (
+    COLUMN,
+    ENDINGS,
+    Flights,
+    checked_actions,
+    drawn_info,
+    start_options,
+)
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
@@ -90,7 +97,18 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;
-    `filter_status`, 0 while all is well; `gates_passed`.
+    `filter_status`, 0 while all is well; `gates_passed`. With `randomization` also `drawn`, the
+    parameters of the episode by name.
+
+    ## World
+    By default the air is still and every episode flies the same vehicle with the same sensors.
+    `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C), linear
+    rotor drag, ground effect and a battery; `randomization={"mass": Uniform(0.8, 1.2,
+    relative=True), "wind_speed": Uniform(0.0, 5.0)}` draws parameters anew for every episode. What
+    can be drawn is listed in `quad_gym.randomization.DRAWABLES`. The filter and the controller know
+    of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
+    know all but the wind and the ground). With `privileged=True` the truth ends with the wind in
+    the body frame and the draws, each less the middle of its distribution over its spread.
 
     Args:
         task: The kind of task; `gymnasium.make` fills it in from the id.
@@ -121,6 +139,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             wrapper of `gymnasium.make` cuts, `info["ending"]` stays "none".)
         true_vehicle: What really flies, where the controller believes in `vehicle`.
         true_sensors: What really measures, where the filter believes in `sensors`.
+        world: "calm", "breeze", "fresh_breeze", or `WorldParams`.
+        randomization: What is drawn for every episode: distributions by name, or `Randomization`.
         radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
             max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
             `quad_gym.TaskParams`.
@@ -182,6 +202,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "ending": ENDINGS[0],
             "filter_status": int(batch.read("filter_status")[0]),
             "gates_passed": 0,
+            **drawn_info(batch.drawn(), 0),
         }
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -221,6 +242,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
                 "ending": ENDINGS[int(row[COLUMN["ending"]])],
                 "filter_status": int(row[COLUMN["filter_status"]]),
                 "gates_passed": int(row[COLUMN["gates_passed"]]),
+                **drawn_info(batch.drawn(), 0),
             },
         )
 

@@ -4,6 +4,7 @@
 order.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym import validation as check
+from quad_gym.randomization import COLUMNS
 from quad_gym.records import Control, Layout, Source
 
 OBSERVATIONS = {
@@ -111,6 +113,20 @@ def _sensor_fields(feature_count: int) -> tuple[Part, ...]:
     return (*fields, *_REFERENCE)
 
 
+def _world_fields(drawn: Sequence[str]) -> tuple[Part, ...]:
+    for name in drawn:
+        check.choice("drawn", name, tuple(COLUMNS))
+    sizes = {name: columns.stop - columns.start for name, columns in COLUMNS.items()}
+    return (
+        ("wind", 3, "m/s", "B", 100.0),
+        *(
+            (f"drawn_{n}", size, "of its spread", "-", 10.0)
+            for n, size in sizes.items()
+            if n in drawn
+        ),
+    )
+
+
 def _table(parts: tuple[Part, ...], first: int) -> list[ObservationField]:
     table = []
     for name, size, unit, frame, bound in parts:
@@ -127,6 +143,7 @@ def observation_layout(
     include_covariance: bool = False,
     privileged: bool = False,
     feature_count: int = 2,
+    drawn: Sequence[str] | None = None,
 ) -> tuple[ObservationField, ...]:
     """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
 
@@ -137,12 +154,14 @@ def observation_layout(
         privileged: Whether the truth ends the table; its slices go on counting, though the
             environment returns that part under a key of its own.
         feature_count: Features of the camera, for "sensors".
+        drawn: What is drawn for every episode, see `quad_gym.Randomization`: the truth ends with
+            the wind and the draws. None: in a calm world without draws it does not.
 
     Returns:
         The table.
 
     Raises:
-        ValueError: If `observation` or `layout` is unknown.
+        ValueError: If `observation`, `layout` or a name in `drawn` is unknown.
     """
     check.choice("observation", observation, tuple(OBSERVATIONS))
     check.choice("layout", layout, tuple(LAYOUTS))
@@ -158,7 +177,7 @@ def observation_layout(
             for name, unit, frame in zip(STATE_NAMES, units, frames, strict=True)
         )
     if privileged:
-        parts += _PRIVILEGED
+        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn))
     return tuple(_table(parts, 0))
 
 

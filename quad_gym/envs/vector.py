@@ -26,7 +26,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     """N flights in one compiled call; flight i is that of a `QuadEnv` seeded with seed + i.
 
     Observations, actions, rewards, endings and keywords are those of `QuadEnv`. `info` holds arrays
-    (n,) of the same names, each with its mask `_name`.
+    (n,) of the same names, each with its mask `_name`; `drawn` is a dictionary of such arrays.
 
     Args:
         num_envs: Number of flights.
@@ -117,6 +117,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "ending": np.full(self.num_envs, ENDINGS[0], object),
             "filter_status": batch.read("filter_status").astype(np.int64),
             "gates_passed": np.zeros(self.num_envs, np.int64),
+            **self._drawn(),
         }
         return self.flights.split(observations), _masked(infos, mask)
 
@@ -148,6 +149,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             )
         batch = self.flights.batch
         began = np.flatnonzero(self._over)
+        flown_with = batch.drawn()
         observations = batch.step(numbers)
         results = batch.results
         terminated, truncated = (
@@ -162,7 +164,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             self._replace_by_start(infos, began)
         infos = _masked(infos, self._everyone)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
-            infos = self._with_finals(infos)
+            infos = self._with_finals(infos, flown_with)
         return (
             self.flights.split(observations),
             results[:, COLUMN["reward"]].copy(),
@@ -208,6 +210,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
         }
+        infos |= self._drawn()
         ended = np.flatnonzero(self._over)
         if ended.size:  # seldom: looking up a name for every flight would cost more than the rest
             infos["ending"][ended] = _ENDING_NAMES[results[ended, COLUMN["ending"]].astype(np.intp)]
@@ -222,7 +225,14 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         infos["ending"][began] = ENDINGS[0]
         infos["gates_passed"][began] = 0
 
-    def _with_finals(self, infos: dict[str, Any]) -> dict[str, Any]:
+    def _drawn(self) -> dict[str, Any]:
+        """The draws of all flights, as `info` holds them; nothing where nothing is drawn."""
+        drawn = self.flights.batch.drawn()
+        return {"drawn": drawn} if drawn else {}
+
+    def _with_finals(
+        self, infos: dict[str, Any], flown_with: dict[str, NDArray[np.float64]]
+    ) -> dict[str, Any]:
         """Move what ended into `final_obs` and `final_info`; describe the new episodes instead."""
         over = self._over.copy()
         finals = self.flights.batch.final_observations
@@ -232,8 +242,10 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         final_info = {
             name: np.where(over, values, _blank(values))
             for name, values in infos.items()
-            if not name.startswith("_")
+            if not (name.startswith("_") or name == "drawn")
         }
+        if flown_with:
+            final_info["drawn"] = flown_with
         self._replace_by_start(infos, np.flatnonzero(over))
         infos |= {
             "final_obs": final_obs,
@@ -267,6 +279,8 @@ def _blank(values: NDArray[Any]) -> Any:
 def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
     """Every array beside the mask of the environments that it speaks of."""
     masked = dict(infos)
-    for name in infos:
+    for name, values in infos.items():
+        if isinstance(values, dict):
+            masked[name] = _masked(values, mask)
         masked[f"_{name}"] = mask.copy()
     return masked

@@ -86,12 +86,19 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
 
 
 @kernel
+def accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, wind_I, p, settings):
+    """As `vehicle.accelerations`, in air that moves with the velocity wind_I."""
+    v_air_I = sub(v_I, wind_I)
+    force_I, torque_B = air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings)
+    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, rotor_speeds, add(d_I, force_I), p)
+    return a_I, add(dw_B, apply(load33(p.inertia_inverse), torque_B))
+
+
+@kernel
 def _derivative(state, voltages, d_I, wind_I, p, settings):
     r_I, v_I, q, w_B, W = state
-    R_BI, v_air_I = quaternion_to_dcm(q), sub(v_I, wind_I)
-    force_I, torque_B = air_wrench(r_I, R_BI, v_air_I, W, p, settings)
-    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, W, add(d_I, force_I), p)
-    dw_B = add(dw_B, apply(load33(p.inertia_inverse), torque_B))
+    R_BI = quaternion_to_dcm(q)
+    a_I, dw_B = accelerations_in_air(r_I, R_BI, v_I, w_B, W, d_I, wind_I, p, settings)
     return v_I, a_I, quaternion_rate(q, w_B), dw_B, rotor_lag(W, voltages, p)
 
 

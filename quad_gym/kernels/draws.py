@@ -31,10 +31,16 @@ _WIND, _WIND_SPEED = COLUMNS["wind_east"].start, COLUMNS["wind_speed"].start
 _WIND_DIRECTION, _GUST = COLUMNS["wind_direction"].start, COLUMNS["gust_wind_speed"].start
 _LINEAR_DRAG, _ROTOR_DRAG = COLUMNS["linear_drag_B"].start, COLUMNS["rotor_drag_B"].start
 _CHARGE, _RESISTANCE = COLUMNS["battery_charge"].start, COLUMNS["battery_resistance"].start
-_ACCEL_NOISE, _GYRO_NOISE = COLUMNS["accel_noise_density"].start, COLUMNS["gyro_noise_density"].start
+_ACCEL_NOISE, _GYRO_NOISE = (
+    COLUMNS["accel_noise_density"].start,
+    COLUMNS["gyro_noise_density"].start,
+)
 _ACCEL_BIAS, _GYRO_BIAS = COLUMNS["accel_bias_sigma"].start, COLUMNS["gyro_bias_sigma"].start
 _ACCEL_TAU, _GYRO_TAU = COLUMNS["accel_bias_tau"].start, COLUMNS["gyro_bias_tau"].start
-_POSITION_SIGMA, _BASELINE_SIGMA = COLUMNS["position_sigma_I"].start, COLUMNS["baseline_sigma"].start
+_POSITION_SIGMA, _BASELINE_SIGMA = (
+    COLUMNS["position_sigma_I"].start,
+    COLUMNS["baseline_sigma"].start,
+)
 _PIXEL_SIGMA, _LEVER_ARM = COLUMNS["pixel_sigma"].start, COLUMNS["lever_arm_B"].start
 _PRIMARY, _SECONDARY = COLUMNS["primary_antenna_B"].start, COLUMNS["secondary_antenna_B"].start
 _CAMERA, _CAMERA_ROTATION = COLUMNS["camera_position_B"].start, COLUMNS["camera_rotation"].start

@@ -2,6 +2,7 @@
 
 import math
 
+from quad_gym.distributions import FIXED
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import apply, load3, load33, scale, sub
@@ -9,6 +10,7 @@ from quad_gym.kernels.reference import evaluate_reference, position_on_reference
 from quad_gym.kernels.rotation import quaternion_to_dcm
 from quad_gym.kernels.vehicle import load4
 from quad_gym.params import MAX_GATES
+from quad_gym.randomization import DRAWN_SIZE
 from quad_gym.records import Layout, Source, Task
 
 
@@ -129,6 +131,17 @@ def _put_privileged(flight, p, settings, row, k):
 
 
 @kernel
+def _put_world(flight, settings, row, k):
+    """The air's velocity, and each draw as its deviation from the middle in units of its spread."""
+    k = _put3(row, k, apply(quaternion_to_dcm(load4(flight.q)), load3(flight.wind)))
+    for column in range(DRAWN_SIZE):
+        if settings.draw_kind[column] != FIXED:
+            deviation = flight.drawn[column] - settings.draw_center[column]
+            row[k] = deviation / settings.draw_spread[column]
+            k += 1
+
+
+@kernel
 def observe(flight, p, settings, row):
     """Write the observation of the present instant.
 
@@ -164,4 +177,6 @@ def observe(flight, p, settings, row):
             row[k + i] = math.sqrt(variance)
         k += 15
     if settings.privileged:
-        _put_privileged(flight, p, settings, row, k)
+        k = _put_privileged(flight, p, settings, row, k)
+        if settings.observe_world:
+            _put_world(flight, settings, row, k)

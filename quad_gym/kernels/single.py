@@ -1,5 +1,6 @@
 """Entries for one flight: the scalar instances behind the friendly classes."""
 
+from quad_gym.kernels.air import accelerations_in_air
 from quad_gym.kernels.compilation import entry
 from quad_gym.kernels.linalg import add_outer, load3, load33, scale, scale33, store3, store33
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
@@ -82,6 +83,24 @@ def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
     """Write the acceleration in I and the angular acceleration in B."""
     a, dw = accelerations(
         load33(R_BI), load3(v_I), load3(w_B), load4(rotor_speeds), load3(d_I), params[0]
+    )
+    store3(a_I, a)
+    store3(dw_B, dw)
+
+
+@entry
+def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, settings, a_I, dw_B):
+    """Write the acceleration in I and the angular acceleration in B in a world that is not calm."""
+    a, dw = accelerations_in_air(
+        load3(r_I),
+        load33(R_BI),
+        load3(v_I),
+        load3(w_B),
+        load4(rotor_speeds),
+        load3(d_I),
+        load3(params[0].wind),
+        params[0],
+        settings[0],
     )
     store3(a_I, a)
     store3(dw_B, dw)

@@ -60,8 +60,8 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     """Acceleration of the centre of mass in I and angular acceleration in B.
 
     `m dv/dt = -m g e3 + z_I sum(F_i) + d - 0.5 Cd Ad rho |z_I . v| v` with `F_i = kF W_i^2`, and
-    `J dw/dt = N - w x J w` with `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`; where the air moves, v is
-    the velocity relative to it.
+    `J dw/dt = N - w x J w` with `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`; where the air moves, v
+    is the velocity relative to it.
     """
     W = rotor_speeds
     forces = (p.kF * W[0] * W[0], p.kF * W[1] * W[1], p.kF * W[2] * W[2], p.kF * W[3] * W[3])
