@@ -46,15 +46,9 @@ def gust_scales(height, wind_speed):
 def sinh_less_argument(h):
     """Sinh h - h for h >= 0, without cancellation."""
     z = h * h
-    series = (
-        z
-        * h
-        / 6.0
-        * (
-            1.0
-            + z / 20.0 * (1.0 + z / 42.0 * (1.0 + z / 72.0 * (1.0 + z / 110.0 * (1.0 + z / 156.0))))
-        )
-    )
+    tail = 1.0 + z / 156.0 * (1.0 + z / 210.0 * (1.0 + z / 272.0))
+    tail = 1.0 + z / 42.0 * (1.0 + z / 72.0 * (1.0 + z / 110.0 * tail))
+    series = z * h / 6.0 * (1.0 + z / 20.0 * tail)
     return select(h < 1.0, series, 0.5 * (exp(h) - exp(-h)) - h)
 
 

@@ -1,0 +1,201 @@
+"""Dryden gusts against MIL-F-8785C: scales, exact discretisation, variance, correlation, spectrum."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import signal, stats
+from scipy.linalg import expm
+
+import quad_gym
+from quad_gym.kernels.dryden import first_order, gust_scales, second_order, sinh_less_argument
+from quad_gym.records import Control, Source
+from quad_gym.simulation import FlightBatch
+from tests.unit.alarms import ALARM, alarm_score, assert_normal
+from tests.unit.compiled import Compiled
+
+FOOT = 0.3048
+WIND, HEIGHT = 8.0, 6.0
+ROOT3 = np.sqrt(3.0)
+
+
+def military_scales(height, wind_speed):
+    """sigma_u, sigma_w [m/s], L_u, L_w [m] as the specification prints them, in feet."""
+    h = np.clip(height / FOOT, 10.0, 1000.0)
+    sigma_w = 0.1 * wind_speed
+    sigma_u = sigma_w / (0.177 + 0.000823 * h) ** 0.4
+    return sigma_u, sigma_w, FOOT * h / (0.177 + 0.000823 * h) ** 1.2, FOOT * h
+
+
+def scales(f, _):
+    f.sigma_u, f.sigma_w, f.L_u, f.L_w = gust_scales(f.height, f.wind_speed)
+
+
+def filters(f, _):
+    f.u = first_order(f.x, f.h, f.n)
+    f.v, f.w = second_order(f.x, f.y, f.h, f.n, f.m)
+    f.excess = sinh_less_argument(f.h)
+
+
+scales_of = Compiled(scales, height=(), wind_speed=(), sigma_u=(), sigma_w=(), L_u=(), L_w=())
+filter_of = Compiled(filters, x=(), y=(), h=(), n=(), m=(), u=(), v=(), w=(), excess=())
+
+
+@given(st.floats(-10.0, 1000.0), st.floats(0.0, 40.0))
+def test_scales_are_those_of_the_specification(height, wind_speed):
+    got = scales_of.on_floats(height=[height], wind_speed=[wind_speed])
+    expected = military_scales(height, wind_speed)
+    for name, value in zip(("sigma_u", "sigma_w", "L_u", "L_w"), expected, strict=True):
+        np.testing.assert_allclose(got[name][0], value, rtol=1e-13, err_msg=name)
+
+
+@pytest.mark.parametrize("h", [1e-9, 1e-6, 1e-3, 0.03, 0.9, 1.1, 4.0])
+def test_the_discretisation_is_exact(h):
+    """Transition and noise covariance are those of Van Loan's matrix exponential (1978)."""
+    A, B = np.array([[-1.0, 0.0], [1.0, -1.0]]), np.array([[1.0], [0.0]])
+    van_loan = expm(h * np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]))
+    transition = van_loan[2:, 2:].T
+    noise = transition @ van_loan[:2, 2:]
+    # columns: response to each state, and to each normal
+    inputs = {"x": [1, 0, 0, 0], "y": [0, 1, 0, 0], "n": [0, 0, 1, 0], "m": [0, 0, 0, 1]}
+    got = filter_of.on_lanes(**inputs, h=[h] * 4)
+    responses = np.stack([got["v"], got["w"]])
+    np.testing.assert_allclose(responses[:, :2], transition, rtol=1e-13, atol=1e-14)
+    factor = responses[:, 2:]
+    # Van Loan's own entries lose digits where h^3 vanishes beside 1: compare in their proportions
+    sizes = np.sqrt(np.diag([h, h**3 / 3])) if h < 1e-2 else np.eye(2)
+    whiten = np.linalg.inv(sizes)
+    if h >= 1e-3:
+        np.testing.assert_allclose(
+            whiten @ (factor @ factor.T) @ whiten, whiten @ noise @ whiten, rtol=1e-8, atol=1e-8
+        )
+    else:  # the leading terms of the integrals of e^(-2t), t e^(-2t), t^2 e^(-2t)
+        leading = np.array([[h, h**2 / 2], [h**2 / 2, h**3 / 3]])
+        np.testing.assert_allclose(
+            whiten @ (factor @ factor.T) @ whiten, whiten @ leading @ whiten, rtol=3 * h + 1e-6
+        )
+    np.testing.assert_allclose(got["u"][0], np.exp(-h), rtol=1e-15)
+    np.testing.assert_allclose(got["u"][2] ** 2, -np.expm1(-2 * h), rtol=1e-6)
+
+
+def test_sinh_less_its_argument_keeps_its_digits():
+    h = np.geomspace(1e-8, 5.0, 300)
+    got = filter_of.on_floats(x=h, h=h)["excess"]
+    series = sum(h**k / float(np.prod(np.arange(1.0, k + 1.0))) for k in range(3, 41, 2))
+    np.testing.assert_allclose(got, series, rtol=1e-14)
+
+
+def test_the_stationary_covariance_stays():
+    stationary = np.array([[0.5, 0.25], [0.25, 0.25]])
+    for h in (1e-4, 0.1, 2.0):
+        got = filter_of.on_floats(
+            x=[1, 0, 0, 0], y=[0, 1, 0, 0], n=[0, 0, 1, 0], m=[0, 0, 0, 1], h=[h] * 4
+        )
+        response = np.stack([got["v"], got["w"]])
+        inputs = np.zeros((4, 4))
+        inputs[:2, :2], inputs[2:, 2:] = stationary, np.eye(2)
+        np.testing.assert_allclose(response @ inputs @ response.T, stationary, atol=1e-14)
+
+
+# ---- gusts as flights meet them ------------------------------------------------------------------
+
+
+def hovering_in_gusts(count, *, height=HEIGHT, wind=(0.0, WIND, 0.0), dt=0.005):
+    """Vehicles that nothing moves: no drag, level, thrust as large as the weight."""
+    vehicle = quad_gym.vehicle_params("lab").replace(disc_area=0.0)
+    sensors = quad_gym.sensor_suite("lab").replace(camera=None).with_rates(imu=1.0 / dt)
+    batch = FlightBatch(
+        count,
+        vehicle=vehicle,
+        sensors=sensors,
+        source=Source.TRUTH,
+        control=Control.MOTOR,
+        task=quad_gym.TaskParams(kind="hover", start="hover", duration=0.0),
+        world=quad_gym.WorldParams(wind_I=wind, gust_wind_speed=WIND, ground_height=0.0),
+    )
+    batch.reset(seeds=range(count), position=(0.0, 0.0, height), velocity=(0.0, 0.0, 0.0), yaw=0.0)
+    batch._blocks["q"] = np.array([1.0, 0.0, 0.0, 0.0])[:, np.newaxis]
+    return batch
+
+
+def gusts(batch):
+    """(n, 3) along the wind (north), across it (west) and up, over their intensities."""
+    sigma_u, sigma_w, _, _ = military_scales(HEIGHT, WIND)
+    east, north, up = (batch.read("wind") - batch.world.wind_I).T
+    return np.stack([north / sigma_u, -east / sigma_u, up / sigma_w], axis=1)
+
+
+@pytest.fixture(scope="module")
+def history():
+    """Gusts of 4,000 flights at ticks 0, 1, 40, 400 and 4,000: {tick: (n, 3)}."""
+    batch, found = hovering_in_gusts(4000), {}
+    for tick in range(4001):
+        if tick in (0, 1, 40, 400, 4000):
+            found[tick] = gusts(batch)
+        batch.step()
+    np.testing.assert_allclose(batch.read("r"), [[0.0, 0.0, HEIGHT]] * 4000, atol=1e-6)
+    return found
+
+
+@pytest.mark.parametrize("tick", [0, 1, 4000])
+def test_gusts_are_normal_with_the_intensities_of_the_specification(history, tick):
+    assert_normal(history[tick], np.zeros(3), np.eye(3))
+
+
+@pytest.mark.parametrize("tick", [1, 40, 400])
+def test_gusts_are_correlated_over_time_as_the_spectra_say(history, tick):
+    _, _, L_u, L_w = military_scales(HEIGHT, WIND)
+    x, z = np.array([L_u, L_u, L_w]), WIND * tick * 0.005
+    first_order_decay = np.exp(-z / x)
+    expected = first_order_decay * np.array([1.0, 1.0 - 0.5 * z / L_u, 1.0 - 0.5 * z / L_w])
+    start, now = history[0], history[tick]
+    # the innovation of one time given the other is normal with a known variance
+    innovation = (now - expected * start) / np.sqrt(1.0 - expected**2)
+    assert_normal(np.hstack([start, innovation]), np.zeros(6), np.eye(6))
+
+
+def test_the_spectra_are_drydens():
+    """Welch's estimate over 256 flights of 82 s, in half octaves."""
+    dt, ticks = 0.02, 4096
+    batch = hovering_in_gusts(256, dt=dt)
+    record = np.empty((ticks, 256, 3))
+    for tick in range(ticks):
+        batch.step()
+        record[tick] = gusts(batch)
+    frequency, density = signal.welch(record, fs=1 / dt, nperseg=1024, axis=0)
+    density = density.mean(axis=1)
+    _, _, L_u, L_w = military_scales(HEIGHT, WIND)
+    edges = 0.2 * 2.0 ** (np.arange(14) / 2)
+    for k, L in enumerate((L_u, L_u, L_w)):
+        T = L / WIND
+
+        def spectrum(f, k=k, T=T):
+            s = (2 * np.pi * f * T) ** 2
+            return 4 * T / (1 + s) if k == 0 else 2 * T * (1 + 3 * s) / (1 + s) ** 2
+
+        # what is sampled every dt is aliased
+        aliased = spectrum(frequency) + sum(
+            spectrum(n / dt + frequency) + spectrum(n / dt - frequency) for n in range(1, 200)
+        )
+        ratio = density[:, k] / aliased
+        for low, high in zip(edges[:-1], edges[1:], strict=True):
+            chosen = (frequency >= low) & (frequency < high)
+            # half-overlapping Hann segments: 7 in a record, worth some 5.8; bins share neighbours
+            freedom = 2 * 256 * 5.8 * max(1.0, chosen.sum() / 1.94)
+            bound = stats.norm.isf(ALARM / 2 / 39) * np.sqrt(2.0 / freedom)
+            assert abs(ratio[chosen].mean() - 1.0) < bound + 0.005, (k, low)
+
+
+def test_across_and_along_follow_the_wind():
+    still, turned = hovering_in_gusts(8), hovering_in_gusts(8, wind=(-WIND, 0.0, 0.0))
+    np.testing.assert_allclose(
+        (turned.read("wind") - turned.world.wind_I)[:, 0], -(still.read("wind")[:, 1] - WIND)
+    )
+    np.testing.assert_allclose(turned.read("wind")[:, 1], still.read("wind")[:, 0])
+
+
+def test_different_flights_and_axes_meet_different_gusts(history):
+    scores = np.corrcoef(history[4000].T)[np.triu_indices(3, 1)] * np.sqrt(4000)
+    assert np.abs(scores).max() < alarm_score(3)
+    neighbours = (history[0][1:] * history[0][:-1]).mean(axis=0) * np.sqrt(3999)
+    assert np.abs(neighbours).max() < alarm_score(3)
