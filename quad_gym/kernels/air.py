@@ -29,7 +29,7 @@ from quad_gym.kernels.vehicle import (
     rotor_lag,
     store_state,
 )
-from quad_gym.records import Supply
+from quad_gym.world_fields import Supply
 
 
 @kernel

@@ -50,6 +50,7 @@ def sources_digest() -> str:
         "sensor_params.py",
         "distributions.py",
         "randomization.py",
+        "world_fields.py",
     )
     for path in (*sorted(package.glob("*.py")), *(package.parent / name for name in constants)):
         digest.update(path.name.encode() + path.read_bytes())

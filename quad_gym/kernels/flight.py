@@ -44,7 +44,8 @@ from quad_gym.kernels.task import draw_reference, draw_start
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
 from quad_gym.kernels.vehicle import integrate, load4, load_state
-from quad_gym.records import Control, FilterForm, Source, Supply
+from quad_gym.records import Control, FilterForm, Source
+from quad_gym.world_fields import Supply
 
 _ONE = np.uint64(1)
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)

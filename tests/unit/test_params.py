@@ -23,6 +23,8 @@ CLASSES = [
     quad_gym.ActionParams,
     quad_gym.Clocks,
     quad_gym.TaskParams,
+    quad_gym.WorldParams,
+    quad_gym.BatteryParams,
 ]
 NO_NUMBERS = ["fast", None, float("nan"), float("inf"), [1.0, 2.0]]
 BELOW_ZERO = [-1.0, *NO_NUMBERS]
@@ -140,6 +142,18 @@ BAD_VALUES = {
     ("TaskParams", "max_acceleration"): NOT_POSITIVE,
     ("TaskParams", "gate_count"): [0, MAX_GATES + 1, 2.5, *NO_NUMBERS],
     ("TaskParams", "gate_radius"): NOT_POSITIVE,
+    ("WorldParams", "wind_I"): NO_VECTORS,
+    ("WorldParams", "gust_wind_speed"): BELOW_ZERO,
+    ("WorldParams", "linear_drag_B"): [*NO_VECTORS, (0.1, 0.1, -0.1)],
+    ("WorldParams", "rotor_drag_B"): [*NO_VECTORS, (0.1, 0.1, -0.1)],
+    ("WorldParams", "rotor_radius"): NOT_POSITIVE,
+    ("WorldParams", "ground_height"): NO_NUMBERS,
+    ("WorldParams", "battery"): ["full", 3.0],
+    ("BatteryParams", "energy"): NOT_POSITIVE,
+    ("BatteryParams", "charge"): [*NOT_POSITIVE, 1.1],
+    ("BatteryParams", "empty_voltage"): [*NOT_POSITIVE, 1.1],
+    ("BatteryParams", "resistance"): BELOW_ZERO,
+    ("BatteryParams", "motor_efficiency"): [*NOT_POSITIVE, 1.1],
     ("TaskParams", "preview"): [(0.2,), 0.2, (-0.1, 0.2), (0.1, float("nan")), None],
 }
 

@@ -1,0 +1,431 @@
+"""Draws against SciPy's distributions, drawn flights against flights that are told the draws."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import special, stats
+
+import quad_gym
+from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
+from quad_gym.distributions import Distribution
+from quad_gym.kernels.draws import normal_quantile
+from quad_gym.randomization import COLUMNS, DRAWABLES, DRAWN_SIZE, nominal_values
+from quad_gym.records import Control, Source
+from quad_gym.rotations import euler_to_dcm
+from quad_gym.simulation import FlightBatch
+from tests.unit.alarms import ALARM, alarm_score
+from tests.unit.compiled import Compiled
+
+LAB, SUITE = quad_gym.vehicle_params("lab"), quad_gym.sensor_suite("lab")
+WORLD = WorldParams(
+    wind_I=(2.0, 1.0, 0.5),
+    gust_wind_speed=5.0,
+    linear_drag_B=(0.4, 0.3, 0.1),
+    rotor_drag_B=(1e-5, 1e-5, 1e-5),
+    battery=quad_gym.BatteryParams(),
+)
+
+
+def quantile(f, _):
+    f.x = normal_quantile(f.p)
+
+
+quantiles = Compiled(quantile, p=(), x=())
+
+
+# ---- distributions -------------------------------------------------------------------------------
+
+
+@given(st.floats(1e-300, 1.0 - 2.0**-53))
+def test_the_normal_quantile_is_that_of_scipy(p):
+    got = quantiles.on_floats(p=[p])["x"][0]
+    np.testing.assert_allclose(got, special.ndtri(p), rtol=2e-13, atol=1e-15)
+
+
+DRAWS = {
+    "mass": (Uniform(0.8, 1.2, relative=True), stats.uniform(0.8 * 0.78, 0.4 * 0.78)),
+    "motor_time_constant": (
+        LogUniform(0.5, 2.0, relative=True),
+        stats.loguniform(0.025, 0.1),
+    ),
+    "wind_north": (Normal(1.0, 2.0), stats.norm(1.0, 2.0)),
+    "wind_east": (
+        Normal(0.0, 1.0, low=-0.5, high=2.0, offset=True),
+        stats.truncnorm(-0.5, 2.0, loc=2.0),
+    ),
+    "baseline_sigma": (Uniform(0.01, 0.1), stats.uniform(0.01, 0.09)),
+    "primary_antenna_B": (
+        Normal(0.0, 0.01, offset=True),
+        [stats.norm(x, 0.01) for x in SUITE.gnss.primary_antenna_B],
+    ),
+    "start_yaw": (Uniform(-3.0, 3.0), stats.uniform(-3.0, 6.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    count = 20_000
+    batch = FlightBatch(
+        count,
+        source=Source.TRUTH,
+        world=WORLD,
+        randomization={name: given for name, (given, _) in DRAWS.items()},
+    )
+    batch.reset(seeds=range(count))
+    first = batch.drawn()
+    batch.reset()
+    return first, batch.drawn()
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_draws_have_their_distribution(drawn, name):
+    values = np.reshape(drawn[0][name], (20_000, -1))
+    expected = DRAWS[name][1]
+    expected = expected if isinstance(expected, list) else [expected]
+    for component, distribution in zip(values.T, expected, strict=True):
+        assert stats.kstest(component, distribution.cdf).pvalue > ALARM
+        low, high = distribution.support()
+        assert low <= component.min() < component.max() <= high
+
+
+def test_draws_of_parameters_components_flights_and_episodes_are_independent(drawn):
+    columns = [
+        np.reshape(episode[name], (20_000, -1)).T for episode in drawn for name in sorted(DRAWS)
+    ]
+    ranks = stats.rankdata(np.concatenate(columns), axis=1)
+    scores = np.corrcoef(ranks)[np.triu_indices(len(ranks), 1)] * math.sqrt(20_000)
+    assert np.abs(scores).max() < alarm_score(scores.size)
+    centred = ranks - ranks.mean(axis=1, keepdims=True)
+    along = (
+        (centred[:, 1:] * centred[:, :-1]).mean(axis=1) / centred.var(axis=1) * math.sqrt(19_999)
+    )
+    assert np.abs(along).max() < alarm_score(along.size)
+
+
+@given(st.floats(-5.0, 5.0), st.floats(0.0, 3.0), st.floats(0.1, 4.0), st.integers(0, 3))
+def test_bounds_hold_to_the_last_bit(low, width, sigma, kind):
+    high = low + width
+    given = Uniform(low, high)
+    if kind == 1:
+        given = LogUniform(math.exp(low), math.exp(high))
+    elif kind == 2:
+        given = Normal(low + 0.3 * width, sigma, low, high + 1e-3)
+    elif kind == 3:
+        given = Uniform(low, high, offset=True)
+    batch = FlightBatch(16, source=Source.TRUTH, randomization={"wind_up": given}, threads=1)
+    batch.reset(seeds=range(16))
+    values = batch.read("wind_up")
+    assert (given.support[0] <= values).all()
+    assert (values <= given.support[1]).all()
+
+
+def test_a_parameter_does_not_depend_on_which_others_are_drawn():
+    few, many = (
+        FlightBatch(12, source=Source.TRUTH, randomization=randomization)
+        for randomization in (
+            {"mass": Uniform(0.5, 1.0)},
+            {"mass": Uniform(0.5, 1.0), "inertia": LogUniform(0.5, 2.0, relative=True)},
+        )
+    )
+    few.reset(seeds=range(12))
+    many.reset(seeds=range(12))
+    np.testing.assert_array_equal(few.read("mass"), many.read("mass"))
+    assert len(np.unique(many.read("inertia"))) == 36
+
+
+def test_a_component_without_a_distribution_stays():
+    batch = FlightBatch(
+        5, source=Source.TRUTH, randomization={"lever_arm_B": (None, Uniform(0.1, 0.2), None)}
+    )
+    batch.reset(seeds=range(5))
+    lever_arm = batch.read("lever_arm_B")
+    np.testing.assert_array_equal(lever_arm[:, [0, 2]], 0.0)
+    assert len(np.unique(lever_arm[:, 1])) == 5
+
+
+# ---- drawn flights are flights with these parameters ---------------------------------------------
+
+
+def told(name, value):
+    """Vehicle, sensors and world with a parameter set in the dataclass that holds it."""
+    scalar = float(value[0]) if value.size == 1 else tuple(value)
+    imu, gnss, camera, battery = SUITE.imu, SUITE.gnss, SUITE.camera, WORLD.battery
+    vehicle, sensors, world = LAB, SUITE, WORLD
+    if name == "inertia":
+        vehicle = LAB.replace(inertia=np.diag(value))
+    elif name == "center_of_mass_B":
+        vehicle = LAB.replace(rotor_positions_B=np.array(LAB.rotor_positions_B) - value)
+        sensors = SUITE.replace(
+            imu=imu.replace(lever_arm_B=np.array(imu.lever_arm_B) - value),
+            gnss=gnss.replace(
+                primary_antenna_B=np.array(gnss.primary_antenna_B) - value,
+                secondary_antenna_B=np.array(gnss.secondary_antenna_B) - value,
+            ),
+            camera=camera.replace(position_B=np.array(camera.position_B) - value),
+        )
+    elif name in ("wind_east", "wind_north", "wind_up"):
+        wind = list(WORLD.wind_I)
+        wind[["wind_east", "wind_north", "wind_up"].index(name)] = scalar
+        world = WORLD.replace(wind_I=wind)
+    elif name == "wind_speed":
+        angle = math.atan2(1.0, 2.0)
+        world = WORLD.replace(wind_I=(scalar * math.cos(angle), scalar * math.sin(angle), 0.5))
+    elif name == "wind_direction":
+        speed = math.hypot(2.0, 1.0)
+        world = WORLD.replace(wind_I=(speed * math.cos(scalar), speed * math.sin(scalar), 0.5))
+    elif name.startswith("battery_"):
+        changed = {name.removeprefix("battery_"): scalar}
+        world = WORLD.replace(battery=battery.replace(**changed))
+    elif name == "camera_position_B":
+        sensors = SUITE.replace(camera=camera.replace(position_B=scalar))
+    elif name in ("pixel_sigma", "focal_length"):
+        sensors = SUITE.replace(camera=camera.replace(**{name: scalar}))
+    elif hasattr(LAB, name):
+        vehicle = LAB.replace(**{name: scalar})
+    elif hasattr(WORLD, name):
+        world = WORLD.replace(**{name: scalar})
+    elif hasattr(imu, name):
+        sensors = SUITE.replace(imu=imu.replace(**{name: scalar}))
+    else:
+        sensors = SUITE.replace(gnss=gnss.replace(**{name: scalar}))
+    return vehicle, sensors, world
+
+
+def some_distribution(name):
+    nominal = nominal_values(LAB, SUITE, WORLD)[COLUMNS[name]]
+    if name == "battery_charge":
+        return Uniform(0.2, 0.9)
+    if name in ("center_of_mass_B", "lever_arm_B"):
+        return Uniform(-0.01, 0.01)
+    return Uniform(0.9, 1.1, relative=True) if (nominal != 0.0).all() else Uniform(-0.02, 0.02)
+
+
+def flown(ticks=60, seeds=(3,), **keywords):
+    task = quad_gym.TaskParams(kind="circle", start="hover", duration=0.0)
+    batch = FlightBatch(len(seeds), task=task, threads=1, **keywords)
+    batch.reset(seeds=seeds)
+    for _ in range(ticks):
+        batch.step()
+    return batch
+
+
+SEEN = ("r", "v", "q", "w", "rotor_speeds", "charge", "wind", "accel", "gyro", "b_a", "b_g",
+        "gnss_position", "gnss_baseline", "pixels", "r_hat", "v_hat", "b_a_hat")  # fmt: skip
+
+
+def assert_alike(left, right, flight=0):
+    for name in SEEN:
+        np.testing.assert_allclose(
+            left.read(name)[flight], right.read(name)[0], rtol=1e-7, atol=1e-8, err_msg=name
+        )
+
+
+OTHERS = {"rotor_efficiency", "camera_rotation"}
+TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startswith("start_")]
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_a_flight_that_draws_a_parameter_is_the_flight_that_has_it(name):
+    batch = flown(seeds=(2, 3), world=WORLD, randomization={name: some_distribution(name)})
+    value = np.atleast_1d(batch.read(name)[1])
+    nominal = nominal_values(LAB, SUITE, WORLD)[COLUMNS[name]]
+    assert (value != nominal).any()
+    vehicle, sensors, world = told(name, value)
+    told_so = flown(true_vehicle=vehicle, true_sensors=sensors, world=world)
+    assert_alike(batch, told_so, flight=1)
+    if name in ("max_voltage", "battery_resistance"):
+        return  # limits that this vehicle does not reach: see the next test
+    unaware = flown(world=WORLD)
+    changed = [n for n in SEEN if (batch.read(n)[1] != unaware.read(n)[0]).any()]
+    assert changed, "the draw changes nothing"
+
+
+@pytest.mark.parametrize("name", ["max_voltage", "battery_resistance", "battery_charge"])
+def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
+    task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e3)
+    heavy = {"vehicle": LAB.replace(mass=6.0), "control": Control.MOTOR, "task": task}
+    given = Uniform(0.2, 0.4) if name == "battery_resistance" else some_distribution(name)
+    drawing = FlightBatch(2, **heavy, world=WORLD, randomization={name: given})
+    drawing.reset(seeds=(2, 3))
+    vehicle, _, world = told(name, np.atleast_1d(drawing.read(name)[1]))
+    telling = FlightBatch(1, **heavy, world=world, true_vehicle=vehicle.replace(mass=6.0))
+    telling.reset(seeds=[3])
+    for _ in range(100):
+        drawing.step(np.ones((2, 4)))
+        telling.step(np.ones((1, 4)))
+    first, second = drawing.read("voltages")
+    np.testing.assert_allclose(second, telling.read("voltages")[0], rtol=1e-9)
+    assert (first != second).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["mass", "inertia", "thrust_coefficient", "torque_coefficient", "motor_speed_per_volt",
+             "position_sigma_I", "accel_bias_tau", "primary_antenna_B", "center_of_mass_B"]
+)  # fmt: skip
+def test_what_is_known_is_what_filter_and_controller_believe(name):
+    given = Randomization({name: some_distribution(name)}, known=True)
+    batch = flown(seeds=(2, 3), world=WORLD, randomization=given)
+    vehicle, sensors, world = told(name, np.atleast_1d(batch.read(name)[1]))
+    assert_alike(batch, flown(vehicle=vehicle, sensors=sensors, world=world), flight=1)
+
+
+def test_each_rotor_has_its_efficiency():
+    """After a tick the body turns and climbs as these forces say."""
+    still = {
+        "source": Source.TRUTH,
+        "control": Control.MOTOR,
+        "task": quad_gym.TaskParams(kind="hover", start="hover", duration=0.0),
+    }
+    plain = FlightBatch(1, **still)
+    batch = FlightBatch(1, **still, randomization={"rotor_efficiency": Uniform(0.8, 1.0)})
+    plain.reset(seeds=[1])
+    batch.reset(seeds=[1])
+    start_v = plain.read("v")[0]
+    efficiency, W = batch.read("rotor_efficiency")[0], batch.read("rotor_speeds")[0]
+    batch.step(np.zeros((1, 4)))
+    v, w, R = batch.read("v")[0], batch.read("w")[0], batch.read("R_seen")[0]
+    forces = efficiency * LAB.thrust_coefficient * W**2
+    torque = LAB.effectiveness[1:] @ forces
+    np.testing.assert_allclose(w, 0.005 * np.linalg.solve(np.array(LAB.inertia), torque), rtol=2e-3)
+    pull = (v - start_v) / 0.005 + [0.0, 0.0, LAB.gravity]
+    np.testing.assert_allclose(R @ pull, [0.0, 0.0, forces.sum() / LAB.mass], atol=0.1)
+
+
+def test_a_camera_turned_in_its_mount_sees_what_a_turned_camera_sees():
+    batch = flown(ticks=0, randomization={"camera_rotation": Uniform(-0.1, 0.1),
+                                          "pixel_sigma": Uniform(1e-9, 1e-9)})  # fmt: skip
+    turn = euler_to_dcm(batch.read("camera_rotation")[0])
+    camera = SUITE.camera
+    R_BI = quad_gym.rotations.quaternion_to_dcm(batch.read("q"))[0]
+    for i, X in enumerate(camera.features_I):
+        if batch.read("feature_valid")[0, i] == 0.0:
+            continue
+        in_B = R_BI @ (np.array(X) - batch.read("r")[0]) - camera.position_B
+        in_C = turn @ euler_to_dcm(camera.attitude) @ in_B
+        expected = camera.focal_length * in_C[:2] / in_C[2]
+        np.testing.assert_allclose(batch.read("pixels")[0, i], expected, atol=1e-6)
+
+
+def test_the_start_is_spread_as_told():
+    given = {
+        "start_position_I": Uniform(-1.0, 1.0),
+        "start_velocity_I": Normal(0.0, 2.0),
+        "start_body_rates": Uniform(-1.0, 1.0),
+        "start_yaw": Uniform(-3.0, 3.0),
+        "start_roll": Uniform(-0.5, 0.5),
+        "start_pitch": Uniform(-0.5, 0.5),
+    }
+    plain, spread = flown(0, range(20)), flown(0, range(20), randomization=given)
+    drawn = spread.drawn()
+    np.testing.assert_allclose(
+        spread.read("r"), plain.read("r") + drawn["start_position_I"], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        spread.read("v"), plain.read("v") + drawn["start_velocity_I"], atol=1e-12
+    )
+    np.testing.assert_array_equal(spread.read("w"), drawn["start_body_rates"])
+    eulers = [
+        quad_gym.rotations.dcm_to_euler(quad_gym.rotations.quaternion_to_dcm(b.read("q")))
+        for b in (plain, spread)
+    ]
+    change = np.stack([drawn[f"start_{n}"] for n in ("roll", "pitch", "yaw")], axis=1)
+    turned = (eulers[1] - eulers[0] - change + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(turned, 0.0, atol=1e-9)
+
+
+def test_a_start_that_the_caller_gives_stays():
+    batch = FlightBatch(3, randomization={"start_position_I": Uniform(1.0, 2.0)})
+    batch.reset(seeds=range(3), position=(0.5, 0.6, 0.7))
+    np.testing.assert_array_equal(batch.read("r"), [[0.5, 0.6, 0.7]] * 3)
+
+
+def test_a_snapshot_keeps_what_was_drawn():
+    keywords = {"world": WORLD, "randomization": {"mass": Uniform(0.6, 0.9)}}
+    batch = flown(20, range(11), **keywords)
+    instant, mass = batch.snapshot(), batch.read("mass")
+    for _ in range(20):
+        batch.step()
+    future = batch.snapshot()
+    fresh = flown(1, range(50, 61), **keywords)
+    fresh.restore(instant)
+    np.testing.assert_array_equal(fresh.read("mass"), mass)
+    for _ in range(20):
+        fresh.step()
+    assert fresh.snapshot().tobytes() == future.tobytes()
+
+
+# ---- what is refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"colour": Uniform(0, 1)}, "'colour' is unknown"),
+        ({3: Uniform(0, 1)}, "3 is unknown"),
+        ({"mass": 0.8}, "'mass' must be a distribution"),
+        ({"mass": None}, "'mass' must be a distribution"),
+        ({"inertia": (Uniform(1, 2), Uniform(1, 2))}, "'inertia' must be a distribution or 3"),
+        ({"inertia": (Uniform(1, 2), 3.0, None)}, "'inertia' must hold distributions"),
+        ({"mass": Uniform(0.0, 1.0)}, "'mass' must stay above 0 kg"),
+        ({"mass": Uniform(-0.5, 0.5, relative=True)}, "'mass' must stay above 0"),
+        ({"mass": Normal(0.8, 0.1)}, "'mass' must stay above 0"),
+        ({"mass": Uniform(0.5, 20.0)}, "able to hover"),
+        ({"mass": Uniform(1.0, 20.0, relative=True)}, "able to hover"),
+        ({"max_voltage": Uniform(1.0, 12.0)}, "able to hover"),
+        ({"rotor_efficiency": Uniform(0.01, 1.0)}, "able to hover"),
+        ({"battery_charge": Uniform(0.5, 1.5)}, "'battery_charge' needs a battery"),
+        ({"wind_up": Uniform(0.5, 1.5, relative=True)}, "nominal value is 0"),
+        ({"wind_speed": Normal(3.0, 1.0)}, "'wind_speed' must stay at least 0"),
+        ({"wind_speed": Uniform(0, 1), "wind_east": Uniform(0, 1)}, "not by both"),
+        ([("mass", Uniform(0.5, 1.0))], "must be distributions by name"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_randomisation_that_makes_no_sense_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        FlightBatch(1, randomization=given)
+
+
+def test_a_camera_that_is_not_there_cannot_be_drawn():
+    for name in ("pixel_sigma", "camera_rotation", "camera_position_B", "focal_length"):
+        with pytest.raises(ValueError, match=f"'{name}' needs a camera"):
+            FlightBatch(
+                1, sensors=SUITE.replace(camera=None), randomization={name: Uniform(1.0, 2.0)}
+            )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Uniform(2.0, 1.0), "low"),
+        (lambda: Uniform("a", 1.0), "low"),
+        (lambda: Uniform(0.0, math.inf), "high"),
+        (lambda: LogUniform(0.0, 1.0), "low"),
+        (lambda: LogUniform(1.0, 2.0, offset=True), "offset"),
+        (lambda: Normal(0.0, 0.0), "sigma"),
+        (lambda: Normal(0.0, 1.0, low=1.0, high=0.0), "low"),
+        (lambda: Normal(0.0, 1.0, low=math.nan), "low"),
+        (lambda: Normal(0.0, 1.0, low=20.0), "probability"),
+        (lambda: Uniform(1.0, 2.0, relative=True, offset=True), "not both"),
+        (lambda: Uniform(1.0, 2.0, relative=1), "relative"),
+        (lambda: Randomization({}, known="yes"), "known"),
+    ],
+)
+def test_a_distribution_that_makes_no_sense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_what_is_not_drawn_cannot_be_read():
+    batch = FlightBatch(1, randomization={"mass": Uniform(0.6, 0.9)})
+    with pytest.raises(ValueError, match="one of the drawn mass"):
+        batch.read("inertia")
+
+
+def test_the_table_has_a_column_for_every_number():
+    assert sum(d.size for d in DRAWABLES) == DRAWN_SIZE == len(nominal_values(LAB, SUITE, WORLD))
+    assert len(COLUMNS) == len(DRAWABLES)
+    assert isinstance(Uniform(0.0, 1.0), Distribution)

@@ -1,0 +1,329 @@
+"""Wind, drag, ground effect and battery against closed forms and a plain reference."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+import quad_gym
+from quad_gym import BatteryParams, Uniform, WorldParams
+from quad_gym.records import Control, Source
+from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.simulation import FlightBatch
+from quad_gym.vehicle import state_derivative
+from tests.unit.test_vehicle import LAB, NO_FORCE, SKEWED, at_rest, newton_and_euler, random_state
+
+FULL = WorldParams(
+    wind_I=(3.0, -2.0, 1.0),
+    linear_drag_B=(0.4, 0.3, 0.1),
+    rotor_drag_B=(1e-5, 2e-5, 3e-5),
+    ground_effect=True,
+    ground_height=-0.3,
+)
+HOVER_SPEED = LAB.motor_speed_per_volt * LAB.hover_voltage
+
+
+def in_world(state, voltages, d_I, p, world):
+    """The world's forces added to the printed model of calm air, term by term."""
+    v_air = state["velocity"] - world.wind_I
+    R_BI, W = state["R_BI"], state["rotor_speeds"]
+    k = np.array(world.linear_drag_B) + np.array(world.rotor_drag_B) * W.sum()
+    force, torque = d_I - R_BI.T @ (k * (R_BI @ v_air)), np.zeros(3)
+    if world.ground_effect:
+        tilt = max(0.0, R_BI[2, 2])
+        for place, speed in zip(p.rotor_positions_B, W, strict=True):
+            z = (state["position"] + R_BI.T @ place)[2] - world.ground_height
+            z = max(z, world.rotor_radius / 2)
+            gain = 1.0 / (1.0 - (world.rotor_radius / (4.0 * z)) ** 2) - 1.0
+            thrust = tilt * gain * p.thrust_coefficient * speed**2 * np.array([0.0, 0.0, 1.0])
+            force, torque = force + R_BI.T @ thrust, torque + np.cross(place, thrust)
+    rates = newton_and_euler({**state, "velocity": v_air}, voltages, force, p)
+    rates["position"] = state["velocity"]
+    rates["body_rates"] = rates["body_rates"] + np.linalg.solve(np.array(p.inertia), torque)
+    return rates
+
+
+@pytest.mark.parametrize("params", [LAB, SKEWED], ids=["lab", "skewed"])
+def test_the_derivative_is_that_of_the_printed_forces(params):
+    rng = np.random.default_rng(1)
+    for seed in range(100):
+        state, voltages, d_I = random_state(seed), rng.uniform(0, 12, 4), rng.normal(size=3)
+        state["position"][2] = rng.uniform(-0.5, 1.0)
+        got = state_derivative(state, voltages, d_I, params, FULL)
+        expected = in_world(state, voltages, d_I, params, FULL)
+        for name, value in expected.items():
+            scale = 1.0 + np.abs(value).max()
+            np.testing.assert_allclose(got[name], value, rtol=0.0, atol=1e-12 * scale, err_msg=name)
+
+
+def test_a_calm_world_is_no_world():
+    for seed in range(10):
+        arguments = random_state(seed), np.full(4, 5.0), np.ones(3), SKEWED
+        plain, calm = state_derivative(*arguments), state_derivative(*arguments, WorldParams())
+        for name, value in plain.items():
+            np.testing.assert_allclose(calm[name], value, rtol=1e-14, atol=1e-12, err_msg=name)
+
+
+# ---- ground effect -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("height", [0.0, 0.05, 0.1, 0.2, 0.5, 2.0])
+def test_hover_takes_less_thrust_near_the_ground(height):
+    """Cheeseman and Bennett: at z the weight is carried by W with T(W) = m g (1 - (R / 4z)^2)."""
+    world = WorldParams(ground_effect=True, ground_height=0.0)
+    z = max(height, world.rotor_radius / 2)
+    speed = HOVER_SPEED * np.sqrt(1.0 - (world.rotor_radius / (4.0 * z)) ** 2)
+    state = at_rest(position=np.array([1.0, 2.0, height]), rotor_speeds=np.full(4, speed))
+    rates = state_derivative(state, np.zeros(4), NO_FORCE, LAB, world)
+    np.testing.assert_allclose(rates["velocity"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(rates["body_rates"], 0.0, atol=1e-12)
+
+
+def test_thrust_grows_by_a_third_at_most_however_deep():
+    world = WorldParams(ground_effect=True, ground_height=0.0)
+    for depth in (0.0, 0.4, 10.0):
+        state = at_rest(position=np.array([0, 0, -depth]), rotor_speeds=np.full(4, HOVER_SPEED))
+        rise = state_derivative(state, np.zeros(4), NO_FORCE, LAB, world)["velocity"][2]
+        assert rise == pytest.approx(LAB.gravity / 3, rel=1e-12)
+
+
+def test_the_ground_rights_a_tilted_vehicle_and_does_nothing_to_one_upside_down():
+    world = WorldParams(ground_effect=True, ground_height=0.0)
+    roll = 0.1  # the left side, at body +y, up
+    R_BI = np.array([[1, 0, 0], [0, np.cos(roll), np.sin(roll)], [0, -np.sin(roll), np.cos(roll)]])
+    state = at_rest(position=np.array([0, 0, 0.15]), R_BI=R_BI, rotor_speeds=np.full(4, 600.0))
+    assert state_derivative(state, np.zeros(4), NO_FORCE, LAB, world)["body_rates"][0] < -1.0
+    over = np.diag([1.0, -1.0, -1.0])
+    state = at_rest(position=np.array([0, 0, 0.15]), R_BI=over, rotor_speeds=np.full(4, 600.0))
+    plain, near = (state_derivative(state, np.zeros(4), NO_FORCE, LAB, w) for w in (None, world))
+    np.testing.assert_allclose(near["velocity"], plain["velocity"], rtol=1e-14)
+
+
+# ---- flights in moving air -----------------------------------------------------------------------
+
+
+def motors_only(world, *, vehicle=LAB, voltage=0.0, speed=0.0, velocity=(0, 0, 0), yaw=0.0, **more):
+    """One vehicle, level, at a steady voltage; nothing ends its episode."""
+    batch = FlightBatch(
+        1,
+        vehicle=vehicle,
+        source=Source.TRUTH,
+        control=Control.MOTOR,
+        task=quad_gym.TaskParams(
+            kind="hover", start="ground", duration=0.0, out_of_bounds=1e9, ground=-1e9
+        ),
+        world=world,
+        **more,
+    )
+    batch.reset(seeds=[1], position=(0.0, 0.0, 10.0), velocity=velocity, yaw=yaw)
+    batch._blocks["rotor_speeds"] = speed
+    action = voltage / batch.vehicle.hover_voltage - 1.0
+    return batch, np.full((1, 4), action)
+
+
+def flown(batch, action, seconds):
+    for _ in range(round(seconds * 200)):
+        batch.step(action)
+    return batch
+
+
+def test_a_falling_vehicle_reaches_terminal_velocity_in_an_updraft():
+    """m dv/dt = -m g + k (v - w)^2 gives v = w - V tanh(g t / V + atanh(w / V)), V^2 = m g / k."""
+    vehicle, updraft = LAB.replace(disc_area=0.8), 3.0
+    k = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
+    V = np.sqrt(vehicle.mass * vehicle.gravity / k)
+    batch, off = motors_only(WorldParams(wind_I=(0.0, 0.0, updraft)), vehicle=vehicle)
+    for t in (0.5, 1.0, 5.0):
+        done = float(batch.read("tick")[0]) / 200
+        flown(batch, off, t - done)
+        expected = updraft - V * np.tanh(vehicle.gravity * t / V + np.arctanh(updraft / V))
+        np.testing.assert_allclose(batch.read("v")[0], [0.0, 0.0, expected], atol=1e-7)
+    assert batch.read("v")[0, 2] == pytest.approx(updraft - V, abs=1e-2)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+@pytest.mark.parametrize("by_rotor_speed", [False, True])
+def test_a_hovering_vehicle_drifts_off_with_the_wind(yaw, by_rotor_speed):
+    """Along each body axis v = wind (1 - exp(-D t / m))."""
+    D = np.array([0.5, 0.3, 0.2])
+    drag = {"linear_drag_B": D}
+    if by_rotor_speed:
+        drag = {"linear_drag_B": 0.5 * D, "rotor_drag_B": 0.5 * D / (4 * HOVER_SPEED)}
+    wind = np.array([4.0, -3.0, 0.5])
+    batch, action = motors_only(
+        WorldParams(wind_I=wind, **drag),
+        vehicle=LAB.replace(disc_area=0.0),
+        voltage=LAB.hover_voltage,
+        speed=HOVER_SPEED,
+        yaw=yaw,
+    )
+    flown(batch, action, 2.0)
+    R_BI = quaternion_to_dcm(batch.read("q"))[0]
+    expected = R_BI.T @ ((R_BI @ wind) * -np.expm1(-D * 2.0 / LAB.mass))
+    np.testing.assert_allclose(batch.read("v")[0], expected, rtol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_a_flight_in_a_wind_is_the_calm_flight_carried_along(seed):
+    rng = np.random.default_rng(seed)
+    wind, velocity = rng.normal(0.0, 5.0, 3), rng.normal(0.0, 3.0, 3)
+    drag = {"linear_drag_B": (0.5, 0.3, 0.1), "rotor_drag_B": (1e-5, 1e-5, 0.0)}
+    keywords = {"vehicle": LAB.replace(disc_area=0.5), "voltage": 3.2, "speed": 500.0, "yaw": 0.3}
+    calm, blown = (
+        flown(*motors_only(WorldParams(wind_I=air, **drag), velocity=velocity + air, **keywords), 1)
+        for air in (np.zeros(3), wind)
+    )
+    np.testing.assert_allclose(blown.read("v"), calm.read("v") + wind, atol=1e-10)
+    np.testing.assert_allclose(blown.read("r"), calm.read("r") + wind, atol=1e-10)
+    np.testing.assert_allclose(blown.read("q"), calm.read("q"), atol=1e-10)
+
+
+def test_air_forces_take_energy_in_still_air():
+    world = WorldParams(linear_drag_B=(0.5, 0.3, 0.1), rotor_drag_B=(1e-5, 1e-5, 1e-5))
+    batch, off = motors_only(world, velocity=(5.0, 4.0, 8.0), yaw=1.0)
+    energies = []
+    for _ in range(50):
+        flown(batch, off, 0.02)
+        v, z = batch.read("v")[0], batch.read("r")[0, 2]
+        energies.append(0.5 * LAB.mass * v @ v + LAB.mass * LAB.gravity * z)
+    assert (np.diff(energies) < 0.0).all()
+
+
+def test_the_accelerometer_feels_what_the_air_does():
+    """Without noise it reads R (a + g e3) with the derivative of the present instant."""
+    quiet = dict.fromkeys(
+        ("accel_noise_density", "gyro_noise_density", "accel_bias_sigma", "gyro_bias_sigma"),
+        Uniform(0.0, 0.0),
+    )
+    sensors = quad_gym.sensor_suite("lab")
+    world = FULL.replace(gust_wind_speed=8.0)
+    batch = FlightBatch(
+        8,
+        sensors=sensors.replace(imu=sensors.imu.replace(lever_arm_B=(0.1, -0.2, 0.05))),
+        task=quad_gym.TaskParams(kind="hover", start="hover", height=0.3),
+        world=world,
+        randomization=quiet,
+    )
+    batch.reset(seeds=range(8))
+    for _ in range(150):
+        batch.step()
+    lever = np.array([0.1, -0.2, 0.05])
+    for i in range(8):
+        R_BI, w = quaternion_to_dcm(batch.read("q"))[i], batch.read("w")[i]
+        state = {
+            "position": batch.read("r")[i],
+            "velocity": batch.read("v")[i],
+            "R_BI": R_BI,
+            "body_rates": w,
+            "rotor_speeds": batch.read("rotor_speeds")[i],
+        }
+        now = world.replace(wind_I=batch.read("wind")[i], gust_wind_speed=0.0)
+        rates = state_derivative(state, np.zeros(4), NO_FORCE, LAB, now)
+        a = R_BI @ (rates["velocity"] + [0.0, 0.0, LAB.gravity])
+        a = a + np.cross(rates["body_rates"], lever) + np.cross(w, np.cross(w, lever))
+        np.testing.assert_allclose(batch.read("accel")[i], a, atol=1e-10)
+        np.testing.assert_allclose(batch.read("gyro")[i], w, atol=1e-12)
+
+
+# ---- battery -------------------------------------------------------------------------------------
+
+
+def battery_law(charge, speeds, battery, vehicle=LAB):
+    """U from U = U0 - R P / U, the larger root."""
+    power = vehicle.torque_coefficient * (speeds**3).sum() / battery.motor_efficiency
+    empty = battery.empty_voltage
+    U0 = vehicle.max_voltage * (empty + (1 - empty) * charge)
+    if 4 * battery.resistance * power > U0**2:
+        return U0 / 2, power
+    return max(np.roots([1.0, -U0, battery.resistance * power]).real), power
+
+
+def test_the_battery_gives_what_it_has_and_no_more():
+    battery = BatteryParams(energy=5000.0)
+    batch, _ = motors_only(WorldParams(battery=battery))
+    taken = 0.0
+    for _ in range(200):
+        charge, speeds = batch.read("charge")[0], batch.read("rotor_speeds")[0]
+        assert charge == pytest.approx(1.0 - taken / battery.energy, rel=1e-12)
+        voltage, power = battery_law(charge, speeds, battery)
+        batch.step(np.ones((1, 4)))
+        asked = 2.0 * LAB.hover_voltage
+        expected = min(asked, voltage)
+        np.testing.assert_allclose(batch.read("voltages")[0], expected, rtol=1e-12)
+        taken += 0.005 * power
+    assert taken > 0.0
+
+
+def test_rotors_settle_where_the_loaded_battery_holds_them():
+    battery = BatteryParams(energy=1e12, resistance=0.3)
+    vehicle = LAB.replace(mass=6.0)  # hovers at 8.1 V, so that full action asks for 12 V
+    batch, _ = motors_only(WorldParams(battery=battery), vehicle=vehicle)
+    flown(batch, np.ones((1, 4)), 3.0)
+
+    def excess(speed):
+        return 200.0 * battery_law(1.0, np.full(4, speed), battery)[0] - speed
+
+    settled = brentq(excess, 600.0, 2400.0)
+    np.testing.assert_allclose(batch.read("rotor_speeds")[0], settled, rtol=1e-6)
+    assert settled < 2200.0
+
+
+def test_an_empty_battery_cuts_off():
+    batch, action = motors_only(
+        WorldParams(battery=BatteryParams(energy=30.0)),
+        voltage=LAB.hover_voltage,
+        speed=HOVER_SPEED,
+    )
+    flown(batch, action, 2.0)
+    assert batch.read("charge")[0] == 0.0
+    np.testing.assert_array_equal(batch.read("voltages"), 0.0)
+
+
+def test_the_true_vehicles_largest_voltage_holds_whatever_the_controller_believes():
+    weak = LAB.replace(max_voltage=4.0)
+    batch, _ = motors_only("calm", true_vehicle=weak)
+    batch.step(np.ones((1, 4)))
+    np.testing.assert_array_equal(batch.read("voltages"), 4.0)
+
+
+# ---- off is off ----------------------------------------------------------------------------------
+
+
+def states_after(ticks=100, **keywords):
+    batch = FlightBatch(9, threads=1, **keywords)
+    batch.reset(seeds=range(9))
+    for _ in range(ticks):
+        batch.step()
+    return batch
+
+
+def test_a_calm_world_flies_the_same_bits():
+    plain = states_after().snapshot()
+    for world in ("calm", WorldParams(), WorldParams(rotor_radius=0.3, ground_height=-5.0)):
+        assert states_after(world=world, randomization={}).snapshot().tobytes() == plain.tobytes()
+
+
+def test_air_that_does_nothing_changes_nothing_but_rounding():
+    vehicle = LAB.replace(disc_area=0.0)
+    plain = states_after(vehicle=vehicle)
+    blown = states_after(
+        vehicle=vehicle, world=WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0)
+    )
+    for name in ("b_a", "b_g", "key", "instant"):  # random draws are those of the calm flight
+        np.testing.assert_array_equal(blown.read(name), plain.read(name))
+    for name in ("r", "v", "q", "w", "r_hat", "accel", "pixels"):
+        np.testing.assert_allclose(blown.read(name), plain.read(name), rtol=1e-6, atol=1e-7)
+    assert np.ptp(blown.read("wind")[:, 0]) > 0.1
+
+
+def test_presets_are_known_by_name_and_fly():
+    for name in ("calm", "breeze", "fresh_breeze"):
+        batch = states_after(world=name)
+        assert batch.world == quad_gym.world_params(name)
+        assert np.isfinite(batch.read("r")).all()
+    with pytest.raises(ValueError, match="world must be one of calm"):
+        FlightBatch(1, world="storm")
+    with pytest.raises(ValueError, match="world must be a WorldParams"):
+        FlightBatch(1, world=3.0)
