@@ -207,7 +207,11 @@ def _impose_noise(flight, nominal, own, settings):
         g = own.gyro_bias_decay
         own.gyro_bias_drive = own.gyro_bias_sigma * math.sqrt((1.0 - g) * (1.0 + g))
     for i in range(3):
-        own.gnss_sigma[i] = _value(flight, settings, _POSITION_SIGMA + i, nominal.gnss_sigma[i])
+        if settings.draw_kind[_POSITION_SIGMA + i] != FIXED:
+            white, all_of_it = nominal.gnss_sigma[i], nominal.position_sigma[i]
+            slow = (all_of_it - white) * (all_of_it + white)  # taken for white by the filter, too
+            own.gnss_sigma[i] = flight.drawn[_POSITION_SIGMA + i]
+            own.position_sigma[i] = math.sqrt(own.gnss_sigma[i] * own.gnss_sigma[i] + slow)
     own.baseline_sigma = _value(flight, settings, _BASELINE_SIGMA, nominal.baseline_sigma)
     own.pixel_sigma = _value(flight, settings, _PIXEL_SIGMA, nominal.pixel_sigma)
 
