@@ -30,7 +30,7 @@ import quad_gym
 from baselines.checkpoints import Keeper, has_checkpoint, load_model
 from baselines.mlp import mlp_of
 from baselines.policies import interface_of
-from baselines.recipes import Recipe, recipe
+from baselines.recipes import Recipe, recipe, unfreeze
 from quad_gym import validation as check
 from quad_gym.reports import as_json, versions, write_json
 from quad_gym.threads import resolve_threads
@@ -61,6 +61,10 @@ class Plan(Checked):
         self._check(check.whole, "seed", least=0)
         check.instance("Plan.recipe", self.recipe, Recipe)
         self._set("environment", MappingProxyType(dict(self.environment)))
+
+    def __reduce__(self) -> Any:
+        """Plans go to other processes."""
+        return unfreeze(self)
 
     def make_flights(self) -> "ScaledReward":
         """The flights to train on."""

@@ -13,7 +13,9 @@ and writes figures, numbers and a report (report.html) that opens without a netw
 A comparison that was stopped goes on where it stopped when it is started again.
 """
 
+import multiprocessing
 import time
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +28,7 @@ from compare_report import Comparison, Setting, conclusions, matrix_text, write_
 from quad_gym import IDS, plots
 from quad_gym.cli import option, parse, usage_errors
 from quad_gym.reports import as_json, require_writable, versions, write_csv, write_json
+from quad_gym.threads import resolve_threads
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200
 FLOWN_ON = ("truth", "estimate")
@@ -53,7 +56,9 @@ class Args:
         None, "environment steps of each training; if not given, the recipe's"
     )
     env: dict[str, Any] = option({}, "keywords of the environment, such as control_rate=100")
-    threads: int | None = option(None, "threads; if not given, one per core")
+    jobs: int | None = option(
+        None, "trainings at a time, each with one thread; if not given, one per core"
+    )
 
     episodes: int = option(1000, "flown with each policy on each observation", group="flights")
     seed: int = option(0, "of the first episode, and of the first training")
@@ -82,6 +87,8 @@ def configure(args: Args) -> Setting:
     for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    if args.jobs is not None and args.jobs < 1:
+        raise ValueError(f"--jobs must be at least 1, got {args.jobs}")
     if {"observation", "sensors"} & set(args.env):
         raise ValueError("--env must leave observation and sensors to --train-on and --sensors")
     chosen = recipe(args.env_id, args.algorithm)
@@ -98,7 +105,7 @@ def configure(args: Args) -> Setting:
                     environment=environment,
                     recipe=chosen,
                     seed=seed,
-                    threads=args.threads,
+                    threads=1,
                 )
                 if seed == args.seed:
                     make_model(plan, plan.make_flights())
@@ -142,23 +149,62 @@ def _require_same(setting: Setting) -> None:
         )
 
 
-def train_all(setting: Setting) -> dict[Any, Any]:
-    """Train every policy that is not trained yet; what came of each, by suite, source and seed."""
+def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
+    """Train every policy that is not trained yet; what came of each, by suite, source and seed.
+
+    Raises:
+        KeyboardInterrupt: If a training was stopped; it is kept, and goes on the next time.
+    """
+    from tqdm import tqdm
+
+    total = setting.steps * len(setting.plans)
+    context = multiprocessing.get_context("spawn")  # compiled kernels and torch do not fork well
+    with (
+        ProcessPoolExecutor(min(jobs, len(setting.plans)), context) as pool,
+        tqdm(total=total, desc="training", unit=" steps", unit_scale=True) as bar,
+    ):
+        waiting = {
+            pool.submit(train_one, plan, setting.run_folder(key)): key
+            for key, plan in setting.plans.items()
+        }
+        done = {}
+        try:
+            while waiting:
+                ended, _ = wait(waiting, timeout=2.0, return_when=FIRST_COMPLETED)
+                bar.n = sum(_steps_done(setting.run_folder(key)) for key in setting.plans)
+                bar.refresh()
+                for future in ended:
+                    suite, source, seed = key = waiting.pop(future)
+                    done[key] = training = future.result()
+                    if not training.finished:
+                        raise KeyboardInterrupt
+                    bar.write(
+                        f"[{len(done)}/{len(setting.plans)}] trained on {source}, sensors {suite}, "
+                        f"seed {seed}: {training.seconds:.0f} s"
+                    )
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return {key: done[key] for key in setting.plans}
+
+
+def train_one(plan: Any, folder: Path) -> Any:
+    """Train a policy, or go on with a training that was stopped; in a process of its own."""
     from baselines.training import train
 
-    done = {}
-    for number, (key, plan) in enumerate(setting.plans.items(), start=1):
-        suite, source, seed = key
-        print(f"[{number}/{len(setting.plans)}] train on {source}, sensors {suite}, seed {seed}")
-        folder = setting.run_folder(key)
-        training = train(plan, folder, resume=True, tensorboard=False)
-        if not training.finished:
-            raise KeyboardInterrupt
-        done[key] = training
-    return done
+    return train(plan, folder, resume=True, tensorboard=False, quiet=True)
 
 
-def fly_all(setting: Setting, args: Args) -> Comparison:
+def _steps_done(folder: Path) -> int:
+    """Environment steps at the last evaluation of a run."""
+    try:
+        last = (folder / "evaluations.csv").read_text(encoding="utf-8").splitlines()[-1]
+        return int(float(last.split(",")[0]))
+    except (OSError, IndexError, ValueError):  # not begun
+        return 0
+
+
+def fly_all(setting: Setting) -> Comparison:
     """Fly every policy on every observation, unless it was flown before."""
     from tqdm import tqdm
 
@@ -178,7 +224,6 @@ def fly_all(setting: Setting, args: Args) -> Comparison:
                     num_envs=setting.episodes,
                     observation=observation,
                     sensors=suite,
-                    threads=args.threads,
                     **setting.environment,
                 )
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -242,11 +287,11 @@ def main(args: Args) -> None:
         f"{setting.episodes:,} episodes with each policy; into {setting.folder}."
     )
     try:
-        trainings = train_all(setting)
+        trainings = train_all(setting, args.jobs or resolve_threads(None))
     except KeyboardInterrupt:
         print("\nStopped. Start the same command again to go on from here.")
         raise SystemExit(130) from None
-    comparison = fly_all(setting, args)
+    comparison = fly_all(setting)
     for suite in setting.suites:
         print(f"\nSensors {suite}\n\n{matrix_text(comparison, suite)}")
     print()
