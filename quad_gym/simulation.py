@@ -302,6 +302,22 @@ class FlightBatch:
         """Steps after which an episode is truncated; 0: never."""
         return int(self._settings["max_steps"][0])
 
+    def switch_sensors(self, *, gnss: bool | None = None, camera: bool | None = None) -> None:
+        """Let sensors of all flights fail, or measure again, from the next tick on.
+
+        The filter goes on without them. A new episode begins with all sensors measuring.
+
+        Args:
+            gnss: Whether GNSS measures; None: as it does now.
+            camera: Likewise.
+        """
+        for sensor, measures in (("gnss", gnss), ("camera", camera)):
+            waits = self._blocks[f"{sensor}_wait"]
+            if measures is not None and check.flag(sensor, measures):
+                waits[np.isinf(waits)] = 0.0
+            elif measures is not None:
+                waits[:] = np.inf  # it is never due
+
     # ---- reading ------------------------------------------------------------------------------
 
     def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:

@@ -283,3 +283,29 @@ def test_an_episode_ends_at_its_time_limit_and_the_next_step_begins_another():
     np.testing.assert_array_equal(batch.read("tick"), 0.0)
     np.testing.assert_array_equal(batch.read("episode"), 2.0)
     np.testing.assert_array_equal(batch.result("truncated"), 0.0)
+
+
+def test_sensors_that_are_switched_off_measure_nothing_until_they_are_back():
+    def flown(*switches):
+        batch = FlightBatch(2, sensors="lab", task=TaskParams(kind="hover", start="hover"))
+        batch.reset(seeds=[0, 1])
+        for gnss, camera in switches:
+            batch.switch_sensors(gnss=gnss, camera=camera)
+            batch.step()
+        return batch
+
+    batch = flown((None, None))
+    assert batch.read("position_valid").all()
+    assert batch.read("feature_valid")[:, :2].any()
+    batch = flown((False, None), (None, False))
+    assert not batch.read("position_valid").any()
+    assert not batch.read("feature_valid").any()
+    batch = flown((False, False), (True, None))
+    assert batch.read("position_valid").all()
+    assert not batch.read("feature_valid").any()
+    batch.reset(seeds=[0, 1])
+    assert batch.read("feature_valid")[:, :2].any()
+    same = flown((True, True), (True, None), (None, None))
+    assert same.snapshot().tobytes() == flown(*[(None, None)] * 3).snapshot().tobytes()
+    with pytest.raises(ValueError, match="gnss"):
+        batch.switch_sensors(gnss=1)
