@@ -6,7 +6,7 @@ The archive (`.npz`, readable by `numpy.load` alone) holds
 |---|---|
 | `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and what the stage has in single numbers |
 | `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flight_record.COLUMNS` |
-| `stage/NAME` | one float64 array per array of `quad_gym.flight_record.Stage` |
+| `stage/NAME` | one float64 array per array of `quad_gym.flight_stage.Stage` |
 
 A table has the same columns with one number each, vectors as `_x`, `_y`, `_z` (`_w`, `_x`, `_y`,
 `_z` for quaternions, `_1` ... where there are no axes), and in place of the covariance the square
@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import COLUMNS, Flight, Stage, row_dtype
+from quad_gym.flight_record import COLUMNS, Flight, row_dtype
+from quad_gym.flight_stage import Stage
 
 if TYPE_CHECKING:
     import pandas
@@ -122,11 +123,13 @@ def _stage(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> Stage:
 
 
 def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
-    count = len(entries["columns/time"])
+    count = len(entries.get("columns/time", ()))
     if not count:
         raise ValueError("it has no rows")
     rows = np.zeros(count, row_dtype(features))
     for column in COLUMNS:
+        if f"columns/{column.name}" not in entries:
+            raise ValueError(f"it lacks columns/{column.name}")
         values = entries[f"columns/{column.name}"]
         if values.shape != rows[column.name].shape or values.dtype != np.float64:
             raise ValueError(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.flight_stage import Stage
 from quad_gym.metrics import nees, state_error
 from quad_gym.packing import params_record
 from quad_gym.records import Source
@@ -20,6 +21,7 @@ from quad_gym.simulation import FlightBatch
 
 if TYPE_CHECKING:
     import pandas
+    import rerun
 
 Floats = NDArray[np.float64]
 
@@ -50,6 +52,7 @@ COLUMNS = (
     Column("accel_bias", (3,), "m/s^2", "B", "true accelerometer bias"),
     Column("gyro_bias", (3,), "rad/s", "B", "true gyro bias"),
     Column("disturbance", (3,), "N", "I", "external force on the body"),
+    Column("wind", (3,), "m/s", "I", "velocity of the air"),
     # the filter
     Column("estimated_position", (3,), "m", "I", "the filter's"),
     Column("estimated_velocity", (3,), "m/s", "I", "the filter's"),
@@ -69,6 +72,7 @@ COLUMNS = (
     Column("accel", (3,), "m/s^2", "B", "specific force"),
     Column("gnss_position", (3,), "m", "I", "primary antenna"),
     Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
+    Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
     Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's centre"),
     # the task
     Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),
@@ -89,6 +93,7 @@ _DIRECT = {
     "accel_bias": "b_a",
     "gyro_bias": "b_g",
     "disturbance": "disturbance",
+    "wind": "wind",
     "seen_position": "r_seen",
     "action": "action",
     "gates_passed": "gate_next",
@@ -112,69 +117,9 @@ _ESTIMATED = {
 _WITH_FILTER = (
     *_ESTIMATED,
     *("estimated_attitude", "covariance", "nees"),
-    *("gyro", "accel", "gnss_position", "gnss_baseline", "pixels"),
+    *("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "pixels"),
 )
 """Columns that hold NaN where no filter, and so no sensor, runs."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Stage:
-    """Where a flight takes place and what flies: what a picture of it needs besides its rows."""
-
-    task: str
-    """kind of task"""
-    observation: str
-    """what the controller saw: "truth", "estimate", "noisy" or "sensors" """
-    control_rate: float
-    """rows per second [Hz]"""
-    rotor_positions_B: Floats
-    """(4, 3) [m]"""
-    max_rotor_speed: float
-    """[rad/s]"""
-    hover_rotor_speed: float
-    """[rad/s]"""
-    antennas_B: Floats
-    """(2, 3) primary and secondary antenna [m]"""
-    camera_B: Floats
-    """(3,) projection centre [m]; NaN: there is no camera"""
-    R_CB: Floats
-    """(3, 3) body to camera"""
-    focal_length: float
-    """[pixels]"""
-    half_image: Floats
-    """(2,) half the image's width and height [pixels]"""
-    features_I: Floats
-    """(n, 3) [m]"""
-    gates_I: Floats
-    """(n, 3) centres of the course's gates; (0, 3) on other tasks [m]"""
-    gate_radius: float
-    """[m]"""
-    reference_omega: float
-    """fundamental frequency of the reference [rad/s]"""
-    reference_center: Floats
-    """(3,) its constant term [m]"""
-    reference_cos: Floats
-    """(k, 3) its cosine coefficients [m]"""
-    reference_sin: Floats
-    """(k, 3) its sine coefficients [m]"""
-
-    @property
-    def has_camera(self) -> bool:
-        """Whether there is a camera with a feature to see."""
-        return len(self.features_I) > 0
-
-    def reference(self, times: Floats) -> Floats:
-        """Where the reference is at times [s], (n, 3) in I [m]: a Fourier series per axis."""
-        harmonics = np.arange(1, len(self.reference_cos) + 1)
-        angles = self.reference_omega * np.outer(times, harmonics)
-        swing = np.cos(angles) @ self.reference_cos + np.sin(angles) @ self.reference_sin
-        return np.asarray(self.reference_center + swing)
-
-    @property
-    def reference_period(self) -> float:
-        """Time after which the reference repeats [s]; 0: it stands still."""
-        moves = bool(np.any(self.reference_cos) or np.any(self.reference_sin))
-        return 2.0 * np.pi / self.reference_omega if moves else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +184,19 @@ class Flight:
         from quad_gym.flight_files import flight_frame
 
         return flight_frame(self)
+
+    def to_rerun(self) -> "rerun.RecordingStream":
+        """A recording for the Rerun viewer: 3D, the camera's image and plots on one time line.
+
+        `flight.to_rerun().spawn()` opens the viewer; `flight.to_rerun().save("flight.rrd")` writes
+        a file for it. See `quad_gym.flight_rerun` for what it holds.
+
+        Raises:
+            ImportError: If rerun-sdk is not installed.
+        """
+        from quad_gym.flight_rerun import rerun_recording
+
+        return rerun_recording(self)
 
 
 def row_dtype(features: int) -> np.dtype[Any]:
@@ -333,10 +291,16 @@ class FlightRecorder:
 
     def _fill_measurements(self, row: Any) -> None:
         row["gyro"], row["accel"] = self._read("gyro"), self._read("accel")
-        for column, flag in (("gnss_position", "position"), ("gnss_baseline", "baseline")):
+        gnss = self._batch.sensors.gnss
+        gives_velocity = gnss is not None and gnss.velocity_sigma is not None
+        for column, flag, given in (
+            ("gnss_position", "position", True),
+            ("gnss_baseline", "baseline", True),
+            ("gnss_velocity", "position", gives_velocity),
+        ):
             # at the start nothing is "fresh" but everything has been measured
             measured = self._read(f"{flag}_fresh") + self._read(f"{flag}_valid") > 0.0
-            row[column] = self._R_IG @ self._read(column) if measured else np.nan
+            row[column] = self._R_IG @ self._read(column) if measured and given else np.nan
         features = row["pixels"].shape[0]
         if features:
             seen = self._read("feature_fresh") + self._read("feature_valid") > 0.0
@@ -346,6 +310,7 @@ class FlightRecorder:
     def _stage_of_episode(self) -> Stage:
         batch, model = self._batch, self._model
         camera = batch.sensors.camera
+        antennas_B = np.array([model["antenna"], model["antenna"] + model["baseline"]])
         gate_count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
         return Stage(
             task=batch.task.kind,
@@ -354,7 +319,7 @@ class FlightRecorder:
             rotor_positions_B=np.array(batch.vehicle.rotor_positions_B),
             max_rotor_speed=float(model["motor_gain"] * model["max_voltage"]),
             hover_rotor_speed=float(model["motor_gain"] * model["hover_voltage"]),
-            antennas_B=np.array([model["antenna"], model["antenna"] + model["baseline"]]),
+            antennas_B=antennas_B if batch.sensors.gnss else np.full((2, 3), np.nan),
             camera_B=np.array(camera.position_B if camera else [np.nan] * 3),
             R_CB=np.array(model["R_CB"]),
             focal_length=float(model["focal_length"]),

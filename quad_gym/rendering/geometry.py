@@ -1,4 +1,4 @@
-"""The geometry of pictures: a viewing camera, outlines of ellipsoids, frusta; NumPy alone.
+"""The geometry of pictures: a viewing camera, outlines of ellipsoids; NumPy alone.
 
 A viewing camera's axes are x to the right, y down and z into the picture, in pixels from the
 picture's upper left corner.
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight, Stage
+from quad_gym.flight_record import Flight
 from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
@@ -56,6 +56,12 @@ class View:
         at = a + cut * (b - a)
         a, b = np.where(a[:, 2:] > NEAR, a, at), np.where(b[:, 2:] > NEAR, b, at)
         return np.stack([self.flatten(a), self.flatten(b)], axis=1)
+
+    @property
+    def horizon(self) -> float:
+        """The row of pixels at which level lines end; a view without roll has one [pixels]."""
+        down, level = self.R_VI[2, 2], float(np.hypot(*self.R_VI[2, :2]))
+        return float(self.center[1] + self.focal * down / max(level, 1e-9))
 
     def scale_at(self, point: Floats) -> float:
         """Pixels per metre across the line of sight at a point in I."""
@@ -168,29 +174,3 @@ def ellipsoid_outline(center: Floats, axes: Floats, view: View, count: int = 48)
     angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ root.T
     return np.asarray(view.center + view.focal * (middle + ring))
-
-
-def frustum_corners(stage: Stage, position: Floats, R_BI: Floats, depth: float) -> Floats:
-    """Projection centre and the image's four corners at a depth along the optical axis, in I.
-
-    Returns:
-        (5, 3) [m].
-    """
-    x, y = stage.half_image / stage.focal_length
-    corners_C = depth * np.array([[x, y, 1.0], [-x, y, 1.0], [-x, -y, 1.0], [x, -y, 1.0]])
-    corners_B = stage.camera_B + np.concatenate([np.zeros((1, 3)), corners_C @ stage.R_CB])
-    return np.asarray(position + corners_B @ R_BI)
-
-
-def project_features(stage: Stage, position: Floats, R_BI: Floats) -> Floats:
-    """Where the features are in the image of a camera at a pose, (n, 2) pixels from its centre.
-
-    Returns:
-        NaN for a feature that is behind the camera; those outside the image are not left out.
-    """
-    X_B = (stage.features_I - position) @ R_BI.T
-    X_C = (X_B - stage.camera_B) @ stage.R_CB.T
-    in_front = X_C[:, 2:] > 1e-9
-    return np.where(
-        in_front, stage.focal_length * X_C[:, :2] / np.where(in_front, X_C[:, 2:], 1), np.nan
-    )

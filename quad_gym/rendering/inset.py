@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight, Stage
+from quad_gym.flight_record import Flight
+from quad_gym.flight_stage import Stage
 from quad_gym.rendering.canvas import GREY, INK, PALE, VERMILLION, WHITE, Canvas
-from quad_gym.rendering.geometry import project_features
 from quad_gym.rendering.strip import Box
 from quad_gym.rotations import quaternion_to_dcm
 
@@ -55,7 +55,7 @@ class Inset:
         canvas.inside((box.left, box.top, box.width, box.height))
         q = now["estimated_attitude"]
         if np.isfinite(q).all():
-            predicted = project_features(stage, now["estimated_position"], quaternion_to_dcm(q))
+            predicted = stage.project_features(now["estimated_position"], quaternion_to_dcm(q))
             for at in place_in_inset(predicted, stage, box):
                 canvas.disc(at, 6.0, VERMILLION, 1.5)
         canvas.crosses(place_in_inset(now["pixels"], stage, box), 3.2, INK, 1.6)
@@ -67,7 +67,10 @@ class Inset:
         canvas, box, now = self._canvas, self._box, flight.rows[-1]
         seen = np.isfinite(now["pixels"]).all(axis=1)
         words = "camera" if seen.any() else "camera: no feature in view"
-        canvas.text(words, box.left + 4.0, box.top + 3.0, self._size, INK if seen.any() else GREY)
+        top, size = box.top + box.height + 2.0, self._size
+        width = canvas.width_of(words, size)
+        canvas.veil(box.left, top, width + 8, canvas.line_height(size))
+        canvas.text(words, box.left + 4.0, top + 1.0, size, INK if seen.any() else GREY)
         if len(seen) <= 4:
             for k in np.flatnonzero(seen):
                 x, y = place_in_inset(now["pixels"][k], flight.stage, box)

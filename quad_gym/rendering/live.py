@@ -34,8 +34,8 @@ class Window:
         except self._pygame.error as error:
             self._pygame.display.quit()
             raise RuntimeError(
-                f'render_mode="human" cannot open a window ({error}); use "rgb_array" where there '
-                "is no screen"
+                f"cannot open a window ({error}); where there is no screen, use "
+                'render_mode="rgb_array"'
             ) from None
         self._pygame.display.set_caption(title)
         self._due = time.monotonic()
@@ -51,7 +51,7 @@ class Window:
         self._pygame.display.flip()
         self._due = max(self._due, time.monotonic() - 0.1) + seconds  # what is late is not made up
 
-    def keys(self) -> list[str]:
+    def pressed_keys(self) -> list[str]:
         """Names of the keys pressed since the last call; a closed window is noticed here too."""
         pressed: list[str] = []
         if self.closed:
@@ -167,7 +167,7 @@ class Rendering:
         picture = tile(list(self.frames()))
         if self._window is None:
             self._window = Window((picture.shape[1], picture.shape[0]), self._title)
-        self._window.keys()
+        self._window.pressed_keys()
         self._window.show(picture, seconds)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import validation as check
-from quad_gym.flight_record import Flight, Stage
+from quad_gym.flight_record import Flight
+from quad_gym.flight_stage import Stage
 from quad_gym.records import FilterStatus
 from quad_gym.rendering.canvas import (
     BLUE,
@@ -65,12 +66,12 @@ class Renderer:
             (height, width, 3) red, green, blue.
         """
         canvas, (width, _), small = self._canvas, self.size, self._text - 2
-        scene = Scene(canvas, flight, self._view_of(flight))
+        scene = Scene(canvas, flight, self._view_of(flight), self.view == "chase")
         self._draw_background(flight, scene)
         canvas.inside((0.0, 0.0, width, self._scene_height))
         labels = scene.draw()
         inset = None
-        if flight.stage.has_camera:
+        if flight.stage.has_camera and flight.estimated:
             box = inset_box(flight.stage, width - 8.0, 8.0, 0.27 * width)
             inset = Inset(canvas, box, small)
             inset.draw(flight)
@@ -99,17 +100,19 @@ class Renderer:
         return self._fixed
 
     def _draw_background(self, flight: Flight, scene: Scene) -> None:
-        """What does not change; a fixed view keeps it for the whole flight."""
-        if self.view == "fixed" and self._stage is flight.stage:
-            self._canvas.show_background()
-            return
-        self._canvas.inside((0.0, 0.0, self.size[0], self._scene_height))
-        scene.draw_background()
-        self._canvas.inside(None)
-        self._strip.draw_background(flight.stage.hover_rotor_speed / flight.stage.max_rotor_speed)
-        if self.view == "fixed":
+        """What does not change: of a fixed view everything, of a chase the strip."""
+        known, moves = self._stage is flight.stage, self.view == "chase"
+        if known:
+            self._canvas.show_background(self._scene_height if moves else 0.0)
+        if moves or not known:
+            self._canvas.inside((0.0, 0.0, self.size[0], self._scene_height))
+            scene.draw_background()
+            self._canvas.inside(None)
+        if not known:
+            stage = flight.stage
+            self._strip.draw_background(stage.hover_rotor_speed / stage.max_rotor_speed)
             self._canvas.keep_background()
-            self._stage = flight.stage
+            self._stage = stage
 
     def _write_legend(self, flight: Flight) -> None:
         """What, when, what the colours mean, and what is wrong, in the upper left corner."""
@@ -117,14 +120,16 @@ class Renderer:
         large, small = self._text + 2, self._text - 1
         name = stage.task.replace("_", " ")
         title = f"{name} on {_SEEN[stage.observation]}"
-        aim = "next gate" if len(stage.gates_I) else "reference, next second"
+        aim = "reference, next second" if stage.reference_period else "reference"
+        aim = "next gate" if len(stage.gates_I) else aim
         entries: list[tuple[str, Color]] = [(aim, GREEN), ("truth", BLUE)]
         if flight.estimated:
-            scale = f", drawn x {ellipsoid_scale(flight):g}"
-            scale = "" if scale.endswith(" 1") else scale
-            entries.append(("estimate", VERMILLION))
-            entries.append((f"3-sigma ellipsoid, error{scale}", VERMILLION))
-            entries.append(("GNSS fix", PURPLE))
+            scale = ellipsoid_scale(flight)
+            size = "3-sigma ellipsoid, true size"
+            size = size if scale == 1.0 else f"3-sigma ellipsoid, error, drawn x {scale:g}"
+            entries += [("estimate", VERMILLION), (size, VERMILLION)]
+            if stage.has_gnss:
+                entries.append(("GNSS fix", PURPLE))
         elif stage.observation == "noisy":
             entries.append(("what the controller sees", VERMILLION))
         warnings = self._warnings(flight)
@@ -141,7 +146,10 @@ class Renderer:
         canvas.text(clock, 6 + width - 6, y, large, INK, 1.0)
         y += canvas.line_height(large) + 2
         for words, color in entries:
-            canvas.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
+            if color == PURPLE:
+                canvas.text("x", x + 1, y - 1, small, color)
+            else:
+                canvas.surface.fill(color, (round(x), round(y + 0.3 * step), 10, 4))
             canvas.text(words, x + 15, y, small, INK)
             y += step
         for words in warnings:
@@ -155,7 +163,7 @@ class Renderer:
         rows, now, found = flight.rows, flight.rows[-1], []
         fixes = np.flatnonzero(np.isfinite(rows["gnss_position"][:, 0]))
         age = now["time"] - rows["time"][fixes[-1]] if fixes.size else now["time"]
-        if age > STALE_FIX:
+        if flight.stage.has_gnss and age > STALE_FIX:
             found.append(f"no GNSS fix for {age:.1f} s")
         if now["filter_status"] != 0:
             names = [str(s.name).lower() for s in FilterStatus if s & int(now["filter_status"])]

@@ -24,7 +24,6 @@ from quad_gym.rendering.geometry import (
     View,
     ellipsoid_axes,
     ellipsoid_outline,
-    frustum_corners,
 )
 from quad_gym.rotations import quaternion_to_dcm
 
@@ -32,6 +31,7 @@ Floats = NDArray[np.float64]
 
 TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
 """How long trails and fixes stay, and how far ahead the reference is drawn boldly."""
+TRAIL_POINTS = 180
 SIGMAS = 3.0
 ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)
 """How many times its size an ellipsoid may be drawn."""
@@ -67,10 +67,11 @@ class Scene:
         canvas: To draw on.
         flight: The flight; its last row is the present.
         view: Where from.
+        moving: Whether the view follows the vehicle, so that the ground must, too.
     """
 
-    def __init__(self, canvas: Canvas, flight: Flight, view: View) -> None:
-        self._canvas, self._flight, self._view = canvas, flight, view
+    def __init__(self, canvas: Canvas, flight: Flight, view: View, moving: bool) -> None:
+        self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
         self._stage, self._now = flight.stage, flight.rows[-1]
         self._R_BI = self._attitude("attitude")
         self.labels: list[Label] = []
@@ -101,16 +102,17 @@ class Scene:
 
     def _ground(self) -> None:
         view, canvas = self._view, self._canvas
-        canvas.clear(SKY)
-        around = np.round(self._now["position"][:2]) if self._is_near() else np.zeros(2)
         n = 9.0
         lines = np.arange(-n, n + 0.5)
-        shift = np.array([*around, 0.0])
-        corners = shift + n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-        border = view.segments(corners, np.roll(corners, -1, axis=0))
-        if len(border) == 4:
-            canvas.polygon(border[:, 0], GROUND)
-        elif len(border) > 1:  # the square is cut by the near plane
+        shift = np.zeros(3)
+        if self._moving:  # over a plane without an end, with the grid around the vehicle
+            shift[:2] = np.round(self._now["position"][:2])
+            canvas.clear(SKY)
+            canvas.clear_below(view.horizon, GROUND)
+        else:
+            canvas.clear(SKY)
+            corners = n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+            border = view.segments(corners, np.roll(corners, -1, axis=0))
             canvas.polygon(border.reshape(-1, 2), GROUND)
         grid = [np.stack([lines, np.full_like(lines, s * n), 0.0 * lines], axis=1) for s in (-1, 1)]
         grid += [
@@ -121,10 +123,6 @@ class Scene:
         origin = np.zeros((2, 3))
         tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         canvas.segments(view.segments(origin, tips), GREY, 1.6)
-
-    def _is_near(self) -> bool:
-        """Whether the view is so close that the ground must move along."""
-        return bool(np.linalg.norm(self._now["position"] - self._view.eye) < 5.0)
 
     def _reference(self) -> None:
         stage, view, canvas = self._stage, self._view, self._canvas
@@ -166,20 +164,19 @@ class Scene:
             self._canvas.polygon(self._view.project(foot + 0.22 * _RING)[0], GREY, 0.35)
             self._canvas.segments(self._view.segments(foot[np.newaxis], r_I[np.newaxis]), GREY, 0.7)
 
-    def _recent(self, seconds: float, most: int) -> NDArray[np.void]:
-        """The rows of the last seconds, thinned out evenly to at most about so many."""
-        rows = self._flight.rows[-max(2, round(seconds * self._stage.control_rate)) :]
-        stride = -(-len(rows) // most)
+    def _trail(self, column: str) -> Floats:
+        """Pixels of the last seconds of a position, thinned out evenly."""
+        count, wanted = len(self._flight.rows), round(TRAIL_SECONDS * self._stage.control_rate)
+        stride = -(-wanted // TRAIL_POINTS)
         # rows are counted from the flight's start, so that a trail does not flicker
-        offset = (len(rows) - len(self._flight.rows)) % stride
-        return np.concatenate([rows[offset::stride], rows[-1:]])
+        first = -(-max(0, count - wanted) // stride) * stride
+        rows = np.append(np.arange(first, count - 1, stride), count - 1)
+        return self._view.project(self._flight.rows[column][rows])[0]
 
     def _trails(self) -> None:
-        rows = self._recent(TRAIL_SECONDS, 180)
         if self._flight.estimated:
-            where = self._view.project(rows["estimated_position"])[0]
-            self._canvas.line(where, VERMILLION, 2.6)
-        self._canvas.line(self._view.project(rows["position"])[0], BLUE, 1.5)
+            self._canvas.line(self._trail("estimated_position"), VERMILLION, 2.6)
+        self._canvas.line(self._trail("position"), BLUE, 1.5)
 
     # ---- sensors ------------------------------------------------------------------------------
 
@@ -187,8 +184,11 @@ class Scene:
         stage, view, canvas = self._stage, self._view, self._canvas
         if not stage.has_camera:
             return
+        if not self._flight.estimated:  # nothing measures, but the features stand there
+            self._features(np.zeros(len(stage.features_I), bool))
+            return
         r_I = self._now["position"]
-        corners = frustum_corners(stage, r_I, self._R_BI, FRUSTUM_DEPTH)
+        corners = stage.frustum_corners(r_I, self._R_BI, FRUSTUM_DEPTH)
         apex = np.repeat(corners[:1], 4, axis=0)
         image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
         if len(image) == 4:
@@ -200,7 +200,12 @@ class Scene:
         if seen.any():
             eye = np.repeat(corners[:1], seen.sum(), axis=0)
             canvas.segments(view.segments(eye, features[seen]), LIGHT_BLUE, 1.4)
-        for at, visible in zip(view.project(features)[0], seen, strict=True):
+        self._features(seen)
+
+    def _features(self, seen: NDArray[np.bool_]) -> None:
+        canvas = self._canvas
+        places = self._view.project(self._stage.features_I)[0]
+        for at, visible in zip(places, seen, strict=True):
             if np.isfinite(at).all():
                 x, y = at
                 canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, INK if visible else WHITE)

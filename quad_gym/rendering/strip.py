@@ -92,6 +92,8 @@ def height_on(plot: Plot, value: Floats | float, box: Box) -> Floats:
 
 def shows(flight: Flight, column: str) -> bool:
     """Whether a curve has anything to say: on the truth, nothing is estimated."""
+    if column == "nees":
+        return flight.estimated
     return column != "estimation_error" or flight.stage.observation != "truth"
 
 
@@ -151,7 +153,11 @@ class Strip:
         for plot, place in zip(PLOTS, self._boxes, strict=True):
             x = place.left
             for column, name, color in plot.curves:
-                value = float(now[column]) if shows(flight, column) else np.nan
+                if not shows(flight, column):
+                    words = "no filter runs" if plot is CONSISTENCY else ""
+                    canvas.text(words, x, self._title_y, self._size, GREY)
+                    continue
+                value = float(now[column])
                 number = f"{value:.0f}" if plot is CONSISTENCY else format_length(value)
                 words = f"{name} {'-' if np.isnan(value) else number}"
                 if plot is ERRORS and column == "position_error" and len(flight.stage.gates_I):
@@ -159,7 +165,7 @@ class Strip:
                 if plot is ERRORS and column == "estimation_error":
                     words += " error" if canvas.width_of("0" * 45, small) < place.width else ""
                 x += canvas.text(words, x, self._title_y, self._size, color) + 0.04 * place.width
-            if plot is CONSISTENCY:
+            if plot is CONSISTENCY and flight.estimated:
                 words = f"({STATE_DIMENSION} if consistent)"
                 if x + canvas.width_of(words, small) < place.left + place.width:
                     canvas.text(words, x, self._title_y + 1, small, GREY)

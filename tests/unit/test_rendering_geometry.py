@@ -14,9 +14,7 @@ from quad_gym.rendering.geometry import (
     ellipsoid_outline,
     fit_view,
     fixed_view,
-    frustum_corners,
     look_at,
-    project_features,
 )
 from quad_gym.rendering.inset import inset_box, place_in_inset
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
@@ -49,6 +47,15 @@ def test_known_points_land_on_the_expected_pixels():
     np.testing.assert_allclose(depth, [10.0, 10.0, 10.0, 20.0], atol=1e-12)
     expected = [[320.0, 180.0], [370.0, 180.0], [320.0, 130.0], [370.0, 230.0]]
     np.testing.assert_allclose(pixels, expected, atol=1e-9)
+
+
+def test_far_level_points_lie_on_the_horizon():
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        eye, target = rng.normal(size=3), rng.normal(size=3)
+        view = look_at(eye, target, 500.0, CENTER)
+        far = eye + 1e9 * (target - eye) * (1.0, 1.0, 0.0)
+        assert view.project(far)[0][1] == pytest.approx(view.horizon, abs=1e-3)
 
 
 def test_what_is_behind_the_eye_is_nowhere():
@@ -160,7 +167,7 @@ def test_features_are_drawn_where_the_camera_measures_them():
     for place, R_BI in poses(200, 1):
         measured = camera.measure(place, R_BI)
         seen = np.isfinite(measured).all(axis=1)
-        predicted = project_features(flight.stage, place, R_BI)
+        predicted = flight.stage.project_features(place, R_BI)
         np.testing.assert_allclose(predicted[seen], measured[seen], atol=1e-4)
         compared += seen.sum()
     assert compared > 100
@@ -171,7 +178,7 @@ def test_the_frustum_holds_exactly_what_the_camera_sees():
     camera = Camera(CameraParams(), np.random.default_rng(0))
     for place, R_BI in poses(100, 2):
         seen = np.isfinite(camera.measure(place, R_BI)).all(axis=1)
-        apex, *corners = frustum_corners(flight.stage, place, R_BI, 1.0)
+        apex, *corners = flight.stage.frustum_corners(place, R_BI, 1.0)
         # inside: on the inner side of the four planes through the apex and two corners
         rays = np.array(corners) - apex
         normals = np.cross(rays, np.roll(rays, -1, axis=0))
@@ -203,7 +210,7 @@ def test_the_inset_shows_the_image_upright_and_to_scale():
 def test_the_rays_of_the_measured_pixels_point_at_the_features():
     flight = a_flight("hover", seed=4, steps=80, sensors=sensor_suite("lab"))
     row, stage = flight.rows[-1], flight.stage
-    predicted = project_features(stage, row["position"], quaternion_to_dcm(row["attitude"]))
+    predicted = stage.project_features(row["position"], quaternion_to_dcm(row["attitude"]))
     seen = np.isfinite(row["pixels"]).all(axis=1)
     assert seen.any()
     assert (abs(row["pixels"] - predicted)[seen] < 6 * 20.0).all()  # pixel noise of 20

@@ -1,0 +1,101 @@
+"""`Stage`: where a flight takes place and what flies; what a picture needs besides the rows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stage:
+    """What stays as it is during a flight."""
+
+    task: str
+    """kind of task"""
+    observation: str
+    """what the controller saw: "truth", "estimate", "noisy" or "sensors" """
+    control_rate: float
+    """rows per second [Hz]"""
+    rotor_positions_B: Floats
+    """(4, 3) [m]"""
+    max_rotor_speed: float
+    """[rad/s]"""
+    hover_rotor_speed: float
+    """[rad/s]"""
+    antennas_B: Floats
+    """(2, 3) primary and secondary antenna [m]; NaN: there is no GNSS"""
+    camera_B: Floats
+    """(3,) projection centre [m]; NaN: there is no camera"""
+    R_CB: Floats
+    """(3, 3) body to camera"""
+    focal_length: float
+    """[pixels]"""
+    half_image: Floats
+    """(2,) half the image's width and height [pixels]"""
+    features_I: Floats
+    """(n, 3) [m]"""
+    gates_I: Floats
+    """(n, 3) centres of the course's gates; (0, 3) on other tasks [m]"""
+    gate_radius: float
+    """[m]"""
+    reference_omega: float
+    """fundamental frequency of the reference [rad/s]"""
+    reference_center: Floats
+    """(3,) its constant term [m]"""
+    reference_cos: Floats
+    """(k, 3) its cosine coefficients [m]"""
+    reference_sin: Floats
+    """(k, 3) its sine coefficients [m]"""
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether there is a camera with a feature to see."""
+        return len(self.features_I) > 0
+
+    @property
+    def has_gnss(self) -> bool:
+        """Whether there is GNSS."""
+        return bool(np.isfinite(self.antennas_B).all())
+
+    def reference(self, times: Floats) -> Floats:
+        """Where the reference is at times [s], (n, 3) in I [m]: a Fourier series per axis."""
+        harmonics = np.arange(1, len(self.reference_cos) + 1)
+        angles = self.reference_omega * np.outer(times, harmonics)
+        swing = np.cos(angles) @ self.reference_cos + np.sin(angles) @ self.reference_sin
+        return np.asarray(self.reference_center + swing)
+
+    @property
+    def reference_period(self) -> float:
+        """Time after which the reference repeats [s]; 0: it stands still."""
+        moves = bool(np.any(self.reference_cos) or np.any(self.reference_sin))
+        return 2.0 * np.pi / self.reference_omega if moves else 0.0
+
+    def project_features(self, position: Floats, R_BI: Floats) -> Floats:
+        """Where the features are in the image of a camera at a pose.
+
+        Args:
+            position: (..., 3) of the centre of mass in I [m].
+            R_BI: (..., 3, 3) inertial to body.
+
+        Returns:
+            (..., n, 2) pixels from the image's centre; NaN for a feature that is behind the camera.
+            Those outside the image are not left out.
+        """
+        X_B = (self.features_I - position[..., np.newaxis, :]) @ np.swapaxes(R_BI, -1, -2)
+        X_C = (X_B - self.camera_B) @ self.R_CB.T
+        in_front = X_C[..., 2:] > 1e-9
+        depth = np.where(in_front, X_C[..., 2:], np.nan)
+        return np.asarray(self.focal_length * X_C[..., :2] / depth)
+
+    def frustum_corners(self, position: Floats, R_BI: Floats, depth: float) -> Floats:
+        """Projection centre and the image's four corners at a depth along the optical axis, in I.
+
+        Returns:
+            (5, 3) [m].
+        """
+        x, y = self.half_image / self.focal_length
+        corners_C = depth * np.array([[x, y, 1.0], [-x, y, 1.0], [-x, -y, 1.0], [x, -y, 1.0]])
+        corners_B = self.camera_B + np.concatenate([np.zeros((1, 3)), corners_C @ self.R_CB])
+        return np.asarray(position + corners_B @ R_BI)
