@@ -18,7 +18,7 @@ $(VENV)/.trainer: $(VENV)/.user
 	touch $@
 
 $(VENV)/.developer: $(VENV)/.user
-	$(INSTALL) ".[train,plot,render,pandas,dev]"
+	$(INSTALL) ".[train,plot,render,pandas,rerun,dev]"
 	touch $@
 
 demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each, and compare: some minutes

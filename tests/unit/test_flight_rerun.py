@@ -1,0 +1,152 @@
+"""Recordings for the Rerun viewer hold what the flight holds: written to a file and read back."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from quad_gym.envs.single import QuadEnv
+from quad_gym.flight_record import FlightRecorder
+from quad_gym.rotations import quaternion_to_dcm
+
+
+def flown(task="hover", steps=30, **keywords):
+    env = QuadEnv(task, **keywords)
+    recorder = FlightRecorder(env.flights.batch, about={"seed": 3})
+    env.reset(seed=3)
+    recorder.keep()
+    for action in np.random.default_rng(3).uniform(-0.2, 0.2, (steps, 4)):
+        env.step(action)
+        recorder.keep()
+    return recorder.flight
+
+
+@pytest.fixture
+def read_back(tmp_path):
+    """A function from a flight to the columns of its recording, entity by entity."""
+    pytest.importorskip("rerun")
+    chunk = pytest.importorskip("rerun.chunk", reason="this rerun-sdk cannot read files")
+
+    def entities(flight):
+        file = tmp_path / "flight.rrd"
+        flight.to_rerun().save(file)
+        found = {}
+        for piece in chunk.RrdReader(file).stream().to_chunks():
+            batch = piece.to_record_batch()
+            columns = {name: batch.column(name) for name in batch.schema.names}
+            found.setdefault(piece.entity_path, {}).update(columns)
+        return found
+
+    return entities
+
+
+def numbers(column):
+    """A column with one value per row, as an array."""
+    return np.array([np.array(row[0], np.float64) for row in column.to_pylist()])
+
+
+def seconds(entity):
+    return np.array(entity["flight"].cast("int64").to_pylist()) * 1e-9
+
+
+def test_poses_are_those_of_the_flight_on_its_time_line(read_back):
+    flight = flown()
+    entities = read_back(flight)
+    for name, position, attitude in (
+        ("truth", "position", "attitude"),
+        ("estimate", "estimated_position", "estimated_attitude"),
+    ):
+        entity = entities[f"/world/{name}"]
+        np.testing.assert_allclose(seconds(entity), flight["time"], atol=1e-9)
+        found = numbers(entity["Transform3D:translation"])
+        np.testing.assert_allclose(found, flight[position], atol=1e-6)
+        # a quaternion (x, y, z, w) turns by v + 2 w (u x v) + 2 u x (u x v)
+        q = numbers(entity["Transform3D:quaternion"])
+        u, w = q[:, :3], q[:, 3:]
+        for axis in np.eye(3):
+            turned = axis + 2 * w * np.cross(u, axis) + 2 * np.cross(u, np.cross(u, axis))
+            expected = np.einsum("nji,j->ni", quaternion_to_dcm(flight[attitude]), axis)
+            np.testing.assert_allclose(turned, expected, atol=1e-6)
+
+
+def test_ellipsoids_are_those_of_the_covariance(read_back):
+    flight = flown(steps=5)
+    entity = read_back(flight)["/world/ellipsoid"]
+    half = numbers(entity["Ellipsoids3D:half_sizes"])
+    q = numbers(entity["Ellipsoids3D:quaternions"])
+    R = np.swapaxes(quaternion_to_dcm(np.roll(q, 1, axis=1)), 1, 2)  # axes of the ellipsoid to I
+    P = np.einsum("nij,nj,nkj->nik", R, (half / 3.0) ** 2, R)
+    expected = flight["covariance"][:, :3, :3]
+    np.testing.assert_allclose(P, expected, atol=1e-5 * expected.max())
+
+
+def test_the_image_holds_what_was_measured(read_back):
+    flight = flown()
+    entities = read_back(flight)
+    camera = "/world/truth/camera/image"
+    rows = entities[f"{camera}/measured"]["Points2D:positions"].to_pylist()
+    seen = np.isfinite(flight["pixels"]).all(axis=2)
+    assert [len(row) for row in rows] == seen.sum(axis=1).tolist()
+    assert seen.any()
+    expected = (flight["pixels"] + flight.stage.half_image)[seen]
+    np.testing.assert_allclose(np.concatenate([row for row in rows if row]), expected, rtol=1e-6)
+    rays = entities["/world/rays"]["LineStrips3D:strips"].to_pylist()
+    assert [len(row) for row in rays] == seen.sum(axis=1).tolist()
+    matrix = np.reshape(entities[camera]["Pinhole:image_from_camera"].to_pylist()[0], (3, 3)).T
+    ahead = matrix @ (0.1, 0.0, 1.0)  # a tenth off the axis: a tenth of the focal length
+    found = ahead[:2] / ahead[2] - flight.stage.half_image
+    np.testing.assert_allclose(found, [0.1 * flight.stage.focal_length, 0.0], rtol=1e-5)
+
+
+def test_fixes_appear_when_they_come(read_back):
+    flight = flown(gnss_rate=10.0)
+    entity = read_back(flight)["/world/gnss"]
+    measured = np.isfinite(flight["gnss_position"]).all(axis=1)
+    assert measured.sum() == 7
+    np.testing.assert_allclose(seconds(entity), flight["time"][measured], atol=1e-9)
+    found = numbers(entity["Points3D:positions"])
+    np.testing.assert_allclose(found, flight["gnss_position"][measured], atol=1e-6)
+
+
+def test_plots_keep_every_bit(read_back):
+    flight = flown()
+    entities = read_back(flight)
+    error = flight["estimated_position"] - flight["position"]
+    for name, expected in (
+        ("errors/tracking", flight["position_error"]),
+        ("errors/estimation", flight["estimation_error"]),
+        ("consistency/nees", flight["nees"]),
+        ("position/up/error", error[:, 2]),
+        ("position/up/upper", 3.0 * np.sqrt(flight["covariance"][:, 2, 2])),
+        ("rotors/4", flight["rotor_speeds"][:, 3]),
+        ("actions/1", flight["action"][:, 0]),
+    ):
+        found = numbers(entities[f"/plots/{name}"]["Scalars:scalars"])
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "there", "missing"),
+    [
+        ({"observation": "truth"}, "/world/truth", "/world/estimate"),
+        ({"camera": False}, "/world/estimate", "/world/features"),
+        ({"sensors": "indoor"}, "/world/rays", "/world/gnss"),
+        ({"task": "waypoints"}, "/world/gates", "/world/reference/path"),
+    ],
+)
+def test_what_a_flight_lacks_is_left_out(read_back, keywords, there, missing):
+    entities = read_back(flown(steps=3, **keywords))
+    assert there in entities
+    assert missing not in entities
+
+
+def test_a_missing_rerun_gives_the_install_hint(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ImportError, match=r"quad-gym\[rerun\]"):
+        flown(steps=1).to_rerun()
+
+
+def test_rerun_is_imported_only_when_a_recording_is_made():
+    code = "import sys, quad_gym, quad_gym.flight_rerun; assert 'rerun' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
