@@ -1,0 +1,298 @@
+"""Watch a flight: live in a window, as a video, or in the Rerun viewer; and keep its numbers.
+
+    python scripts/fly.py --task lemniscate
+    python scripts/fly.py --task circle --fault gnss --fault-time 4 7 --output results/outage.mp4
+    python scripts/fly.py --replay results/outage.npz --view chase
+    python scripts/fly.py --replay results/outage.npz --output results/outage.rrd
+
+The blue vehicle is the truth. The orange ghost is where the filter believes it to be, with the
+ellipsoid that holds it with 3 sigma; the controller flies on that belief, unless --observation says
+otherwise.
+
+In the window: C and G make camera and GNSS fail and come back, V changes the view, the space bar
+stops time, R begins the next episode, and Q or Escape ends the program.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+
+from baselines.policies import load_policy
+from quad_gym import IDS, Flight, FlightRecorder
+from quad_gym.cli import option, parse, usage_errors
+from quad_gym.evaluation import Policy
+from quad_gym.flight_rerun import load_rerun
+from quad_gym.rendering import Renderer, save_video
+from quad_gym.rendering.live import WINDOW_RATE, Window
+from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
+from quad_gym.reports import require_writable
+
+ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
+OTHER_ENDINGS = (".npz", ".csv", ".rrd")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the flight."""
+
+    task: Literal["hover", "circle", "lemniscate", "random_trajectory", "waypoints"] = option(
+        "circle", "what to fly", group="flight"
+    )
+    policy: str = option(
+        "pd",
+        "who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for "
+        "the task), or a file of scripts/train.py (.zip or .npz)",
+    )
+    observation: Literal["estimate", "truth", "noisy", "sensors"] = option(
+        "estimate", "what the controller sees"
+    )
+    action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] = option(
+        "ctbr", "what the controller commands"
+    )
+    seed: int = option(0, "of the episode; in the window, the next ones follow it")
+    duration: float | None = option(None, "time limit [s]; if not given, the task's")
+    env: dict[str, Any] = option(
+        {}, "further keywords of the environment, such as control_rate=100 estimator=ekf"
+    )
+
+    sensors: str = option("lab", "sensor suite", group="sensors")
+    camera: bool = option(True, "measure with the camera")
+    gnss_rate: float | None = option(None, "GNSS fixes per second [Hz]; if not given, the suite's")
+    camera_rate: float | None = option(None, "images per second [Hz]; if not given, the suite's")
+    fault: Literal["none", "gnss", "camera", "both"] = option("none", "what fails on the way")
+    fault_time: tuple[float, float] = option((4.0, 7.0), "when it fails, and when it is back [s]")
+
+    view: Literal["fixed", "chase"] = option(
+        "fixed", "from outside, or from behind the vehicle", group="picture"
+    )
+    size: tuple[int, int] = option((640, 480), "width and height [pixels]")
+    speed: float = option(1.0, "seconds of flight per second of watching; 0.5: slow motion")
+    fps: float = option(25.0, "pictures per second of a video")
+    output: Path | None = option(
+        None,
+        "write this file instead of opening a window: a video (.mp4, .gif or .webp), with the "
+        "flight as .npz beside it; numbers alone (.npz or .csv); or a recording for the Rerun "
+        "viewer (.rrd)",
+    )
+    replay: Path | None = option(None, "show this .npz file instead of flying")
+
+
+@dataclass
+class Switches:
+    """Which sensors have failed, by the schedule or by hand."""
+
+    args: Args
+    failed: dict[str, bool] = field(default_factory=lambda: {"gnss": False, "camera": False})
+
+    def schedule(self, before: float, now: float) -> None:
+        """Let sensors fail and come back when their time comes."""
+        start, end = self.args.fault_time
+        for sensor in self.failed:
+            if self.args.fault in (sensor, "both"):
+                if before < start <= now:
+                    self.failed[sensor] = True
+                if before < end <= now:
+                    self.failed[sensor] = False
+
+    def apply(self, batch: Any) -> None:
+        """Switch the sensors of a batch."""
+        batch.switch_sensors(**{sensor: not failed for sensor, failed in self.failed.items()})
+
+
+def check_options(args: Args) -> None:
+    """Refuse options that make no sense before anything is flown.
+
+    Raises:
+        ValueError: If one does.
+        ImportError: If a library that writes a file is not installed.
+    """
+    for name in ("speed", "fps"):
+        value = getattr(args, name)
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(f"--{name} must be greater than 0, got {value:g}")
+    start, end = args.fault_time
+    if not 0.0 <= start < end:
+        raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
+    if args.fault in ("camera", "both") and not args.camera:
+        raise ValueError(f"--fault {args.fault} has no meaning with --no-camera")
+    if args.output is not None:
+        if args.output.suffix.lower() not in VIDEO_ENDINGS + OTHER_ENDINGS:
+            endings = ", ".join(VIDEO_ENDINGS + OTHER_ENDINGS)
+            raise ValueError(f"--output must end in one of {endings}, got {args.output}")
+        if args.output.suffix.lower() in VIDEO_ENDINGS:
+            checked_video_path(args.output)
+        if args.output.suffix.lower() == ".rrd":
+            load_rerun()
+        require_writable("--output", args.output.parent)
+    Renderer(args.view, args.size)
+
+
+def make_env(args: Args) -> Any:
+    """An environment of one flight.
+
+    Raises:
+        ValueError: If an option makes no sense.
+    """
+    return gymnasium.make_vec(
+        ID_OF_TASK[args.task],
+        num_envs=1,
+        autoreset_mode="Disabled",
+        observation=args.observation,
+        action=args.action,
+        sensors=args.sensors,
+        camera=args.camera,
+        gnss_rate=args.gnss_rate,
+        camera_rate=args.camera_rate,
+        duration=args.duration,
+        **args.env,
+    )
+
+
+def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> Iterator[Flight]:
+    """Fly an episode, and yield the flight so far after every step; it ends with the episode."""
+    batch = env.unwrapped.flights.batch
+    recorder = FlightRecorder(batch, about=about | {"seed": seed})
+    observation, _ = env.reset(seed=seed)
+    recorder.keep()
+    yield recorder.flight
+    state, starts, over, before = None, np.ones(1, bool), False, -1.0
+    while not over:
+        now = float(recorder.flight["time"][-1])
+        switches.schedule(before, now)
+        switches.apply(batch)
+        before = now
+        action, state = policy.predict(
+            observation, state=state, episode_start=starts, deterministic=True
+        )
+        observation, _, terminated, truncated, info = env.step(action)
+        starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
+        recorder.keep()
+        yield recorder.flight
+    print(
+        f"seed {seed}: {str(info['ending'][0]).replace('_', ' ')} after {in_words(recorder.flight)}"
+    )
+
+
+def replayed(flight: Flight) -> Iterator[Flight]:
+    """A saved flight, yielded as if it were flown."""
+    for time in flight["time"]:
+        yield flight.until(time)
+
+
+def in_words(flight: Flight) -> str:
+    """How long a flight was and how well it went."""
+    error = 1e3 * flight["position_error"].mean()
+    words = f"{flight['time'][-1]:.2f} s, mean tracking error {error:.1f} mm"
+    if flight.stage.observation != "truth":
+        words += f", mean estimation error {1e3 * flight['estimation_error'].mean():.1f} mm"
+    return words
+
+
+def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switches) -> bool:
+    """Show a flight while it is flown; return whether to go on to the next one."""
+    renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
+    for flight in flights:
+        waiting += 1.0 / flight.stage.control_rate / args.speed
+        if waiting < 0.999 / WINDOW_RATE:
+            continue
+        seconds, waiting = min(waiting, 1.0), 0.0
+        window.show(renderer.draw(flight), seconds)
+        stopped = False
+        while True:
+            for key in window.pressed_keys():
+                if key in ("q", "escape"):
+                    return False
+                if key == "r":
+                    return True
+                if key == "space":
+                    stopped = not stopped
+                if key == "v":
+                    renderer = Renderer("chase" if renderer.view == "fixed" else "fixed", args.size)
+                for letter, sensor in (("c", "camera"), ("g", "gnss")):
+                    if key == letter:
+                        switches.failed[sensor] = not switches.failed[sensor]
+            if window.closed:
+                return False
+            if not stopped:
+                break
+            window.show(renderer.draw(flight), 1.0 / WINDOW_RATE)
+    return True
+
+
+def open_window(args: Args) -> Window:
+    """A window to watch in.
+
+    Raises:
+        OSError: If there is no screen.
+    """
+    try:
+        return Window(args.size, f"quad_gym: {args.task}")
+    except RuntimeError as error:
+        raise OSError(f"{error}; --output writes a video instead") from None
+
+
+def write(flight: Flight, path: Path, args: Args) -> list[Path]:
+    """Write the flight to a file, and a video's numbers beside it; return what was written."""
+    from tqdm import tqdm
+
+    if path.suffix.lower() == ".npz":
+        return [flight.save(path)]
+    if path.suffix.lower() == ".csv":
+        return [flight.to_csv(path)]
+    if path.suffix.lower() == ".rrd":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        recording = flight.to_rerun()
+        recording.save(path)
+        recording.disconnect()  # which completes the file
+        return [path]
+    video = save_video(
+        flight,
+        path,
+        view=args.view,
+        size=args.size,
+        fps=args.fps,
+        speed=args.speed,
+        progress=lambda times: tqdm(times, desc="drawing", unit=" pictures"),
+    )
+    return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
+
+
+def main(args: Args) -> None:
+    """Fly or replay, and show or write."""
+    with usage_errors():
+        check_options(args)
+        saved = Flight.load(args.replay) if args.replay else None
+        env = make_env(args) if saved is None else None
+        if env is not None and args.output and not env.unwrapped.flights.batch.max_steps:
+            raise ValueError("--output needs a flight with an end: a --duration above 0")
+        policy = None if env is None else load_policy(args.policy, env)
+    about = {"task": args.task, "policy": args.policy, "sensors": args.sensors, "fault": args.fault}
+
+    def flights(seed: int, switches: Switches) -> Iterator[Flight]:
+        if saved is not None:
+            return replayed(saved)
+        assert policy is not None
+        return fly(env, policy, seed, switches, about)
+
+    if args.output:
+        *_, flight = flights(args.seed, Switches(args))
+        for file in write(flight, args.output, args):
+            print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
+        return
+    with usage_errors():
+        window = open_window(args)
+    seed, goes_on = args.seed, True
+    while goes_on:
+        switches = Switches(args)
+        goes_on = watch(flights(seed, switches), args, window, switches)
+        seed += 1
+    window.close()
+
+
+if __name__ == "__main__":
+    main(parse(Args, description=__doc__))

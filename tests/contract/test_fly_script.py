@@ -1,0 +1,137 @@
+"""`scripts/fly.py` from the command line."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quad_gym import Flight
+
+ROOT = Path(__file__).resolve().parents[2]
+pytest.importorskip("pygame")
+
+
+def fly(*options, cwd, **environment):
+    return subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "fly.py"), *map(str, options)],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
+    size = ("--size", 320, 240, "--fps", 5)
+    done = fly(
+        *("--task", "hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"),
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "time limit after 1.00 s" in done.stdout
+    assert "Wrote new/hover.gif" in done.stdout
+    flight = Flight.load(tmp_path / "new" / "hover.npz")
+    assert (len(flight), flight.about["seed"], flight.about["task"]) == (51, 4, "hover")
+
+    done = fly("--replay", "new/hover.npz", *size, "--output", "again.gif", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "again.gif").read_bytes() == (tmp_path / "new/hover.gif").read_bytes()
+
+
+def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
+    pytest.importorskip("rerun")
+    options = ("--task", "hover", "--duration", 0.1, "--output", "new/hover.rrd")
+    done = fly(*options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Wrote new/hover.rrd" in done.stdout
+    assert (tmp_path / "new" / "hover.rrd").read_bytes()[:4] == b"RRF2"
+
+
+def test_faults_take_the_sensors_away_for_their_time(tmp_path):
+    options = ("--task", "hover", "--duration", 3, "--fault", "gnss", "--fault-time", 1, 2)
+    done = fly(*options, "--no-camera", "--output", "flight.npz", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    flight = Flight.load(tmp_path / "flight.npz")
+    fixed = np.isfinite(flight["gnss_position"][:, 0])
+    expected = (flight["time"] <= 1.0) | (flight["time"] > 2.0)
+    np.testing.assert_array_equal(fixed, expected)
+    sigma = np.sqrt(flight["covariance"][:, 0, 0])
+    assert sigma[100] > 10.0 * sigma[50]  # the filter knows that it is lost
+    assert sigma[110] < 0.1 * sigma[100]
+    assert not flight.stage.has_camera
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--output", "a.avi"), "--output must end in"),
+        (("--speed", 0), "--speed"),
+        (("--fault-time", 3, 2), "--fault-time"),
+        (("--fault", "camera", "--no-camera"), "--no-camera"),
+        (("--size", 10, 10), "render_size"),
+        (("--replay", "nowhere.npz"), "nowhere.npz"),
+        (("--policy", "me"), "policy must be"),
+        (("--gnss-rate", 77), "gnss_rate"),
+        (("--duration", 0), "--duration"),
+    ],
+)
+def test_wrong_options_are_one_line_and_write_nothing(tmp_path, options, message):
+    done = fly("--output", "a.npz", *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_screen_the_window_is_a_clear_error(tmp_path):
+    done = fly("--task", "hover", cwd=tmp_path, SDL_VIDEODRIVER="x11")
+    assert done.returncode == 2
+    assert "--output writes a video instead" in done.stderr
+
+
+def test_keys_change_the_flight_while_one_watches():
+    sys.path.insert(0, str(ROOT / "scripts"))
+    try:
+        import fly as script
+    finally:
+        sys.path.remove(str(ROOT / "scripts"))
+
+    class Keyboard:
+        """A window on which keys are pressed at given pictures."""
+
+        def __init__(self, presses):
+            self.presses, self.shown, self.closed = presses, 0, False
+
+        def show(self, frame, seconds):
+            self.shown += 1
+
+        def pressed_keys(self):
+            return self.presses.pop(self.shown, [])
+
+    args = script.Args(task="hover", duration=2.0, camera=False, size=(320, 240))
+    env = script.make_env(args)
+    policy = script.load_policy("pd", env)
+
+    def watched(presses):
+        switches, flights = script.Switches(args), []
+        steps = script.fly(env, policy, 0, switches, {})
+        kept = (flights.append(flight) or flight for flight in steps)
+        window = Keyboard(presses)
+        return script.watch(kept, args, window, switches), flights[-1], window.shown
+
+    goes_on, flight, shown = watched(
+        {20: ["g"], 50: ["g"], 60: ["v"], 70: ["space"], 75: ["space"]}
+    )
+    assert goes_on
+    assert shown == len(flight) + 5  # time stood still for five pictures
+    fixed = np.isfinite(flight["gnss_position"][:, 0])
+    np.testing.assert_array_equal(np.flatnonzero(~fixed), np.arange(20, 50))
+    assert watched({10: ["r"]})[0]
+    for key in ("q", "escape"):
+        goes_on, flight, _ = watched({10: [key]})
+        assert not goes_on
+        assert len(flight) == 10
