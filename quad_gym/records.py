@@ -34,6 +34,8 @@ FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES)
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 256
 """Numbers that an observation can hold."""
+WARM_DRAWS = 21
+"""Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""
 
 
 class FilterStatus(IntFlag):
@@ -336,6 +338,7 @@ SETTINGS_FIELDS = (
     Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
     Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),
     Field("reuse_first_fix", (), "0 or 1", "whether the fix that starts the filter is its first measurement, too", "i8"),
+    Field("warm", (), "0 or 1", "whether the filter has converged before an episode begins", "i8"),
     Field("feature_count", (), "-", "features in use", "i8"),
     Field("form", (), "bits", "of the filter, see FilterForm", "i8"),
     Field("imu_averages", (), "0 or 1", "whether IMU samples are averages over the tick", "i8"),
@@ -361,6 +364,8 @@ SETTINGS_FIELDS = (
     Field("gate_count", (), "-", "gates of a course"),
     Field("gate_radius", (), "m", "distance at which a gate counts as passed"),
     Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
+    Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
+    Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
     *WORLD_SETTINGS_FIELDS,
 )
 # fmt: on

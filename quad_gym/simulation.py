@@ -35,6 +35,7 @@ from quad_gym.records import (
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
 from quad_gym.threads import resolve_threads, run_ranges
+from quad_gym.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.world_packing import pack_options
 from quad_gym.world_params import WorldParams, world_params
 
@@ -75,6 +76,9 @@ class FlightBatch:
         bounds: (low, high) of the observation, each (n,); None: the batch observes nothing.
         autoreset: When a flight whose episode is over begins the next one.
         run_filter: Whether sensors and filter run; None: where something needs them.
+        filter_start: "cold": the filter starts from its first fix; "warm": it has converged in
+            `quad_gym.warm_start.WARM_UP` of hovering where the task begins, with errors drawn from
+            the covariance that it has reached.
         innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
             "innovation_sigma", "block_nis"; a gate keeps them anyway.
         threads: Threads to use; None: as many as there are cores.
@@ -108,6 +112,7 @@ class FlightBatch:
         bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         autoreset: Autoreset = Autoreset.DISABLED,
         run_filter: bool | None = None,
+        filter_start: str = "cold",
         innovations: bool = False,
         threads: int | None = None,
         true_vehicle: VehicleParams | None = None,
@@ -151,6 +156,7 @@ class FlightBatch:
             if (getattr(true_sensors, name) is None) != (getattr(self.sensors, name) is None):
                 raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
         check.flag("innovations", innovations)
+        check.choice("filter_start", filter_start, FILTER_STARTS)
         if run_filter is None:
             needed = include_covariance or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
@@ -182,6 +188,15 @@ class FlightBatch:
             known=self.randomization.known,
             limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
         )
+        if run_filter and filter_start == "warm":
+            pack_warm_start(
+                self._settings[0],
+                FlightBatch,
+                vehicle=self.vehicle,
+                sensors=self.sensors,
+                task=self.task,
+                substeps=substeps,
+            )
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
@@ -189,7 +204,6 @@ class FlightBatch:
         self._blocks["needs_reset"] = 1.0
         for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
             self._blocks[name] = np.nan
-        self._blocks["start_given"] = np.nan
         self._blocks["drawn"] = draws.low[:, np.newaxis]  # as it stays where nothing is drawn
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._actions = np.zeros((self.count, 4))

@@ -7,10 +7,14 @@ from quad_gym.records import Control
 from quad_gym.simulation import FlightBatch
 
 
-def fly(sensors, count=200, *, task="random_trajectory", seed=0, **keywords):
+def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **keywords):
     """A batch under PD control on its estimate that goes on whatever happens."""
     params = TASK_DEFAULTS[task].replace(
-        duration=0.0, out_of_bounds=1e6, max_tilt=np.pi, ground=-1e6
+        duration=0.0,
+        out_of_bounds=1e6,
+        max_tilt=np.pi,
+        ground=-1e6,
+        start=start or TASK_DEFAULTS[task].start,
     )
     batch = FlightBatch(
         count,

@@ -91,7 +91,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped,
     level, looking as wanted. "hover": hovering at rest, with standard deviations of 0.3 m, 0.2 rad
     in yaw and 0.03 rad in tilt. "mixed": either, by a coin, for training: a policy that has learned
-    to hover then learns to take off. The filter starts from its first fix in each.
+    to hover then learns to take off. The filter starts from its first fix in each, or with
+    `filter_start="warm"` as if it had been running for 10 s, as before any real take-off.
     `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these for one
     episode.
 
@@ -129,6 +130,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             None: as the suite has it; but for "lab" by name "predicted", as the report's own
             "measured" makes some 6 circles in 1,000 crash in their first second.
         estimator: "ukf" or "ekf", in place of the suite's.
+        filter_start: "cold": the filter starts from its first fix, or from the mark where there is
+            no GNSS; "warm": it has been running for 10 s before the episode and has converged.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
         imu_rate: In place of the suite's [Hz].
         gnss_rate: In place of the suite's [Hz].

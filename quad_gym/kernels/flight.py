@@ -44,6 +44,7 @@ from quad_gym.kernels.task import draw_reference, draw_start
 from quad_gym.kernels.ukf import initialize, predict
 from quad_gym.kernels.ukf_update import update
 from quad_gym.kernels.vehicle import integrate, load4, load_state
+from quad_gym.kernels.warm import start_warm
 from quad_gym.records import Control, FilterForm, Source
 from quad_gym.world_fields import Supply
 
@@ -92,7 +93,7 @@ def _sense_gnss(flight, world, settings, mask, starting):
     fresh = measured & (settings.gnss_ticks > 0)
     flight.position_fresh = select(fresh, 1.0, flight.position_fresh)
     flight.baseline_fresh = select(fresh, 1.0, flight.baseline_fresh)
-    if starting and settings.reuse_first_fix == 0:
+    if starting and settings.reuse_first_fix == 0 and not settings.warm:
         due = due & (settings.gnss_ticks < 0)
     valid = select(due, 1.0, 0.0)
     flight.position_valid = select(mask, valid, flight.position_valid)
@@ -145,6 +146,8 @@ def sense(flight, world, model, settings, work, mask, starting):
 
         if starting:
             initialize(flight, model, mask)
+            if settings.warm:
+                start_warm(flight, settings, stream_of(flight), work, mask)
         update(flight, model, work, settings.feature_count, mask, settings.form)
     _look(flight, model, settings, mask)
 

@@ -15,6 +15,7 @@ from quad_gym.randomization import COLUMNS
 from quad_gym.records import MAX_HARMONICS, Start, Task
 
 DRAW_COURSE, DRAW_START, DRAW_SERIES = DRAW_RESET, DRAW_RESET + 2, DRAW_RESET + 16
+DRAW_FIRST_BIASES = DRAW_START + 5
 """Numbers of the draws of an episode's first instant."""
 START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
 """Spread of a hovering start: [m], [rad], [rad], [m/s]."""
@@ -199,7 +200,7 @@ def draw_start(flight, p, model, settings, stream, mask):
         flight.action[i] = select(mask, 0.0, flight.action[i])
         flight.last_action[i] = select(mask, 0.0, flight.last_action[i])
 
-    n_a, n_g = six_normals(stream, DRAW_START + 5)
+    n_a, n_g = six_normals(stream, DRAW_FIRST_BIASES)
     for i in range(3):
         flight.b_a[i] = select(mask, p.accel_bias_sigma * n_a[i], flight.b_a[i])
         flight.b_g[i] = select(mask, p.gyro_bias_sigma * n_g[i], flight.b_g[i])

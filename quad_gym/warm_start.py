@@ -1,0 +1,131 @@
+"""Warm starts: the covariance that a filter has reached before a flight begins.
+
+Before any real take-off the filter has been running for a while. How sure it is then depends on the
+sensors and hardly on the flight, so that it is computed once for a configuration: flights hover
+where the task begins, each with noise of its own, and the mean of their covariances, turned to a
+common heading, is what every episode begins with.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import TaskParams, VehicleParams
+from quad_gym.records import WARM_DRAWS, WIDTH, Autoreset, Control, Source
+from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.sensor_params import ImuParams, SensorSuite
+
+FILTER_STARTS = ("cold", "warm")
+"""Values of the keyword `filter_start`."""
+
+WARM_UP = 10.0
+"""How long a filter has been running at a warm start [s]: some correlation times of its velocity
+and attitude, as between switching a vehicle on and its take-off."""
+
+Floats = NDArray[np.float64]
+
+
+def pack_warm_start(settings: Any, make: Callable[..., Any], **configuration: Any) -> None:
+    """Fill the settings' fields of a warm start.
+
+    Args:
+        settings: One SETTINGS record.
+        make: Makes a batch of flights, called as `FlightBatch`.
+        configuration: Arguments of `converged_covariance`.
+    """
+    P = converged_covariance(make, **configuration)
+    W = root_with_biases(P, configuration["sensors"].imu)
+    settings["warm"] = True
+    settings["warm_root"], settings["warm_covariance"] = W, W @ W.T
+
+
+@functools.lru_cache(maxsize=64)
+def converged_covariance(
+    make: Callable[..., Any],
+    *,
+    vehicle: VehicleParams,
+    sensors: SensorSuite,
+    task: TaskParams,
+    substeps: int,
+) -> Floats:
+    """The covariance that filters reach from a cold start in `WARM_UP` of hovering.
+
+    Args:
+        make: Makes a batch of flights, called as `FlightBatch`.
+        vehicle: As the controller believes it to be.
+        sensors: As the filter believes them to be.
+        task: Where its starts are; on the ground the flights hover at height 0.
+        substeps: Runge-Kutta steps in a tick.
+
+    Returns:
+        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east.
+
+    Raises:
+        ValueError: If a filter fails on the way.
+    """
+    batch = make(
+        WIDTH,
+        vehicle=vehicle,
+        sensors=sensors,
+        task=task.replace(start="hover"),
+        source=Source.TRUTH,
+        control=Control.VELOCITY,
+        control_rate=sensors.imu.rate / round(WARM_UP * sensors.imu.rate),
+        substeps=substeps,
+        run_filter=True,
+        autoreset=Autoreset.DISABLED,
+        threads=1,
+    )
+    batch.reset(seeds=range(WIDTH))
+    if task.start == "ground":
+        at_rest = np.zeros((WIDTH, 3))
+        batch.reset(
+            seeds=range(WIDTH), position=batch.read("r") * (1.0, 1.0, 0.0), velocity=at_rest
+        )
+    batch.step(np.zeros((WIDTH, 4)))  # one step, as long as the whole
+    if batch.read("filter_status").any():
+        raise ValueError(
+            f"filter_start must be 'cold' for these sensors: the filter fails within {WARM_UP:g} s "
+            "of hovering"
+        )
+    forward_I = quaternion_to_dcm(batch.read("q"))[:, 0]
+    yaw = np.arctan2(forward_I[:, 1], forward_I[:, 0])
+    turn = np.broadcast_to(np.eye(15), (WIDTH, 15, 15)).copy()
+    for block in (slice(0, 3), slice(3, 6)):
+        turn[:, block, block] = [_about_vertical(angle) for angle in yaw]
+    P = turn.transpose(0, 2, 1) @ batch.covariance() @ turn
+    return P.mean(axis=0)  # type: ignore[no-any-return]
+
+
+def _about_vertical(angle: float) -> Floats:
+    """(3, 3) turn of components in I by an angle about the vertical."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def root_with_biases(P: Floats, imu: ImuParams) -> Floats:
+    """W with W W^T = P, whose last six columns belong to the true biases.
+
+    A filter that started from the stationary distribution of the biases, of covariance S, has an
+    estimate that is independent of its error, so that cov(error, bias) = P_b, the columns of P for
+    the biases. Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals.
+
+    Args:
+        P: (15, 15) covariance, whose share of the biases is not larger than S.
+        imu: Says what S is.
+
+    Returns:
+        (15, WARM_DRAWS).
+    """
+    sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
+    with_biases = P[:, 9:] / sigma
+    values, vectors = np.linalg.eigh(P - with_biases @ with_biases.T)
+    # what the biases do not explain; rounding may leave eigenvalues a little below zero
+    rest = vectors * np.sqrt(np.maximum(values, 0.0))
+    W = np.zeros((15, WARM_DRAWS))
+    W[:, :15], W[:, 15:] = rest, with_biases
+    return W

@@ -1,0 +1,202 @@
+"""Warm starts: errors as the covariance claims them from the first instant on, in every face."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import Uniform
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import FLIGHT_FIELDS
+from quad_gym.sensor_suites import SUITES
+from quad_gym.simulation import FlightBatch
+from quad_gym.warm_start import WARM_UP
+from tests.field_flights import attitudes, fly, nees, state_errors, steps
+from tests.unit.alarms import assert_normal
+
+BIASES = slice(9, 15)
+FILTER = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
+
+
+def unmeasured(name):
+    """A suite that measures nothing at the first instant, so that the start is seen as it is."""
+    suite = quad_gym.sensor_suite(name)
+    changes = {"estimator": suite.estimator.replace(reuse_first_fix=False)}
+    for sensor in ("gnss", "camera"):
+        params = getattr(suite, sensor)
+        if params is not None:
+            changes[sensor] = params.replace(rate=10.0, phase=0.5)
+    return suite.replace(**changes)
+
+
+def whitened_errors(batch):
+    return np.linalg.solve(batch.read("L"), state_errors(batch)[..., np.newaxis])[..., 0]
+
+
+def biases(batch):
+    return np.hstack([batch.read("b_a"), batch.read("b_g")])
+
+
+def estimated_biases(batch):
+    return np.hstack([batch.read("b_a_hat"), batch.read("b_g_hat")])
+
+
+# ---- the errors of the start -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("start", ["hover", "ground"])
+def test_whitened_errors_of_the_start_are_standard_normal(name, start):
+    batch = fly(unmeasured(name), 4000, filter_start="warm", start=start)
+    assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))
+
+
+def test_with_any_yaw_they_are_too_and_the_covariance_looks_the_way_of_the_vehicle():
+    anywhere = {"start_yaw": Uniform(-np.pi, np.pi), "start_roll": Uniform(-0.3, 0.3)}
+    suite = unmeasured("lab")  # whose camera has two features ahead: uneven in the horizontal
+    batch = fly(suite, 4000, task="hover", filter_start="warm", randomization=anywhere)
+    assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))
+
+    ahead = attitudes(batch.read("q"))[:, 0]
+    azimuth = np.arctan2(ahead[:, 1], ahead[:, 0])
+    assert azimuth.min() < -3.0 < 3.0 < azimuth.max()
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    to_I = np.zeros((len(c), 15, 15)) + np.eye(15)
+    for k in (0, 3):
+        to_I[:, k, k], to_I[:, k, k + 1], to_I[:, k + 1, k], to_I[:, k + 1, k + 1] = c, -s, s, c
+    seen_from_the_vehicle = to_I.transpose(0, 2, 1) @ batch.covariance() @ to_I
+    common = seen_from_the_vehicle.mean(axis=0)
+    assert abs(common[0, 0] / common[1, 1] - 1.0) > 0.02
+    scale = np.sqrt(np.outer(np.diag(common), np.diag(common)))
+    np.testing.assert_allclose((seen_from_the_vehicle - common) / scale, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_the_estimated_biases_are_independent_of_their_errors(name):
+    """As of a filter that started from their stationary distribution."""
+    suite = unmeasured(name)
+    batch = fly(suite, 4000, task="hover", filter_start="warm")
+    S = np.diag(np.repeat([suite.imu.accel_bias_sigma, suite.imu.gyro_bias_sigma], 3) ** 2)
+    P = batch.covariance()[:, BIASES, BIASES].mean(axis=0)
+    assert_normal(biases(batch), np.zeros(6), S)
+    errors = state_errors(batch)[:, BIASES]
+    floor = 1e-6 * S  # what is known of a bias may be next to nothing
+    joint = np.hstack([estimated_biases(batch), errors])
+    noise = np.random.default_rng(0).normal(size=(4000, 6)) * np.sqrt(np.diag(floor))
+    joint[:, :6] += noise
+    nothing = np.zeros((6, 6))
+    expected = np.block([[S - P + floor, nothing], [nothing, P]])
+    assert_normal(joint, np.zeros(12), expected)
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_the_covariance_is_that_of_a_filter_that_has_run_as_long(name):
+    """Of other flights, under another controller."""
+    cold = fly(name, 40, task="hover")
+    steps(cold, WARM_UP)
+    warm = fly(name, 40, task="hover", filter_start="warm")
+    sigmas = [
+        np.sqrt(np.diagonal(b.covariance(), axis1=1, axis2=2)).mean(axis=0) for b in (cold, warm)
+    ]
+    np.testing.assert_allclose(sigmas[1], sigmas[0], rtol=0.35)
+    at_start = fly(name, 40, task="hover").covariance()
+    assert (sigmas[1][12:] < 0.9 * np.sqrt(np.diagonal(at_start, axis1=1, axis2=2))[0, 12:]).any()
+
+
+@pytest.mark.parametrize("name", ["rtk", "consumer", "indoor"])
+def test_nees_is_right_from_the_first_instant_on(name):
+    """Means over 500 flights, five deviations wide; the band itself is for longer flights."""
+    suite = quad_gym.sensor_suite(name)
+    if name == "consumer":  # whose filter takes the slow error for white, and errs on the safe side
+        suite = suite.replace(gnss=suite.gnss.replace(drift_sigma_I=(0.0, 0.0, 0.0)))
+    batch = fly(suite, 500, filter_start="warm")
+    means = [nees(batch).mean()]
+    for _ in range(10):
+        steps(batch, 0.1)
+        means.append(nees(batch).mean())
+    deviation = np.sqrt(2 * 15 / 500)
+    assert np.abs(np.array(means) - 15.0).max() < 5 * deviation, means
+    assert not batch.read("filter_status").any()
+
+
+# ---- what does not change --------------------------------------------------------------------
+
+
+def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
+    default, cold, warm = (
+        fly("rtk", 20, task="hover", **keywords)
+        for keywords in ({}, {"filter_start": "cold"}, {"filter_start": "warm"})
+    )
+    assert default.snapshot().tobytes() == cold.snapshot().tobytes()
+    estimates = {*FILTER, "nis", "nis_dimension", "innovation", "innovation_sigma", "block_nis"}
+    seen = {"r_seen", "v_seen", "R_seen", "w_seen", "estimation_error", "gate"}
+    fixes = {"position_valid", "baseline_valid", "velocity_valid"}
+    for field in FLIGHT_FIELDS:
+        if field.name not in estimates | seen | fixes:
+            np.testing.assert_array_equal(
+                warm.read(field.name), cold.read(field.name), err_msg=field.name
+            )
+    assert (warm.read("r_hat") != cold.read("r_hat")).all()
+
+
+def test_a_first_fix_is_a_measurement_of_a_filter_that_it_did_not_start():
+    rtk = quad_gym.sensor_suite("rtk")
+    suite = rtk.replace(gnss=rtk.gnss.replace(phase=0.0), camera=None)
+    assert not fly(suite, 3).read("position_valid").any()
+    warm = fly(suite, 3, filter_start="warm")
+    assert warm.read("position_valid").all()
+    assert (warm.read("nis_dimension") == 9.0).all()
+
+
+def test_without_a_filter_there_is_nothing_to_warm():
+    keywords = {"source": quad_gym.records.Source.TRUTH, "sensors": "rtk"}
+    flown = [FlightBatch(4, filter_start=start, **keywords) for start in ("cold", "warm")]
+    for batch in flown:
+        batch.reset(seeds=range(4))
+        batch.step()
+    assert flown[0].snapshot().tobytes() == flown[1].snapshot().tobytes()
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(ValueError, match="filter_start must be one of cold, warm, got 'hot'"):
+        FlightBatch(1, filter_start="hot")
+    with pytest.raises(ValueError, match="filter_start"):
+        QuadEnv("hover", filter_start=None)
+
+
+# ---- the faces -------------------------------------------------------------------------------
+
+
+def test_every_face_starts_warm_alike():
+    keywords = {
+        "sensors": "rtk",
+        "filter_start": "warm",
+        "include_covariance": True,
+        "randomization": {"start_yaw": Uniform(-np.pi, np.pi)},
+    }
+    vector = QuadVectorEnv(3, "hover", **keywords)
+    together, infos = vector.reset(seed=5)
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=3, seed=5, **keywords)
+    np.testing.assert_array_equal(sb3.reset(), together)
+    action = np.full((3, 4), 0.1, np.float32)
+    stepped = vector.step(action)[0]
+    np.testing.assert_array_equal(sb3.step(action)[0], stepped)
+    for i in range(3):
+        alone = QuadEnv("hover", **keywords)
+        observation, info = alone.reset(seed=5 + i)
+        np.testing.assert_array_equal(observation, together[i])
+        assert info["estimation_error"] == infos["estimation_error"][i] > 0.0
+        np.testing.assert_array_equal(alone.step(action[i])[0], stepped[i])
+
+
+def test_every_episode_starts_warm_anew():
+    env = QuadVectorEnv(
+        2, "hover", sensors="indoor", filter_start="warm", duration=0.1, autoreset_mode="SameStep"
+    )
+    env.reset(seed=0)
+    batch = env.flights.batch
+    first = batch.read("r_hat") - batch.read("r")
+    for _ in range(5):
+        env.step(np.zeros((2, 4), np.float32))
+    assert (batch.read("episode") == 2.0).all()
+    assert (batch.read("r_hat") - batch.read("r") != first).all()
