@@ -105,7 +105,7 @@ def rows(folder):
     return len(file.read_text().splitlines()) - 1 if file.exists() else 0
 
 
-def wait_for(condition, process, seconds=240.0):
+def wait_for(condition, process, seconds=1200.0):
     end = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()
