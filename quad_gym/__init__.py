@@ -6,6 +6,7 @@ compiled or loaded from their cache, when the first environment is made.
 
 from typing import Any
 
+from quad_gym import faults
 from quad_gym.distributions import LogUniform, Normal, Uniform
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all
 from quad_gym.params import (
@@ -76,6 +77,7 @@ __all__ = [
     "VehicleParams",
     "WorldParams",
     "__version__",
+    "faults",
     "make_sb3_vec_env",
     "pd_gains",
     "sensor_suite",

@@ -46,7 +46,7 @@ def params_record(
     p["inertia"], p["inertia_inverse"] = vehicle.inertia, np.linalg.inv(vehicle.inertia)
     p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
     p["kF"] = vehicle.thrust_coefficient
-    p["effectiveness"] = vehicle.effectiveness
+    p["effectiveness"] = p["sound_effectiveness"] = vehicle.effectiveness
     p["allocation"] = np.linalg.inv(vehicle.effectiveness)
     p["motor_tau"], p["motor_gain"] = vehicle.motor_time_constant, vehicle.motor_speed_per_volt
     p["max_voltage"], p["max_rotor_force"] = vehicle.max_voltage, vehicle.max_rotor_force

@@ -11,6 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.fault_fields import (
+    FAULT_PARAMS_FIELDS,
+    FAULT_SETTINGS_FIELDS,
+    FAULT_STATE_FIELDS,
+)
 from quad_gym.params import MAX_GATES
 from quad_gym.sensor_params import MAX_FEATURES
 from quad_gym.world_fields import (
@@ -69,6 +74,8 @@ class Gate(IntEnum):
     """not measured since the start of the episode"""
     ACCEPTED = 1
     REJECTED = 2
+    FAILED = 3
+    """the update that it was part of failed as a whole, see FilterStatus"""
 
 
 class Source(IntEnum):
@@ -185,6 +192,8 @@ FLIGHT_FIELDS = (
     Field("b_g_hat", (3,), "rad/s", "estimated gyro bias"),
     Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
+    Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
+    Field("update_failures", (), "-", "updates that failed since the filter's start"),
     Field("nis", (), "-", "normalised innovation squared of the last update"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
     # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
@@ -234,6 +243,8 @@ FLIGHT_FIELDS = (
     Field("estimation_error", (), "m", "distance of the seen from the true position"),
     Field("episode_return", (), "-", "sum of rewards in this episode"),
     Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
+    # what goes wrong
+    *FAULT_STATE_FIELDS,
 )
 
 PARAMS_FIELDS = (
@@ -251,6 +262,7 @@ PARAMS_FIELDS = (
     Field("max_rotor_force", (), "N", "thrust of a rotor at the largest voltage"),
     Field("hover_voltage", (), "V", "voltage that carries the weight"),
     *WORLD_PARAMS_FIELDS,
+    *FAULT_PARAMS_FIELDS,
     Field("gain_k", (), "N/m", "PD gain of position"),
     Field("gain_kd", (), "N s/m", "PD gain of velocity"),
     Field("gain_K", (3,), "N m", "PD gain of attitude"),
@@ -367,6 +379,7 @@ SETTINGS_FIELDS = (
     Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
     Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
     *WORLD_SETTINGS_FIELDS,
+    *FAULT_SETTINGS_FIELDS,
 )
 # fmt: on
 
@@ -393,6 +406,7 @@ RESULTS = (
     "episode_return",
     "episode_error_sum",
     "gates_passed",
+    "faults",
 )
 """Columns of what a step returns for every flight."""
 

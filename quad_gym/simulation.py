@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym import validation as check
+from quad_gym.fault_packing import pack_faults
+from quad_gym.fault_presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.batch import fly
 from quad_gym.packing import params_block, params_record, settings_record
 from quad_gym.params import (
@@ -88,6 +90,7 @@ class FlightBatch:
         world: Wind, gusts, drag, ground and battery, or the name of a preset.
         randomization: What is drawn anew for every episode, around `true_vehicle`, `true_sensors`
             and `world`: a `Randomization`, or distributions by name.
+        faults: What goes wrong: faults, or names of presets, see `quad_gym.faults`.
 
     Raises:
         ValueError: If an argument makes no sense; nothing is allocated then.
@@ -119,6 +122,7 @@ class FlightBatch:
         true_sensors: SensorSuite | None = None,
         world: WorldParams | str = "calm",
         randomization: Randomization | Mapping[str, Given] | None = None,
+        faults: FaultsGiven = None,
     ) -> None:
         self.count = check.whole("count", count)
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
@@ -155,7 +159,8 @@ class FlightBatch:
         for name in ("gnss", "camera"):
             if (getattr(true_sensors, name) is None) != (getattr(self.sensors, name) is None):
                 raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
-        check.flag("innovations", innovations)
+        self.faults = faults_of(faults, true_sensors)
+        self.innovations = check.flag("innovations", innovations)
         check.choice("filter_start", filter_start, FILTER_STARTS)
         if run_filter is None:
             needed = include_covariance or innovations
@@ -188,6 +193,7 @@ class FlightBatch:
             known=self.randomization.known,
             limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
         )
+        pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
         if run_filter and filter_start == "warm":
             pack_warm_start(
                 self._settings[0],
@@ -369,6 +375,10 @@ class FlightBatch:
             values = values.reshape(-1, values.shape[-1])[: self.count].copy()
             found[name] = values[:, 0] if values.shape[1] == 1 else values
         return found
+
+    def active_faults(self) -> dict[str, NDArray[np.bool_]]:
+        """Which of the faults that can come are there now, by name: (count,) each."""
+        return named_faults(self.faults, self.read("faults"))
 
     def covariance(self) -> NDArray[np.float64]:
         """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""

@@ -18,6 +18,7 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
+from quad_gym.fault_presets import FaultsGiven
 from quad_gym.params import ActionParams, TaskParams, VehicleParams
 from quad_gym.randomization import Given, Randomization
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
@@ -92,6 +93,7 @@ class Flights:
         true_sensors: SensorSuite | None = None,
         world: WorldParams | str = "calm",
         randomization: Randomization | Mapping[str, Given] | None = None,
+        faults: FaultsGiven = None,
         **unknown: Any,
     ) -> None:
         if unknown:
@@ -157,6 +159,7 @@ class Flights:
             true_sensors=true_sensors,
             world=place,
             randomization=drawn,
+            faults=faults,
         )
         if max_episode_steps is not None:
             steps = check.whole("max_episode_steps", max_episode_steps)

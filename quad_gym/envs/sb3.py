@@ -17,6 +17,7 @@ from quad_gym.envs.configuration import (
     drawn_info,
     start_options,
 )
+from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.single import keys_of
 from quad_gym.envs.spaces import action_space
@@ -29,7 +30,8 @@ class QuadVecEnv(VecEnv):
     An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with
     the return "r", the length "l", the time "t" since construction [s] and the mean true position
     error "e" [m]. With `randomization` it also holds `drawn`, the parameters of that episode; so
-    do `reset_infos`.
+    do `reset_infos`. With `faults` and `innovations` every `info` and `reset_infos` hold these, as
+    in `QuadEnv`; but the last of an episode has no innovations, as the filter has begun anew.
 
     Args:
         num_envs: Number of flights.
@@ -118,7 +120,12 @@ class QuadVecEnv(VecEnv):
                 strict=True,
             )
         ]
+        more = flight_info(batch, results[:, COLUMN["faults"]])
+        if more:
+            for i, info in enumerate(infos):
+                info |= info_of_flight(more, i)
         for i in np.flatnonzero(done).tolist():
+            infos[i].pop("innovations", None)
             infos[i] |= self._episode_end(i, results[i]) | drawn_info(flown_with, i)
         rewards = results[:, COLUMN["reward"]].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
@@ -220,8 +227,13 @@ class QuadVecEnv(VecEnv):
             batch.read("estimation_error").tolist(),
             strict=True,
         )
-        drawn = batch.drawn()
+        drawn, more = batch.drawn(), flight_info(batch, batch.read("faults"))
         return [
-            {"position_error": p, "estimation_error": e, **drawn_info(drawn, i)}
+            {
+                "position_error": p,
+                "estimation_error": e,
+                **drawn_info(drawn, i),
+                **info_of_flight(more, i),
+            }
             for i, (p, e) in enumerate(errors)
         ]

@@ -14,6 +14,7 @@ from quad_gym.envs.configuration import (
     drawn_info,
     start_options,
 )
+from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
@@ -99,7 +100,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;
     `filter_status`, 0 while all is well; `gates_passed`. With `randomization` also `drawn`, the
-    parameters of the episode by name.
+    parameters of the episode by name. With `faults` also `faults`: whether each is there now, by
+    name. With `innovations=True` also `innovations`: the last innovations of the filter, their
+    squares (NIS) and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
 
     ## World
     By default the air is still and every episode flies the same vehicle with the same sensors.
@@ -121,8 +124,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
         sensors: "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or a
             `SensorSuite`.
-        innovations: Whether `flights.batch.read` has the innovations of the filter block by block;
-            a suite whose filter gates keeps them anyway.
+        innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
+            block by block; a suite whose filter gates keeps them for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
@@ -144,6 +147,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         true_sensors: What really measures, where the filter believes in `sensors`.
         world: "calm", "breeze", "fresh_breeze", or `WorldParams`.
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
+        faults: What goes wrong with sensors and rotors: names of presets, such as "gnss_outage" or
+            "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
         radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
             max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
             `quad_gym.TaskParams`.
@@ -206,6 +211,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "filter_status": int(batch.read("filter_status")[0]),
             "gates_passed": 0,
             **drawn_info(batch.drawn(), 0),
+            **info_of_flight(flight_info(batch, batch.read("faults")), 0),
         }
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -246,6 +252,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
                 "filter_status": int(row[COLUMN["filter_status"]]),
                 "gates_passed": int(row[COLUMN["gates_passed"]]),
                 **drawn_info(batch.drawn(), 0),
+                **info_of_flight(flight_info(batch, batch.results[:, COLUMN["faults"]]), 0),
             },
         )
 

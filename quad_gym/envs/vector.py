@@ -9,6 +9,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.flight_info import final_faults, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import keys_of, seeds_of
 from quad_gym.envs.spaces import action_space
@@ -26,7 +27,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     """N flights in one compiled call; flight i is that of a `QuadEnv` seeded with seed + i.
 
     Observations, actions, rewards, endings and keywords are those of `QuadEnv`. `info` holds arrays
-    (n,) of the same names, each with its mask `_name`; `drawn` is a dictionary of such arrays.
+    (n,) of the same names, each with its mask `_name`; `drawn`, `faults` and `innovations` are
+    dictionaries of such arrays.
 
     Args:
         num_envs: Number of flights.
@@ -118,6 +120,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "filter_status": batch.read("filter_status").astype(np.int64),
             "gates_passed": np.zeros(self.num_envs, np.int64),
             **self._drawn(),
+            **flight_info(batch, batch.read("faults")),
         }
         return self.flights.split(observations), _masked(infos, mask)
 
@@ -210,7 +213,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
         }
-        infos |= self._drawn()
+        infos |= self._drawn() | flight_info(self.flights.batch, results[:, COLUMN["faults"]])
         ended = np.flatnonzero(self._over)
         if ended.size:  # seldom: looking up a name for every flight would cost more than the rest
             infos["ending"][ended] = _ENDING_NAMES[results[ended, COLUMN["ending"]].astype(np.intp)]
@@ -224,6 +227,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos[name][began] = self.flights.batch.read(name, began)
         infos["ending"][began] = ENDINGS[0]
         infos["gates_passed"][began] = 0
+        replace_faults(infos, self.flights.batch, began)
 
     def _drawn(self) -> dict[str, Any]:
         """The draws of all flights, as `info` holds them; nothing where nothing is drawn."""
@@ -242,8 +246,9 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         final_info = {
             name: np.where(over, values, _blank(values))
             for name, values in infos.items()
-            if not (name.startswith("_") or name == "drawn")
+            if not (name.startswith("_") or isinstance(values, dict))
         }
+        final_info |= final_faults(infos, over)
         if flown_with:
             final_info["drawn"] = flown_with
         self._replace_by_start(infos, np.flatnonzero(over))

@@ -3,6 +3,7 @@
 from quad_gym.kernels.blocks import lanes_of
 from quad_gym.kernels.compilation import entry, kernel
 from quad_gym.kernels.draws import impose
+from quad_gym.kernels.faults import meet_rotors
 from quad_gym.kernels.flight import begin_episode, tick
 from quad_gym.kernels.judge import judge
 from quad_gym.kernels.lanes import any_of, logical_not, select
@@ -50,6 +51,7 @@ def _write_results(block, results, index):
         row[8] = block.episode_return[lane]
         row[9] = block.episode_error[lane]
         row[10] = block.gate_next[lane]
+        row[11] = block.faults[lane]
 
 
 @kernel
@@ -100,7 +102,7 @@ def fly(
         resets: (n,) uint8; for RESET, which flights begin an episode.
         world: (1,) PARAMS_BLOCK: parameters as they are.
         own: (1,) PARAMS_BLOCK, used by no other thread: a copy of `world`, where the parameters of
-            the flights at hand are put together if they draw some.
+            the flights at hand are put together if they draw some, or if their rotors can fail.
         model: (1,) PARAMS_BLOCK: parameters as the filter and the controller believe them.
         settings: (1,) SETTINGS.
         work: (1,) WORK_BLOCK, used by no other thread.
@@ -109,16 +111,19 @@ def fly(
         observations: (n, n_observation), written; with no columns nothing is observed.
         final_observations: Likewise, written where one episode ends and the next begins in this
             step.
-        results: (n, 11), written in a STEP: see `quad_gym.records.RESULTS`.
+        results: (n, 12), written in a STEP: see `quad_gym.records.RESULTS`.
     """
     scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
-    true = lanes_of(own[0]) if todo.randomized else nominal
+    differ = todo.randomized > 0 or todo.faults > 0
+    true = lanes_of(own[0]) if differ else nominal
     believed = true if todo.known else lanes_of(model[0])
     observing = observations.shape[1] > 0
     for index in range(first_block, last_block):
         block, flight = blocks[index], lanes_of(blocks[index])
         if todo.randomized:
             impose(flight, nominal, true, todo)
+        if todo.faults:
+            meet_rotors(flight, true, todo)
         if command == Command.RESET:
             for lane in range(WIDTH):
                 known = index * WIDTH + lane < resets.shape[0]

@@ -51,6 +51,7 @@ def sources_digest() -> str:
         "distributions.py",
         "randomization.py",
         "world_fields.py",
+        "fault_fields.py",
     )
     for path in (*sorted(package.glob("*.py")), *(package.parent / name for name in constants)):
         digest.update(path.name.encode() + path.read_bytes())

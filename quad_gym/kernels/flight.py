@@ -11,8 +11,16 @@ from quad_gym.kernels.air import begin_world, fly_through_air, supply
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.control import act
 from quad_gym.kernels.draws import draw_parameters, impose
+from quad_gym.kernels.faults import (
+    advance_faults,
+    begin_faults,
+    gnss_heard,
+    saturate_imu,
+    spoil_features,
+    spoil_gnss,
+)
 from quad_gym.kernels.innovations import forget_innovations
-from quad_gym.kernels.lanes import any_of, select
+from quad_gym.kernels.lanes import any_of, logical_not, select
 from quad_gym.kernels.linalg import (
     add,
     keep3,
@@ -84,20 +92,27 @@ def _sense_gnss(flight, world, settings, mask, starting):
     if settings.gnss_drifts > 0 and not starting and any_of(due):
         drift_gnss(flight, world, due)
     measured = mask if starting else due
+    paired = measured
+    sound = starting and not settings.warm  # the fix that starts the filter
+    if settings.faults and not sound:
+        measured, paired = gnss_heard(flight, settings, due)
     if any_of(measured):
         measure_gnss(flight, world, measured)
+        if settings.faults and not sound:
+            spoil_gnss(flight, world, settings, measured)
         if settings.gnss_velocity > 0:
             measure_gnss_velocity(flight, world, measured)
     wait = select(due, 1.0 * settings.gnss_ticks, flight.gnss_wait) - 1.0
     flight.gnss_wait = select(mask, wait, flight.gnss_wait)
-    fresh = measured & (settings.gnss_ticks > 0)
+    fresh, alone = measured & (settings.gnss_ticks > 0), measured & logical_not(paired)
     flight.position_fresh = select(fresh, 1.0, flight.position_fresh)
     flight.baseline_fresh = select(fresh, 1.0, flight.baseline_fresh)
+    flight.baseline_fresh = select(alone, 0.0, flight.baseline_fresh)
     if starting and settings.reuse_first_fix == 0 and not settings.warm:
         due = due & (settings.gnss_ticks < 0)
-    valid = select(due, 1.0, 0.0)
+    valid = select(due & measured, 1.0, 0.0)
     flight.position_valid = select(mask, valid, flight.position_valid)
-    flight.baseline_valid = select(mask, valid, flight.baseline_valid)
+    flight.baseline_valid = select(mask, select(alone, 0.0, valid), flight.baseline_valid)
     if settings.gnss_velocity > 0:
         flight.velocity_valid = select(mask, valid, flight.velocity_valid)
 
@@ -129,6 +144,8 @@ def sense(flight, world, model, settings, work, mask, starting):
     if settings.run_filter:
         if starting or not settings.imu_averages:  # at its start an average has nothing behind it
             measure_imu(flight, world, mask)
+            if settings.faults:
+                saturate_imu(flight, settings, mask)
         _sense_gnss(flight, world, settings, mask, starting)
 
         if settings.camera_ticks > 0:
@@ -138,6 +155,8 @@ def sense(flight, world, model, settings, work, mask, starting):
                 flight.feature_valid[i] = select(mask, 0.0, flight.feature_valid[i])
             if any_of(due):
                 measure_features(flight, world, settings.feature_count, due)
+                if settings.faults:
+                    spoil_features(flight, settings, due)
             wait = select(due, period, flight.camera_wait) - 1.0
             flight.camera_wait = select(mask, wait, flight.camera_wait)
             for i in range(settings.feature_count):
@@ -172,9 +191,13 @@ def tick(flight, world, model, settings, work):
     if settings.run_filter:
         if settings.imu_averages:
             measure_imu_average(flight, world, start, everyone)
+            if settings.faults:
+                saturate_imu(flight, settings, everyone)
         predict(flight, model, work, settings.form)
         drift_biases(flight, world)
     flight.tick = flight.tick + 1.0
+    if settings.faults:
+        advance_faults(flight, world, settings, everyone)
     sense(flight, world, model, settings, work, everyone, False)
 
 
@@ -206,6 +229,8 @@ def begin_episode(flight, nominal, world, model, settings, work, mask):
     draw_reference(flight, settings, stream, mask)
     draw_start(flight, world, model, settings, stream, mask)
     begin_world(flight, world, settings, stream, mask)
+    if settings.faults:
+        begin_faults(flight, world, settings, stream, mask)
     sense(flight, world, model, settings, work, mask, True)
 
     flight.step = select(mask, 0.0, flight.step)

@@ -21,7 +21,7 @@ import numpy as np
 
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.elementary import maximum
-from quad_gym.kernels.lanes import any_of, select
+from quad_gym.kernels.lanes import any_of, logical_not, select
 from quad_gym.kernels.linalg import (
     add33,
     add_outer,
@@ -45,10 +45,13 @@ from quad_gym.records import (
     POSITION_BLOCK,
     VELOCITY_BLOCK,
     FilterForm,
+    FilterStatus,
     Gate,
 )
 
 _REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
+_FAILED = float(Gate.FAILED)
+_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _GATE = int(FilterForm.GATE)
 
 
@@ -218,6 +221,21 @@ def judge_innovations(
 
 
 @kernel
+def _mark_block(flight, s, failed):
+    flight.gate[s] = select(failed, _FAILED, flight.gate[s])
+
+
+@kernel
+def mark_failed(flight, feature_count, failed):
+    """Say of the blocks of an update that failed as a whole that none was taken."""
+    _mark_block(flight, POSITION_BLOCK, failed & (flight.position_valid > 0.0))
+    _mark_block(flight, BASELINE_BLOCK, failed & (flight.baseline_valid > 0.0))
+    _mark_block(flight, VELOCITY_BLOCK, failed & (flight.velocity_valid > 0.0))
+    for i in range(feature_count):
+        _mark_block(flight, FEATURE_BLOCKS + i, failed & (flight.feature_valid[i] > 0.0))
+
+
+@kernel
 def _squares(nu, mask):
     """The squares of an innovation on a diagonal, where `mask`, else zeros."""
     x, y, z = select(mask, nu[0], 0.0), select(mask, nu[1], 0.0), select(mask, nu[2], 0.0)
@@ -227,7 +245,10 @@ def _squares(nu, mask):
 
 @kernel
 def _add_to_covariance(flight, work, D_r, D_v, D_e, mask):
-    """P + D, with D of position, velocity and attitude error, where `mask` and it succeeds."""
+    """P + D, with D of position, velocity and attitude error, where `mask`; return where it failed.
+
+    There the covariance stays as it was.
+    """
     L, P = flight.L, work.P
     for i in range(0, 15, 3):
         for j in range(0, i + 3, 3):
@@ -239,6 +260,7 @@ def _add_to_covariance(flight, work, D_r, D_v, D_e, mask):
     for i in range(15):
         for j in range(i + 1):
             L[i, j] = select(ok, P[i, j], L[i, j])
+    return mask & logical_not(ok)
 
 
 @kernel
@@ -284,7 +306,11 @@ def reopen_gates(flight, p, work, feature_count, mask):
             angle = maximum(angle, square)
             offset = maximum(offset, square * (dx * dx + dy * dy + dz * dz))
         D_e, D_r = add_to_diagonal(D_e, angle), add_to_diagonal(D_r, offset)
-        _add_to_covariance(flight, work, D_r, D_v, D_e, doubtful)
+        failed = _add_to_covariance(flight, work, D_r, D_v, D_e, doubtful)
+        flight.filter_status = select(
+            failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
+        )
+        flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
         for group in range(4):
             done = mask & (flight.rejected_in_row[group] >= patience)
             flight.reopened[group] = select(

@@ -253,7 +253,7 @@ def predict(flight, p, work, form=0):
     take the place of sigma points, see `ekf.py`.
 
     A lane whose predicted covariance is not positive definite keeps its state and sets
-    PREDICTION_FAILED.
+    PREDICTION_FAILED, and counts it.
 
     Args:
         flight: Record; reads gyro and accel, changes the estimate.
@@ -299,6 +299,7 @@ def predict(flight, p, work, form=0):
     flight.filter_status = select(
         ok, flight.filter_status, flight.filter_status | _PREDICTION_FAILED
     )
+    flight.prediction_failures = flight.prediction_failures + select(ok, 0.0, 1.0)
 
 
 @kernel
@@ -340,6 +341,8 @@ def initialize(flight, p, mask):
     keep3(flight.b_a_hat, mask, (0.0, 0.0, 0.0))
     keep3(flight.b_g_hat, mask, (0.0, 0.0, 0.0))
     flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
+    flight.prediction_failures = select(mask, 0.0, flight.prediction_failures)
+    flight.update_failures = select(mask, 0.0, flight.update_failures)
 
     L = flight.L
     for i in range(15):

@@ -15,7 +15,7 @@ from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.ekf import measure_columns
 from quad_gym.kernels.elementary import is_finite
 from quad_gym.kernels.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.innovations import judge_innovations, reopen_gates
+from quad_gym.kernels.innovations import judge_innovations, mark_failed, reopen_gates
 from quad_gym.kernels.lanes import any_of, logical_not, select
 from quad_gym.kernels.linalg import (
     add,
@@ -275,9 +275,9 @@ def _sum_noise(p, work, n):
 def update(flight, p, work, feature_count, mask, form=0):
     """Condition the estimate on the valid measurements of the present instant, where `mask`.
 
-    A lane whose result is not finite keeps its state bit for bit and sets UPDATE_FAILED. The gate
-    masks after the spread c of the sigma points was chosen for all measurements; c enters the
-    moments in their fourth order only.
+    A lane whose result is not finite keeps its state bit for bit, sets UPDATE_FAILED and counts it.
+    The gate masks after the spread c of the sigma points was chosen for all measurements; c enters
+    the moments in their fourth order only.
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
@@ -370,5 +370,8 @@ def update(flight, p, work, feature_count, mask, form=0):
     flight.filter_status = select(
         failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
     )
+    flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
+    if (form & _WATCH) != 0 and any_of(failed):
+        mark_failed(flight, feature_count, failed)
     if (form & _GATE) != 0:
-        reopen_gates(flight, p, work, feature_count, mask)
+        reopen_gates(flight, p, work, feature_count, mask & logical_not(failed))

@@ -1,0 +1,78 @@
+"""What `info` says of a flight beside the judge's findings: faults, and innovations."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.fault_presets import named_faults
+from quad_gym.records import FEATURE_BLOCKS
+from quad_gym.simulation import FlightBatch
+
+Parts = dict[str, dict[str, NDArray[Any]]]
+
+
+def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
+    """What `info` holds as "faults" and "innovations" of all flights, each if there are any.
+
+    Args:
+        batch: The flights.
+        bits: (n,) active faults, as of a flight's field "faults".
+    """
+    found: Parts = {}
+    if batch.faults:
+        found["faults"] = named_faults(batch.faults, bits)
+    if batch.innovations:
+        found["innovations"] = innovations_of(batch)
+    return found
+
+
+def innovations_of(batch: FlightBatch) -> dict[str, NDArray[Any]]:
+    """The last innovations of all flights, block by block: position, baseline, velocity, features.
+
+    Returns:
+        Arrays (n, blocks, ...): "measured" (since the last step), "innovation" and "sigma" (what
+        the filter expected), three numbers each, of which a direction has two; "nis"; "gate", see
+        `quad_gym.records.Gate`; "rejections" in this episode. NaN: not measured yet.
+    """
+    camera = batch.sensors.camera
+    blocks = FEATURE_BLOCKS + (0 if camera is None else len(camera.features_I))
+    position, baseline = batch.read("position_fresh"), batch.read("baseline_fresh")
+    has_velocity = batch.sensors.gnss is not None and batch.sensors.gnss.velocity_sigma is not None
+    features = batch.read("feature_fresh")
+    measured = np.column_stack([position, baseline, position * has_velocity, features])
+    return {
+        "measured": measured[:, :blocks] > 0.0,
+        "innovation": batch.read("innovation")[:, :blocks],
+        "sigma": batch.read("innovation_sigma")[:, :blocks],
+        "nis": batch.read("block_nis")[:, :blocks],
+        "gate": batch.read("gate")[:, :blocks].astype(np.int64),
+        "rejections": batch.read("rejections")[:, :blocks].astype(np.int64),
+    }
+
+
+def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
+    """The same of one flight, with truth values in place of arrays of one."""
+    return {
+        name: {
+            key: values[flight] if values.ndim > 1 else bool(values[flight])
+            for key, values in part.items()
+        }
+        for name, part in parts.items()
+    }
+
+
+def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[np.intp]) -> None:
+    """Describe the present instant of some flights instead, where `info` has faults."""
+    if batch.faults:
+        now = named_faults(batch.faults, batch.read("faults", flights))
+        for name, values in now.items():
+            infos["faults"][name][flights] = values
+
+
+def final_faults(infos: dict[str, Any], over: NDArray[np.bool_]) -> dict[str, Any]:
+    """Faults at the end of the episodes that are over, as `final_info` holds them."""
+    if "faults" not in infos:
+        return {}
+    faults = infos["faults"].items()
+    return {"faults": {name: values & over for name, values in faults if name[0] != "_"}}

@@ -1,0 +1,71 @@
+"""Faults as numbers in the settings record that kernels read."""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from quad_gym.faults import (
+    AccelBiasStep,
+    CameraOcclusion,
+    Fault,
+    GnssJump,
+    GnssOutliers,
+    GnssRamp,
+    GyroBiasStep,
+    ImuSaturation,
+    PositionJump,
+    RotorLoss,
+    Span,
+    WrongAssociations,
+    ends,
+)
+from quad_gym.kernels.faults import NEVER
+
+
+def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
+    """Write faults into a settings record.
+
+    Args:
+        s: The settings.
+        faults: One of a kind at most.
+        dt: The tick [s].
+    """
+    for fault in faults:
+        k = fault.kind
+        s["faults"], s["fault_on"][k] = True, True
+        s["fault_rate"][k] = fault.rate * dt
+        s["fault_start"][k] = _ticks(fault.start, dt)
+        s["fault_duration"][k] = _ticks(fault.duration, dt, least=1.0)
+        s["fault_probability"][k] = fault.probability
+        if isinstance(fault, (GnssOutliers, CameraOcclusion, WrongAssociations)):
+            s["fault_share"][k] = fault.share
+        if isinstance(fault, (GnssOutliers, GnssJump, PositionJump, AccelBiasStep, GyroBiasStep)):
+            s["fault_size"][k] = _low_and_range(fault.size)
+        if isinstance(fault, (GnssRamp, GnssJump, PositionJump, AccelBiasStep, GyroBiasStep)):
+            s["fault_direction"][k] = fault.unit
+        if isinstance(fault, GnssRamp):
+            s["fault_size"][k] = _low_and_range(fault.speed)
+        if isinstance(fault, WrongAssociations):
+            s["fault_swaps"] = fault.how == "swap"
+        if isinstance(fault, ImuSaturation):
+            s["imu_range"] = fault.accel_range, fault.gyro_range
+        if isinstance(fault, RotorLoss):
+            s["fault_size"][k] = _low_and_range(fault.share)
+            s["fault_pick"] = 0.0, 1.0
+            if fault.rotor is not None:
+                s["fault_pick"] = (fault.rotor + 0.5) / 4.0, 0.0
+
+
+def _low_and_range(value: Span) -> tuple[float, float]:
+    low, high = ends(value)
+    return low, high - low
+
+
+def _ticks(value: Span, dt: float, least: float = 0.0) -> tuple[float, float]:
+    """Time in ticks: a number in whole ones, of a range the lower end and the length."""
+    low, high = ends(value)
+    if math.isinf(high):
+        return NEVER, 0.0
+    if low == high:
+        return max(float(round(low / dt)), least), 0.0
+    return low / dt, (high - low) / dt

@@ -1,0 +1,419 @@
+"""Faults: when they come and go, and what they do, against the same flights without them.
+
+A fault changes no other draw, so on the true state a flight with faults is the flight without, but
+for what the fault does: differences show that alone.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym.fault_fields import FaultKind
+from quad_gym.fault_presets import ALL, PRESETS, faults_of
+from quad_gym.faults import (
+    AccelBiasStep,
+    BaselineLoss,
+    CameraOcclusion,
+    Fault,
+    GnssJump,
+    GnssOutage,
+    GnssOutliers,
+    GnssRamp,
+    GyroBiasStep,
+    ImuSaturation,
+    PositionJump,
+    RotorLoss,
+    WrongAssociations,
+)
+from quad_gym.frames import ecef_to_enu
+from quad_gym.records import POSITION_BLOCK, Source
+from quad_gym.rotations import quaternion_to_dcm
+from tests.field_flights import fly
+from tests.unit.alarms import ALARM, alarm_score
+
+LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk")
+DT = LAB.imu.dt
+BLIND = LAB.replace(camera=None)
+R_IG = ecef_to_enu(LAB.gnss.reference_antenna_G)
+
+
+def both(sensors, faults, count=16, **options):
+    """The same flights on the true state, without and with faults."""
+    options = {"source": Source.TRUTH, "run_filter": True, "threads": 1} | options
+    return tuple(fly(sensors, count, faults=given, **options) for given in (None, faults))
+
+
+def at(kind, batch, name="fault_active"):
+    return batch.read(name)[:, kind]
+
+
+# ---- when --------------------------------------------------------------------------------------
+
+
+def test_a_scheduled_fault_is_there_from_its_start_until_its_end():
+    faults = (GnssOutage(start=0.1, duration=0.05), BaselineLoss(), ImuSaturation(start=0.2))
+    batch = fly(BLIND, 3, faults=faults, threads=1)
+    for tick in range(1, 61):
+        batch.step()
+        now = batch.active_faults()
+        assert list(now) == ["gnss_outage", "baseline_loss", "imu_saturation"]
+        assert (now["gnss_outage"] == (20 <= tick < 30)).all()
+        assert now["baseline_loss"].all()
+        assert (now["imu_saturation"] == (tick >= 40)).all()
+    assert (at(FaultKind.GNSS_OUTAGE, batch, "fault_count") == 1.0).all()
+
+
+def test_random_times_are_uniform_in_their_ranges_and_episodes_are_spared_as_often_as_said():
+    fault = GnssOutage(start=(1.0, 3.0), duration=(0.5, 4.5), probability=0.7)
+    batch = fly(BLIND, 4000, faults=fault, threads=1)
+    begins, ends = (at(fault.kind, batch, f"fault_{name}") * DT for name in ("from", "until"))
+    concerned = begins < 1e9
+    assert stats.binomtest(concerned.sum(), 4000, 0.7).pvalue > ALARM
+    assert stats.kstest(begins[concerned], stats.uniform(1.0, 2.0).cdf).pvalue > ALARM
+    lengths = (ends - begins)[concerned]
+    assert stats.kstest(lengths, stats.uniform(0.5, 4.0).cdf).pvalue > ALARM
+    assert abs(np.corrcoef(begins[concerned], lengths)[0, 1]) * math.sqrt(2800) < alarm_score(1)
+
+
+def test_a_fault_with_a_rate_comes_again_after_exponential_waits():
+    fault = GnssOutage(rate=20.0, duration=(0.05, 0.15), probability=0.5)
+    batch = fly(BLIND, 800, faults=fault, threads=1)
+    begun = at(fault.kind, batch, "fault_from")
+    concerned = begun < 1e9
+    assert stats.binomtest(concerned.sum(), 800, 0.5).pvalue > ALARM
+    waits = [begun[concerned] * DT]
+    for _ in range(200):
+        before, until = begun, at(fault.kind, batch, "fault_until")
+        batch.step()
+        begun = at(fault.kind, batch, "fault_from")
+        anew = concerned & (begun != before)
+        now = np.ceil(until[anew])  # the tick at which the next one is drawn
+        waits.append((begun[anew] - now) * DT)
+    np.testing.assert_array_equal(begun[~concerned], 1e18)
+    waits = np.concatenate(waits)
+    assert len(waits) > 2000
+    assert stats.kstest(waits, stats.expon(scale=1 / 20.0).cdf).pvalue > ALARM
+    counts = at(fault.kind, batch, "fault_count")
+    # renewals of 0.05 s wait and 0.1 s stay on average, within one second
+    assert 5.0 < counts[concerned].mean() < 7.5
+    assert (counts[~concerned] == 0.0).all()
+
+
+def test_a_fault_that_never_comes_changes_no_bit():
+    later = tuple(
+        type(fault)(start=1e6, **({"size": (1.0, 2.0)} if hasattr(fault, "size") else {}))
+        for fault in faults_of(ALL, RTK)
+    )
+    assert len(later) == len(FaultKind)
+    calm, faulty = both(RTK, later, source=Source.ESTIMATE)
+    for _ in range(200):
+        calm.step()
+        faulty.step()
+    for name in ("r", "v", "q", "w", "b_a", "b_g", "r_hat", "v_hat", "R_hat", "L", "pixels"):
+        np.testing.assert_array_equal(calm.read(name), faulty.read(name), err_msg=name)
+    assert not any(active.any() for active in faulty.active_faults().values())
+
+
+def test_a_new_episode_begins_without_the_faults_of_the_last():
+    faults = (GnssOutage(start=0.5), AccelBiasStep(start=0.5), RotorLoss(start=0.5, share=0.5))
+    batch = fly(BLIND, 4, faults=faults, threads=1)
+    for _ in range(101):
+        batch.step()
+    assert all(active.all() for active in batch.active_faults().values())
+    assert (batch.read("rotor_gain").min(axis=1) == 0.5).all()
+    batch.reset(mask=np.array([True, False, True, False]))
+    for active in batch.active_faults().values():
+        np.testing.assert_array_equal(active, [False, True, False, True])
+    np.testing.assert_array_equal(batch.read("rotor_gain").min(axis=1), [1.0, 0.5, 1.0, 0.5])
+
+
+# ---- GNSS --------------------------------------------------------------------------------------
+
+
+def test_in_an_outage_there_are_no_fixes_and_else_the_same():
+    faults = (GnssOutage(start=0.1, duration=0.1), BaselineLoss(start=0.15, duration=0.1))
+    calm, faulty = both(BLIND, faults, count=3)
+    for tick in range(1, 61):
+        calm.step()
+        faulty.step()
+        heard, paired = not 20 <= tick < 40, not 20 <= tick < 50
+        assert (faulty.read("position_valid") == heard).all()
+        assert (faulty.read("baseline_valid") == paired).all()
+        assert (faulty.read("position_fresh") == heard).all()
+        assert (faulty.read("baseline_fresh") == paired).all()
+        np.testing.assert_array_equal(calm.read("r"), faulty.read("r"))
+        if heard:
+            np.testing.assert_array_equal(calm.read("gnss_position"), faulty.read("gnss_position"))
+
+
+def offsets(calm, faulty, ticks):
+    """(ticks, flights, 3) what faults add to GNSS positions, in I."""
+    found = []
+    for _ in range(ticks):
+        calm.step()
+        faulty.step()
+        found.append((faulty.read("gnss_position") - calm.read("gnss_position")) @ R_IG.T)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", ["lab", "consumer"])
+def test_outliers_are_as_frequent_and_as_large_as_said_and_lie_everywhere(name):
+    suite = quad_gym.sensor_suite(name).replace(camera=None).with_rates(gnss=200.0)
+    calm, faulty = both(suite, GnssOutliers(share=0.05, size=(10.0, 100.0)), count=200)
+    found, told = [], []
+    for _ in range(100):
+        found.append(offsets(calm, faulty, 1)[0])
+        told.append(faulty.read("outlier") > 0.0)
+    found, told = np.concatenate(found), np.concatenate(told)
+    gnss = suite.gnss
+    sigma = np.hypot(gnss.position_sigma_I, gnss.drift_sigma_I)
+    sizes = np.linalg.norm(found / sigma, axis=1)
+    np.testing.assert_array_equal(sizes > 1e-6, told)
+    assert stats.binomtest(int(told.sum()), told.size, 0.05).pvalue > ALARM
+    assert stats.kstest(sizes[told], stats.uniform(10.0, 90.0).cdf).pvalue > ALARM
+    directions = (found / sigma)[told] / sizes[told, np.newaxis]
+    for component in directions.T:  # each is uniform for a direction uniform on the sphere
+        assert stats.kstest(component, stats.uniform(-1.0, 2.0).cdf).pvalue > ALARM
+
+
+def test_a_ramp_grows_with_time_and_a_jump_stays():
+    ramp = GnssRamp(start=0.1, duration=0.2, speed=(0.5, 1.0))
+    jump = GnssJump(start=0.5, duration=0.1, size=2.0, direction=(0.0, 3.0, 4.0))
+    calm, faulty = both(BLIND, (jump, ramp), count=200)
+    found = offsets(calm, faulty, 130)
+    during = found[19:59]  # ticks 20 to 59
+    speeds = np.linalg.norm(during[-1], axis=1) / (39 * DT)
+    assert stats.kstest(speeds, stats.uniform(0.5, 0.5).cdf).pvalue > ALARM
+    expected = during[-1] * np.arange(40)[:, np.newaxis, np.newaxis] / 39
+    np.testing.assert_allclose(during, expected, rtol=0.0, atol=1e-8)
+    steady = np.broadcast_to([0.0, 1.2, 1.6], (20, 200, 3))
+    np.testing.assert_allclose(found[99:119], steady, rtol=0.0, atol=1e-8)
+    for quiet in (found[:19], found[59:99], found[119:]):
+        np.testing.assert_allclose(quiet, 0.0, atol=1e-8)
+
+
+# ---- camera ------------------------------------------------------------------------------------
+
+
+def test_an_occlusion_hides_the_same_share_of_features_as_long_as_it_stays():
+    suite = quad_gym.sensor_suite("indoor").with_rates(camera=200.0)
+    calm, faulty = both(suite, CameraOcclusion(start=0.1, duration=0.1, share=0.4), count=300)
+    for tick in range(1, 51):
+        calm.step()
+        faulty.step()
+        seen, left = calm.read("feature_valid"), faulty.read("feature_valid")
+        hidden = faulty.read("feature_hidden") * (20 <= tick < 40)
+        np.testing.assert_array_equal(left, seen * (1.0 - hidden))
+        if tick == 20:
+            first = hidden
+            assert stats.binomtest(int(hidden.sum()), hidden.size, 0.4).pvalue > ALARM
+        elif 20 < tick < 40:
+            np.testing.assert_array_equal(hidden, first)
+
+
+@pytest.mark.parametrize("how", ["swap", "copy"])
+def test_wrong_associations_take_one_seen_feature_for_another(how):
+    suite = quad_gym.sensor_suite("indoor").with_rates(camera=200.0)
+    calm, faulty = both(suite, WrongAssociations(share=0.3, how=how), count=100)
+    images = changed = 0
+    places = []
+    for _ in range(50):
+        calm.step()
+        faulty.step()
+        seen = faulty.read("feature_valid") > 0.0
+        np.testing.assert_array_equal(seen, calm.read("feature_valid") > 0.0)
+        right, wrong = calm.read("pixels"), faulty.read("pixels")
+        mistaken = faulty.read("feature_mistaken") > 0.0
+        for i in np.flatnonzero(seen.sum(axis=1) >= 2):
+            differs = seen[i] & (right[i] != wrong[i]).any(axis=1)
+            np.testing.assert_array_equal(differs, mistaken[i])
+            images += 1
+            if not differs.any():
+                continue
+            changed += 1
+            which = np.flatnonzero(differs)
+            assert len(which) == (2 if how == "swap" else 1)
+            if how == "swap":
+                np.testing.assert_array_equal(wrong[i, which], right[i, which[::-1]])
+            else:
+                sources = (right[i] == wrong[i, which[0]]).all(axis=1) & seen[i]
+                assert sources.sum() == 1
+            places.append((np.flatnonzero(seen[i]).tolist().index(which[0]), seen[i].sum()))
+    assert images > 1000
+    assert stats.binomtest(changed, images, 0.3).pvalue > ALARM
+    three = [place for place, count in places if count == 3]
+    if how == "copy" and three:  # any of those seen is as likely
+        assert stats.chisquare(np.bincount(three, minlength=3)).pvalue > ALARM
+
+
+# ---- IMU ---------------------------------------------------------------------------------------
+
+
+def test_a_bias_step_is_part_of_the_true_bias_while_it_lasts():
+    steps = (
+        AccelBiasStep(start=0.1, duration=0.3, size=(0.05, 0.2)),
+        GyroBiasStep(start=0.2, duration=0.3, size=0.01, direction=(1.0, 0.0, 0.0)),
+    )
+    calm, faulty = both(BLIND, steps, count=100)
+    for tick in range(1, 121):
+        calm.step()
+        faulty.step()
+        gap_a, gap_g = (faulty.read(name) - calm.read(name) for name in ("b_a", "b_g"))
+        if tick == 20:
+            first = gap_a
+            sizes = np.linalg.norm(gap_a, axis=1)
+            assert stats.kstest(sizes, stats.uniform(0.05, 0.15).cdf).pvalue > ALARM
+        np.testing.assert_allclose(gap_a, first if 20 <= tick < 80 else 0.0, atol=1e-12)
+        wanted = [0.01, 0.0, 0.0] if 40 <= tick < 100 else [0.0, 0.0, 0.0]
+        np.testing.assert_allclose(gap_g, np.tile(wanted, (100, 1)), atol=1e-13)
+        sensed = faulty.read("accel") - calm.read("accel")
+        np.testing.assert_allclose(sensed, gap_a, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("sensors", [BLIND, RTK], ids=["instant", "average"])
+def test_saturated_samples_end_at_the_ranges(sensors):
+    ranges = ImuSaturation(start=0.1, accel_range=9.5, gyro_range=0.3)
+    calm, faulty = both(sensors, ranges, count=50)
+    clipped = 0
+    for tick in range(1, 101):
+        calm.step()
+        faulty.step()
+        a, w = (9.5, 0.3) if tick >= 20 + (sensors is RTK) else (np.inf, np.inf)
+        np.testing.assert_array_equal(faulty.read("accel"), calm.read("accel").clip(-a, a))
+        np.testing.assert_array_equal(faulty.read("gyro"), calm.read("gyro").clip(-w, w))
+        np.testing.assert_array_equal(faulty.read("w_meas"), calm.read("w_meas").clip(-w, w))
+        clipped += (abs(calm.read("accel")) > a).any() + (abs(calm.read("gyro")) > w).any()
+    assert clipped > 50
+
+
+# ---- the vehicle -------------------------------------------------------------------------------
+
+
+def test_a_position_jump_displaces_the_vehicle_once():
+    jump = PositionJump(start=0.1, size=(1.0, 2.0))
+    calm, faulty = both(BLIND, jump, count=200)
+    for _ in range(19):
+        calm.step()
+        faulty.step()
+    np.testing.assert_array_equal(calm.read("r"), faulty.read("r"))
+    calm.step()
+    faulty.step()
+    gap = faulty.read("r") - calm.read("r")
+    np.testing.assert_array_equal(calm.read("v"), faulty.read("v"))
+    assert stats.kstest(np.linalg.norm(gap, axis=1), stats.uniform(1.0, 1.0).cdf).pvalue > ALARM
+    for component in (gap / np.linalg.norm(gap, axis=1)[:, np.newaxis]).T:
+        assert stats.kstest(component, stats.uniform(-1.0, 2.0).cdf).pvalue > ALARM
+    calm.step()
+    faulty.step()
+    np.testing.assert_allclose(faulty.read("r") - calm.read("r"), gap, atol=5e-3)
+
+
+@pytest.mark.parametrize("randomization", [None, {"mass": quad_gym.Uniform(0.7, 0.9)}])
+@pytest.mark.parametrize("rotor", [None, 2])
+def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomization):
+    loss = RotorLoss(start=0.5, share=(0.2, 1.0), rotor=rotor)
+    calm, faulty = both(BLIND, loss, count=100, task="hover", randomization=randomization)
+    for _ in range(100):
+        calm.step()
+        faulty.step()
+    np.testing.assert_array_equal(calm.read("w"), faulty.read("w"))
+    speeds, z_I = calm.read("rotor_speeds"), quaternion_to_dcm(calm.read("q"))[:, 2]
+    calm.step()
+    faulty.step()
+
+    vehicle, gain = calm.vehicle, faulty.read("rotor_gain")
+    which, lost = gain.argmin(axis=1), 1.0 - gain.min(axis=1)
+    assert (gain.max(axis=1) == 1.0).all()
+    assert stats.kstest(lost, stats.uniform(0.2, 0.8).cdf).pvalue > ALARM
+    if rotor is None:
+        assert stats.chisquare(np.bincount(which, minlength=4)).pvalue > ALARM
+    else:
+        assert (which == rotor).all()
+    each = np.arange(100)
+    force = vehicle.thrust_coefficient * speeds[each, which] ** 2 * lost
+    mass = vehicle.mass if randomization is None else calm.read("mass")
+    dv = -(force / mass * DT)[:, np.newaxis] * z_I
+    np.testing.assert_allclose(faulty.read("v") - calm.read("v"), dv, rtol=0.05, atol=2e-3)
+    arm = np.array(vehicle.rotor_positions_B)[which]
+    torque = np.stack([-arm[:, 1] * force, arm[:, 0] * force], axis=1)
+    dw = torque / np.diag(vehicle.inertia)[:2] * DT
+    measured = (faulty.read("w") - calm.read("w"))[:, :2]
+    np.testing.assert_allclose(measured, dw, rtol=0.05, atol=5e-3)
+
+
+# ---- the filter and the gate -------------------------------------------------------------------
+
+
+def test_the_gate_rejects_most_outliers_and_says_so():
+    batch = fly(RTK, 100, faults=GnssOutliers(share=0.2), threads=1)
+    caught = sound = outliers = fixes = 0
+    for tick in range(800):
+        batch.step()
+        if tick < 400:
+            continue
+        now = batch.read("position_valid") > 0.0
+        wild = batch.read("outlier") > 0.0
+        rejected = batch.read("gate")[:, POSITION_BLOCK] == 2.0
+        outliers, fixes = outliers + (now & wild).sum(), fixes + (now & ~wild).sum()
+        caught, sound = (
+            caught + (now & wild & rejected).sum(),
+            sound + (now & ~wild & rejected).sum(),
+        )
+    assert caught / outliers > 0.99
+    assert sound / fixes < 0.01
+
+
+# ---- what is refused ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: GnssOutage(start=-1.0), "GnssOutage.start must be at least 0"),
+        (lambda: GnssOutage(start=(3.0, 1.0)), r"GnssOutage.start must be \(low, high\)"),
+        (lambda: GnssOutage(start=(1.0, 2.0, 3.0)), r"must be a number or \(low, high\)"),
+        (lambda: GnssOutage(duration=0.0), "GnssOutage.duration must be greater than 0"),
+        (lambda: GnssOutage(duration=np.nan), "GnssOutage.duration must be finite"),
+        (lambda: GnssOutage(start=1.0, rate=0.1), "start or rate, not both"),
+        (lambda: GnssOutage(probability=1.5), "GnssOutage.probability must be at most 1"),
+        (lambda: GnssOutliers(share=0.0), "GnssOutliers.share must be greater than 0"),
+        (lambda: GnssOutliers(size="large"), "GnssOutliers.size must be a number"),
+        (lambda: GnssJump(direction=(0.0, 0.0, 0.0)), "GnssJump.direction must not be zero"),
+        (lambda: WrongAssociations(how="mix"), "WrongAssociations.how must be one of swap, copy"),
+        (lambda: ImuSaturation(gyro_range=0.0), "ImuSaturation.gyro_range must be greater"),
+        (lambda: RotorLoss(share=1.2), "RotorLoss.share must be at most 1"),
+        (lambda: RotorLoss(rotor=4), "RotorLoss.rotor must be 0, 1, 2 or 3"),
+        (lambda: Fault(), "of a kind"),
+        (lambda: faults_of("gnss_outtage", LAB), "faults must be one of none, gnss_outage"),
+        (lambda: faults_of(3, LAB), "faults must be faults or names of presets, got 3"),
+        (lambda: faults_of([3], LAB), "faults must be faults or names of presets, got 3"),
+        (lambda: faults_of([GnssOutage(), "gnss_outage"], LAB), "one of a kind, got two Gnss"),
+        (lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor")), "needs a gnss"),
+        (lambda: faults_of(CameraOcclusion(), BLIND), "needs a camera"),
+        (
+            lambda: faults_of(
+                WrongAssociations(),
+                LAB.replace(camera=LAB.camera.replace(features_I=((0.0, 0.0, 0.0),))),
+            ),
+            "two features",
+        ),
+    ],
+)
+def test_faults_that_make_no_sense_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_presets_by_name():
+    assert faults_of(None, LAB) == faults_of("none", LAB) == faults_of((), LAB) == ()
+    kinds = {fault.kind for preset in PRESETS.values() for fault in preset}
+    assert kinds == set(FaultKind)
+    named = faults_of("rotor_loss+gnss_outage", LAB)
+    assert [type(fault) for fault in named] == [GnssOutage, RotorLoss]
+    assert named == faults_of(["rotor_loss", PRESETS["gnss_outage"][0]], LAB)
+    assert len(faults_of(ALL, RTK)) == len(FaultKind)
+    for suite in ("consumer", "indoor"):
+        assert 0 < len(faults_of(ALL, quad_gym.sensor_suite(suite))) < len(FaultKind)
