@@ -11,7 +11,7 @@ import gymnasium
 
 from baselines.mlp import MlpPolicy
 from baselines.pd import PDPolicy
-from quad_gym import IDS
+from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
@@ -43,10 +43,10 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     """A policy, ready to fly in an environment.
 
     Args:
-        name: "pd" (tuned gains), "pd:lab" (the report's), "pretrained" (the policy that ships for
-            the environment's task), or a file: `.npz` as `MlpPolicy` saves it, or `.zip` as
-            Stable-Baselines3 does. A `.zip` can run code while it is loaded: open only those that
-            you trust.
+        name: "pd" (tuned gains), "pd:lab" (the report's), "pd:FILE.json" (gains of
+            `scripts/tune.py`), "pretrained" (the policy that ships for the environment's task), or
+            a file: `.npz` as `MlpPolicy` saves it, or `.zip` as Stable-Baselines3 does. A `.zip`
+            can run code while it is loaded: open only those that you trust.
         env: A `QuadVectorEnv`.
 
     Raises:
@@ -55,6 +55,8 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     """
     if name in ("pd", "pd:tuned", "pd:lab"):
         return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
+    if name.startswith("pd:"):
+        return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
     if file.suffix == ".npz":
         policy: Any = MlpPolicy.load(file)
@@ -63,9 +65,20 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
         return policy  # type: ignore[no-any-return]
     if file.suffix != ".zip":
         raise ValueError(
-            f"policy must be pd, pd:lab, pretrained, or a .npz or .zip file, got {name!r}"
+            "policy must be pd, pd:lab, pd:FILE.json, pretrained, or a .npz or .zip file, "
+            f"got {name!r}"
         )
     return _stable_baselines_policy(file, env)
+
+
+def _gains_of(file: Path) -> PDGains:
+    """PD gains as `scripts/tune.py` writes them."""
+    if not file.exists():
+        raise ValueError(f"there are no gains {file}")
+    try:
+        return PDGains(**json.loads(file.read_text(encoding="utf-8"))["gains"])
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} holds no PD gains: {error!r}") from None
 
 
 def pretrained_file(env_id: str) -> Path:

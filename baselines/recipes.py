@@ -68,11 +68,12 @@ class Recipe(Checked):
         return unfreeze(self)
 
 
-def unfreeze(recipe: Any) -> Any:
+def unfreeze(recipe: Any) -> tuple[Any, ...]:
     """What pickle needs to make a dataclass with read-only mappings again."""
     values = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
     plain = {k: dict(v) if isinstance(v, Mapping) else v for k, v in values.items()}
-    return partial(type(recipe), **plain), ()
+    kind: Any = type(recipe)
+    return partial(kind, **plain), ()
 
 
 _PPO = Recipe(

@@ -33,8 +33,8 @@ class Args:
     env_id: str = option("QuadGym/Circle-v0", f"what to fly: {', '.join(IDS)}", positional=True)
     policy: tuple[str, ...] = option(
         ("pd", "pretrained"),
-        "policies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for "
-        "the task), or files of scripts/train.py (.zip or .npz)",
+        "policies: pd (tuned gains), pd:lab (the report's), pd:FILE.json (of scripts/tune.py), "
+        "pretrained (the one that ships for the task), or files of scripts/train.py (.zip or .npz)",
         group="what to fly",
     )
     observation: tuple[str, ...] = option(
