@@ -32,7 +32,8 @@ TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
 ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
 """[m]"""
 
-# those of Okabe and Ito, which people with a colour vision deficiency can tell apart
+# those of Okabe and Ito, which people with a colour vision deficiency can tell apart; the viewer's
+# ground is dark
 TRUTH, ESTIMATE, REFERENCE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
 

@@ -1,4 +1,4 @@
-"""Measure what quad_gym costs: its filter, its tick, its environments, its memory.
+"""Measure what quad_gym costs: its filter, its tick, its environments, its memory, its pictures.
 
 Every figure is the best of some repeats, as whatever else the machine does can only slow it down;
 "spread" is how much longer the median of the repeats took. All ratios are taken within one run.
@@ -35,6 +35,7 @@ from quad_gym.threads import available_cores
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from benchmark_faces import faces_table, time_faces
 from benchmark_peers import Measured, filterpy_cycles, plain_cycles
+from benchmark_rendering import rendering_table, time_rendering
 from benchmark_timing import Effort, Row, Timing, measure, percent, report
 
 
@@ -42,7 +43,7 @@ from benchmark_timing import Effort, Row, Timing, measure, percent, report
 class Args:
     """Options of the benchmark."""
 
-    only: Literal["all", "filter", "tick", "faces", "memory"] = option(
+    only: Literal["all", "filter", "tick", "faces", "memory", "rendering"] = option(
         "all", "section to run", group="what to measure"
     )
     batch: int = option(256, "flights in the filter's and the tick's batch, in eights")
@@ -308,6 +309,7 @@ SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str
         faces_table,
     ),
     "memory": (measure_memory, memory_table),
+    "rendering": (lambda args: time_rendering(args.effort), rendering_table),
 }
 
 

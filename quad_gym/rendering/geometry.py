@@ -48,14 +48,17 @@ class View:
 
     def segments(self, starts: Floats, ends: Floats) -> Floats:
         """Pixels (m, 2, 2) of line segments (n, 3), cut off where they come too near."""
-        a, b = self.in_view(starts), self.in_view(ends)
-        visible = (a[:, 2] > NEAR) | (b[:, 2] > NEAR)
-        a, b = a[visible], b[visible]
-        gap = b[:, 2:] - a[:, 2:]
-        cut = np.clip((NEAR * 1.001 - a[:, 2:]) / np.where(np.abs(gap) < 1e-12, 1.0, gap), 0.0, 1.0)
-        at = a + cut * (b - a)
-        a, b = np.where(a[:, 2:] > NEAR, a, at), np.where(b[:, 2:] > NEAR, b, at)
-        return np.stack([self.flatten(a), self.flatten(b)], axis=1)
+        both = self.in_view(np.stack([starts, ends], axis=1))
+        in_front = both[..., 2] > NEAR
+        if in_front.all():
+            return self.flatten(both)
+        visible = in_front.any(axis=1)
+        both, in_front = both[visible], in_front[visible, :, np.newaxis]
+        a, b = both[:, :1], both[:, 1:]
+        gap = b[..., 2:] - a[..., 2:]
+        share = (NEAR * 1.001 - a[..., 2:]) / np.where(np.abs(gap) < 1e-12, 1.0, gap)
+        cut = a + np.clip(share, 0.0, 1.0) * (b - a)
+        return self.flatten(np.where(in_front, both, cut))
 
     @property
     def horizon(self) -> float:

@@ -40,6 +40,16 @@ ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0
 ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
 """[m]"""
 
+GRID_HALF_SIZE = 9
+"""[m]"""
+
+_LINES = np.arange(-GRID_HALF_SIZE, GRID_HALF_SIZE + 1.0)
+_NORTHWARD = [
+    np.stack([_LINES, np.full_like(_LINES, s * GRID_HALF_SIZE), 0.0 * _LINES], axis=1)
+    for s in (-1, 1)
+]
+_GRID = np.stack([np.concatenate([ends, ends[:, [1, 0, 2]]]) for ends in _NORTHWARD])
+"""Starts and ends of the lines on the ground, one metre apart, (2, n, 3)."""
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
 
@@ -102,24 +112,19 @@ class Scene:
 
     def _ground(self) -> None:
         view, canvas = self._view, self._canvas
-        n = 9.0
-        lines = np.arange(-n, n + 0.5)
+        n = GRID_HALF_SIZE
         shift = np.zeros(3)
         if self._moving:  # over a plane without an end, with the grid around the vehicle
             shift[:2] = np.round(self._now["position"][:2])
-            canvas.clear(SKY)
-            canvas.clear_below(view.horizon, GROUND)
+            canvas.clear(SKY, bottom=view.horizon)
+            canvas.clear(GROUND, top=view.horizon)
         else:
             canvas.clear(SKY)
             corners = n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
             border = view.segments(corners, np.roll(corners, -1, axis=0))
             canvas.polygon(border.reshape(-1, 2), GROUND)
-        grid = [np.stack([lines, np.full_like(lines, s * n), 0.0 * lines], axis=1) for s in (-1, 1)]
-        grid += [
-            np.stack([np.full_like(lines, s * n), lines, 0.0 * lines], axis=1) for s in (-1, 1)
-        ]
-        for starts, ends in ((grid[0], grid[1]), (grid[2], grid[3])):
-            canvas.segments(view.segments(starts + shift, ends + shift), GRID)
+        starts, ends = _GRID + shift
+        canvas.segments(view.segments(starts, ends), GRID)
         origin = np.zeros((2, 3))
         tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         canvas.segments(view.segments(origin, tips), GREY, 1.6)
@@ -213,19 +218,20 @@ class Scene:
 
     def _fixes(self) -> None:
         rows = self._flight.rows[-max(1, round(FIX_SECONDS * self._stage.control_rate)) :]
-        rows = rows[np.isfinite(rows["gnss_position"][:, 0])]
-        if not len(rows):
+        fixes = rows["gnss_position"]
+        measured = np.isfinite(fixes[:, 0])
+        if not measured.any():
             return
-        ages = self._now["time"] - rows["time"]
-        places = self._view.project(rows["gnss_position"])[0]
-        stride = -(-len(rows) // 40)
+        ages = self._now["time"] - rows["time"][measured]
+        places = self._view.project(fixes[measured])[0]
+        stride = -(-len(places) // 40)
         old = ages > 0.5 * FIX_SECONDS
         for faded, which in ((True, old), (False, ~old)):
             self._canvas.crosses(
                 places[which][::stride], 2.6, PALE_PURPLE if faded else PURPLE, 1.3
             )
         self._canvas.crosses(places[-1:], 4.0, PURPLE, 2.0)
-        if ages[-1] < 0.3 and len(rows) < 0.5 * FIX_SECONDS * self._stage.control_rate:
+        if ages[-1] < 0.3 and len(places) < 0.5 * FIX_SECONDS * self._stage.control_rate:
             radius = 6.0 + 40.0 * float(ages[-1])
             self._canvas.disc(places[-1], radius, PURPLE, 1.5)  # a ripple, where fixes are few
 
@@ -278,8 +284,8 @@ class Scene:
         else:
             canvas.segments(arms, INK, thickness)
         speeds = np.nan_to_num(self._now["rotor_speeds"]) / stage.max_rotor_speed
-        for hub, hub_B, speed in zip(hubs, hubs_B, speeds, strict=True):
-            disc = view.project(hub + (ROTOR_RADIUS * _RING) @ R_BI)[0]
+        discs = view.project(hubs[:, np.newaxis] + (ROTOR_RADIUS * _RING) @ R_BI)[0]
+        for disc, hub_B, speed in zip(discs, hubs_B, speeds, strict=True):
             front = hub_B[0] > 1e-9
             if not ghost:
                 canvas.polygon(disc, BLUE, float(np.clip(0.1 + 0.9 * speed, 0.1, 0.7)))

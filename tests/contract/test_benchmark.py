@@ -56,6 +56,13 @@ def test_the_tick_section_names_every_part(script, tmp_path):
     assert rows[-1]["seconds"] == pytest.approx(sum(row["seconds"] for row in rows[1:-1]))
 
 
+def test_the_rendering_section_has_every_task_and_view(script, tmp_path, capsys):
+    pytest.importorskip("pygame")
+    rows = run(script, tmp_path, "--only", "rendering")["sections"]["rendering"]
+    assert len({(row["task"], row["view"]) for row in rows}) == len(rows) == 10
+    assert "frames/s" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "options",
     [
