@@ -53,6 +53,7 @@ COLUMNS = (
     Column("gyro_bias", (3,), "rad/s", "B", "true gyro bias"),
     Column("disturbance", (3,), "N", "I", "external force on the body"),
     Column("wind", (3,), "m/s", "I", "velocity of the air"),
+    Column("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`"),
     # the filter
     Column("estimated_position", (3,), "m", "I", "the filter's"),
     Column("estimated_velocity", (3,), "m/s", "I", "the filter's"),
@@ -94,6 +95,7 @@ _DIRECT = {
     "gyro_bias": "b_g",
     "disturbance": "disturbance",
     "wind": "wind",
+    "faults": "faults",
     "seen_position": "r_seen",
     "action": "action",
     "gates_passed": "gate_next",

@@ -338,6 +338,21 @@ class FlightBatch:
             elif measures is not None:
                 waits[:] = np.inf  # it is never due
 
+    def switch_faults(self, active: bool) -> None:
+        """Let the faults of all flights come, or go, at the next tick, whatever their time is.
+
+        They stay so to the end of the episode, but for those that come at a rate.
+
+        Args:
+            active: Whether they come.
+        """
+        check.flag("active", active)
+        tick = self._blocks["tick"]
+        for fault in self.faults:
+            if active:
+                self._blocks["fault_from"][:, fault.kind] = tick
+            self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
+
     # ---- reading ------------------------------------------------------------------------------
 
     def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:

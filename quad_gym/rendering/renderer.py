@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import validation as check
+from quad_gym.fault_fields import FaultKind
 from quad_gym.flight_record import Flight
 from quad_gym.flight_stage import Stage
 from quad_gym.records import FilterStatus
@@ -153,14 +154,16 @@ class Renderer:
             canvas.text(words, x + 15, y, small, INK)
             y += step
         for words in warnings:
-            canvas.text(words, x, y, small, VERMILLION)
+            canvas.text(words, x, y, small)
             y += step
 
     @staticmethod
     def _warnings(flight: Flight) -> list[str]:
+        rows, now = flight.rows, flight.rows[-1]
+        active = [kind for kind in FaultKind if int(now["faults"]) >> kind & 1]
+        found = [f"fault: {_spoken(kind)}" for kind in active]
         if not flight.estimated:
-            return []
-        rows, now, found = flight.rows, flight.rows[-1], []
+            return found
         fixes = np.flatnonzero(np.isfinite(rows["gnss_position"][:, 0]))
         age = now["time"] - rows["time"][fixes[-1]] if fixes.size else now["time"]
         if flight.stage.has_gnss and age > STALE_FIX:
@@ -169,6 +172,11 @@ class Renderer:
             names = [str(s.name).lower() for s in FilterStatus if s & int(now["filter_status"])]
             found.append("filter: " + ", ".join(names).replace("_", " "))
         return found
+
+
+def _spoken(fault: FaultKind) -> str:
+    words = fault.name.lower().split("_")
+    return " ".join(word.upper() if word in ("gnss", "imu") else word for word in words)
 
 
 _SEEN = {

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.faults import AccelBiasStep, GnssOutage
 from quad_gym.params import TaskParams
 from quad_gym.records import FLIGHT, RESULTS, Autoreset, Control, Source
 from quad_gym.simulation import FlightBatch
@@ -309,3 +310,28 @@ def test_sensors_that_are_switched_off_measure_nothing_until_they_are_back():
     assert same.snapshot().tobytes() == flown(*[(None, None)] * 3).snapshot().tobytes()
     with pytest.raises(ValueError, match="gnss"):
         batch.switch_sensors(gnss=1)
+
+
+def test_faults_that_are_switched_are_those_that_come_by_themselves():
+    def flown(start, switches):
+        span = {"start": start, "duration": 0.25}
+        batch = FlightBatch(
+            9,
+            task=TaskParams(kind="hover", start="hover"),
+            faults=(GnssOutage(**span), AccelBiasStep(**span)),
+            threads=1,
+        )
+        batch.reset(seeds=range(9))
+        for k in range(120):
+            if k in switches:
+                batch.switch_faults(switches[k])
+            batch.step()
+        return batch
+
+    scheduled, switched = flown(0.25, {}), flown(90.0, {49: True, 99: False})
+    for name in ("r", "b_a", "r_hat", "L", "fault_count"):
+        np.testing.assert_array_equal(switched.read(name), scheduled.read(name), err_msg=name)
+    assert not np.array_equal(flown(90.0, {}).read("r_hat"), scheduled.read("r_hat"))
+    assert flown(90.0, {110: True}).active_faults()["gnss_outage"].all()
+    with pytest.raises(ValueError, match="active"):
+        scheduled.switch_faults(1)
