@@ -1,7 +1,8 @@
 """Watch a flight: live in a window, as a video, or in the Rerun viewer; and keep its numbers.
 
     python scripts/fly.py --task lemniscate
-    python scripts/fly.py --task circle --fault gnss --fault-time 4 7 --output results/outage.mp4
+    python scripts/fly.py --task circle --no-camera --fault gnss_outage --fault-time 4 7
+    python scripts/fly.py --task circle --fault rotor_loss --output results/outage.mp4
     python scripts/fly.py --replay results/outage.npz --view chase
     python scripts/fly.py --replay results/outage.npz --output results/outage.rrd
 
@@ -9,13 +10,14 @@ The blue vehicle is the truth. The orange ghost is where the filter believes it 
 ellipsoid that holds it with 3 sigma; the controller flies on that belief, unless --observation says
 otherwise.
 
-In the window: C and G make camera and GNSS fail and come back, V changes the view, the space bar
-stops time, R begins the next episode, and Q or Escape ends the program.
+In the window: C and G switch camera and GNSS off and on, F makes the faults of --fault come and go,
+V changes the view, the space bar stops time, R begins the next episode, and Q or Escape ends the
+program.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,14 +25,17 @@ import gymnasium
 import numpy as np
 
 from baselines.policies import load_policy
-from quad_gym import IDS, Flight, FlightRecorder
+from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
 from quad_gym.cli import option, parse, usage_errors
 from quad_gym.evaluation import Policy
+from quad_gym.fault_presets import PRESETS, faults_of
+from quad_gym.faults import Fault
 from quad_gym.flight_rerun import load_rerun
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
 from quad_gym.reports import require_writable
+from quad_gym.simulation import FlightBatch
 
 ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
 OTHER_ENDINGS = (".npz", ".csv", ".rrd")
@@ -64,8 +69,12 @@ class Args:
     camera: bool = option(True, "measure with the camera")
     gnss_rate: float | None = option(None, "GNSS fixes per second [Hz]; if not given, the suite's")
     camera_rate: float | None = option(None, "images per second [Hz]; if not given, the suite's")
-    fault: Literal["none", "gnss", "camera", "both"] = option("none", "what fails on the way")
-    fault_time: tuple[float, float] = option((4.0, 7.0), "when it fails, and when it is back [s]")
+    fault: tuple[str, ...] = option(
+        (), f"what goes wrong on the way: {', '.join(name for name in PRESETS if name != 'none')}"
+    )
+    fault_time: tuple[float, float] | None = option(
+        None, "when it comes and when it goes [s]; if not given, as each fault has it"
+    )
 
     view: Literal["fixed", "chase"] = option(
         "fixed", "from outside, or from behind the vehicle", group="picture"
@@ -82,26 +91,28 @@ class Args:
     replay: Path | None = option(None, "show this .npz file instead of flying")
 
 
-@dataclass
 class Switches:
-    """Which sensors have failed, by the schedule or by hand."""
+    """What the keys have switched: sensors off and on, and faults on and off."""
 
-    args: Args
-    failed: dict[str, bool] = field(default_factory=lambda: {"gnss": False, "camera": False})
+    def __init__(self) -> None:
+        self._off = {"gnss": False, "camera": False}
+        self._turn_faults = False
 
-    def schedule(self, before: float, now: float) -> None:
-        """Let sensors fail and come back when their time comes."""
-        start, end = self.args.fault_time
-        for sensor in self.failed:
-            if self.args.fault in (sensor, "both"):
-                if before < start <= now:
-                    self.failed[sensor] = True
-                if before < end <= now:
-                    self.failed[sensor] = False
+    def press(self, key: str) -> None:
+        """Take notice of a key."""
+        for letter, sensor in (("c", "camera"), ("g", "gnss")):
+            if key == letter:
+                self._off[sensor] = not self._off[sensor]
+        if key == "f":
+            self._turn_faults = True
 
-    def apply(self, batch: Any) -> None:
-        """Switch the sensors of a batch."""
-        batch.switch_sensors(**{sensor: not failed for sensor, failed in self.failed.items()})
+    def apply(self, batch: FlightBatch) -> None:
+        """Switch a batch."""
+        batch.switch_sensors(**{sensor: not off for sensor, off in self._off.items()})
+        if self._turn_faults:
+            there = any(active.any() for active in batch.active_faults().values())
+            batch.switch_faults(not there)
+            self._turn_faults = False
 
 
 def check_options(args: Args) -> None:
@@ -115,11 +126,12 @@ def check_options(args: Args) -> None:
         value = getattr(args, name)
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(f"--{name} must be greater than 0, got {value:g}")
-    start, end = args.fault_time
-    if not 0.0 <= start < end:
-        raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
-    if args.fault in ("camera", "both") and not args.camera:
-        raise ValueError(f"--fault {args.fault} has no meaning with --no-camera")
+    if args.fault_time is not None:
+        start, end = args.fault_time
+        if not 0.0 <= start < end:
+            raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
+        if not args.fault:
+            raise ValueError("--fault-time needs a --fault")
     if args.output is not None:
         if args.output.suffix.lower() not in VIDEO_ENDINGS + OTHER_ENDINGS:
             endings = ", ".join(VIDEO_ENDINGS + OTHER_ENDINGS)
@@ -130,6 +142,20 @@ def check_options(args: Args) -> None:
             load_rerun()
         require_writable("--output", args.output.parent)
     Renderer(args.view, args.size)
+
+
+def faults_of_args(args: Args) -> tuple[Fault, ...]:
+    """What goes wrong, at its own time or at that of `--fault-time`.
+
+    Raises:
+        ValueError: If there is no such fault, or the sensors lack what it concerns.
+    """
+    sensors = sensor_suite(args.sensors)
+    faults = faults_of(args.fault, sensors if args.camera else sensors.replace(camera=None))
+    if args.fault_time is None:
+        return faults
+    start, end = args.fault_time
+    return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
 
 
 def make_env(args: Args) -> Any:
@@ -149,6 +175,7 @@ def make_env(args: Args) -> Any:
         gnss_rate=args.gnss_rate,
         camera_rate=args.camera_rate,
         duration=args.duration,
+        faults=faults_of_args(args),
         **args.env,
     )
 
@@ -160,12 +187,9 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
     observation, _ = env.reset(seed=seed)
     recorder.keep()
     yield recorder.flight
-    state, starts, over, before = None, np.ones(1, bool), False, -1.0
+    state, starts, over = None, np.ones(1, bool), False
     while not over:
-        now = float(recorder.flight["time"][-1])
-        switches.schedule(before, now)
         switches.apply(batch)
-        before = now
         action, state = policy.predict(
             observation, state=state, episode_start=starts, deterministic=True
         )
@@ -213,9 +237,7 @@ def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switc
                     stopped = not stopped
                 if key == "v":
                     renderer = Renderer("chase" if renderer.view == "fixed" else "fixed", args.size)
-                for letter, sensor in (("c", "camera"), ("g", "gnss")):
-                    if key == letter:
-                        switches.failed[sensor] = not switches.failed[sensor]
+                switches.press(key)
             if window.closed:
                 return False
             if not stopped:
@@ -280,7 +302,7 @@ def main(args: Args) -> None:
         return fly(env, policy, seed, switches, about)
 
     if args.output:
-        *_, flight = flights(args.seed, Switches(args))
+        *_, flight = flights(args.seed, Switches())
         for file in write(flight, args.output, args):
             print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
         return
@@ -288,7 +310,7 @@ def main(args: Args) -> None:
         window = open_window(args)
     seed, goes_on = args.seed, True
     while goes_on:
-        switches = Switches(args)
+        switches = Switches()
         goes_on = watch(flights(seed, switches), args, window, switches)
         seed += 1
     window.close()

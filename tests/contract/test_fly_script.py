@@ -51,17 +51,19 @@ def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
     assert (tmp_path / "new" / "hover.rrd").read_bytes()[:4] == b"RRF2"
 
 
-def test_faults_take_the_sensors_away_for_their_time(tmp_path):
-    options = ("--task", "hover", "--duration", 3, "--fault", "gnss", "--fault-time", 1, 2)
+def test_faults_come_and_go_at_the_given_time(tmp_path):
+    options = ("--task", "hover", "--duration", 3, "--fault", "gnss_outage", "--fault-time", 1, 2)
     done = fly(*options, "--no-camera", "--output", "flight.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     flight = Flight.load(tmp_path / "flight.npz")
     fixed = np.isfinite(flight["gnss_position"][:, 0])
-    expected = (flight["time"] <= 1.0) | (flight["time"] > 2.0)
-    np.testing.assert_array_equal(fixed, expected)
+    away = (flight["time"] >= 1.0) & (flight["time"] < 2.0)
+    # a row holds the fixes since the row before, so that of 1.0 s has some
+    np.testing.assert_array_equal(fixed, ~away | (flight["time"] == 1.0))
+    np.testing.assert_array_equal(flight["faults"] == 1.0, away)
     sigma = np.sqrt(flight["covariance"][:, 0, 0])
-    assert sigma[100] > 10.0 * sigma[50]  # the filter knows that it is lost
-    assert sigma[110] < 0.1 * sigma[100]
+    assert sigma[99] > 10.0 * sigma[50]  # the filter knows that it is lost
+    assert sigma[110] < 0.1 * sigma[99]
     assert not flight.stage.has_camera
 
 
@@ -70,8 +72,10 @@ def test_faults_take_the_sensors_away_for_their_time(tmp_path):
     [
         (("--output", "a.avi"), "--output must end in"),
         (("--speed", 0), "--speed"),
-        (("--fault-time", 3, 2), "--fault-time"),
-        (("--fault", "camera", "--no-camera"), "--no-camera"),
+        (("--fault", "gnss_outage", "--fault-time", 3, 2), "--fault-time"),
+        (("--fault-time", 2, 3), "--fault-time"),
+        (("--fault", "gremlins"), "gremlins"),
+        (("--fault", "camera_occlusion", "--no-camera"), "CameraOcclusion"),
         (("--size", 10, 10), "render_size"),
         (("--replay", "nowhere.npz"), "nowhere.npz"),
         (("--policy", "me"), "policy must be"),
@@ -112,12 +116,13 @@ def test_keys_change_the_flight_while_one_watches():
         def pressed_keys(self):
             return self.presses.pop(self.shown, [])
 
-    args = script.Args(task="hover", duration=2.0, camera=False, size=(320, 240))
+    fault = {"fault": ("imu_bias_step",), "fault_time": (90.0, 99.0)}
+    args = script.Args(task="hover", duration=2.0, camera=False, size=(320, 240), **fault)
     env = script.make_env(args)
     policy = script.load_policy("pd", env)
 
     def watched(presses):
-        switches, flights = script.Switches(args), []
+        switches, flights = script.Switches(), []
         steps = script.fly(env, policy, 0, switches, {})
         kept = (flights.append(flight) or flight for flight in steps)
         window = Keyboard(presses)
@@ -130,6 +135,8 @@ def test_keys_change_the_flight_while_one_watches():
     assert shown == len(flight) + 5  # time stood still for five pictures
     fixed = np.isfinite(flight["gnss_position"][:, 0])
     np.testing.assert_array_equal(np.flatnonzero(~fixed), np.arange(20, 50))
+    _, flight, _ = watched({30: ["f"], 45: ["f"]})
+    np.testing.assert_array_equal(np.flatnonzero(flight["faults"]), np.arange(30, 45))
     assert watched({10: ["r"]})[0]
     for key in ("q", "escape"):
         goes_on, flight, _ = watched({10: [key]})
