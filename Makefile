@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle compare test test-slow soak lint benchmark clean
+.PHONY: setup demo circle animation compare test test-slow soak lint benchmark clean
 
 setup: $(VENV)/.developer
 
@@ -26,6 +26,11 @@ demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each
 
 circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
 	$(BIN)/python scripts/circle_experiment.py --output results/circle
+
+animation: setup  ## the animation of README
+	$(BIN)/python scripts/fly.py --task circle --no-camera --seed 1 \
+		--fault gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
+	rm .github/images/outage.npz
 
 compare: $(VENV)/.trainer  ## the comparison with 5 training seeds
 	$(BIN)/python scripts/compare.py
