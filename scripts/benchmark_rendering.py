@@ -1,13 +1,14 @@
 """Frames a second of the renderer, on one core."""
 
 import itertools
+from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
 from benchmark_timing import Effort, Row, measure, percent, report
 
 from baselines import PDPolicy
-from quad_gym import IDS
+from quad_gym import IDS, Flight
 from quad_gym.rendering import VIEWS, Renderer, flight_of
 from quad_gym.reports import text_table
 
@@ -26,7 +27,7 @@ def time_rendering(effort: Effort) -> list[Row]:
             renderer = Renderer(view, SIZE)
             moments = itertools.cycle([flight.until(time) for time in times])
 
-            def frames(renderer: Renderer = renderer, moments: itertools.cycle = moments) -> None:
+            def frames(renderer: Renderer = renderer, moments: Iterator[Flight] = moments) -> None:
                 for _ in range(INSTANTS):
                     renderer.draw(next(moments))
 
