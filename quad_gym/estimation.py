@@ -207,6 +207,7 @@ class _KalmanFilter:
         rates = check.array("gyro", gyro, (3,))
         force = check.array("accel", accel, (3,))
         self._flight["gyro"], self._flight["accel"] = rates, force
+        self._flight["w_meas"] = rates  # turns the lever arm of a velocity
         before = self.status
         single.ukf_predict(self._flight, self._params, self._work, self._form)
         self._warn_of_news(before)

@@ -35,6 +35,7 @@ FIELD_FILTER = FilterParams(
     feature_noise_across="projected",
     initial_scale=1.0,
     initial_tilt_sigma=0.03,  # how level vehicles stand or hover at the start of an episode
+    initial_velocity_variance=0.03**2,  # and how still
     reuse_first_fix=False,
     gate_false_alarm=1e-4,
 )

@@ -188,6 +188,14 @@ def store_block(a, i, j, m):
 
 
 @kernel
+def keep_block(a, i, j, mask, m):
+    """Write a 3 x 3 block where `mask` is set."""
+    for row in range(3):
+        for column in range(3):
+            a[i + row, j + column] = select(mask, m[row][column], a[i + row, j + column])
+
+
+@kernel
 def outer(a, b):
     """A b^T."""
     return (scale(a[0], b), scale(a[1], b), scale(a[2], b))
@@ -274,7 +282,7 @@ def load_column3(a, i, j):
 
 
 @kernel
-def _cholesky33(m):
+def cholesky33(m):
     """The lower Cholesky factor with its diagonal inverted, the diagonal, and the least pivot."""
     p0 = m[0][0]
     i0 = 1.0 / math.sqrt(p0)
@@ -292,8 +300,19 @@ def _cholesky33(m):
 
 
 @kernel
-def _solve_right33(m, d):
-    """X with x l^T = m, for the factor `d` of `_cholesky33`."""
+def lower33(factor, diagonal):
+    """The lower Cholesky factor itself, of what `cholesky33` returns."""
+    zero = 0.0 * diagonal[0]
+    return (
+        (diagonal[0], zero, zero),
+        (factor[1][0], diagonal[1], zero),
+        (factor[2][0], factor[2][1], diagonal[2]),
+    )
+
+
+@kernel
+def solve_right33(m, d):
+    """X with x l^T = m, for the factor `d` of `cholesky33`."""
     x0 = (m[0][0] * d[0][0], m[1][0] * d[0][0], m[2][0] * d[0][0])
     x1 = (
         (m[0][1] - x0[0] * d[1][0]) * d[1][1],
@@ -326,7 +345,7 @@ def cholesky(a, n, inverse_diagonal):
         for k in range(j):
             column = load_column3(a, j, k)
             block = subtract_outer(block, column, column)
-        factor, diagonal, pivot = _cholesky33(block)
+        factor, diagonal, pivot = cholesky33(block)
         least = select(pivot < least, pivot, select(pivot == pivot, least, pivot))
         a[j, j] = diagonal[0]
         a[j + 1, j] = factor[1][0]
@@ -341,7 +360,7 @@ def cholesky(a, n, inverse_diagonal):
             block = load_block(a, i, j)
             for k in range(j):
                 block = subtract_outer(block, load_column3(a, i, k), load_column3(a, j, k))
-            store_block(a, i, j, _solve_right33(block, factor))
+            store_block(a, i, j, solve_right33(block, factor))
     return least
 
 
@@ -366,7 +385,7 @@ def solve_right(x, rows, factor, n, inverse_diagonal, staircase):
             block = load_block(x, i, j)
             for k in range(max(0, staircase - i), j):
                 block = subtract_outer(block, load_column3(x, i, k), load_column3(factor, j, k))
-            store_block(x, i, j, _solve_right33(block, d))
+            store_block(x, i, j, solve_right33(block, d))
 
 
 @kernel

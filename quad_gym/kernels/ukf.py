@@ -38,22 +38,27 @@ from quad_gym.kernels.linalg import (
     apply,
     apply_transposed,
     cholesky,
+    cholesky33,
     cross,
     keep3,
     keep33,
+    keep_block,
     load3,
     load33,
     load_block,
     load_column3,
+    lower33,
     multiply,
     outer,
     scale,
     scale33,
     select33,
+    solve_right33,
     store_block,
     sub,
     sum_of_outers,
     sum_of_squares,
+    transpose,
     unit_or,
 )
 from quad_gym.kernels.rotation import euler_to_dcm, split_rotation, vector_to_dcm
@@ -314,12 +319,35 @@ def _level_attitude(baseline_B, baseline_I):
 
 
 @kernel
+def _tie_position_to_attitude(L, R_BI, lever_B, mask):
+    """Put into L that the start's position hangs on its attitude, where `mask`.
+
+    The antenna was measured, and r = antenna - R^T l: with R = R(e) R_hat the error of the position
+    is that of the fix and J e, J = R_hat^T [l x].
+    """
+    zero = 0.0 * lever_B[0]
+    x, y, z = lever_B
+    J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
+    root_r, root_e = load_block(L, R, R), load_block(L, E, E)  # diagonal
+    tied = multiply(J, root_e)
+    factor, diagonal, _ = cholesky33(
+        add33(multiply(root_r, root_r), multiply(tied, transpose(tied)))
+    )
+    L_er = solve_right33(multiply(root_e, transpose(tied)), factor)
+    keep_block(L, R, R, mask, lower33(factor, diagonal))
+    keep_block(L, E, R, mask, L_er)
+    rest = scale33(-1.0, multiply(L_er, transpose(L_er)))
+    factor, diagonal, _ = cholesky33(add33(multiply(root_e, root_e), rest))
+    keep_block(L, E, E, mask, lower33(factor, diagonal))
+
+
+@kernel
 def initialize(flight, p, mask):
     """Start the filter from the first fix, where `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
     with equal weights, or level with the baseline's heading; position from the antenna; velocity
-    and biases zero.
+    and biases zero. A level start knows that its position hangs on its attitude.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
@@ -356,3 +384,4 @@ def initialize(flight, p, mask):
         L[E + i, E + i] = select(mask, tilt, L[E + i, E + i])
         L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
         L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])
+    _tie_position_to_attitude(L, R_BI, load3(p.antenna), mask & level)

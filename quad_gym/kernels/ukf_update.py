@@ -109,7 +109,7 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, 
         k += 3
     if use_velocity:
         has = flight.velocity_valid > 0.0
-        w_B = sub(load3(flight.gyro), load3(flight.b_g_hat))
+        w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
         lever_B = cross(w_B, load3(p.antenna))
         _set_triple(h, k, has, add(load3(flight.v_hat), apply_transposed(R_BI, lever_B)))
         _set_triple(z, k, has, apply(R_IG, load3(flight.gnss_velocity)))

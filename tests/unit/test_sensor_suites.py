@@ -5,9 +5,10 @@ import pytest
 from scipy import signal, stats
 
 import quad_gym
+from quad_gym.records import VELOCITY_BLOCK
 from quad_gym.sensor_suites import SUITES
 from quad_gym.sensors import GnssReceiver
-from tests.field_flights import attitudes, fly, nees, steps
+from tests.field_flights import attitudes, fly, state_errors, steps
 from tests.reference_ukf import east_north_up
 from tests.unit.alarms import ALARM, assert_normal
 
@@ -30,12 +31,45 @@ def test_a_suite_of_the_field_is_honest_by_its_settings(name):
     assert 0.0 < suite.estimator.gate_false_alarm < 0.01
 
 
-@pytest.mark.parametrize("name", FIELD)
-def test_the_filter_starts_with_errors_as_large_as_it_believes(name):
-    batch = fly(quad_gym.sensor_suite(name), 1000, task="hover")
-    mean = nees(batch).mean()
-    # a level start is surer of the antenna's place than its noise alone: a few per cent
-    assert 14.0 < mean < 16.5
+# ---- the start ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suite", FIELD)
+def test_errors_at_a_level_start_are_as_claimed(suite):
+    """All 15 together: the position hangs on the attitude, for the antenna is what was measured."""
+    batch = fly(suite, 4000)
+    errors, L = state_errors(batch), batch.read("L")
+    assert_normal(np.linalg.solve(L, errors[..., np.newaxis])[..., 0], np.zeros(15), np.eye(15))
+
+
+def test_a_level_start_ties_the_position_to_the_attitude():
+    """P_re = R^T [l x] P_ee, and P_rr as much more than the fix's."""
+    ukf = quad_gym.UnscentedKalmanFilter(RTK)
+    east, up = RTK.gnss.baseline_B @ [-1.0, 0.0, 0.0], RTK.gnss.baseline_B[2]
+    R_IG = east_north_up(RTK.gnss.reference_antenna_G)
+    ukf.initialize((0.0, 0.0, 0.0), R_IG.T @ (0.0, -east, up))  # looking north
+    lever = np.array(RTK.gnss.primary_antenna_B)
+    J = ukf.R_BI.T @ np.cross(np.eye(3), lever)
+    P_ee = np.diag([0.03**2, 0.03**2, RTK.gnss.baseline_sigma**2])
+    np.testing.assert_allclose(ukf.R_BI[0], (0.0, 1.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(ukf.covariance[6:9, 6:9], P_ee, atol=1e-15)
+    np.testing.assert_allclose(ukf.covariance[0:3, 6:9], J @ P_ee, atol=1e-15)
+    P_rr = np.diag(np.square(RTK.gnss.position_sigma_I)) + J @ P_ee @ J.T
+    np.testing.assert_allclose(ukf.covariance[0:3, 0:3], P_rr, atol=1e-15)
+
+
+def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
+    """Flights turn hard toward their reference at first; a rate half a tick old would show."""
+    batch = fly("rtk", 2000)
+    batch.reset(seeds=range(2000), position=(1.0, -1.0, 2.0))
+    squares = []
+    for _ in range(40):
+        batch.step()
+        measured = batch.read("velocity_valid") > 0.0
+        squares.append(batch.read("block_nis")[measured, VELOCITY_BLOCK])
+    nis = np.concatenate(squares)
+    assert len(nis) > 3000
+    assert ALARM < stats.chi2.cdf(nis.sum(), 3 * len(nis)) < 1.0 - ALARM
 
 
 # ---- rates and phases ------------------------------------------------------------------------
