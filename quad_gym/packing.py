@@ -106,6 +106,7 @@ def params_record(
     p["initial_velocity_variance"] = estimator.initial_velocity_variance
     p["initial_scale"] = estimator.initial_scale
     p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
+    p["gradual_above"] = estimator.gradual_above or 0.0
     alarm = estimator.gate_false_alarm
     p["gate_position"] = special.chdtri(FREEDOMS[POSITION_BLOCK], alarm)
     p["gate_direction"] = special.chdtri(FREEDOMS[BASELINE_BLOCK], alarm)
@@ -126,6 +127,8 @@ def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
         form |= FilterForm.TURN
     if estimator.gate_false_alarm > 0.0:
         form |= FilterForm.GATE
+    if estimator.gradual_above is not None:
+        form |= FilterForm.GRADUAL
     return form
 
 

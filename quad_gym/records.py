@@ -65,6 +65,8 @@ class FilterForm(IntFlag):
     """updates keep the innovations, their predicted deviations and their NIS, block by block"""
     GATE = 16
     """updates leave out blocks whose NIS is beyond the gate, and keep all of these, too"""
+    GRADUAL = 32
+    """updates take images in portions while the attitude is uncertain"""
 
 
 class Gate(IntEnum):
@@ -194,7 +196,7 @@ FLIGHT_FIELDS = (
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
     Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
     Field("update_failures", (), "-", "updates that failed since the filter's start"),
-    Field("nis", (), "-", "normalised innovation squared of the last update"),
+    Field("nis", (), "-", "normalised innovation squared of the last update; NaN: it was taken in portions"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
     # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
     Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
@@ -310,6 +312,7 @@ PARAMS_FIELDS = (
     Field("initial_velocity_variance", (), "m^2/s^2", "of the filter's start"),
     Field("initial_scale", (), "-", "factor on the first fix's covariance"),
     Field("initial_tilt_sigma", (), "rad", "of roll and pitch at a level start; 0: attitude by Wahba's problem"),
+    Field("gradual_above", (), "rad", "deviation of the attitude above which images are taken in portions"),
     Field("gate_position", (), "-", "largest accepted NIS of a position"),
     Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
     Field("gate_patience", (), "-", "rejections in a row that reopen the gate"),

@@ -237,6 +237,11 @@ class FilterParams(Checked):
     reuse_first_fix: bool = True
     """whether the fix that starts the filter is also its first measurement, as in the laboratory;
     that counts it twice, so suites other than "lab" do not"""
+    gradual_above: float | None = None
+    """deviation of the attitude above which images are taken in portions, each about the estimate
+    that the one before has left [rad]; None: always whole (report). The derivatives of pixels are
+    off by the square of the attitude's error, more than a precise camera's noise at a rough start
+    """
     gate_false_alarm: float = 0.0
     """probability that a sound measurement is rejected: a position, a baseline or a feature whose
     normalised innovation squared exceeds the chi-square quantile of this alarm level is left out of
@@ -268,6 +273,8 @@ class FilterParams(Checked):
         self._check(check.flag, "reuse_first_fix")
         if self.initial_tilt_sigma is not None:
             self._check(check.positive, "initial_tilt_sigma")
+        if self.gradual_above is not None:
+            self._check(check.positive, "gradual_above")
         self._check(check.whole, "gate_patience")
         self._check(check.number, "gate_false_alarm", least=0.0)
         if self.gate_false_alarm >= 0.5:

@@ -37,6 +37,7 @@ FIELD_FILTER = FilterParams(
     initial_tilt_sigma=0.03,  # how level vehicles stand or hover at the start of an episode
     initial_velocity_variance=0.03**2,  # and how still
     reuse_first_fix=False,
+    gradual_above=0.01,  # its square is below what a pixel subtends
     gate_false_alarm=1e-4,
 )
 """The filter outside the laboratory: honest about its start, and gated."""

@@ -109,7 +109,7 @@ def _keep_block(flight, s, has, nu, sigma, nis, rejected):
     flight.block_nis[s] = select(has, nis, flight.block_nis[s])
     decision = select(rejected, _REJECTED, _ACCEPTED)
     flight.gate[s] = select(has, decision, flight.gate[s])
-    flight.rejections[s] = select(rejected, flight.rejections[s] + 1.0, flight.rejections[s])
+    flight.rejections[s] = select(has & rejected, flight.rejections[s] + 1.0, flight.rejections[s])
 
 
 @kernel
@@ -126,43 +126,53 @@ def _mask_block(work, k, rejected):
 
 
 @kernel
-def _count_in_row(flight, group, measured, rejected):
+def _count_in_row(flight, group, measured, rejected, again):
     """Count a group's rejections in a row; an acceptance begins anew."""
     row = select(rejected, flight.rejected_in_row[group] + 1.0, 0.0)
+    measured = measured & logical_not(again)
     flight.rejected_in_row[group] = select(measured, row, flight.rejected_in_row[group])
 
 
 @kernel
-def _judge_triple(flight, p, work, k, s, has, gating):
+def _decide(flight, s, has, beyond, again):
+    """Where a block is rejected: beyond the gate or, in a later portion, as it was in the first."""
+    return has & ((beyond & logical_not(again)) | (again & (flight.gate[s] == _REJECTED)))
+
+
+@kernel
+def _judge_triple(flight, p, work, k, s, has, again, gating):
     """Keep the innovation of a position or velocity; return where it is rejected."""
     S = _covariance(p, work, k)
     nu = (work.z[k], work.z[k + 1], work.z[k + 2])
     nis = _nis_of_triple(S, nu)
-    rejected = has & (nis > p.gate_position) & gating
+    rejected = _decide(flight, s, has, (nis > p.gate_position) & gating, again)
     sigma = (math.sqrt(S[0][0]), math.sqrt(S[1][1]), math.sqrt(S[2][2]))
-    _keep_block(flight, s, has, nu, sigma, nis, rejected)
+    _keep_block(flight, s, has & logical_not(again), nu, sigma, nis, rejected)
     return rejected
 
 
 @kernel
-def _judge_direction(flight, p, work, k, s, has, gating):
+def _judge_direction(flight, p, work, k, s, has, again, gating):
     """Keep the innovation of a direction; return where it is rejected."""
     S = _covariance(p, work, k)
     u = (work.h[k], work.h[k + 1], work.h[k + 2])
     nu, S2 = _across(u, S, (work.z[k], work.z[k + 1], work.z[k + 2]))
     nis = _nis_of_direction(S2, nu)
-    rejected = has & (nis > p.gate_direction) & gating
+    rejected = _decide(flight, s, has, (nis > p.gate_direction) & gating, again)
     none = np.nan + 0.0 * nis
     sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), none)
+    has = has & logical_not(again)
     _keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected)
     return rejected
 
 
 @kernel
 def judge_innovations(
-    flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask
+    flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask, again
 ):
     """Keep the innovations of the present measurements and mask those beyond the gate.
+
+    Where measurements are taken in portions, the first decides for all.
 
     Args:
         flight: Record; keeps innovations, NIS, decisions and counters.
@@ -172,6 +182,7 @@ def judge_innovations(
         use_position, use_baseline, use_velocity: Whether any lane has them.
         form: A `FilterForm`.
         mask: Which lanes.
+        again: Which lanes take a later portion of measurements that they have met before.
 
     Returns:
         How many measurements were masked in each lane.
@@ -182,33 +193,33 @@ def judge_innovations(
     k = 0
     if use_position:
         has = mask & (flight.position_valid > 0.0)
-        rejected = _judge_triple(flight, p, work, k, POSITION_BLOCK, has, gating)
+        rejected = _judge_triple(flight, p, work, k, POSITION_BLOCK, has, again, gating)
         if gating:
             _mask_block(work, k, rejected)
-            _count_in_row(flight, POSITION_BLOCK, has, rejected)
+            _count_in_row(flight, POSITION_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
         k += 3
     if use_baseline:
         has = mask & (flight.baseline_valid > 0.0)
-        rejected = _judge_direction(flight, p, work, k, BASELINE_BLOCK, has, gating)
+        rejected = _judge_direction(flight, p, work, k, BASELINE_BLOCK, has, again, gating)
         if gating:
             _mask_block(work, k, rejected)
-            _count_in_row(flight, BASELINE_BLOCK, has, rejected)
+            _count_in_row(flight, BASELINE_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
         k += 3
     if use_velocity:
         has = mask & (flight.velocity_valid > 0.0)
-        rejected = _judge_triple(flight, p, work, k, VELOCITY_BLOCK, has, gating)
+        rejected = _judge_triple(flight, p, work, k, VELOCITY_BLOCK, has, again, gating)
         if gating:
             _mask_block(work, k, rejected)
-            _count_in_row(flight, VELOCITY_BLOCK, has, rejected)
+            _count_in_row(flight, VELOCITY_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
         k += 3
     seen, refused = zero, zero
     for i in range(feature_count):
         if any_of(flight.feature_valid[i] > 0.0):
             has = mask & (flight.feature_valid[i] > 0.0)
-            rejected = _judge_direction(flight, p, work, k, FEATURE_BLOCKS + i, has, gating)
+            rejected = _judge_direction(flight, p, work, k, FEATURE_BLOCKS + i, has, again, gating)
             if gating:
                 _mask_block(work, k, rejected)
                 left_out = left_out + select(rejected, 3.0, 0.0)
@@ -216,7 +227,7 @@ def judge_innovations(
                 refused = refused + select(rejected, 1.0, 0.0)
             k += 3
     if gating and feature_count > 0:
-        _count_in_row(flight, FEATURE_BLOCKS, seen > 0.0, refused >= seen)
+        _count_in_row(flight, FEATURE_BLOCKS, seen > 0.0, refused >= seen, again)
     return left_out
 
 

@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compilation import kernel
+from quad_gym.kernels.directions import direction_noise, direction_pair
 from quad_gym.kernels.ekf import measure_columns
 from quad_gym.kernels.elementary import is_finite
 from quad_gym.kernels.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
@@ -35,6 +36,7 @@ from quad_gym.kernels.linalg import (
     multiply,
     norm,
     scale,
+    scale33,
     select3,
     solve_left_vector,
     solve_right,
@@ -50,6 +52,7 @@ from quad_gym.records import FilterForm, FilterStatus
 
 _EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
 _GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
+_GRADUAL = int(FilterForm.GRADUAL)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -66,15 +69,6 @@ def _set_noise(Rz, k, has, block):
     for i in range(3):
         for j in range(3):
             Rz[k + i, k + j] = select(has, block[i][j], 1.0 if i == j else 0.0)
-
-
-@kernel
-def _direction_noise(direction, variance, floor):
-    """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 but for the floor."""
-    negative = scale(-variance, direction)
-    zero = 0.0 * variance
-    empty = ((zero, zero, zero), (zero, zero, zero), (zero, zero, zero))
-    return add_to_diagonal(add_outer(empty, negative, direction), variance + floor)
 
 
 @kernel
@@ -105,7 +99,7 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, 
         measured = apply(R_IG, load3(flight.gnss_baseline))
         _set_triple(z, k, has, scale(1.0 / norm(measured), measured))
         variance = p.baseline_sigma * p.baseline_sigma
-        _set_noise(Rz, k, has, _direction_noise(u_I, variance, p.direction_floor))
+        _set_noise(Rz, k, has, direction_noise(u_I, variance, p.direction_floor))
         k += 3
     if use_velocity:
         has = flight.velocity_valid > 0.0
@@ -139,58 +133,13 @@ def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, 
             sigma = p.pixel_sigma * pixel / length
             predicted = scale(work.inverse_distance[i], to_feature)
             u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
-            noise = _direction_noise(u_B, sigma * sigma, p.direction_floor)
+            noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
             # a pixel does not move along the optical axis c: less c c^T, across u
             across = sub(R_CB[2], scale(dot(R_CB[2], u_B), u_B))
             less = scale(-p.noise_projected * sigma * sigma, across)
             _set_noise(Rz, k, has, add_outer(noise, less, across))
             k += 3
     return k
-
-
-@kernel
-def _inverse_root_minus_one(d):
-    """(1 + d)^(-1/2) - 1 by its binomial series, exact to float64 for |d| < 0.01."""
-    return d * (
-        -1.0 / 2.0
-        + d
-        * (
-            3.0 / 8.0
-            + d
-            * (
-                -5.0 / 16.0
-                + d
-                * (35.0 / 128.0 + d * (-63.0 / 256.0 + d * (231.0 / 1024.0 - d * (429.0 / 2048.0))))
-            )
-        )
-    )
-
-
-@kernel
-def _shrinkage(d):
-    """(1 + d)^(-1/2) - 1 for d > -1."""
-    value = _inverse_root_minus_one(d)
-    if any_of(abs(d) >= 0.01):
-        root = math.sqrt(1.0 + d)
-        value = select(abs(d) < 0.01, value, -d / (root * (1.0 + root)))
-    return value
-
-
-@kernel
-def _direction_pair(v, inverse_norm, v_even, v_odd):
-    """Half-difference, and half-sum less unit(v), of the pair unit(v + v_even +- v_odd).
-
-    |v + v_even +- v_odd|^2 = |v|^2 (1 + d): the small d gives the lengths without cancellation.
-    """
-    centre = add(v, v_even)
-    inverse_square = inverse_norm * inverse_norm
-    d_even = inverse_square * (dot(v_even, add(v, centre)) + dot(v_odd, v_odd))
-    d_odd = inverse_square * (2.0 * dot(centre, v_odd))
-    plus, minus = _shrinkage(d_even + d_odd), _shrinkage(d_even - d_odd)
-    both, gap = 0.5 * (plus + minus), 0.5 * (plus - minus)
-    difference = add(add(v_odd, scale(both, v_odd)), scale(gap, centre))
-    half_sum = add(add(v_even, scale(both, centre)), scale(gap, v_odd))
-    return scale(inverse_norm, difference), scale(inverse_norm, half_sum)
 
 
 @kernel
@@ -237,7 +186,7 @@ def _measure_sigma_points(
                 v_odd = sub(sub(apply(odd, X_B), dr_B), apply(even, dr_B))
                 v_even = sub(apply(even, X_B), apply(odd, dr_B))
                 v = sub(X_B, camera)
-                a, s = _direction_pair(v, work.inverse_distance[i], v_even, v_odd)
+                a, s = direction_pair(v, work.inverse_distance[i], v_even, v_odd)
                 _set_triple(A, k, has, scale(inverse_c, a))
                 _set_triple(S, k, has, scale(inverse_c, s))
                 k += 3
@@ -256,8 +205,8 @@ def _innovate(work, n, c):
 
 
 @kernel
-def _sum_noise(p, work, n):
-    """Add the even parts' share to work.Rz."""
+def _sum_noise(p, work, n, doubt):
+    """Multiply the measurement noise in work.Rz by `doubt` and add the even parts' share."""
     S, mu = work.E, work.mu
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     for i in range(0, n, 3):
@@ -266,9 +215,13 @@ def _sum_noise(p, work, n):
             block = sum_of_outers_of_rows(S, S, i, j, 9)
             block = add_outer(block, mu_i, (mu[j], mu[j + 1], mu[j + 2]))
             if i == j:
-                noise = load_block(work.Rz, i, i)
+                noise = scale33(doubt, load_block(work.Rz, i, i))
                 block = (add(block[0], noise[0]), add(block[1], noise[1]), add(block[2], noise[2]))
             store_block(work.Rz, i, j, block)
+
+
+_DOUBTS = (100.0, 100.0 / 9.0, 100.0 / 90.0)
+"""Factors on the noise of the portions of a measurement; the sum of their inverses is one."""
 
 
 @kernel
@@ -279,6 +232,12 @@ def update(flight, p, work, feature_count, mask, form=0):
     The gate masks after the spread c of the sigma points was chosen for all measurements; c enters
     the moments in their fourth order only.
 
+    With GRADUAL, lanes whose attitude is uncertain take images in portions: three updates by the
+    same measurements with more noise, each about the estimate that the one before has left. Their
+    information adds up to that of the measurements, so that a linear model would see no difference;
+    the derivatives of this one are taken where they matter. (R. Zanetti, "Recursive Update
+    Filtering for Nonlinear Estimation", IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
+
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
         p: Parameters as the filter believes them.
@@ -286,6 +245,36 @@ def update(flight, p, work, feature_count, mask, form=0):
         feature_count: Features in use.
         mask: Which lanes.
         form: A `FilterForm`.
+    """
+    loose, first = mask & (p.sigma_spread < 0.0), 2  # nobody
+    if (form & _GRADUAL) != 0 and feature_count > 0:
+        loose = mask & _is_loose(flight, p, feature_count)
+        if any_of(loose):
+            first = 0
+    for part in range(first, 3):
+        doubt = select(loose, _DOUBTS[part], 1.0)
+        taking, again = mask & (loose | (part == 2)), loose & (part > 0)
+        _update_by(flight, p, work, feature_count, taking, form, doubt, again)
+    if (form & _GRADUAL) != 0:
+        flight.nis = select(loose, np.nan, flight.nis)
+
+
+@kernel
+def _is_loose(flight, p, feature_count):
+    """Where the camera sees a feature and the attitude deviates by more than `gradual_above`."""
+    seen = flight.feature_valid[0]
+    for i in range(1, feature_count):
+        seen = seen + flight.feature_valid[i]
+    P_ee = sum_of_squares(flight.L, E, 9)
+    variance = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
+    return (seen > 0.0) & (variance > p.gradual_above * p.gradual_above)
+
+
+@kernel
+def _update_by(flight, p, work, feature_count, mask, form, doubt, again):
+    """Condition the estimate on the measurements with `doubt` times their noise, where `mask`.
+
+    `again`: where these measurements were met before, with another doubt.
     """
     use_position = any_of(flight.position_valid > 0.0)
     use_baseline = any_of(flight.baseline_valid > 0.0)
@@ -306,9 +295,18 @@ def update(flight, p, work, feature_count, mask, form=0):
     _innovate(work, n, c)
     if (form & _WATCH) != 0:
         measured = measured - judge_innovations(
-            flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask
+            flight,
+            p,
+            work,
+            feature_count,
+            use_position,
+            use_baseline,
+            use_velocity,
+            form,
+            mask,
+            again,
         )
-    _sum_noise(p, work, n)
+    _sum_noise(p, work, n, doubt)
 
     # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
     A, z, N, t, L9 = work.A, work.z, work.N, work.t, work.L9

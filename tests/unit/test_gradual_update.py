@@ -1,0 +1,90 @@
+"""Images in portions: the same filter where the model is linear, an honest one where it is not."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from tests.field_flights import fly, state_errors
+from tests.unit.alarms import ALARM
+
+INDOOR = quad_gym.sensor_suite("indoor")
+
+
+def with_gradual(above, kind="ukf"):
+    camera = INDOOR.camera.replace(phase=0.0)
+    estimator = INDOOR.estimator.replace(gradual_above=above, kind=kind)
+    return INDOOR.replace(camera=camera, estimator=estimator)
+
+
+def started(above, sigma, gate=0.0):
+    """A filter before its first image, with an attitude known to `sigma`, and what it sees."""
+    suite = with_gradual(above)
+    suite = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=gate))
+    ukf = quad_gym.UnscentedKalmanFilter(suite)
+    P = np.diag(np.repeat([0.05, 0.03, sigma, 0.2, 0.01], 3) ** 2)
+    ukf.set_state(
+        position=(0.5, -0.3, 1.2),
+        velocity=np.zeros(3),
+        R_BI=np.eye(3),
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=P,
+    )
+    camera = quad_gym.sensors.Camera(suite, rng=np.random.default_rng(3))
+    truth = np.array((0.5, -0.3, 1.2)) + (0.03, -0.05, 0.02)
+    return ukf, camera.measure(truth, np.eye(3))
+
+
+def test_portions_of_a_linear_measurement_add_up_to_it():
+    whole, pixels = started(None, 1e-5)
+    parts, _ = started(1e-6, 1e-5)
+    before = whole.covariance
+    whole.update(pixels=pixels)
+    parts.update(pixels=pixels)
+    scale = np.sqrt(np.diag(whole.covariance))
+    assert (scale[:3] < 0.2 * np.sqrt(np.diag(before))[:3]).all()
+    off = np.abs(parts.position - whole.position) / scale[:3]
+    assert off.max() < 0.05  # what is left is the curvature of the position
+    np.testing.assert_allclose(
+        parts.covariance / np.outer(scale, scale),
+        whole.covariance / np.outer(scale, scale),
+        atol=0.02,
+    )
+    assert np.isfinite(whole.nis[0])
+    assert np.isnan(parts.nis[0])
+    np.testing.assert_array_equal(parts.block_nis, whole.block_nis)
+
+
+def test_a_feature_that_the_gate_refuses_is_left_out_of_every_portion():
+    clean, pixels = started(0.01, 0.03, gate=1e-4)
+    wrong, _ = started(0.01, 0.03, gate=1e-4)
+    seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    spoilt, without = pixels.copy(), pixels.copy()
+    spoilt[seen[0]] += 900.0
+    without[seen[0]] = np.nan
+    wrong.update(pixels=spoilt)
+    clean.update(pixels=without)
+    assert (wrong.gate == quad_gym.records.Gate.REJECTED).sum() == 1
+    np.testing.assert_allclose(wrong.position, clean.position, atol=1e-6)
+    np.testing.assert_allclose(wrong.covariance, clean.covariance, rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_a_rough_start_is_honest_after_the_first_image_in_portions_only(kind):
+    sums = {}
+    for above in (0.01, None):
+        batch = fly(with_gradual(above, kind), 2000, task="hover")
+        errors, L = state_errors(batch), batch.read("L")
+        white = np.linalg.solve(L, errors[..., np.newaxis])[..., 0]
+        sums[above] = (white**2).sum()
+        assert (batch.read("feature_valid").sum(axis=1) > 0).mean() > 0.99
+    expected = stats.chi2(15 * 2000)
+    assert expected.cdf(sums[0.01]) < 1.0 - ALARM
+    assert expected.cdf(sums[0.01]) > ALARM
+    assert expected.sf(sums[None]) < ALARM
+
+
+def test_a_deviation_that_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match=r"^FilterParams.gradual_above must be"):
+        quad_gym.FilterParams(gradual_above=0.0)
