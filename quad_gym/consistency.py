@@ -41,6 +41,11 @@ PARTS = {
 HONEST_SHARE = 0.9
 """Share of instants in the 95 % band from which a filter is called honest."""
 
+BAND_FLIGHTS = 1000
+"""Flights whose mean the band is for, where there are more. The means over more flights have less
+chance in them; they are then judged by how far off they are, some 2 % for the whole state, and not
+by whether enough flights can tell."""
+
 NEGLIGIBLE_CORRELATION = 0.02
 """Of innovations: it does not matter, even where flights enough can tell it from zero."""
 
@@ -211,7 +216,7 @@ class NeesRecorder:
         time, found = np.array(self._time), {}
         for name, part in PARTS.items():
             dimension = part.stop - part.start
-            low, high = mean_band(dimension, np.full(time.shape, self._count))
+            low, high = mean_band(dimension, np.full(time.shape, min(self._count, BAND_FLIGHTS)))
             found[name] = MeanSquare(name, dimension, time, np.array(self._means[name]), low, high)
         return found
 
@@ -311,7 +316,7 @@ class InnovationRecorder:
             if some.any():
                 counts, dimension = self._counts[name][some], FREEDOMS[blocks[0]]
                 mean = self._sums[name][some] / counts
-                low, high = mean_band(dimension, counts)
+                low, high = mean_band(dimension, np.minimum(counts, BAND_FLIGHTS))
                 found[name] = MeanSquare(name, dimension, middle[some], mean, low, high)
         return found
 

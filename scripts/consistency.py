@@ -2,15 +2,17 @@
 
 Flies random trajectories (or another task) by PD control and takes the normalised estimation error
 squared (NEES) of the 15 states and of each block of three, over time, and the normalised innovation
-squared (NIS) of each sensor. If the covariance is right, means over flights lie in known bands at
-95 % of the instants, and innovations are white. The truth is the simulator's.
+squared (NIS) of each sensor. If the covariance is right, means over 1,000 flights lie in known
+bands at 95 % of the instants, and innovations are white. The truth is the simulator's.
 
-Prints a table and a verdict, and writes figures (PNG and SVG) and all numbers with the whole
+Prints tables and a verdict, and writes figures (PNG and SVG) and all numbers with the whole
 configuration and the seeds (consistency.json). For example:
 
-  python scripts/consistency.py                             the laboratory's suite, mended
-  python scripts/consistency.py --form report               in the report's form
-  python scripts/consistency.py --estimator ekf --start matched
+  python scripts/consistency.py                             the suite "rtk"
+  python scripts/consistency.py --suite indoor --start warm
+  python scripts/consistency.py --suite lab                 the report's filter
+  python scripts/consistency.py --suite lab --form mended   the same sensors, all mends
+  python scripts/consistency.py --estimator ekf             an extended Kalman filter
   python scripts/consistency.py --mass-factor 1.2           a vehicle heavier than it is taken for
   python scripts/consistency.py --noise-factor 1.5          sensors worse than the filter believes
 """
@@ -20,52 +22,36 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
-
-from quad_gym import SensorSuite, sensor_suite, vehicle_params
+from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
 from quad_gym.cli import option, parse, usage_errors
-from quad_gym.consistency import (
-    HONEST_SHARE,
-    InnovationRecorder,
-    MeanSquare,
-    NeesRecorder,
-    Whiteness,
-    start_matched,
-    verdict,
-)
+from quad_gym.consistency import HONEST_SHARE, MeanSquare
+from quad_gym.consistency_flights import Findings, endless, put_to_the_test
 from quad_gym.consistency_plots import errors_figure, nees_figure, nis_figure, whiteness_figure
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.plots import house_style, require_matplotlib, save_figure
 from quad_gym.records import Source
 from quad_gym.reports import text_table, versions, write_json
+from quad_gym.sensor_suites import FIELD_FILTER
 from quad_gym.simulation import FlightBatch
-
-MENDS = {
-    "samples": ("instant", "average"),
-    "integration": ("euler", "midpoint"),
-    "covariance_reset": ("none", "turn"),
-    "feature_noise_across": ("measured", "projected"),
-}
-"""What each mend is in the report's form, and mended."""
 
 
 @dataclass(frozen=True)
 class Args:
     """Options of the experiment."""
 
-    flights: int = option(1000, "flights", group="experiment")
+    flights: int = option(4000, "flights", group="experiment")
     first_seed: int = option(0, "seed of the first flight; the others follow it")
     duration: float = option(10.0, "length of a flight [s]")
     task: Literal["random_trajectory", "hover", "circle", "lemniscate"] = option(
         "random_trajectory", "what is flown"
     )
     fly_on: Literal["estimate", "truth"] = option("estimate", "what the controller sees")
-    start: Literal["suite", "matched"] = option(
-        "suite",
-        "the filter's start: as the suite has it, or with errors drawn from its own covariance, "
-        "which tests the filter apart from its start",
+    start: Literal["cold", "warm", "matched"] = option(
+        "cold",
+        "the filter's start: from its first fix; after some seconds of hovering; or with errors "
+        "drawn from its own covariance, which tests the filter apart from its start",
     )
     every: float = option(0.05, "time between two looks at the errors [s]")
     settle: float = option(0.0, "time at the start that does not count [s]")
@@ -76,9 +62,9 @@ class Args:
         None, "threads; if not given, as many as there are cores; results do not depend on it"
     )
 
-    suite: str = option("lab", "sensor suite", group="sensors and filter")
+    suite: str = option("rtk", "sensor suite", group="sensors and filter")
     form: Literal["suite", "report", "mended"] = option(
-        "mended", "form of filter and IMU: as the suite has it, the report's, or with all mends"
+        "suite", "form of filter and IMU: as the suite has it, the report's, or with all mends"
     )
     samples: Literal["instant", "average"] | None = option(None, "in place of the form's")
     integration: Literal["euler", "midpoint"] | None = option(None, "in place of the form's")
@@ -95,13 +81,15 @@ class Args:
     mass_factor: float = option(
         1.0, "true mass, as a multiple of what the controller believes", group="model mismatch"
     )
+    motor_lag_factor: float = option(1.0, "true lag of the motors, likewise")
+    world: str = option("calm", "what air, ground and battery do: calm, breeze or fresh_breeze")
     noise_factor: float = option(1.0, "true white noise, as a multiple of what the filter believes")
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         if self.flights < 2:
             raise ValueError(f"--flights must be at least 2, got {self.flights}")
-        for name in ("duration", "every", "mass_factor", "noise_factor"):
+        for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value}")
@@ -114,17 +102,18 @@ def suite_of(args: Args) -> SensorSuite:
     suite = sensor_suite(args.suite)
     if not args.camera:
         suite = suite.replace(camera=None)
-    chosen: dict[str, Any] = {}
-    for name, (report, mended) in MENDS.items():
-        if args.form != "suite":
-            chosen[name] = report if args.form == "report" else mended
+    samples = suite.imu.samples
+    if args.form != "suite":
+        samples = "instant" if args.form == "report" else "average"
+        form = FilterParams() if args.form == "report" else FIELD_FILTER
+        suite = suite.replace(estimator=form)
+    chosen = {"kind": args.estimator} if args.estimator is not None else {}
+    for name in ("integration", "covariance_reset", "feature_noise_across"):
         if getattr(args, name) is not None:
             chosen[name] = getattr(args, name)
-    samples = chosen.pop("samples", suite.imu.samples)
-    if args.estimator is not None:
-        chosen["kind"] = args.estimator
     suite = suite.replace(
-        imu=suite.imu.replace(samples=samples), estimator=suite.estimator.replace(**chosen)
+        imu=suite.imu.replace(samples=args.samples or samples),
+        estimator=suite.estimator.replace(**chosen),
     )
     camera_rate = args.camera_rate if args.camera else None
     return suite.with_rates(imu=args.imu_rate, gnss=args.gnss_rate, camera=camera_rate)
@@ -133,42 +122,45 @@ def suite_of(args: Args) -> SensorSuite:
 def batch_of(args: Args) -> FlightBatch:
     """Flights that nothing ends before their time."""
     suite, vehicle = suite_of(args), vehicle_params("lab")
-    endless = {"duration": 0.0, "out_of_bounds": 1e9, "ground": -1e9, "max_tilt": math.pi}
+    true_vehicle = vehicle.replace(
+        mass=args.mass_factor * vehicle.mass,
+        motor_time_constant=args.motor_lag_factor * vehicle.motor_time_constant,
+    )
     return FlightBatch(
         args.flights,
         vehicle=vehicle,
         sensors=suite,
         gains="tuned",
-        task=TASK_DEFAULTS[args.task].replace(**endless),
+        task=endless(TASK_DEFAULTS[args.task]),
         source=Source.ESTIMATE if args.fly_on == "estimate" else Source.TRUTH,
+        filter_start="warm" if args.start == "warm" else "cold",
         innovations=True,
         threads=args.threads,
-        true_vehicle=vehicle.replace(mass=args.mass_factor * vehicle.mass),
+        true_vehicle=true_vehicle,
         true_sensors=suite.scaled_noise(args.noise_factor),
+        world=args.world,
     )
 
 
-def fly(args: Args, batch: FlightBatch) -> tuple[NeesRecorder, InnovationRecorder]:
+def fly(args: Args, batch: FlightBatch) -> Findings:
     """Fly all flights to their end, looking at the errors on the way."""
-    dt = batch.sensors.imu.dt
-    ticks, stride = round(args.duration / dt), max(1, round(args.every / dt))
-    recorder = NeesRecorder()
-    bins = dt * stride * np.arange(ticks // stride + 1)
-    innovations = InnovationRecorder(batch, bins, args.settle)
-    batch.reset(seeds=range(args.first_seed, args.first_seed + args.flights))
-    if args.start == "matched":
-        start_matched(batch, args.first_seed)
-    recorder.add(batch, 0.0)
     shown = time.monotonic()
-    for tick in range(1, ticks + 1):
-        batch.step()
-        innovations.add(batch, tick * dt)
-        if tick % stride == 0:
-            recorder.add(batch, tick * dt)
+
+    def progress(flown: float) -> None:
+        nonlocal shown
         if time.monotonic() > shown + 2.0:
             shown = time.monotonic()
-            print(f"  {tick * dt:.1f} of {args.duration:g} s flown", file=sys.stderr, flush=True)
-    return recorder, innovations
+            print(f"  {flown:.1f} of {args.duration:g} s flown", file=sys.stderr, flush=True)
+
+    return put_to_the_test(
+        batch,
+        seeds=range(args.first_seed, args.first_seed + args.flights),
+        duration=args.duration,
+        every=args.every,
+        settle=args.settle,
+        matched=args.start == "matched",
+        progress=progress,
+    )
 
 
 def title_of(batch: FlightBatch, args: Args) -> str:
@@ -202,46 +194,18 @@ def table_of(quantity: str, parts: dict[str, MeanSquare]) -> str:
     return text_table({quantity: ["of"], "mean over flights": columns}, rows)
 
 
-@dataclass(frozen=True)
-class Findings:
-    """What was found about a filter, from the instant on that counts."""
-
-    nees: dict[str, MeanSquare]
-    nis: dict[str, MeanSquare]
-    whiteness: dict[str, Whiteness]
-    failed: int
-    """filters that failed in a cycle"""
-
-    @property
-    def honest(self) -> bool:
-        """Whether everything is as an honest filter's."""
-        squares = (*self.nees.values(), *self.nis.values())
-        white = all(part.white for part in self.whiteness.values())
-        return self.failed == 0 and white and all(part.honest for part in squares)
-
-    def sentences(self) -> dict[str, str]:
-        """Verdicts in plain English, by what they are on."""
-        said = {f"nees_{name}": f"NEES of the {verdict(part)}" for name, part in self.nees.items()}
-        said |= {f"nis_{name}": f"NIS of the {verdict(part)}" for name, part in self.nis.items()}
-        for name, part in self.whiteness.items():
-            judged = "white" if part.white else "not white"
-            text = (
-                f"Innovations of the {name}: autocorrelation at most {part.largest:+.3f}: {judged}."
-            )
-            said[f"innovations_{name}"] = text
-        return said
-
-    def report(self) -> str:
-        """Tables and the verdict, for the screen."""
-        tables = [table_of("NEES", self.nees)]
-        if self.nis:
-            tables.append(table_of("NIS", self.nis))
-        lines = [
-            "The filter is honest." if self.honest else "The filter is not honest in everything:",
-            *(f"  {text}" for text in self.sentences().values()),
-            f"  Filters that failed in a cycle: {self.failed}.",
-        ]
-        return "\n\n".join([*tables, "\n".join(lines)])
+def report_of(findings: Findings) -> str:
+    """Tables and the verdict, for the screen."""
+    tables = [table_of("NEES", findings.nees)]
+    if findings.nis:
+        tables.append(table_of("NIS", findings.nis))
+    lines = [
+        "The filter is honest." if findings.honest else "The filter is not honest in everything:",
+        *(f"  {text}" for text in findings.sentences().values()),
+        f"  Filters that failed in a cycle: {findings.failed}. Flights astray: "
+        f"{findings.astray.sum()}.",
+    ]
+    return "\n\n".join([*tables, "\n".join(lines)])
 
 
 def main(args: Args) -> None:
@@ -252,25 +216,18 @@ def main(args: Args) -> None:
         args.output.mkdir(parents=True, exist_ok=True)
     began, title = time.monotonic(), title_of(batch, args)
     print(f"{title}; {args.flights:,} flights of {args.duration:g} s, {args.task}.\n")
-    recorder, innovations = fly(args, batch)
-    nees, nis = recorder.nees(), innovations.nis()
-    errors, sigmas = recorder.errors()
-    findings = Findings(
-        nees={name: part.since(args.settle) for name, part in nees.items()},
-        nis={name: part.since(args.settle) for name, part in nis.items()},
-        whiteness=innovations.whiteness(),
-        failed=int((batch.read("filter_status") != 0).sum()),
-    )
-    print(findings.report())
+    whole = fly(args, batch)
+    findings = whole.since(args.settle)
+    print(report_of(findings))
 
     files = []
     with house_style():
         figures = {
-            "nees": nees_figure(nees, title, args.settle),
-            "errors": errors_figure(nees["state"].time, errors, sigmas, title),
+            "nees": nees_figure(whole.nees, title, args.settle),
+            "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
         }
-        if nis:
-            figures["nis"] = nis_figure(nis, title, args.settle)
+        if whole.nis:
+            figures["nis"] = nis_figure(whole.nis, title, args.settle)
         if findings.whiteness:
             figures["whiteness"] = whiteness_figure(findings.whiteness, title)
         for name, figure in figures.items():
@@ -283,16 +240,19 @@ def main(args: Args) -> None:
         "share_inside": {name: part.share_inside for name, part in squares.items()},
         "overall": {name: part.overall for name, part in squares.items()},
         "filters_failed": findings.failed,
+        "flights_astray": int(findings.astray.sum()),
+        "mean_tracking_error": float(findings.tracking.mean.mean()),
         "configuration": args,
         "sensors": batch.sensors,
         "vehicle": batch.vehicle,
+        "world": batch.world,
         "seeds": [args.first_seed, args.first_seed + args.flights - 1],
         "versions": versions("numpy", "numba", "scipy"),
-        "nees": nees,
-        "nis": nis,
+        "nees": whole.nees,
+        "nis": whole.nis,
         "whiteness": findings.whiteness,
-        "rms_errors": errors,
-        "rms_claimed": sigmas,
+        "rms_errors": whole.errors,
+        "rms_claimed": whole.claimed,
     }
     files.append(write_json(args.output / "consistency.json", found))
     seconds = time.monotonic() - began

