@@ -1,4 +1,4 @@
-"""Measure what quad_gym costs: its filter, its tick, its environments, its memory, its pictures.
+"""Measure what quad_gym costs: filter, tick, options, environments, memory, pictures.
 
 Every figure is the best of some repeats, as whatever else the machine does can only slow it down;
 "spread" is how much longer the median of the repeats took. All ratios are taken within one run.
@@ -34,6 +34,7 @@ from quad_gym.threads import available_cores
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from benchmark_faces import faces_table, time_faces
+from benchmark_options import options_table, time_options
 from benchmark_peers import Measured, filterpy_cycles, plain_cycles
 from benchmark_rendering import rendering_table, time_rendering
 from benchmark_timing import Effort, Row, Timing, measure, percent, report
@@ -43,10 +44,10 @@ from benchmark_timing import Effort, Row, Timing, measure, percent, report
 class Args:
     """Options of the benchmark."""
 
-    only: Literal["all", "filter", "tick", "faces", "memory", "rendering"] = option(
+    only: Literal["all", "filter", "tick", "options", "faces", "memory", "rendering"] = option(
         "all", "section to run", group="what to measure"
     )
-    batch: int = option(256, "flights in the filter's and the tick's batch, in eights")
+    batch: int = option(256, "flights in the batches of filter, tick and options, in eights")
     envs: int = option(1024, "environments in the faces' batches")
     threads: int | None = option(None, "most threads to use; if not given, one per core")
     cold: bool = option(False, "measure the first use with an empty cache too: a minute or more")
@@ -304,6 +305,7 @@ def processor() -> dict[str, Any]:
 SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str]]] = {
     "filter": (time_filter, filter_table),
     "tick": (time_tick, tick_table),
+    "options": (lambda args: time_options(args.batch, args.effort), options_table),
     "faces": (
         lambda args: time_faces(args.envs, args.most_threads, args.effort),
         faces_table,

@@ -63,6 +63,17 @@ def test_the_rendering_section_has_every_task_and_view(script, tmp_path, capsys)
     assert "frames/s" in capsys.readouterr().out
 
 
+def test_the_options_section_compares_each_with_everything_off(script, tmp_path):
+    found = run(script, tmp_path, "--only", "options", "--batch", "16")
+    rows = {row["name"]: row for row in found["sections"]["options"]}
+    assert next(iter(rows)) == "everything off"
+    assert {"gate", "gusts", "suite rtk", "extended Kalman filter"} < set(rows)
+    off = rows["everything off"]
+    for row in rows.values():
+        assert row["times_off"] == pytest.approx(row["seconds"] / off["seconds"])
+        assert row["seconds"] > 0.0
+
+
 @pytest.mark.parametrize(
     "options",
     [

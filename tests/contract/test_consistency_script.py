@@ -9,7 +9,19 @@ SCRIPT = Path(__file__).parents[2] / "scripts" / "consistency.py"
 
 
 def run(output, *options):
-    common = ("--flights", "64", "--duration", "1", "--output", str(output), "--no-camera")
+    common = (
+        "--suite",
+        "lab",
+        "--form",
+        "mended",
+        "--no-camera",
+        "--flights",
+        "64",
+        "--duration",
+        "1",
+        "--output",
+        str(output),
+    )
     return subprocess.run(
         [sys.executable, str(SCRIPT), *common, *options],
         capture_output=True,

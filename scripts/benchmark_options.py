@@ -1,0 +1,101 @@
+"""The options' part of the benchmark: what each costs, over a tick with all of them off.
+
+Batches take turns, so that whatever else the machine does slows all of them alike.
+"""
+
+import itertools
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from benchmark_timing import Effort, Row, Timing, percent, report
+
+import quad_gym
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.reports import text_table
+from quad_gym.sensor_suites import SUITES
+from quad_gym.simulation import FlightBatch
+
+LAB = quad_gym.sensor_suite("lab")
+OFF = "everything off"
+
+
+def filter_form(**changes: Any) -> dict[str, Any]:
+    """The laboratory's suite with another form of the filter, as a keyword of a batch."""
+    return {"sensors": LAB.replace(estimator=LAB.estimator.replace(**changes))}
+
+
+def in_a_world(**changes: Any) -> dict[str, Any]:
+    """Another world, as a keyword of a batch."""
+    return {"world": quad_gym.WorldParams(**changes)}
+
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    OFF: {},
+    "extended Kalman filter": filter_form(kind="ekf"),
+    "averaged IMU samples": {"sensors": LAB.replace(imu=LAB.imu.replace(samples="average"))},
+    "midpoint integration": filter_form(integration="midpoint"),
+    "covariance turns at its reset": filter_form(covariance_reset="turn"),
+    "pixel noise as projected": filter_form(feature_noise_across="projected"),
+    "images in portions at the start": filter_form(gradual_above=0.01),
+    "innovations kept": {"innovations": True},
+    "gate": filter_form(gate_false_alarm=1e-4),
+    "wind and rotor drag": in_a_world(wind_I=(4.0, 0.0, 0.0), linear_drag_B=(0.4, 0.3, 0.0)),
+    "gusts": in_a_world(gust_wind_speed=4.0),
+    "ground effect": in_a_world(ground_effect=True),
+    "battery": in_a_world(battery=quad_gym.BatteryParams()),
+    "world breeze": {"world": "breeze"},
+    "mass drawn anew each episode": {
+        "randomization": {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
+    },
+    **{f"suite {name}": {"sensors": name} for name in SUITES if name != "lab"},
+}
+"""What is switched on, as keywords of `FlightBatch`."""
+
+STARTS: dict[str, dict[str, Any]] = {
+    "reset of a flight, cold start": {"filter_start": "cold"},
+    "reset of a flight, warm start": {"filter_start": "warm"},
+}
+"""Likewise, of what is timed at its reset."""
+
+
+def time_options(count: int, effort: Effort) -> list[Row]:
+    """A tick of a flight with each option, and a reset with each start, on one core."""
+    task = TASK_DEFAULTS["hover"].replace(duration=0.0)
+    jobs: dict[str, Callable[[], Any]] = {}
+    for name, options in {**OPTIONS, **STARTS}.items():
+        batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
+        batch.reset(seeds=range(count))
+        for _ in range(50):  # the start, where images come in portions, is not what counts
+            batch.step()
+        jobs[name] = batch.step if name in OPTIONS else batch.reset
+    began = time.perf_counter()
+    jobs[OFF]()
+    calls = max(1, round(effort.seconds / (time.perf_counter() - began)))
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for turn, (name, job) in itertools.product(range(effort.repeats), jobs.items()):
+        if name == OFF:
+            print(f"  turn {turn + 1} of {effort.repeats}", file=sys.stderr, flush=True)
+        began = time.perf_counter()
+        for _ in range(calls):
+            job()
+        times[name].append((time.perf_counter() - began) / (calls * count))
+    off = min(times[OFF])
+    rows = []
+    for name, found in times.items():
+        best = min(found)
+        timing = Timing(best, statistics.median(found) / best - 1.0)
+        rows.append(report(name, timing, times_off=best / off))
+    return rows
+
+
+def options_table(rows: list[Row]) -> str:
+    """The options' figures."""
+    cells = [
+        (r["name"], f"{1e6 * r['seconds']:.3f}", percent(r["spread"]), f"{r['times_off']:.2f}")
+        for r in rows
+    ]
+    heading = "One flight's tick with one option on, one core"
+    return text_table({heading: ["option", "us", "spread", "x off"]}, cells)
