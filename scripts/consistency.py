@@ -83,6 +83,10 @@ class Args:
     )
     motor_lag_factor: float = option(1.0, "true lag of the motors, likewise")
     world: str = option("calm", "what air, ground and battery do: calm, breeze or fresh_breeze")
+    faults: str | None = option(
+        None,
+        "what goes wrong with sensors and rotors: presets joined by +, as gnss_outage+rotor_loss",
+    )
     noise_factor: float = option(1.0, "true white noise, as a multiple of what the filter believes")
 
     def __post_init__(self) -> None:
@@ -139,6 +143,7 @@ def batch_of(args: Args) -> FlightBatch:
         true_vehicle=true_vehicle,
         true_sensors=suite.scaled_noise(args.noise_factor),
         world=args.world,
+        faults=args.faults,
     )
 
 
@@ -246,6 +251,7 @@ def main(args: Args) -> None:
         "sensors": batch.sensors,
         "vehicle": batch.vehicle,
         "world": batch.world,
+        "faults": batch.faults,
         "seeds": [args.first_seed, args.first_seed + args.flights - 1],
         "versions": versions("numpy", "numba", "scipy"),
         "nees": whole.nees,

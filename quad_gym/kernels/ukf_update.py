@@ -251,9 +251,11 @@ def update(flight, p, work, feature_count, mask, form=0):
         loose = mask & _is_loose(flight, p, feature_count)
         if any_of(loose):
             first = 0
+    failures = flight.update_failures
     for part in range(first, 3):
         doubt = select(loose, _DOUBTS[part], 1.0)
-        taking, again = mask & (loose | (part == 2)), loose & (part > 0)
+        well = flight.update_failures == failures  # a portion that fails is the last
+        taking, again = mask & well & (loose | (part == 2)), loose & (part > 0)
         _update_by(flight, p, work, feature_count, taking, form, doubt, again)
     if (form & _GRADUAL) != 0:
         flight.nis = select(loose, np.nan, flight.nis)
