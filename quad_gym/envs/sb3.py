@@ -19,9 +19,9 @@ from quad_gym.envs.configuration import (
 )
 from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import rendering_of, rendering_options
-from quad_gym.envs.single import keys_of
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
+from quad_gym.simulation import stream_keys
 
 
 class QuadVecEnv(VecEnv):
@@ -76,7 +76,7 @@ class QuadVecEnv(VecEnv):
         start = self._start_values()
         if not self._seeded or any(seed is not None for seed in seeds):
             chosen = np.array([not self._seeded or seed is not None for seed in seeds])
-            observations = batch.reset(keys=keys_of(seeds), mask=chosen, **start)
+            observations = batch.reset(keys=stream_keys(seeds), mask=chosen, **start)
             if not chosen.all():
                 observations = batch.reset(mask=~chosen, **start)
             self._seeded = True

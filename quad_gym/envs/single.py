@@ -4,7 +4,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.utils import seeding
 
 from quad_gym.envs.configuration import (
     COLUMN,
@@ -297,8 +296,3 @@ def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None
     if len(seed) != count:
         raise ValueError(f"seed must be a number or {count} numbers, got {len(seed)} of them")
     return [None if s is None else int(s) for s in seed]
-
-
-def keys_of(seeds: list[int | None]) -> np.ndarray:
-    """Keys of the random streams, as `reset(seed=...)` of single environments draws them."""
-    return np.array([stream_key(seeding.np_random(seed)[0]) for seed in seeds])

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
 from quad_gym.envs.flight_info import final_faults, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
-from quad_gym.envs.single import keys_of, seeds_of
+from quad_gym.envs.single import seeds_of
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
+from quad_gym.simulation import stream_keys
 
 _MODES = {
     AutoresetMode.NEXT_STEP: Autoreset.NEXT_STEP,
@@ -100,14 +101,14 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(int(seed))
         batch = self.flights.batch
         if not self._seeded:
-            observations = batch.reset(keys=keys_of(seeds), **start)
+            observations = batch.reset(keys=stream_keys(seeds), **start)
             self._seeded = True
         else:
             chosen = mask & np.array([s is not None for s in seeds])
             goes_on = mask & ~chosen
             if chosen.any():
                 filled = [s if chosen[i] else 0 for i, s in enumerate(seeds)]
-                observations = batch.reset(keys=keys_of(filled), mask=chosen, **start)
+                observations = batch.reset(keys=stream_keys(filled), mask=chosen, **start)
             if goes_on.any():
                 observations = batch.reset(mask=goes_on, **start)
         self._over[mask] = False
