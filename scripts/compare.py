@@ -171,7 +171,8 @@ def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
         try:
             while waiting:
                 ended, _ = wait(waiting, timeout=2.0, return_when=FIRST_COMPLETED)
-                bar.n = sum(_steps_done(setting.run_folder(key)) for key in setting.plans)
+                steps = sum(_steps_done(setting.run_folder(key)) for key in setting.plans)
+                bar.n = min(steps, total)  # a training ends with the rollout that it is in
                 bar.refresh()
                 for future in ended:
                     suite, source, seed = key = waiting.pop(future)

@@ -5,7 +5,7 @@ import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from compare_flights import Floats, Flown
@@ -154,37 +154,52 @@ def matrix_text(comparison: Comparison, suite: str) -> str:
 
 def conclusions(comparison: Comparison) -> list[str]:
     """What the intervals allow one to conclude, and what they do not."""
+    setting = comparison.setting
     sentences = []
-    for suite in comparison.setting.suites:
-        where = f"Sensors {suite}: "
-
-        def errors(source: str, observation: str, suite: str = suite) -> Floats:
-            return comparison.cell(suite, source, observation).errors
-
-        sources = comparison.setting.sources
-        if "truth" in sources:
-            lost = (errors("truth", "estimate"), errors("truth", "truth"))
-            sentences.append(where + _sentence("flying on the estimate", "on the truth", *lost))
-        for source in ("truth", "noisy"):
-            if source in sources and "estimate" in sources:
-                gain = (errors("estimate", "estimate"), errors(source, "estimate"))
-                what = f"training on the {'truth' if source == 'truth' else 'noisy truth'}"
-                text = _sentence("training on the estimate", what, *gain)
-                sentences.append(where + text + " Both flown on the estimate.")
-        if "estimate" in sources:
-            pd = np.full(len(comparison.setting.seeds), errors("PD", "estimate")[0])
-            against = (errors("estimate", "estimate"), pd)
-            text = _sentence("training on the estimate", "tuned PD control", *against)
-            sentences.append(where + text + " Both flown on the estimate.")
-        crashes = {s: max(comparison.cell(suite, s, "estimate").crash_rates) for s in sources}
-        for source in (s for s in sources if crashes[s] > MANY_CRASHES):
-            sentences.append(
-                f"{where}up to {crashes[source]:.0%} of the episodes {NAMES[source]} crashed on "
-                "the estimate: their errors end with them, and do not compare."
-            )
-    if len(comparison.setting.seeds) == 1:
+    for suite in setting.suites:
+        for first, second in _questions(setting.sources):
+            cells = [comparison.cell(suite, way.source, way.observation) for way in (first, second)]
+            if max(float(cell.crash_rates.max()) for cell in cells) > MANY_CRASHES:
+                continue  # errors of episodes that crashed end with them, and do not compare
+            # PD has no training seed: its one number stands beside each
+            errors = [np.resize(cell.errors, len(setting.seeds)) for cell in cells]
+            text = _sentence(first.name, second.name, *errors)
+            both = " Both flown on the estimate." if second.observation == "estimate" else ""
+            sentences.append(f"Sensors {suite}: {text}{both}")
+        for source in rows_of(comparison):
+            share = float(comparison.cell(suite, source, "estimate").crash_rates.max())
+            if share > MANY_CRASHES:
+                sentences.append(
+                    f"Sensors {suite}: {NAMES[source]}, up to {share:.0%} of the episodes crashed on "
+                    "the estimate, so that the errors are not compared."
+                )
+    if len(setting.seeds) == 1:
         sentences.append(ONE_SEED)
     return sentences
+
+
+class _Way(NamedTuple):
+    """A cell of the matrix, as sentences call it."""
+
+    name: str
+    source: str
+    observation: str
+
+
+def _questions(sources: Sequence[str]) -> list[tuple[_Way, _Way]]:
+    """The pairs of cells that answer what a comparison asks."""
+    ours = _Way("training on the estimate", "estimate", "estimate")
+    pairs = [
+        (
+            _Way("flying on the estimate", "truth", "estimate"),
+            _Way("on the truth", "truth", "truth"),
+        ),
+        (ours, _Way("training on the truth", "truth", "estimate")),
+        (ours, _Way("training on the noisy truth", "noisy", "estimate")),
+        (ours, _Way("tuned PD control", "PD", "estimate")),
+    ]
+    known = {*sources, "PD"}
+    return [pair for pair in pairs if all(way.source in known for way in pair)]
 
 
 def _sentence(first: str, second: str, errors: Floats, others: Floats) -> str:
