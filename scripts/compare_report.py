@@ -170,8 +170,8 @@ def conclusions(comparison: Comparison) -> list[str]:
             share = float(comparison.cell(suite, source, "estimate").crash_rates.max())
             if share > MANY_CRASHES:
                 sentences.append(
-                    f"Sensors {suite}: {NAMES[source]}, up to {share:.0%} of the episodes crashed on "
-                    "the estimate, so that the errors are not compared."
+                    f"Sensors {suite}: {NAMES[source]}, up to {share:.0%} of the episodes crashed "
+                    "on the estimate, so that the errors are not compared."
                 )
     if len(setting.seeds) == 1:
         sentences.append(ONE_SEED)
