@@ -111,6 +111,7 @@ def params_record(
     p["gate_position"] = special.chdtri(FREEDOMS[POSITION_BLOCK], alarm)
     p["gate_direction"] = special.chdtri(FREEDOMS[BASELINE_BLOCK], alarm)
     p["gate_patience"] = estimator.gate_patience
+    p["gate_uncertainty"] = np.inf if gnss is None else estimator.gate_direction_sigma**2
     noisy = sensors.noisy
     p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
     return record

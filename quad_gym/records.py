@@ -78,6 +78,8 @@ class Gate(IntEnum):
     REJECTED = 2
     FAILED = 3
     """the update that it was part of failed as a whole, see FilterStatus"""
+    UNSURE = 4
+    """a feature left out, as its direction was predicted too vaguely for a linear model"""
 
 
 class Source(IntEnum):
@@ -315,6 +317,7 @@ PARAMS_FIELDS = (
     Field("gradual_above", (), "rad", "deviation of the attitude above which images are taken in portions"),
     Field("gate_position", (), "-", "largest accepted NIS of a position"),
     Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
+    Field("gate_uncertainty", (), "rad^2", "largest sum of the variances of a feature's predicted direction"),
     Field("gate_patience", (), "-", "rejections in a row that reopen the gate"),
     Field("noisy_sigma", (4,), "mixed", "of a noisy observation: position, velocity, attitude, body rates"),
 )

@@ -251,6 +251,11 @@ class FilterParams(Checked):
     """positions, baselines or images rejected in a row after which the filter rather doubts itself:
     it adds the square of the innovation to the covariance of what the sensor measures, and takes
     the next one"""
+    gate_direction_sigma: float = 0.2
+    """[rad] a gating filter leaves out features whose direction it predicts more vaguely than that,
+    as after a long outage: what its model neglects, half the square, is ten times the noise of a
+    good camera then. GNSS has to bring such a filter home; one without GNSS takes all features, as
+    it has nothing else"""
     gravity: float = GRAVITY
     """[m/s^2] that the filter subtracts"""
 
@@ -261,6 +266,7 @@ class FilterParams(Checked):
             "direction_variance_floor",
             "initial_velocity_variance",
             "initial_scale",
+            "gate_direction_sigma",
             "gravity",
         )
         self._check(check.number, "beta", least=0.0)

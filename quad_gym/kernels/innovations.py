@@ -6,7 +6,9 @@ alpha^2) mu mu^T + R` (3 x 3). A direction has two degrees of freedom: its innov
 across the predicted direction, for along it the length of a unit vector tells nothing.
 
 A block whose normalised innovation squared, chi-square in a filter that is right, lies beyond the
-gate is masked as if the flight lacked it. Where one kind of measurement has been rejected
+gate is masked as if the flight lacked it. So is a feature whose predicted direction is too
+uncertain for a linear model: as a direction's error is bounded it would pass any gate, and its
+update would be wrong and sure of itself. Where one kind of measurement has been rejected
 `gate_patience` times in a row, the filter is likelier wrong than the sensor: `reopen_gates` adds
 the square of the innovation to the covariance of what the sensor measures, so that the next
 measurement passes and moves the estimate there, while all else keeps its covariance.
@@ -50,7 +52,7 @@ from quad_gym.records import (
 )
 
 _REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
-_FAILED = float(Gate.FAILED)
+_FAILED, _UNSURE = float(Gate.FAILED), float(Gate.UNSURE)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _GATE = int(FilterForm.GATE)
 
@@ -101,13 +103,13 @@ def _nis_of_direction(S, nu):
 
 
 @kernel
-def _keep_block(flight, s, has, nu, sigma, nis, rejected):
+def _keep_block(flight, s, has, nu, sigma, nis, rejected, unsure):
     """Write what is known of block s, where a lane has measured it."""
     for i in range(3):
         flight.innovation[s, i] = select(has, nu[i], flight.innovation[s, i])
         flight.innovation_sigma[s, i] = select(has, sigma[i], flight.innovation_sigma[s, i])
     flight.block_nis[s] = select(has, nis, flight.block_nis[s])
-    decision = select(rejected, _REJECTED, _ACCEPTED)
+    decision = select(unsure, _UNSURE, select(rejected, _REJECTED, _ACCEPTED))
     flight.gate[s] = select(has, decision, flight.gate[s])
     flight.rejections[s] = select(has & rejected, flight.rejections[s] + 1.0, flight.rejections[s])
 
@@ -134,9 +136,9 @@ def _count_in_row(flight, group, measured, rejected, again):
 
 
 @kernel
-def _decide(flight, s, has, beyond, again):
-    """Where a block is rejected: beyond the gate or, in a later portion, as it was in the first."""
-    return has & ((beyond & logical_not(again)) | (again & (flight.gate[s] == _REJECTED)))
+def _decide(flight, s, has, wanting, again, decision):
+    """Where a block is decided upon: as it is wanting or, in a later portion, as in the first."""
+    return has & ((wanting & logical_not(again)) | (again & (flight.gate[s] == decision)))
 
 
 @kernel
@@ -145,25 +147,31 @@ def _judge_triple(flight, p, work, k, s, has, again, gating):
     S = _covariance(p, work, k)
     nu = (work.z[k], work.z[k + 1], work.z[k + 2])
     nis = _nis_of_triple(S, nu)
-    rejected = _decide(flight, s, has, (nis > p.gate_position) & gating, again)
+    rejected = _decide(flight, s, has, (nis > p.gate_position) & gating, again, _REJECTED)
     sigma = (math.sqrt(S[0][0]), math.sqrt(S[1][1]), math.sqrt(S[2][2]))
-    _keep_block(flight, s, has & logical_not(again), nu, sigma, nis, rejected)
+    nowhere = rejected & logical_not(rejected)
+    _keep_block(flight, s, has & logical_not(again), nu, sigma, nis, rejected, nowhere)
     return rejected
 
 
 @kernel
-def _judge_direction(flight, p, work, k, s, has, again, gating):
-    """Keep the innovation of a direction; return where it is rejected."""
+def _judge_direction(flight, p, work, k, s, has, again, gating, most):
+    """Keep the innovation of a direction; return where it is rejected, and where too uncertain.
+
+    Too uncertain is one whose predicted variances add up to more than `most`.
+    """
     S = _covariance(p, work, k)
     u = (work.h[k], work.h[k + 1], work.h[k + 2])
     nu, S2 = _across(u, S, (work.z[k], work.z[k + 1], work.z[k + 2]))
     nis = _nis_of_direction(S2, nu)
-    rejected = _decide(flight, s, has, (nis > p.gate_direction) & gating, again)
+    unsure = _decide(flight, s, has, (S2[0] + S2[2] > most) & gating, again, _UNSURE)
+    beyond = (nis > p.gate_direction) & gating & logical_not(unsure)
+    rejected = _decide(flight, s, has, beyond, again, _REJECTED)
     none = np.nan + 0.0 * nis
     sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), none)
     has = has & logical_not(again)
-    _keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected)
-    return rejected
+    _keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
+    return rejected, unsure
 
 
 @kernel
@@ -201,7 +209,9 @@ def judge_innovations(
         k += 3
     if use_baseline:
         has = mask & (flight.baseline_valid > 0.0)
-        rejected = _judge_direction(flight, p, work, k, BASELINE_BLOCK, has, again, gating)
+        rejected, _ = _judge_direction(
+            flight, p, work, k, BASELINE_BLOCK, has, again, gating, np.inf
+        )
         if gating:
             _mask_block(work, k, rejected)
             _count_in_row(flight, BASELINE_BLOCK, has, rejected, again)
@@ -219,11 +229,14 @@ def judge_innovations(
     for i in range(feature_count):
         if any_of(flight.feature_valid[i] > 0.0):
             has = mask & (flight.feature_valid[i] > 0.0)
-            rejected = _judge_direction(flight, p, work, k, FEATURE_BLOCKS + i, has, again, gating)
+            s = FEATURE_BLOCKS + i
+            rejected, unsure = _judge_direction(
+                flight, p, work, k, s, has, again, gating, p.gate_uncertainty
+            )
             if gating:
-                _mask_block(work, k, rejected)
-                left_out = left_out + select(rejected, 3.0, 0.0)
-                seen = seen + select(has, 1.0, 0.0)
+                _mask_block(work, k, rejected | unsure)
+                left_out = left_out + select(rejected | unsure, 3.0, 0.0)
+                seen = seen + select(has & logical_not(unsure), 1.0, 0.0)
                 refused = refused + select(rejected, 1.0, 0.0)
             k += 3
     if gating and feature_count > 0:
