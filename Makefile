@@ -41,8 +41,8 @@ test: setup  ## the tests, without the slow statistical and soak ones
 test-slow: setup  ## the slow statistical and soak tests
 	$(BIN)/python -m pytest -m slow
 
-soak: setup  ## 10^8 random-action steps over all tasks: about five minutes
-	QUAD_GYM_SOAK_STEPS=100000000 $(BIN)/python -m pytest -s -m slow tests/soak
+soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults
+	QUAD_GYM_SOAK_STEPS=100000000 QUAD_GYM_SOAK_UPDATES=10000000 $(BIN)/python -m pytest -s -m slow tests/soak
 
 lint: setup  ## style, types and import rules
 	$(BIN)/ruff format --check .

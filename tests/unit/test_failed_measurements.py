@@ -18,8 +18,8 @@ from tests.circle_flight import record_circle
 from tests.lane_filter import STATE, LaneFilter
 
 LAB = quad_gym.sensor_suite("lab")
+LAB = LAB.replace(gnss=LAB.gnss.replace(velocity_sigma=0.05))
 FIELD = LAB.replace(
-    gnss=LAB.gnss.replace(velocity_sigma=0.05),
     estimator=LAB.estimator.replace(
         feature_noise_across="projected",
         integration="midpoint",
