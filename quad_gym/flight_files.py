@@ -19,13 +19,14 @@ import json
 import os
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import COLUMNS, Flight, row_dtype
+from quad_gym.flight_record import COLUMNS, Column, Flight, row_dtype
 from quad_gym.flight_stage import Stage
 
 if TYPE_CHECKING:
@@ -155,10 +156,18 @@ def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
         elif values.ndim == 1:
             found[column.name] = values
         else:
-            axes = {"attitude": "wxyz"}.get(column.name.split("_")[-1], "xyz")
-            axes = "1234" if column.name in ("action", "rotor_speeds") else axes
-            found |= {f"{column.name}_{axis}": values[:, k] for k, axis in enumerate(axes)}
+            for k, part in enumerate(_parts(column, values.shape[1])):
+                found[f"{column.name}_{part}"] = values[:, k]
     return found
+
+
+def _parts(column: Column, count: int) -> Sequence[str]:
+    """What the numbers of a row of a column are called."""
+    if column.name == "gnss_gate":
+        return "position", "baseline", "velocity"
+    if column.name in ("action", "rotor_speeds", "feature_gate"):
+        return [str(k + 1) for k in range(count)]
+    return "wxyz" if column.name.endswith("attitude") else "xyz"
 
 
 def write_flight_csv(flight: Flight, path: Path) -> Path:

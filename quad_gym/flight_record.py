@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quad_gym.flight_stage import Stage
 from quad_gym.metrics import nees, state_error
 from quad_gym.packing import params_record
-from quad_gym.records import Source
+from quad_gym.records import FEATURE_BLOCKS, Source
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 from quad_gym.simulation import FlightBatch
 
@@ -74,7 +74,9 @@ COLUMNS = (
     Column("gnss_position", (3,), "m", "I", "primary antenna"),
     Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
     Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
+    Column("gnss_gate", (3,), "-", "-", "what the filter made of position, baseline and velocity, see `Gate`; 0: it has no gate"),
     Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's centre"),
+    Column("feature_gate", (FEATURES,), "-", "-", "what the filter made of them, likewise"),
     # the task
     Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),
     Column("reference_position", (3,), "m", "I", "where the vehicle should be; on a course, the next gate"),
@@ -119,7 +121,8 @@ _ESTIMATED = {
 _WITH_FILTER = (
     *_ESTIMATED,
     *("estimated_attitude", "covariance", "nees"),
-    *("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "pixels"),
+    *("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "gnss_gate"),
+    *("pixels", "feature_gate"),
 )
 """Columns that hold NaN where no filter, and so no sensor, runs."""
 
@@ -293,21 +296,25 @@ class FlightRecorder:
 
     def _fill_measurements(self, row: Any) -> None:
         row["gyro"], row["accel"] = self._read("gyro"), self._read("accel")
-        gnss = self._batch.sensors.gnss
+        gnss, gate = self._batch.sensors.gnss, self._read("gate")
         gives_velocity = gnss is not None and gnss.velocity_sigma is not None
-        for column, flag, given in (
-            ("gnss_position", "position", True),
-            ("gnss_baseline", "baseline", True),
-            ("gnss_velocity", "position", gives_velocity),
+        for block, (column, flag, given) in enumerate(
+            (
+                ("gnss_position", "position", True),
+                ("gnss_baseline", "baseline", True),
+                ("gnss_velocity", "position", gives_velocity),
+            )
         ):
             # at the start nothing is "fresh" but everything has been measured
-            measured = self._read(f"{flag}_fresh") + self._read(f"{flag}_valid") > 0.0
-            row[column] = self._R_IG @ self._read(column) if measured and given else np.nan
+            measured = given and self._read(f"{flag}_fresh") + self._read(f"{flag}_valid") > 0.0
+            row[column] = self._R_IG @ self._read(column) if measured else np.nan
+            row["gnss_gate"][block] = gate[block] if measured else np.nan
         features = row["pixels"].shape[0]
         if features:
             seen = self._read("feature_fresh") + self._read("feature_valid") > 0.0
             pixels = np.where(seen[:, np.newaxis], self._read("pixels"), np.nan)
             row["pixels"] = pixels[:features]
+            row["feature_gate"] = np.where(seen, gate[FEATURE_BLOCKS:], np.nan)[:features]
 
     def _stage_of_episode(self) -> Stage:
         batch, model = self._batch, self._model
@@ -324,6 +331,7 @@ class FlightRecorder:
             antennas_B=antennas_B if batch.sensors.gnss else np.full((2, 3), np.nan),
             camera_B=np.array(camera.position_B if camera else [np.nan] * 3),
             R_CB=np.array(model["R_CB"]),
+            camera_rate=camera.rate if camera else 0.0,
             focal_length=float(model["focal_length"]),
             half_image=np.array(model["half_image"]),
             features_I=np.array(camera.features_I if camera else np.zeros((0, 3))),

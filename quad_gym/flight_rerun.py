@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from quad_gym.flight_record import Flight
 from quad_gym.metrics import STATE_DIMENSION, chi_square_band
+from quad_gym.records import Gate
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 Floats = NDArray[np.float64]
@@ -199,12 +200,15 @@ class _Log:
     # ---- sensors ------------------------------------------------------------------------------
 
     def fixes(self) -> None:
-        """GNSS fixes at the times of their arrival."""
+        """GNSS fixes when they arrive; grey where the filter's gate has rejected them."""
         rr, fixes = self._rr, self._flight["gnss_position"]
         measured = np.isfinite(fixes).all(axis=1)
         if measured.any():
-            self._static("world/gnss", rr.Points3D.from_fields(radii=0.025, colors=[FIX]))
-            self._send("world/gnss", rr.Points3D.columns(positions=fixes[measured]), measured)
+            refused = self._flight["gnss_gate"][measured, 0] == Gate.REJECTED
+            colors = np.where(refused[:, np.newaxis], NEUTRAL, FIX).astype(np.uint8)
+            self._static("world/gnss", rr.Points3D.from_fields(radii=0.025))
+            points = rr.Points3D.columns(positions=fixes[measured], colors=colors)
+            self._send("world/gnss", points, measured)
 
     def camera(self) -> None:
         """The image plane with what was measured and what the estimate predicts, and the rays."""

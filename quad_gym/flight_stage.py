@@ -30,6 +30,8 @@ class Stage:
     """(3,) projection centre [m]; NaN: there is no camera"""
     R_CB: Floats
     """(3, 3) body to camera"""
+    camera_rate: float
+    """images per second [Hz]; 0: there is no camera"""
     focal_length: float
     """[pixels]"""
     half_image: Floats

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from quad_gym.flight_record import Flight
 from quad_gym.flight_stage import Stage
+from quad_gym.records import Gate
 from quad_gym.rendering.canvas import GREY, INK, PALE, VERMILLION, WHITE, Canvas
 from quad_gym.rendering.strip import Box
 from quad_gym.rotations import quaternion_to_dcm
@@ -33,6 +34,24 @@ def inset_box(stage: Stage, right: float, top: float, width: float) -> Box:
     return Box(right - width, top, width, height)
 
 
+def last_image(flight: Flight) -> NDArray[np.void]:
+    """The row of the last image, which is shown until the next one is due.
+
+    Where cameras are slower than control most rows have no image; if the last one held no feature,
+    this is the present row.
+    """
+    stage = flight.stage
+    held = max(1, round(stage.control_rate / stage.camera_rate))
+    rows = flight.rows[-held:]
+    seen = np.flatnonzero(np.isfinite(rows["pixels"]).any(axis=(1, 2)))
+    return rows[seen[-1] if seen.size else -1]
+
+
+def rejected_features(row: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Which features of a row the filter's gate has left out, (n,)."""
+    return np.asarray(row["feature_gate"] == Gate.REJECTED)
+
+
 class Inset:
     """Draws the camera's image for the last row of a flight.
 
@@ -47,31 +66,35 @@ class Inset:
 
     def draw(self, flight: Flight) -> None:
         """Measured features as crosses, those that the estimate predicts as rings."""
-        canvas, box, stage, now = self._canvas, self._box, flight.stage, flight.rows[-1]
+        canvas, box, stage, image = self._canvas, self._box, flight.stage, last_image(flight)
         canvas.box(box.left, box.top, box.width, box.height, WHITE)
         x, y = box.left + box.width / 2, box.top + box.height / 2
         canvas.line(np.array([[box.left, y], [box.left + box.width, y]]), PALE)
         canvas.line(np.array([[x, box.top], [x, box.top + box.height]]), PALE)
         canvas.inside((box.left, box.top, box.width, box.height))
-        q = now["estimated_attitude"]
+        q = image["estimated_attitude"]
         if np.isfinite(q).all():
-            predicted = stage.project_features(now["estimated_position"], quaternion_to_dcm(q))
+            predicted = stage.project_features(image["estimated_position"], quaternion_to_dcm(q))
             for at in place_in_inset(predicted, stage, box):
                 canvas.disc(at, 6.0, VERMILLION, 1.5)
-        canvas.crosses(place_in_inset(now["pixels"], stage, box), 3.2, INK, 1.6)
+        places, refused = place_in_inset(image["pixels"], stage, box), rejected_features(image)
+        canvas.crosses(places[~refused], 3.2, INK, 1.6)
+        canvas.crosses(places[refused], 3.2, GREY, 1.6)
         canvas.inside(None)
         canvas.box(box.left, box.top, box.width, box.height, GREY, 1.0)
 
     def write(self, flight: Flight) -> None:
         """Name the features and say what the picture is."""
-        canvas, box, now = self._canvas, self._box, flight.rows[-1]
-        seen = np.isfinite(now["pixels"]).all(axis=1)
+        canvas, box, image = self._canvas, self._box, last_image(flight)
+        seen = np.isfinite(image["pixels"]).all(axis=1)
         words = "camera" if seen.any() else "camera: no feature in view"
+        if (count := rejected_features(image).sum()) > 0:
+            words = f"camera: {count} rejected (grey)"
         top, size = box.top + box.height + 2.0, self._size
         width = canvas.width_of(words, size)
         canvas.veil(box.left, top, width + 8, canvas.line_height(size))
         canvas.text(words, box.left + 4.0, top + 1.0, size, INK if seen.any() else GREY)
         if len(seen) <= 4:
             for k in np.flatnonzero(seen):
-                x, y = place_in_inset(now["pixels"][k], flight.stage, box)
+                x, y = place_in_inset(image["pixels"][k], flight.stage, box)
                 canvas.text(str(k + 1), x + 8.0, y - 6.0, self._size - 2)

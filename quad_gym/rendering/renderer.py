@@ -9,7 +9,7 @@ from quad_gym import validation as check
 from quad_gym.fault_fields import FaultKind
 from quad_gym.flight_record import Flight
 from quad_gym.flight_stage import Stage
-from quad_gym.records import FilterStatus
+from quad_gym.records import FilterStatus, Gate
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,
@@ -130,7 +130,9 @@ class Renderer:
             size = size if scale == 1.0 else f"3-sigma ellipsoid, error, drawn x {scale:g}"
             entries += [("estimate", VERMILLION), (size, VERMILLION)]
             if stage.has_gnss:
-                entries.append(("GNSS fix", PURPLE))
+                refused = (flight.rows["gnss_gate"][:, 0] == Gate.REJECTED).any()
+                words = "GNSS fix (grey: rejected)" if refused else "GNSS fix"
+                entries.append((words, PURPLE))
         elif stage.observation == "noisy":
             entries.append(("what the controller sees", VERMILLION))
         warnings = self._warnings(flight)

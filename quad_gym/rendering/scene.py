@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.flight_record import Flight
+from quad_gym.records import Gate
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,
@@ -25,6 +26,7 @@ from quad_gym.rendering.geometry import (
     ellipsoid_axes,
     ellipsoid_outline,
 )
+from quad_gym.rendering.inset import last_image
 from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
@@ -200,7 +202,7 @@ class Scene:
             canvas.polygon(image[:, 0], LIGHT_BLUE, 0.14)
         canvas.segments(view.segments(apex, corners[1:]), LIGHT_BLUE)
         canvas.segments(image, LIGHT_BLUE, 1.3)
-        seen = np.isfinite(self._now["pixels"]).all(axis=1)
+        seen = np.isfinite(last_image(self._flight)["pixels"]).all(axis=1)
         features = stage.features_I
         if seen.any():
             eye = np.repeat(corners[:1], seen.sum(), axis=0)
@@ -224,16 +226,17 @@ class Scene:
             return
         ages = self._now["time"] - rows["time"][measured]
         places = self._view.project(fixes[measured])[0]
+        refused = rows["gnss_gate"][measured, 0] == Gate.REJECTED
         stride = -(-len(places) // 40)
         old = ages > 0.5 * FIX_SECONDS
-        for faded, which in ((True, old), (False, ~old)):
-            self._canvas.crosses(
-                places[which][::stride], 2.6, PALE_PURPLE if faded else PURPLE, 1.3
-            )
-        self._canvas.crosses(places[-1:], 4.0, PURPLE, 2.0)
+        for color, which in ((PALE_PURPLE, old), (PURPLE, ~old), (GREY, refused)):
+            chosen = which if color == GREY else which & ~refused
+            self._canvas.crosses(places[chosen][::stride], 2.6, color, 1.3)
+        color = GREY if refused[-1] else PURPLE
+        self._canvas.crosses(places[-1:], 4.0, color, 2.0)
         if ages[-1] < 0.3 and len(places) < 0.5 * FIX_SECONDS * self._stage.control_rate:
             radius = 6.0 + 40.0 * float(ages[-1])
-            self._canvas.disc(places[-1], radius, PURPLE, 1.5)  # a ripple, where fixes are few
+            self._canvas.disc(places[-1], radius, color, 1.5)  # a ripple, where fixes are few
 
     # ---- the vehicle and the estimate ---------------------------------------------------------
 

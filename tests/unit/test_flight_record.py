@@ -13,10 +13,13 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
+from quad_gym.fault_fields import FaultKind
+from quad_gym.faults import GnssOutage, GnssOutliers
 from quad_gym.flight_files import table
 from quad_gym.flight_record import COLUMNS
 from quad_gym.flight_stage import Stage
 from quad_gym.frames import ecef_to_enu
+from quad_gym.records import Gate
 from quad_gym.rendering import record_flight
 from quad_gym.rotations import quaternion_to_dcm
 
@@ -108,6 +111,45 @@ def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
     G = env.flights.batch.read("gnss_position")[0]
     enu = ecef_to_enu(quad_gym.sensor_suite("lab").gnss.reference_antenna_G) @ G
     np.testing.assert_allclose(enu, flight["gnss_position"][-1], atol=1e-9)
+
+
+def test_what_the_gate_made_of_measurements_is_kept():
+    faults = {"faults": GnssOutliers(share=0.5, size=(50.0, 100.0))}
+    env, flight, _ = recorded("hover", steps=100, sensors="rtk", **faults)
+    measured = np.isfinite(flight["gnss_position"]).all(axis=1)
+    np.testing.assert_array_equal(np.isfinite(flight["gnss_gate"][:, 0]), measured)
+    antenna_B = env.flights.batch.sensors.gnss.primary_antenna_B
+    antenna = flight["position"] + antenna_B @ quaternion_to_dcm(flight["attitude"])
+    # the vehicle moves some centimetres from a fix to the end of its row
+    far = np.linalg.norm(flight["gnss_position"] - antenna, axis=1) > 0.3
+    assert far.sum() > 5
+    np.testing.assert_array_equal(flight["gnss_gate"][far, 0], Gate.REJECTED)
+    kept = flight["gnss_gate"][measured & ~far, 0][1:]  # the fix of the start is not gated
+    assert (kept == Gate.ACCEPTED).mean() > 0.8
+    np.testing.assert_array_equal(
+        np.isfinite(flight["feature_gate"]), np.isfinite(flight["pixels"]).all(axis=2)
+    )
+    lab = recorded("hover")[1]
+    assert (lab["gnss_gate"][:, 0] == Gate.NONE).all()
+    assert np.isnan(lab["gnss_gate"][:, 2]).all()  # its receiver gives no velocity
+
+
+def test_velocities_are_kept_where_the_receiver_gives_them():
+    _, flight, _ = recorded("hover", steps=100, sensors="rtk")
+    measured = np.isfinite(flight["gnss_velocity"]).all(axis=1)
+    np.testing.assert_array_equal(measured, np.isfinite(flight["gnss_position"]).all(axis=1))
+    miss = (flight["gnss_velocity"] - flight["velocity"])[measured]
+    assert np.abs(miss).max() < 6 * 0.05 + 0.3  # the antenna turns, and the row ends later
+    assert np.isnan(recorded("hover")[1]["gnss_velocity"]).all()
+
+
+def test_wind_and_faults_are_kept():
+    outage = GnssOutage(start=0.1, duration=0.1)
+    _, flight, _ = recorded(world="fresh_breeze", faults=outage)
+    assert np.linalg.norm(flight["wind"], axis=1).min() > 1.0
+    bit = 2.0**FaultKind.GNSS_OUTAGE
+    away = (flight["time"] > 0.099) & (flight["time"] < 0.199)
+    np.testing.assert_array_equal(flight["faults"], np.where(away, bit, 0.0))
 
 
 def test_without_a_filter_nothing_is_estimated():
@@ -289,6 +331,8 @@ def test_the_table_names_every_number_once():
     assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
     np.testing.assert_array_equal(columns["attitude_w"], flight["attitude"][:, 0])
     np.testing.assert_array_equal(columns["rotor_speeds_4"], flight["rotor_speeds"][:, 3])
+    np.testing.assert_array_equal(columns["gnss_gate_velocity"], flight["gnss_gate"][:, 2])
+    np.testing.assert_array_equal(columns["feature_gate_2"], flight["feature_gate"][:, 1])
     np.testing.assert_array_equal(columns["pixels_2_y"], flight["pixels"][:, 1, 1])
     sigma = np.sqrt(flight["covariance"][:, 4, 4])
     np.testing.assert_array_equal(columns["sigma_velocity_y"], sigma)

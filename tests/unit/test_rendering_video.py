@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from quad_gym.faults import GnssOutliers
+from quad_gym.records import Gate
 from quad_gym.rendering import Renderer, record_flight, record_video, save_video, tile
 from quad_gym.rendering import canvas as colors
 from quad_gym.rendering.geometry import fixed_view
-from quad_gym.rendering.inset import inset_box, place_in_inset
+from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
 from quad_gym.rendering.scene import ELLIPSOID_LIMIT, ELLIPSOID_SCALES, ellipsoid_scale
 from quad_gym.rendering.strip import CONSISTENCY, Box, format_length, height_on
 
@@ -51,6 +53,30 @@ def test_the_inset_is_drawn_where_the_camera_measured(flight):
     assert len(seen)
     for pixel in seen:
         assert colour_near(frame, place_in_inset(pixel, flight.stage, box), 2, colors.INK)
+
+
+def test_an_image_is_shown_until_the_next_one_is_due():
+    options = {"camera_rate": 10.0, "max_episode_steps": 30}
+    flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
+    images = np.flatnonzero(np.isfinite(flight["pixels"]).all(axis=(1, 2)))
+    np.testing.assert_array_equal(images, np.arange(0, 31, 5))
+    for k in range(31):
+        shown = last_image(flight.until(flight["time"][k]))
+        assert shown["time"] == flight["time"][k - k % 5]
+
+
+def test_what_the_gate_rejects_is_grey():
+    faults = GnssOutliers(share=1.0, size=100.0, start=0.3)
+    options = {"sensors": "rtk", "faults": faults, "max_episode_steps": 30}
+    flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
+    view = fixed_view(flight, 640, round(0.765 * 480))
+    measured = np.flatnonzero(np.isfinite(flight["gnss_position"][:, 0]))
+    assert flight["gnss_gate"][measured[[2, -1]], 0].tolist() == [Gate.ACCEPTED, Gate.REJECTED]
+    for k, is_purple in ((measured[2], True), (measured[-1], False)):
+        frame = Renderer("fixed", (640, 480)).draw(flight.until(flight["time"][k]))
+        at = view.project(flight["gnss_position"][k])[0]
+        assert colour_near(frame, at, 8, colors.PURPLE) == is_purple
+        assert colour_near(frame, at, 3, colors.GREY) or is_purple
 
 
 def test_a_replay_shows_what_was_seen_live(flight):
