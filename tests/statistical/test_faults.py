@@ -13,7 +13,7 @@ from scipy import linalg, stats
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
-from quad_gym.faults import CameraOcclusion, GnssOutage
+from quad_gym.faults import CameraOcclusion, GnssOutage, GnssOutliers, PositionJump
 from quad_gym.records import POSITION_BLOCK, Gate, Source
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.unit.alarms import ALARM, alarm_score
@@ -167,4 +167,73 @@ def test_after_an_outage_of_a_minute_the_error_is_soon_back_inside_three_sigma(
     assert found.max() < 0.1 * np.median(lost) + 3.0 * np.linalg.norm(
         batch.sensors.gnss.position_sigma_I
     ) + 3.0 * np.linalg.norm(batch.sensors.gnss.drift_sigma_I)
+    assert not batch.read("filter_status").any()
+
+
+# ---- outliers ----------------------------------------------------------------------------------
+
+
+def rms_error(suite, faults):
+    """Of the estimated position, over flights on the estimate, from two to twelve seconds [m]."""
+    batch = fly(suite, COUNT, faults=faults, threads=1)
+    steps(batch, 2.0)
+    squares = []
+    for _ in range(100):
+        steps(batch, 0.1)
+        squares.append((state_errors(batch)[:, R] ** 2).sum(axis=1).mean())
+    assert not batch.read("filter_status").any()
+    return float(np.sqrt(np.mean(squares)))
+
+
+GATED_LAB = LAB.replace(
+    estimator=LAB.estimator.replace(gate_false_alarm=1e-4, feature_noise_across="predicted")
+)
+SUITES = {
+    "lab": GATED_LAB,
+    "rtk": RTK,
+    "rtk, no camera": RTK.replace(camera=None),
+    "consumer": quad_gym.sensor_suite("consumer"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_with_five_percent_outliers_the_error_is_hardly_larger(kind, name):
+    suite = of_kind(SUITES[name], kind)
+    clean = rms_error(suite, None)
+    spoiled = rms_error(suite, GnssOutliers(share=0.05, size=(10.0, 100.0)))
+    print(f"{name}, {kind}: {clean:.4f} m, with outliers {spoiled:.4f} m, {spoiled / clean:.3f}")
+    assert spoiled < 1.2 * clean
+
+
+@pytest.mark.slow
+def test_without_the_gate_outliers_do_harm():
+    suite = SUITES["rtk, no camera"]
+    open_ = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=0.0))
+    clean = rms_error(open_, None)
+    spoiled = rms_error(open_, GnssOutliers(share=0.05, size=(10.0, 100.0)))
+    assert spoiled > 3.0 * clean
+
+
+# ---- jumps -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lab", "rtk", "rtk, no camera"])
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_a_true_jump_does_not_lock_the_filter_out(kind, name):
+    """The gate refuses the truth at first; after `gate_patience` refusals it opens again."""
+    suite = of_kind(SUITES[name], kind)
+    jump = PositionJump(start=5.0, size=(2.0, 4.0))
+    options = {"source": Source.TRUTH, "run_filter": True, "threads": 1}
+    batch = fly(suite, COUNT, task="hover", faults=jump, **options)
+    steps(batch, 5.0)
+    first = np.linalg.norm(state_errors(batch)[:, R], axis=1)
+    assert (first > 1.9).all()
+    steps(batch, 5.0)
+    errors = np.linalg.norm(state_errors(batch)[:, R], axis=1)
+    print(f"{name}, {kind}: {np.median(errors):.4f} m, at most {errors.max():.4f} m")
+    assert errors.max() < 0.2
+    assert (batch.read("reopened").sum(axis=1) >= 1.0).all()
     assert not batch.read("filter_status").any()
