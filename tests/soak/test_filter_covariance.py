@@ -1,0 +1,104 @@
+"""Millions of filter updates, all suites and faults: sound covariances, every failure counted.
+
+QUAD_GYM_SOAK_UPDATES sets how many updates are made in all, by default 10^6; `make soak` makes
+10^7. After every update the covariance is factored anew by LAPACK, and an update without effect
+must be one that the filter has told of: by its gate, or as a failure.
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.fault_presets import PRESETS
+from quad_gym.records import FilterStatus, Gate, Source
+from tests.field_flights import fly, measured_now
+
+UPDATES = int(float(os.environ.get("QUAD_GYM_SOAK_UPDATES", "1e6")))
+COUNT = 256
+SUITES = ("lab", "rtk", "consumer", "indoor")
+CASES = [
+    (suite, kind, fault)
+    for suite in SUITES
+    for kind in ("ukf", "ekf")
+    for fault in (*PRESETS, "all")
+    if fault == "all" or all(
+        not part.needs or getattr(quad_gym.sensor_suite(suite), part.needs) is not None
+        for part in PRESETS[fault]
+    )
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tally():
+    """Counts over all cases, printed at the end."""
+    counts = {"updates": 0, "failed updates": 0, "failed predictions": 0, "wholly left out": 0}
+    yield counts
+    print("\n" + ", ".join(f"{number:,} {name}" for name, number in counts.items()))
+
+
+def assert_positive_definite(L):
+    """Factors (n, 15, 15) are lower triangular, and their squares have Cholesky factors anew."""
+    assert np.isfinite(L).all()
+    assert not np.triu(L, 1).any()
+    assert (np.diagonal(L, axis1=1, axis2=2) > 0.0).all()
+    P = L @ L.transpose(0, 2, 1)
+    np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    correlation = P / sigma[:, :, np.newaxis] / sigma[:, np.newaxis]
+    assert abs(correlation).max() <= 1.0 + 1e-12
+    np.linalg.cholesky(correlation)
+
+
+def assert_told(batch, failures, nis):
+    """Failures are those of the status, and no update that was taken went without effect.
+
+    Returns:
+        How many updates were made, how many of them rejected as a whole, the failures and NIS.
+    """
+    counted = np.array([batch.read("update_failures"), batch.read("prediction_failures")])
+    status, now = batch.read("filter_status").astype(np.int64), batch.read("nis")
+    np.testing.assert_array_equal(counted[0] > 0.0, status & FilterStatus.UPDATE_FAILED > 0)
+    np.testing.assert_array_equal(counted[1] > 0.0, status & FilterStatus.PREDICTION_FAILED > 0)
+    assert ((counted - failures) <= 2.0).all()
+    measured, gate = measured_now(batch), batch.read("gate")
+    made, accepted = measured.any(axis=1), (measured & (gate == Gate.ACCEPTED)).any(axis=1)
+    failed = counted[0] > failures[0]
+    known = np.isfinite(now) & np.isfinite(nis)  # of an image taken in portions there is no NIS
+    np.testing.assert_array_equal((now != nis)[known], (accepted & ~failed)[known])
+    np.testing.assert_array_equal((measured & (gate == Gate.FAILED)).any(axis=1), failed)
+    return made, int((made & ~accepted & ~failed).sum()), counted, now
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "kind", "fault"), CASES)
+def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fault, tally):
+    suite = quad_gym.sensor_suite(name)
+    suite = suite.replace(estimator=suite.estimator.replace(kind=kind))
+    number = CASES.index((name, kind, fault))
+    source = Source.TRUTH if number % 2 else Source.ESTIMATE
+    options = {"seed": 1000 * number, "source": source, "run_filter": True, "threads": 1}
+    batch = fly(suite, COUNT, faults=fault, **options)
+    goal, updates, ticks = UPDATES / len(CASES), 0, 0
+    failures, nis = np.zeros((2, COUNT)), batch.read("nis")
+    while updates < goal:
+        batch.step()
+        ticks += 1
+        made, rejected, failures, nis = assert_told(batch, failures, nis)
+        updates += int(made.sum())
+        tally["wholly left out"] += rejected
+        looked_at = np.flatnonzero(made | (ticks % 20 == 0))
+        if looked_at.size:
+            assert_positive_definite(batch.read("L", looked_at))
+
+        # a crashed vehicle, or one long in the air, begins anew
+        lost = ~(np.abs(batch.read("r")).max(axis=1) < 1e3) | (ticks % 4000 == 0)
+        if lost.any():
+            tally["failed updates"] += int(failures[0, lost].sum())
+            tally["failed predictions"] += int(failures[1, lost].sum())
+            batch.reset(mask=lost)
+            failures, nis = failures * ~lost, batch.read("nis")
+    tally["updates"] += updates
+    tally["failed updates"] += int(failures[0].sum())
+    tally["failed predictions"] += int(failures[1].sum())
