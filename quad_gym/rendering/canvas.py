@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.rendering.shrink import halve
+
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
 
@@ -178,7 +180,7 @@ class Canvas:
 
     def finish(self) -> None:
         """Shrink what has been drawn; after this there is only text to come."""
-        self._pygame.transform.smoothscale(self._large, (self.width, self.height), self.surface)
+        halve(_words(self._large), _words(self.surface))
 
     def veil(self, left: float, top: float, width: float, height: float) -> None:
         """Brighten a rectangle of the finished picture, for text to stand out."""
@@ -231,15 +233,21 @@ class Canvas:
         return rows.reshape(self.height, self.width, 3).copy()
 
 
+def _words(surface: Any) -> NDArray[np.uint32]:
+    """A surface's pixels as words of four bytes, (height, width): its memory, not a copy."""
+    words = np.frombuffer(surface.get_view("0"), np.uint32)
+    return words.reshape(surface.get_height(), surface.get_width())
+
+
 def _large(points: Floats) -> Any:
     """Points in the pixels of the large surface."""
-    return np.minimum(np.maximum(OVERSAMPLING * points, -_FAR), _FAR).tolist()
+    return (OVERSAMPLING * points).clip(-_FAR, _FAR).tolist()
 
 
 def _runs(points: Floats) -> list[Floats]:
     """The pieces of a line between its NaN."""
-    good = np.isfinite(points).all(axis=-1)
-    if good.all():
+    if np.isfinite(points.sum()):  # as nearly always
         return [points]
+    good = np.isfinite(points).all(axis=-1)
     edges = np.flatnonzero(np.diff(good)) + 1
     return [run for run in np.split(points, edges) if np.isfinite(run[0]).all()]

@@ -198,7 +198,7 @@ class Scene:
         corners = stage.frustum_corners(r_I, self._R_BI, FRUSTUM_DEPTH)
         apex = np.repeat(corners[:1], 4, axis=0)
         image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
-        if len(image) == 4:
+        if len(image) == 4 and not self._moving:  # from near it would cover what lies behind
             canvas.polygon(image[:, 0], LIGHT_BLUE, 0.14)
         canvas.segments(view.segments(apex, corners[1:]), LIGHT_BLUE)
         canvas.segments(image, LIGHT_BLUE, 1.3)
@@ -300,9 +300,7 @@ class Scene:
         tips = r_I + 0.42 * self._R_BI
         origin = np.repeat(r_I[np.newaxis], 3, axis=0)
         self._canvas.segments(view.segments(origin, tips), INK, 1.5)
-        names = zip(r_I + 0.5 * self._R_BI, "xyz", strict=True)
-        self.labels += [
-            (name, view.project(tip)[0] - (0.0, 5.0), INK)
-            for tip, name in names
-            if near or name == "x"
-        ]
+        places = view.project(r_I + 0.5 * self._R_BI)[0] - (0.0, 5.0)
+        for name, at in zip("xyz", places, strict=True):
+            if near or name == "x":
+                self.labels.append((name, at, INK))

@@ -10,6 +10,7 @@ from quad_gym.rendering import canvas as colors
 from quad_gym.rendering.geometry import fixed_view
 from quad_gym.rendering.inset import inset_box, last_image, place_in_inset
 from quad_gym.rendering.scene import ELLIPSOID_LIMIT, ELLIPSOID_SCALES, ellipsoid_scale
+from quad_gym.rendering.shrink import halve
 from quad_gym.rendering.strip import CONSISTENCY, Box, format_length, height_on
 
 pygame = pytest.importorskip("pygame")
@@ -129,6 +130,16 @@ def test_logarithmic_plots_place_values_between_their_ends():
 )
 def test_lengths_are_for_people(meters, words):
     assert format_length(meters) == words
+
+
+def test_shrinking_takes_the_mean_of_two_by_two_pixels():
+    rng = np.random.default_rng(0)
+    large = rng.integers(0, 256, (6, 10, 4), dtype=np.uint8)
+    large[:2, :2] = 255
+    small = np.zeros((3, 5, 4), np.uint8)
+    halve(large.view(np.uint32)[..., 0], small.view(np.uint32)[..., 0])
+    mean = large.astype(float).reshape(3, 2, 5, 2, 4).mean(axis=(1, 3))
+    np.testing.assert_array_equal(small, np.floor(mean + 0.5))
 
 
 def test_tiles_fill_a_grid():
