@@ -23,7 +23,7 @@ from quad_gym.records import (
     aligned_zeros,
 )
 from quad_gym.rotations import euler_to_dcm
-from quad_gym.sensor_params import FilterParams, SensorSuite
+from quad_gym.sensor_params import FilterParams, SensorSuite, delay_ticks
 from quad_gym.world_packing import pack_world
 from quad_gym.world_params import WorldParams
 
@@ -136,6 +136,29 @@ def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
 def _phase_ticks(phase: float | None, period: int) -> int:
     """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
     return -1 if phase is None else min(round(phase * period), period - 1)
+
+
+def pack_latency(
+    settings: Any, measures: SensorSuite, clocks: Clocks, believes: FilterParams
+) -> None:
+    """Fill the settings' fields of late measurements.
+
+    Args:
+        settings: One SETTINGS record.
+        measures: The sensors as they are.
+        clocks: When they measure.
+        believes: What the filter makes of it.
+
+    Raises:
+        ValueError: If a sensor is too late for its rate.
+    """
+    for name in ("gnss", "camera"):
+        sensor = getattr(measures, name)
+        if sensor is not None:
+            label = f"{type(sensor).__name__}.latency"
+            rate = getattr(clocks, f"{name}_rate")
+            settings[f"{name}_delay"] = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
+    settings["rewinds"] = believes.late_measurements == "rewind"
 
 
 def params_block(record: NDArray[Any]) -> NDArray[Any]:

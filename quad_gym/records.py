@@ -16,6 +16,7 @@ from quad_gym.fault_fields import (
     FAULT_SETTINGS_FIELDS,
     FAULT_STATE_FIELDS,
 )
+from quad_gym.late_fields import LATE_SETTINGS_FIELDS, LATE_STATE_FIELDS, LATE_WORK_FIELDS
 from quad_gym.params import MAX_GATES
 from quad_gym.sensor_params import MAX_FEATURES
 from quad_gym.world_fields import (
@@ -249,6 +250,7 @@ FLIGHT_FIELDS = (
     Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
     # what goes wrong
     *FAULT_STATE_FIELDS,
+    *LATE_STATE_FIELDS,
 )
 
 PARAMS_FIELDS = (
@@ -344,6 +346,7 @@ WORK_FIELDS = (
     # the batch
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
+    *LATE_WORK_FIELDS,
 )
 
 SETTINGS_FIELDS = (
@@ -384,6 +387,7 @@ SETTINGS_FIELDS = (
     Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
     Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
     Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
+    *LATE_SETTINGS_FIELDS,
     *WORLD_SETTINGS_FIELDS,
     *FAULT_SETTINGS_FIELDS,
 )

@@ -18,6 +18,9 @@ GRAVITY = 9.8
 MAX_FEATURES = 16
 """The most features that a camera model can hold."""
 
+MAX_UNDER_WAY = 2
+"""The most measurements of a sensor that can be under way to the filter at a time."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParams(Checked):
@@ -87,8 +90,13 @@ class GnssParams(Checked):
     relative to the place of the start [m]"""
     drift_tau: float = 60.0
     """its correlation time [s]"""
+    latency: float = 0.0
+    """from when a measurement is taken to when it reaches the filter, with its time stamp, in whole
+    ticks; at most MAX_UNDER_WAY periods [s]. Receivers take about 0.1 s: the autopilot PX4 assumes
+    0.11 s (parameter EKF2_GPS_DELAY)"""
 
     def __post_init__(self) -> None:
+        self._check(check.number, "latency", least=0.0)
         self._check(check.positive, "rate", "baseline_sigma", "drift_tau")
         self._check(check.phase, "phase")
         if self.velocity_sigma is not None:
@@ -161,8 +169,12 @@ class CameraParams(Checked):
     phase: float | None = 0.0
     """when the first image after the start comes, as a share of the period in [0, 1), in whole
     ticks; None: at random in each episode"""
+    latency: float = 0.0
+    """from when an image is taken to when its features reach the filter, with its time stamp, in
+    whole ticks; at most MAX_UNDER_WAY periods [s]"""
 
     def __post_init__(self) -> None:
+        self._check(check.number, "latency", least=0.0)
         self._check(check.phase, "phase")
         self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
         self._check(check.vector, "position_B", "attitude", length=3)
@@ -256,6 +268,10 @@ class FilterParams(Checked):
     as after a long outage: what its model neglects, half the square, is ten times the noise of a
     good camera then. GNSS has to bring such a filter home; one without GNSS takes all features, as
     it has nothing else"""
+    late_measurements: str = "rewind"
+    """what becomes of a measurement that reaches the filter late: "rewind" takes the estimate back
+    to its time stamp over the IMU's samples since then, updates it there, and takes it on again;
+    "as_fresh" ignores the time stamp"""
     gravity: float = GRAVITY
     """[m/s^2] that the filter subtracts"""
 
@@ -273,6 +289,7 @@ class FilterParams(Checked):
         self._check(check.choice, "kind", choices=("ukf", "ekf"))
         self._check(check.choice, "integration", choices=("euler", "midpoint"))
         self._check(check.choice, "covariance_reset", choices=("none", "turn"))
+        self._check(check.choice, "late_measurements", choices=("rewind", "as_fresh"))
         self._check(
             check.choice, "feature_noise_across", choices=("measured", "predicted", "projected")
         )
@@ -307,6 +324,21 @@ class NoisyObservationParams(Checked):
         self._check(check.number, "position", "velocity", "attitude", "body_rates", least=0.0)
 
 
+def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
+    """How many ticks a latency [s] is.
+
+    Raises:
+        ValueError: If more than MAX_UNDER_WAY measurements would be under way at a time.
+    """
+    ticks, longest = round(latency * imu_rate), MAX_UNDER_WAY * check.ticks(name, rate, imu_rate)
+    if ticks > longest:
+        raise ValueError(
+            f"{name} must be at most {MAX_UNDER_WAY} periods of the sensor, {longest / imu_rate:g} "
+            f"s, got {latency:g} s"
+        )
+    return ticks
+
+
 @dataclass(frozen=True, kw_only=True)
 class SensorSuite(Checked):
     """All sensors of a vehicle and the filter that fuses them."""
@@ -331,9 +363,13 @@ class SensorSuite(Checked):
         if self.gnss is not None:
             check.instance("SensorSuite.gnss", self.gnss, GnssParams)
             check.ticks("GnssParams.rate", self.gnss.rate, self.imu.rate)
+            delay_ticks("GnssParams.latency", self.gnss.latency, self.gnss.rate, self.imu.rate)
         if self.camera is not None:
             check.instance("SensorSuite.camera", self.camera, CameraParams)
             check.ticks("CameraParams.rate", self.camera.rate, self.imu.rate)
+            delay_ticks(
+                "CameraParams.latency", self.camera.latency, self.camera.rate, self.imu.rate
+            )
 
     def with_rates(
         self,

@@ -10,7 +10,7 @@ from quad_gym import validation as check
 from quad_gym.fault_packing import pack_faults
 from quad_gym.fault_presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.batch import fly
-from quad_gym.packing import params_block, params_record, settings_record
+from quad_gym.packing import pack_latency, params_block, params_record, settings_record
 from quad_gym.params import (
     ActionParams,
     Clocks,
@@ -194,6 +194,7 @@ class FlightBatch:
             limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
         )
         pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
+        pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors.estimator)
         if run_filter and filter_start == "warm":
             pack_warm_start(
                 self._settings[0],

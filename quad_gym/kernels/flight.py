@@ -21,6 +21,7 @@ from quad_gym.kernels.faults import (
 )
 from quad_gym.kernels.innovations import forget_innovations
 from quad_gym.kernels.lanes import any_of, logical_not, select
+from quad_gym.kernels.late import begin_without_waiting, exchange, set_aside, update_in_turn
 from quad_gym.kernels.linalg import (
     add,
     keep3,
@@ -32,6 +33,7 @@ from quad_gym.kernels.linalg import (
     scale,
     sub,
 )
+from quad_gym.kernels.preintegration import add_increment
 from quad_gym.kernels.random import uniform_pair
 from quad_gym.kernels.reference import evaluate_reference
 from quad_gym.kernels.rotation import euler_to_dcm, quaternion_to_dcm
@@ -50,7 +52,6 @@ from quad_gym.kernels.sensors import (
 )
 from quad_gym.kernels.task import draw_reference, draw_start
 from quad_gym.kernels.ukf import initialize, predict
-from quad_gym.kernels.ukf_update import update
 from quad_gym.kernels.vehicle import integrate, load4, load_state
 from quad_gym.kernels.warm import start_warm
 from quad_gym.records import Control, FilterForm, Source
@@ -105,9 +106,10 @@ def _sense_gnss(flight, world, settings, mask, starting):
     wait = select(due, 1.0 * settings.gnss_ticks, flight.gnss_wait) - 1.0
     flight.gnss_wait = select(mask, wait, flight.gnss_wait)
     fresh, alone = measured & (settings.gnss_ticks > 0), measured & logical_not(paired)
+    fresh = fresh & (starting or settings.gnss_delay == 0)
     flight.position_fresh = select(fresh, 1.0, flight.position_fresh)
     flight.baseline_fresh = select(fresh, 1.0, flight.baseline_fresh)
-    flight.baseline_fresh = select(alone, 0.0, flight.baseline_fresh)
+    flight.baseline_fresh = select(fresh & alone, 0.0, flight.baseline_fresh)
     if starting and settings.reuse_first_fix == 0 and not settings.warm:
         due = due & (settings.gnss_ticks < 0)
     valid = select(due & measured, 1.0, 0.0)
@@ -146,6 +148,9 @@ def sense(flight, world, model, settings, work, mask, starting):
             measure_imu(flight, world, mask)
             if settings.faults:
                 saturate_imu(flight, settings, mask)
+        anything_late = settings.gnss_delay + settings.camera_delay > 0
+        if anything_late:
+            set_aside(flight, work, settings)
         _sense_gnss(flight, world, settings, mask, starting)
 
         if settings.camera_ticks > 0:
@@ -160,14 +165,16 @@ def sense(flight, world, model, settings, work, mask, starting):
             wait = select(due, period, flight.camera_wait) - 1.0
             flight.camera_wait = select(mask, wait, flight.camera_wait)
             for i in range(settings.feature_count):
-                seen = due & (flight.feature_valid[i] > 0.0)
+                seen = due & (flight.feature_valid[i] > 0.0) & (settings.camera_delay == 0)
                 flight.feature_fresh[i] = select(seen, 1.0, flight.feature_fresh[i])
 
         if starting:
             initialize(flight, model, mask)
             if settings.warm:
                 start_warm(flight, settings, stream_of(flight), work, mask)
-        update(flight, model, work, settings.feature_count, mask, settings.form)
+        if anything_late:
+            exchange(flight, work, settings, mask, starting)
+        update_in_turn(flight, model, work, settings, mask, starting)
     _look(flight, model, settings, mask)
 
 
@@ -194,6 +201,8 @@ def tick(flight, world, model, settings, work):
             if settings.faults:
                 saturate_imu(flight, settings, everyone)
         predict(flight, model, work, settings.form)
+        if settings.gnss_delay + settings.camera_delay > 0:
+            add_increment(flight, model, settings.form)
         drift_biases(flight, world)
     flight.tick = flight.tick + 1.0
     if settings.faults:
@@ -216,6 +225,8 @@ def begin_episode(flight, nominal, world, model, settings, work, mask):
     wait = _first_wait(settings.camera_phase, settings.camera_ticks, camera_share)
     flight.camera_wait = select(mask, wait, flight.camera_wait)
     keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    if settings.gnss_delay + settings.camera_delay > 0:
+        begin_without_waiting(flight, mask)
     if (settings.form & _WATCH) != 0:
         forget_innovations(flight, settings.feature_count, mask)
     flight.position_fresh = select(mask, 0.0, flight.position_fresh)

@@ -1,0 +1,319 @@
+"""Measurements that arrive late, with their time stamps."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import WIDTH, FilterStatus, Source
+from tests.field_flights import fly, measured_now, nees, steps
+from tests.reference_late import Rewinding
+from tests.reference_ukf import PlainEKF, PlainUKF
+
+RTK, INDOOR = quad_gym.sensor_suite("rtk"), quad_gym.sensor_suite("indoor")
+DT = RTK.imu.dt
+ESTIMATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
+
+
+def late(suite, gnss=None, camera=None, **choices):
+    """A suite whose sensors have these latencies [s]; None leaves a sensor as it is."""
+    changes = {"estimator": suite.estimator.replace(**choices)}
+    for name, latency in (("gnss", gnss), ("camera", camera)):
+        if latency is not None:
+            changes[name] = getattr(suite, name).replace(latency=latency)
+    return suite.replace(**changes)
+
+
+def mended_lab(kind="ukf", quiet=False, **latencies):
+    """The laboratory's sensors at rates of the field, with the mended filter, without a gate."""
+    lab = quad_gym.sensor_suite("lab").with_rates(gnss=10.0, camera=25.0)
+    imu = lab.imu.replace(samples="average")
+    if quiet:
+        imu = imu.replace(
+            accel_noise_density=1e-7, gyro_noise_density=1e-7, accel_bias_tau=1e7, gyro_bias_tau=1e7
+        )
+    suite = lab.replace(
+        imu=imu,
+        gnss=lab.gnss.replace(phase=0.15),
+        camera=lab.camera.replace(phase=0.5, pixel_sigma=3.0),
+    )
+    return late(
+        suite,
+        **latencies,
+        kind=kind,
+        integration="midpoint",
+        covariance_reset="turn",
+        feature_noise_across="projected",
+        reuse_first_fix=False,
+    )
+
+
+# ---- when measurements arrive ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gnss", "camera"),
+    [(0.035, 0.015), (0.1, 0.04), (0.13, 0.055), (0.2, 0.08), (0.0, 0.06), (0.11, 0.0)],
+)
+def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
+    """Up to two intervals; flights on the truth, so that both batches fly and measure the same."""
+    task = {"task": "circle", "start": "hover", "source": Source.TRUTH}
+    prompt, delayed = fly(RTK, 20, **task), fly(late(RTK, gnss, camera), 20, **task)
+    waits = {"gnss": round(gnss / DT), "camera": round(camera / DT)}
+    history, fixes, images = [], 0, 0
+    for tick in range(150):
+        taken = {name: prompt.read(name) for name in ("gnss_position", "gnss_baseline", "pixels")}
+        taken["gnss_velocity"], taken["valid"] = prompt.read("gnss_velocity"), measured_now(prompt)
+        history.append(taken)
+        valid = measured_now(delayed)
+        for wait, blocks in ((waits["gnss"], slice(0, 3)), (waits["camera"], slice(3, None))):
+            then = history[tick - wait]["valid"] if tick >= wait else np.zeros_like(valid)
+            np.testing.assert_array_equal(valid[:, blocks], then[:, blocks])
+        arrived = np.flatnonzero(valid[:, 0])
+        then = history[max(tick - waits["gnss"], 0)]
+        for name in ("gnss_position", "gnss_baseline", "gnss_velocity"):
+            np.testing.assert_array_equal(delayed.read(name)[arrived], then[name][arrived])
+        seen, then = valid[:, 3:], history[max(tick - waits["camera"], 0)]
+        np.testing.assert_array_equal(delayed.read("pixels")[seen], then["pixels"][seen])
+        fixes, images = fixes + arrived.size, images + seen.any(axis=1).sum()
+        prompt.step()
+        delayed.step()
+    assert fixes > 20 * 4
+    assert images > 20 * 10
+
+
+def test_sensors_are_observed_when_their_measurements_arrive():
+    suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.0)), gnss=0.05)
+    env = QuadEnv("hover", observation="sensors", sensors=suite, control_rate=200.0)
+    env.reset(seed=0)
+    table = {field.name: field.slice for field in env.flights.table}
+    arrivals, positions = [], []
+    for tick in range(1, 60):
+        observation = env.step(np.zeros(4))[0]
+        if observation[table["gnss_position_valid"]]:
+            arrivals.append(tick)
+            positions.append(observation[table["gnss_position"]])
+    assert arrivals == [30, 50]
+    assert np.abs(np.diff(positions, axis=0)).max() < 0.1
+
+
+# ---- what they do to the estimate ------------------------------------------------------------
+
+
+def deviations_from_the_reference(suite, plain, seconds=1.5):
+    """Worst deviation of the means in claimed deviations, and of the covariances' entries.
+
+    Of circles, against a filter that filters all over again.
+    """
+    count = 3
+    batch = fly(suite, count, task="circle", start="hover")
+    references = []
+    for i in range(count):
+        f = plain(suite)
+        f.r, f.v, f.R = (batch.read(name)[i] for name in ("r_hat", "v_hat", "R_hat"))
+        f.b_a, f.b_g, f.P = (
+            batch.read("b_a_hat")[i],
+            batch.read("b_g_hat")[i],
+            batch.covariance()[i],
+        )
+        references.append(Rewinding(f))
+    waits = [round(sensor.latency / DT) for sensor in (suite.gnss, suite.camera)]
+    worst, arrivals = np.zeros(2), 0
+    for _ in range(round(seconds / DT)):
+        batch.step()
+        valid, P = measured_now(batch), batch.covariance()
+        for i, reference in enumerate(references):
+            reference.predict(batch.read("gyro")[i], batch.read("accel")[i])
+            if valid[i, 0]:
+                fix = {
+                    f"gnss_{name}_G": batch.read(f"gnss_{name}")[i]
+                    for name in ("position", "baseline")
+                }
+                reference.update(reference.tick - waits[0], **fix)
+            if valid[i, 3:].any():
+                seen = valid[i, 3:5, np.newaxis]
+                pixels = np.where(seen, batch.read("pixels")[i, :2], np.nan)
+                reference.update(reference.tick - waits[1], pixels=pixels)
+            if valid[i].any():
+                arrivals += 1
+                worst = np.maximum(worst, distance(batch, i, reference.plain, P[i]))
+    assert arrivals > 3 * 20
+    return worst
+
+
+def distance(batch, i, plain, P):
+    sigma = np.sqrt(np.diag(plain.P))
+    turn = batch.read("R_hat")[i] @ plain.R.T
+    angles = (
+        np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]]) / 2
+    )
+    x = np.concatenate(
+        [
+            batch.read("r_hat")[i] - plain.r,
+            batch.read("v_hat")[i] - plain.v,
+            angles,
+            batch.read("b_a_hat")[i] - plain.b_a,
+            batch.read("b_g_hat")[i] - plain.b_g,
+        ]
+    )
+    off = np.abs(P - plain.P) / np.outer(sigma, sigma)
+    return np.abs(x / sigma).max(), off.max()
+
+
+@pytest.mark.parametrize(("kind", "plain"), [("ukf", PlainUKF), ("ekf", PlainEKF)])
+def test_it_is_what_filtering_all_over_again_would_do(kind, plain):
+    """Up to what measurements in between tell about the IMU's noise: a hundredth of a deviation."""
+    mean, covariance = deviations_from_the_reference(mended_lab(kind, gnss=0.1, camera=0.06), plain)
+    assert mean < 0.02, mean
+    assert covariance < 0.02, covariance
+
+
+@pytest.mark.parametrize(("kind", "plain"), [("ukf", PlainUKF), ("ekf", PlainEKF)])
+def test_with_a_quiet_imu_it_is_the_same_to_the_second_order(kind, plain):
+    suite = mended_lab(kind, quiet=True, gnss=0.1, camera=0.06)
+    mean, covariance = deviations_from_the_reference(suite, plain)
+    assert mean < 2e-3, mean
+    assert covariance < 2e-3, covariance
+
+
+def test_taken_as_fresh_it_is_what_a_filter_without_clocks_would_do():
+    """The reference is told that what arrives was measured now."""
+    suite = mended_lab("ukf", gnss=0.1, camera=0.06)
+    ignorant = late(suite, late_measurements="as_fresh")
+    rewinding, _ = deviations_from_the_reference(ignorant, PlainUKF)
+    assert rewinding > 1.0
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+@pytest.mark.parametrize("name", ["rtk", "indoor"])
+def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
+    """Means over 400 flights, five deviations wide; the band itself is for longer flights."""
+    suite = quad_gym.sensor_suite(name)
+    latencies = {"camera": 0.06} if suite.gnss is None else {"gnss": 0.11, "camera": 0.06}
+    suite = late(suite, **latencies, kind=kind)
+    honest = fly(suite, 400, filter_start="warm")
+    ignorant = fly(
+        late(suite, late_measurements="as_fresh", gate_false_alarm=0.0), 400, filter_start="warm"
+    )
+    means = {"honest": [], "ignorant": []}
+    for _ in range(8):
+        for label, batch in (("honest", honest), ("ignorant", ignorant)):
+            steps(batch, 0.25)
+            means[label].append(nees(batch).mean())
+    bound = 5 * np.sqrt(2 * 15 / 400)
+    assert np.abs(np.array(means["honest"]) - 15.0).max() < bound, means
+    assert min(means["ignorant"][-4:]) > 15.0 + 2 * bound, means
+    assert not honest.read("filter_status").any()
+    assert (honest.read("rejections").sum(axis=1) > 0).mean() < 0.05
+
+
+# ---- what must not change --------------------------------------------------------------------
+
+
+def test_a_late_measurement_that_fails_leaves_the_estimate_bit_for_bit():
+    suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
+    batch = fly(suite, 10, task="hover")
+    steps(batch, 6 * DT)  # one fix is under way, until tick 15
+    bad, none = batch.snapshot(), batch.snapshot()
+    assert (bad["late_valid"][:, 0, 0] == 1.0).any()
+    bad["late_position"][0, 0, 1, ::2] = np.nan
+    none["late_valid"][0, 0, :, ::2] = 0.0
+    after = []
+    for start in (bad, none):
+        batch.restore(start)
+        steps(batch, 9 * DT)
+        after.append({name: batch.read(name) for name in ESTIMATE})
+        status = batch.read("filter_status")
+        expected = np.zeros(10, int)
+        if start is bad:
+            expected[[0, 2, 4, 6]] = FilterStatus.UPDATE_FAILED
+        np.testing.assert_array_equal(status, expected)
+    for name in ESTIMATE:
+        np.testing.assert_array_equal(after[0][name], after[1][name], err_msg=name)
+
+
+def test_a_failure_before_does_not_stop_late_measurements():
+    suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
+    batch = fly(suite, WIDTH, task="hover")
+    steps(batch, 6 * DT)
+    clean, marked = batch.snapshot(), batch.snapshot()
+    marked["filter_status"] = FilterStatus.UPDATE_FAILED
+    after = []
+    for start in (clean, marked):
+        batch.restore(start)
+        steps(batch, 9 * DT)
+        after.append({name: batch.read(name) for name in ESTIMATE})
+    assert (batch.read("filter_status") == FilterStatus.UPDATE_FAILED).all()
+    for name in ESTIMATE:
+        np.testing.assert_array_equal(after[0][name], after[1][name])
+
+
+def test_without_latency_it_does_not_matter_what_a_filter_does_about_it():
+    flown = [fly(late(RTK, late_measurements=choice), 20) for choice in ("rewind", "as_fresh")]
+    for batch in flown:
+        steps(batch, 0.5)
+    assert flown[0].snapshot().tobytes() == flown[1].snapshot().tobytes()
+
+
+@pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
+def test_a_flight_in_a_batch_is_the_flight_alone(autoreset):
+    keywords = {
+        "sensors": late(RTK, gnss=0.13, camera=0.06, kind="ekf"),
+        "filter_start": "warm",
+        "duration": 0.3,
+        "include_covariance": True,
+    }
+    vector = QuadVectorEnv(11, "circle", autoreset_mode=autoreset, **keywords)
+    together = [vector.reset(seed=3)[0]] + [
+        vector.step(np.full((11, 4), 0.1 * (k % 3), np.float32))[0] for k in range(30)
+    ]
+    for i in (0, 7, 10):
+        alone = QuadEnv("circle", **keywords)
+        rows, over = [alone.reset(seed=3 + i)[0]], False
+        for k in range(30):
+            if over and autoreset == "NextStep":
+                rows.append(alone.reset()[0])
+                over = False
+                continue
+            observation, _, terminated, truncated, _ = alone.step(
+                np.full(4, 0.1 * (k % 3), np.float32)
+            )
+            over = terminated or truncated
+            if over and autoreset == "SameStep":
+                observation, over = alone.reset()[0], False
+            rows.append(observation)
+        np.testing.assert_array_equal(rows, np.array(together)[:, i])
+
+
+def test_an_episode_begins_with_nothing_under_way():
+    suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25)), gnss=0.1, camera=0.06)
+    batch = fly(suite, 4)
+    for _ in range(2):
+        for _ in range(24):
+            batch.step()
+            assert not batch.read("position_valid").any()
+        batch.step()
+        assert batch.read("position_valid").all()
+        steps(batch, 0.7)
+        batch.reset()
+
+
+# ---- nonsense --------------------------------------------------------------------------------
+
+
+def test_nonsense_is_refused():
+    for params, label in ((RTK.gnss, "GnssParams"), (RTK.camera, "CameraParams")):
+        for latency in (-0.1, np.nan, "soon"):
+            with pytest.raises(ValueError, match=rf"{label}\.latency"):
+                params.replace(latency=latency)
+    with pytest.raises(
+        ValueError, match=r"GnssParams\.latency must be at most 2 periods .* 0\.2 s"
+    ):
+        late(RTK, gnss=0.21)
+    with pytest.raises(ValueError, match=r"CameraParams\.latency must be at most 2 periods"):
+        late(INDOOR, camera=0.06).with_rates(camera=50.0)
+    with pytest.raises(ValueError, match=r"GnssParams\.latency"):
+        fly(RTK.with_rates(gnss=20.0), 1, true_sensors=late(RTK, gnss=0.15))
+    with pytest.raises(ValueError, match="late_measurements must be one of rewind, as_fresh"):
+        RTK.estimator.replace(late_measurements="drop")
