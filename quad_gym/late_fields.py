@@ -17,7 +17,7 @@ LATE_STATE_FIELDS = (
     Field("stamp_velocity", (2, _SLOTS, 3), "m/s", "V"),
     Field("stamp_position", (2, _SLOTS, 3), "m", "X"),
     Field("stamp_bias_gain", (2, _SLOTS, 3, 3), "s", "B"),
-    Field("stamp_gyro", (2, _SLOTS, 3), "rad/s", "the filter's gyro sample"),
+    Field("stamp_rates", (2, _SLOTS, 3), "rad/s", "w_meas"),
     # the measurements under way
     Field("late_position", (_SLOTS, 3), "m", "gnss_position"),
     Field("late_baseline", (_SLOTS, 3), "m", "gnss_baseline"),
@@ -42,8 +42,8 @@ LATE_WORK_FIELDS = (
     Field("kept_b_a", (3,), "m/s^2", "b_a_hat"),
     Field("kept_b_g", (3,), "rad/s", "b_g_hat"),
     Field("kept_L", (15, 15), "mixed", "L"),
-    Field("kept_gyro", (3,), "rad/s", "gyro"),
-    Field("kept_status", (), "bits", "filter_status", "u8"),
+    Field("kept_rates", (3,), "rad/s", "w_meas"),
+    Field("kept_failures", (), "-", "update_failures"),
     # the instant to which a late update goes back
     Field("since_time", (), "s", "T since then"),
     Field("since_turn", (3, 3), "-", "C of then"),

@@ -38,7 +38,7 @@ class GnssReceiver(_Sensor):
     """Two GNSS antennas: noisy position of the primary one and noisy baseline of exact length.
 
     Args:
-        params: Geometry and noise.
+        params: Geometry and noise; to delay measurements by `latency` is the caller's.
         rng: Seeds the sensor's random stream.
 
     Source: report sections 2.1 and 3.1.
@@ -75,7 +75,7 @@ class Camera(_Sensor):
     """A pinhole camera that projects known features with pixel noise.
 
     Args:
-        params: Geometry, noise and features.
+        params: Geometry, noise and features; to delay images by `latency` is the caller's.
         rng: Seeds the sensor's random stream.
 
     Source: report sections 2.2 and 3.2.

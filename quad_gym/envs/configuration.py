@@ -131,6 +131,7 @@ class Flights:
             include_covariance=include_covariance,
             privileged=privileged,
             feature_count=features,
+            gnss_velocity=suite.gnss is not None and suite.gnss.velocity_sigma is not None,
             drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
         self.space = observation_space(self.table)

@@ -98,7 +98,7 @@ _FLAG = 0.0
 """A bound of zero marks a flag, in [0, 1]."""
 
 
-def _sensor_fields(feature_count: int) -> tuple[Part, ...]:
+def _sensor_fields(feature_count: int, gnss_velocity: bool) -> tuple[Part, ...]:
     fields = [
         ("gyro", 3, "rad/s", "B", 200.0),
         ("accel", 3, "m/s^2", "B", 1000.0),
@@ -107,6 +107,9 @@ def _sensor_fields(feature_count: int) -> tuple[Part, ...]:
         ("gnss_baseline", 3, "-", "I", 1.0),
         ("gnss_baseline_valid", 1, "0 or 1", "-", _FLAG),
     ]
+    if gnss_velocity:
+        fields.append(("gnss_velocity", 3, "m/s", "I", 200.0))
+        fields.append(("gnss_velocity_valid", 1, "0 or 1", "-", _FLAG))
     for k in range(1, feature_count + 1):
         fields.append((f"feature_{k}", 2, "half images", "C", 2.0))
         fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
@@ -143,6 +146,7 @@ def observation_layout(
     include_covariance: bool = False,
     privileged: bool = False,
     feature_count: int = 2,
+    gnss_velocity: bool = False,
     drawn: Sequence[str] | None = None,
 ) -> tuple[ObservationField, ...]:
     """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
@@ -154,6 +158,7 @@ def observation_layout(
         privileged: Whether the truth ends the table; its slices go on counting, though the
             environment returns that part under a key of its own.
         feature_count: Features of the camera, for "sensors".
+        gnss_velocity: Whether GNSS measures velocity, for "sensors".
         drawn: What is drawn for every episode, see `quad_gym.Randomization`: the truth ends with
             the wind and the draws. None: in a calm world without draws it does not.
 
@@ -167,7 +172,7 @@ def observation_layout(
     check.choice("layout", layout, tuple(LAYOUTS))
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
     if observation == "sensors":
-        parts = _sensor_fields(feature_count)
+        parts = _sensor_fields(feature_count, gnss_velocity)
     parts = (*parts, _LAST_ACTION)
     if include_covariance:
         units = ("m", "m/s", "rad", "m/s^2", "rad/s")

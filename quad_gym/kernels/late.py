@@ -73,7 +73,7 @@ def set_aside(flight, work, settings):
 @kernel
 def _stamp(flight, sensor, taken):
     """Move the stamps of a sensor on by a place and stamp the first with now, where `taken`."""
-    tick, turn, gyro = flight.stamp_tick, flight.stamp_turn, flight.stamp_gyro
+    tick, turn, rates = flight.stamp_tick, flight.stamp_turn, flight.stamp_rates
     velocity, position = flight.stamp_velocity, flight.stamp_position
     gain = flight.stamp_bias_gain
     for slot in range(MAX_UNDER_WAY - 1, 0, -1):
@@ -82,13 +82,13 @@ def _stamp(flight, sensor, taken):
         keep33(gain[sensor, slot], taken, load33(gain[sensor, slot - 1]))
         keep3(velocity[sensor, slot], taken, load3(velocity[sensor, slot - 1]))
         keep3(position[sensor, slot], taken, load3(position[sensor, slot - 1]))
-        keep3(gyro[sensor, slot], taken, load3(gyro[sensor, slot - 1]))
+        keep3(rates[sensor, slot], taken, load3(rates[sensor, slot - 1]))
     tick[sensor, 0] = select(taken, flight.tick, tick[sensor, 0])
     keep33(turn[sensor, 0], taken, load33(flight.imu_turn))
     keep33(gain[sensor, 0], taken, load33(flight.imu_bias_gain))
     keep3(velocity[sensor, 0], taken, load3(flight.imu_velocity))
     keep3(position[sensor, 0], taken, load3(flight.imu_position))
-    keep3(gyro[sensor, 0], taken, load3(flight.gyro))
+    keep3(rates[sensor, 0], taken, load3(flight.w_meas))
 
 
 @kernel
@@ -192,8 +192,8 @@ def _keep_estimate(flight, work):
     store33(work.kept_R, load33(flight.R_hat))
     store3(work.kept_b_a, load3(flight.b_a_hat))
     store3(work.kept_b_g, load3(flight.b_g_hat))
-    store3(work.kept_gyro, load3(flight.gyro))
-    work.kept_status = flight.filter_status
+    store3(work.kept_rates, load3(flight.w_meas))
+    work.kept_failures = flight.update_failures
     for i in range(15):
         for j in range(i + 1):
             work.kept_L[i, j] = flight.L[i, j]
@@ -212,7 +212,7 @@ def _find_stamp(flight, p, work, sensor, delay, arrived):
         keep33(work.since_bias_gain, here, load33(flight.stamp_bias_gain[sensor, slot]))
         keep3(work.since_velocity, here, load3(flight.stamp_velocity[sensor, slot]))
         keep3(work.since_position, here, load3(flight.stamp_position[sensor, slot]))
-        keep3(flight.gyro, here, load3(flight.stamp_gyro[sensor, slot]))
+        keep3(flight.w_meas, here, load3(flight.stamp_rates[sensor, slot]))
     work.since_time = select(arrived, delay * p.dt, 0.0)
     work.since_noise = select(arrived, 1.0, 0.0)
     C_s, B_s = load33(work.since_turn), load33(work.since_bias_gain)
@@ -284,9 +284,12 @@ def _restore_estimate(flight, work, arrived, good):
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(old, work.kept_L[i, j], flight.L[i, j])
-    store3(flight.gyro, load3(work.kept_gyro))
-    status = flight.filter_status | work.kept_status
-    flight.filter_status = select(arrived & old, status | _UPDATE_FAILED, status)
+    store3(flight.w_meas, load3(work.kept_rates))
+    failed = arrived & old
+    status = flight.filter_status
+    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
+    failures = select(failed, work.kept_failures + 1.0, flight.update_failures)
+    flight.update_failures = failures
 
 
 @kernel
@@ -317,7 +320,7 @@ def update_in_turn(flight, p, work, settings, mask, starting):
     anything_late = not starting and (late_gnss or late_camera)
     flags = (flight.position_valid, flight.baseline_valid, flight.velocity_valid)
     for turn in range(_GNSS if anything_late else _PRESENT, _PRESENT + 1):
-        late, features = turn != _PRESENT, settings.feature_count
+        late, features = anything_late and turn != _PRESENT, settings.feature_count
         arrived = mask
         if anything_late:
             fixes = turn == (_GNSS if late_gnss else _PRESENT)
@@ -332,7 +335,6 @@ def update_in_turn(flight, p, work, settings, mask, starting):
             if not (fixes or images) or not any_of(arrived):
                 continue
             _keep_estimate(flight, work)
-            flight.filter_status = flight.filter_status ^ (flight.filter_status & _UPDATE_FAILED)
             delay = settings.gnss_delay if turn == _GNSS else settings.camera_delay
             _find_stamp(flight, p, work, turn, delay, arrived)
         good = arrived
@@ -342,7 +344,7 @@ def update_in_turn(flight, p, work, settings, mask, starting):
             if leg == 0:
                 update(flight, p, work, features, good, settings.form)
         if late:
-            good = good & ((flight.filter_status & _UPDATE_FAILED) == np.uint64(0))
+            good = good & (flight.update_failures == work.kept_failures)
             _restore_estimate(flight, work, arrived, good)
     if anything_late:
         flight.position_valid, flight.baseline_valid, flight.velocity_valid = flags

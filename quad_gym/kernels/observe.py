@@ -103,6 +103,11 @@ def _put_sensors(flight, p, settings, row):
     k = _put3(row, k + 1, scale(fresh, baseline))
     row[k] = flight.baseline_fresh
     k += 1
+    if settings.gnss_velocity > 0:  # measured with every position
+        fresh = flight.position_fresh
+        k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_velocity))))
+        row[k] = fresh
+        k += 1
     for i in range(settings.feature_count):
         fresh = flight.feature_fresh[i]
         row[k] = fresh * flight.pixels[i, 0] / p.half_image[0]

@@ -27,7 +27,7 @@ import numpy as np
 
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.ekf import acceleration_column, angle_column
-from quad_gym.kernels.elementary import is_finite
+from quad_gym.kernels.elementary import is_finite, maximum, minimum
 from quad_gym.kernels.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import (
@@ -66,6 +66,7 @@ from quad_gym.kernels.wahba import wahba
 from quad_gym.records import FilterForm, FilterStatus
 
 _EKF, _MIDPOINT, _TURN = int(FilterForm.EKF), int(FilterForm.MIDPOINT), int(FilterForm.TURN)
+_NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
 _PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
 
 
@@ -347,7 +348,8 @@ def initialize(flight, p, mask):
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
     with equal weights, or level with the baseline's heading; position from the antenna; velocity
-    and biases zero. A level start knows that its position hangs on its attitude.
+    and biases zero. A level start knows that its position hangs on its attitude. The heading is the
+    less certain the steeper the baseline, up to anywhere.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
@@ -377,11 +379,14 @@ def initialize(flight, p, mask):
         for j in range(i + 1):
             L[i, j] = select(mask, 0.0, L[i, j])
     inflation = math.sqrt(p.initial_scale)
+    attitude = inflation * p.baseline_sigma
+    level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
+    heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
     for i in range(3):
         L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
         L[V + i, V + i] = select(mask, math.sqrt(p.initial_velocity_variance), L[V + i, V + i])
-        tilt = select(level & (i < 2), p.initial_tilt_sigma, inflation * p.baseline_sigma)
-        L[E + i, E + i] = select(mask, tilt, L[E + i, E + i])
+        angle = heading if i == 2 else select(level, p.initial_tilt_sigma, attitude)
+        L[E + i, E + i] = select(mask, angle, L[E + i, E + i])
         L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
         L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])
     _tie_position_to_attitude(L, R_BI, load3(p.antenna), mask & level)

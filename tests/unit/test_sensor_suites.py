@@ -6,6 +6,7 @@ from scipy import signal, stats
 
 import quad_gym
 from quad_gym.records import VELOCITY_BLOCK
+from quad_gym.sensor_params import PlacementParams
 from quad_gym.sensor_suites import SUITES
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import attitudes, fly, state_errors, steps
@@ -237,3 +238,65 @@ def test_sensors_are_observed_as_they_measure():
     table = {field.name: field.slice for field in env.flights.table}
     assert observation[table["gnss_position_valid"]] == 0.0
     assert not observation[table["gnss_position"]].any()
+
+
+def test_velocity_is_observed_with_the_position_by_suites_that_have_it():
+    env = quad_gym.QuadEnv("hover", observation="sensors", sensors="rtk", control_rate=100.0)
+    env.reset(seed=3)
+    table = {field.name: field.slice for field in env.flights.table}
+    assert table["gnss_velocity_valid"].start == table["gnss_velocity"].stop
+    R_IG = east_north_up(RTK.gnss.reference_antenna_G)
+    fixes = 0
+    for _ in range(50):
+        observation = env.step(np.zeros(4, np.float32))[0]
+        seen, fresh = observation[table["gnss_velocity"]], observation[table["gnss_velocity_valid"]]
+        assert fresh == observation[table["gnss_position_valid"]]
+        measured = R_IG @ env.flights.batch.read("gnss_velocity")[0]
+        np.testing.assert_allclose(seen, fresh * measured, atol=1e-6)
+        fixes += int(fresh[0])
+    assert fixes == 5
+    without = quad_gym.QuadEnv("hover", observation="sensors", sensors="lab")
+    assert "gnss_velocity" not in {field.name for field in without.flights.table}
+
+
+# ---- sensors that are not what the filter believes -------------------------------------------
+
+
+def test_the_place_of_the_start_is_as_uncertain_as_it_is_and_not_as_believed():
+    believed = quad_gym.sensor_suite("indoor")
+    true = believed.replace(placement=PlacementParams(position_sigma=0.2, heading_sigma=0.15))
+    batch = fly(believed, 4000, task="hover", true_sensors=true, start="ground")
+    errors = state_errors(batch)
+    assert_normal(errors[:, :3], np.zeros(3), np.eye(3) * 0.2**2)
+    claimed = np.sqrt(np.diagonal(batch.covariance(), axis1=1, axis2=2))
+    np.testing.assert_allclose(claimed[:, :3], 0.05, rtol=1e-9)
+    np.testing.assert_allclose(claimed[:, 8], 0.05, rtol=1e-9)
+    # the heading of a direction of which two components are wrong by 0.15: within some per cent
+    np.testing.assert_allclose(errors[:, 8].std(), 0.15, rtol=0.06)
+
+
+def test_fixes_come_from_the_true_antenna_with_its_true_noise():
+    true = RTK.replace(
+        gnss=RTK.gnss.replace(
+            primary_antenna_B=(0.3, -0.2, 0.1),
+            secondary_antenna_B=(-0.2, 0.1, 0.1),
+            position_sigma_I=(0.1, 0.2, 0.3),
+            velocity_sigma=0.4,
+        )
+    )
+    batch = fly(RTK, 4000, task="hover", true_sensors=true)
+    R_IG = east_north_up(RTK.gnss.reference_antenna_G)
+    R_BI = attitudes(batch.read("q"))
+    antenna = batch.read("r") + np.array(true.gnss.primary_antenna_B) @ R_BI
+    fixes = batch.read("gnss_position") @ R_IG.T - antenna
+    assert_normal(fixes, np.zeros(3), np.diag(np.square([0.1, 0.2, 0.3])))
+    lever = np.cross(batch.read("w"), true.gnss.primary_antenna_B)
+    truth = batch.read("v") + np.einsum("nji,nj->ni", R_BI, lever)
+    assert_normal(batch.read("gnss_velocity") @ R_IG.T - truth, np.zeros(3), np.eye(3) * 0.4**2)
+    baseline = np.array(true.gnss.baseline_B) @ R_BI
+    measured = batch.read("gnss_baseline") @ R_IG.T
+    size = np.linalg.norm(true.gnss.baseline_B)
+    np.testing.assert_allclose(np.linalg.norm(measured, axis=1), size, rtol=1e-9)
+    angles = np.linalg.norm(np.cross(measured, baseline), axis=1) / size**2
+    rayleigh = np.sqrt(np.pi / 2) * RTK.gnss.baseline_sigma
+    np.testing.assert_allclose(angles.mean(), rayleigh, rtol=0.05)

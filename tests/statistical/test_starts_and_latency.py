@@ -1,0 +1,87 @@
+"""Starts from anywhere, warm and cold, and measurements that arrive late, over many flights."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import Uniform
+from quad_gym.consistency import PARTS, InnovationRecorder, NeesRecorder
+from tests.field_flights import attitudes, fly, nees, small_euler_angles, state_errors, steps
+
+ANY_YAW = {"start_yaw": Uniform(-np.pi, np.pi)}
+RTK = quad_gym.sensor_suite("rtk")
+BASELINE_UP = RTK.replace(
+    gnss=RTK.gnss.replace(primary_antenna_B=(0.0, 0.0, 0.05), secondary_antenna_B=(0.0, 0.0, 0.24))
+)
+
+
+def delayed(suite, kind="ukf"):
+    """With the latencies of a usual receiver and of a camera whose images are searched."""
+    changes = {"estimator": suite.estimator.replace(kind=kind)}
+    for name, latency in (("gnss", 0.11), ("camera", 0.06)):
+        if getattr(suite, name) is not None:
+            changes[name] = getattr(suite, name).replace(latency=latency)
+    return suite.replace(**changes)
+
+
+def yaw_errors(batch):
+    """(n,) degrees."""
+    R_error = attitudes(batch.read("q")) @ batch.read("R_hat").transpose(0, 2, 1)
+    return np.degrees(np.abs(small_euler_angles(R_error)[:, 2]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+@pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
+def test_a_warm_filter_is_honest_from_the_first_instant_on(kind, late):
+    """NEES of state and blocks and NIS of all sensors in their bands, innovations white."""
+    suite = delayed(RTK, kind) if late else RTK.replace(estimator=RTK.estimator.replace(kind=kind))
+    batch = fly(suite, 1000, filter_start="warm")
+    recorder = NeesRecorder()
+    innovations = InnovationRecorder(batch, np.linspace(0.0, 10.0, 201))
+    recorder.add(batch, 0.0)
+    for tick in range(1, 2001):
+        batch.step()
+        innovations.add(batch, tick / 200)
+        if tick % 10 == 0:
+            recorder.add(batch, tick / 200)
+    assert not batch.read("filter_status").any()
+    found = recorder.nees()
+    for name in PARTS:
+        assert found[name].honest, (name, found[name].share_inside, found[name].overall)
+    for name, part in innovations.nis().items():
+        assert part.honest, (name, part.share_inside, part.overall)
+    for name, correlation in innovations.whiteness().items():
+        assert correlation.white, (name, correlation.largest)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [True, False], ids=["camera", "no camera"])
+@pytest.mark.parametrize("name", ["lab", "rtk", "late rtk"])
+def test_any_yaw_is_known_to_a_degree_within_ten_seconds(name, camera):
+    """In 99.9 % of flights with a baseline, hovering, from the first fix on."""
+    suite = delayed(RTK) if name == "late rtk" else quad_gym.sensor_suite(name)
+    if name == "lab":  # whose own form is overconfident in its camera
+        suite = suite.replace(estimator=suite.estimator.replace(feature_noise_across="predicted"))
+    if not camera:
+        suite = suite.replace(camera=None)
+    batch = fly(suite, 2000, task="hover", randomization=ANY_YAW)
+    assert yaw_errors(batch).max() > 3.0
+    steps(batch, 10.0)
+    assert (yaw_errors(batch) > 1.0).sum() <= 2
+    assert not batch.read("filter_status").any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [True, False], ids=["camera", "no camera"])
+def test_a_vertical_baseline_does_no_harm_to_a_filter_that_knows_its_heading(camera):
+    suite = BASELINE_UP if camera else BASELINE_UP.replace(camera=None)
+    batch = fly(suite, 1000, filter_start="warm", randomization=ANY_YAW)
+    means = [nees(batch).mean()]
+    for _ in range(20):
+        steps(batch, 0.5)
+        means.append(nees(batch).mean())
+    bound = 5 * np.sqrt(2 * 15 / 1000)
+    assert np.abs(np.array(means) - 15.0).max() < bound, means
+    assert not batch.read("filter_status").any()
+    assert np.abs(state_errors(batch)[:, :3]).max() < 0.05
