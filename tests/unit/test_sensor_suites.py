@@ -264,6 +264,7 @@ def test_velocity_is_observed_with_the_position_by_suites_that_have_it():
 
 def test_the_place_of_the_start_is_as_uncertain_as_it_is_and_not_as_believed():
     believed = quad_gym.sensor_suite("indoor")
+    believed = believed.replace(camera=believed.camera.replace(phase=0.5))
     true = believed.replace(placement=PlacementParams(position_sigma=0.2, heading_sigma=0.15))
     batch = fly(believed, 4000, task="hover", true_sensors=true, start="ground")
     errors = state_errors(batch)
