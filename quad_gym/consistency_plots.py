@@ -25,17 +25,18 @@ _UNITS = {
 
 
 def _grid(count: int, title: str, height: float = 2.1) -> tuple[Any, Any]:
-    """A figure of `count` pictures, three in a row."""
+    """A figure of `count` pictures, three in a row; four are two by two."""
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    rows = -(-count // 3)
+    columns = 2 if count == 4 else 3
+    rows = -(-count // columns)
     figure = Figure(figsize=(10.0, 0.6 + height * rows), layout="constrained")
-    axes = figure.subplots(rows, 3, squeeze=False).ravel()
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for spare in axes[count:]:
         spare.set_visible(False)
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.0)
-    for axis in axes[max(0, count - 3) : count]:
+    for axis in axes[max(0, count - columns) : count]:
         axis.set_xlabel("time [s]")
     return figure, axes[:count]
 
@@ -74,6 +75,9 @@ def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -
 
 def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
     """Root mean square errors (t, 15) over flights, and the deviations that the filter claims."""
+    require_matplotlib()
+    from matplotlib.ticker import LogLocator
+
     text = (
         f"{title}\nError (blue) and what the filter claims (dashed), root mean square over flights"
     )
@@ -88,6 +92,7 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
         axis.set_title(f"{_TITLES[name]} [{unit}]")
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(axis="y", which="minor", labelsize=7.0)
         axis.set_xlim(0.0, time[-1])

@@ -173,7 +173,7 @@ def title_of(batch: FlightBatch, args: Args) -> str:
     sensors = batch.sensors
     choices = sensors.estimator
     parts = [
-        f"{choices.kind.upper()}, suite {args.suite}",
+        f"{choices.kind.upper()}, suite {args.suite}, {args.start} start",
         f"{sensors.imu.samples} samples",
         f"{choices.integration}",
         f"reset {choices.covariance_reset}",
