@@ -180,10 +180,12 @@ def verdict(part: MeanSquare) -> str:
     what = f"{part.name}: mean {part.overall:.2f} where {part.dimension} is right, {inside}"
     if part.honest:
         return f"{what}: honest."
-    factor = 100.0 * abs(np.sqrt(part.overall / part.dimension) - 1.0)
-    if part.overall > part.dimension:
-        return f"{what}: overconfident, as errors are {factor:.1f} % larger than it claims."
-    return f"{what}: too cautious, as errors are {factor:.1f} % smaller than it claims."
+    ratio = float(np.sqrt(part.overall / part.dimension))
+    percent = f"{100.0 * abs(ratio - 1.0):.1f} %"
+    if ratio < 1.0:
+        return f"{what}: too cautious, as errors are {percent} smaller than it claims."
+    size = f"{percent} larger than" if ratio < 2.0 else f"{ratio:.1f} times what"
+    return f"{what}: overconfident, as errors are {size} it claims."
 
 
 class NeesRecorder:

@@ -55,6 +55,7 @@ def test_an_honest_filter_is_called_honest_and_others_by_how_much_they_err():
     for factor, words in (
         (1.1, "overconfident, as errors are 10"),
         (0.9, "too cautious, as errors are 10"),
+        (2.5, "overconfident, as errors are 2.5 times what it claims"),
     ):
         part = drawn(factor)
         assert not part.honest
