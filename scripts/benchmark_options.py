@@ -47,6 +47,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "ground effect": in_a_world(ground_effect=True),
     "battery": in_a_world(battery=quad_gym.BatteryParams()),
     "world breeze": {"world": "breeze"},
+    "all faults": {"faults": "all"},
     "mass drawn anew each episode": {
         "randomization": {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
     },
