@@ -62,27 +62,27 @@ STARTS: dict[str, dict[str, Any]] = {
 """Likewise, of what is timed at its reset."""
 
 
+TICKS = 10
+"""Ticks in a turn: so few that flights with and without an option still see the same features, and
+that some turns pass undisturbed."""
+
+
 def time_options(count: int, effort: Effort) -> list[Row]:
     """A tick of a flight with each option, and a reset with each start, on one core."""
     task = TASK_DEFAULTS["hover"].replace(duration=0.0)
-    jobs: dict[str, Callable[[], Any]] = {}
+    turns: dict[str, Callable[[], float]] = {}
     for name, options in {**OPTIONS, **STARTS}.items():
         batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
         batch.reset(seeds=range(count))
         for _ in range(50):  # the start, where images come in portions, is not what counts
             batch.step()
-        jobs[name] = batch.step if name in OPTIONS else batch.reset
-    began = time.perf_counter()
-    jobs[OFF]()
-    calls = max(1, round(effort.seconds / (time.perf_counter() - began)))
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for turn, (name, job) in itertools.product(range(effort.repeats), jobs.items()):
-        if name == OFF:
-            print(f"  turn {turn + 1} of {effort.repeats}", file=sys.stderr, flush=True)
-        began = time.perf_counter()
-        for _ in range(calls):
-            job()
-        times[name].append((time.perf_counter() - began) / (calls * count))
+        turns[name] = turn_of(batch, batch.step if name in OPTIONS else batch.reset)
+    number = max(2, round(effort.repeats * effort.seconds / (TICKS * count * turns[OFF]())))
+    times: dict[str, list[float]] = {name: [] for name in turns}
+    for k, (name, turn) in itertools.product(range(number), turns.items()):
+        if name == OFF and k % 20 == 0:
+            print(f"  turn {k + 1} of {number}", file=sys.stderr, flush=True)
+        times[name].append(turn())
     off = min(times[OFF])
     rows = []
     for name, found in times.items():
@@ -90,6 +90,20 @@ def time_options(count: int, effort: Effort) -> list[Row]:
         timing = Timing(best, statistics.median(found) / best - 1.0)
         rows.append(report(name, timing, times_off=best / off))
     return rows
+
+
+def turn_of(batch: FlightBatch, job: Callable[[], Any]) -> Callable[[], float]:
+    """A function that does the job `TICKS` times from here on, and returns seconds a flight."""
+    start = batch.snapshot()
+
+    def turn() -> float:
+        batch.restore(start)
+        began = time.perf_counter()
+        for _ in range(TICKS):
+            job()
+        return (time.perf_counter() - began) / (TICKS * batch.count)
+
+    return turn
 
 
 def options_table(rows: list[Row]) -> str:

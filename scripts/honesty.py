@@ -196,12 +196,12 @@ def batch_of(case: Case, args: Args, flights: int, threads: int | None) -> Fligh
 
 def time_ticks(cases: list[Case], args: Args) -> list[float]:
     """Seconds a tick of one flight, sensors and all, of each case: the best of turns about."""
-    count, ticks = 128, 40
+    count, ticks = 128, 8
     batches = [batch_of(case, args, count, 1) for case in cases]
     for batch in batches:
         batch.reset(seeds=range(count))
     times: list[list[float]] = [[] for _ in batches]
-    for _ in range(15):
+    for _ in range(100):  # short turns, some of which nothing disturbs
         for batch, found in zip(batches, times, strict=True):
             began = time.perf_counter()
             for _ in range(ticks):
