@@ -211,6 +211,10 @@ def train(
             raise ValueError(
                 f"folder {folder} holds the run of another plan: {', '.join(differing)} differ"
             )
+        if before["finished"]:
+            return Training(
+                folder, before["steps"], before["training_seconds"], True, before["best"]
+            )
     threads = resolve_threads(plan.threads)
     torch.set_num_threads(1)  # networks this small gain nothing from more
     env, judge = plan.make_flights(), plan.make_judge()
