@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quad_gym.params import TaskParams, VehicleParams
 from quad_gym.records import WARM_DRAWS, WIDTH, Autoreset, Control, Source
-from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 from quad_gym.sensor_params import ImuParams, SensorSuite
 
 FILTER_STARTS = ("cold", "warm")
@@ -25,6 +25,10 @@ FILTER_STARTS = ("cold", "warm")
 WARM_UP = 10.0
 """How long a filter has been running at a warm start [s]: some correlation times of its velocity
 and attitude, as between switching a vehicle on and its take-off."""
+
+LOST = 0.35
+"""Error of the attitude beyond which a filter is lost, whatever it claims [rad]: a linear model of
+it is wrong by its square over two. Overconfidence alone is no reason to refuse a warm start."""
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +69,8 @@ def converged_covariance(
         (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east.
 
     Raises:
-        ValueError: If a filter fails on the way.
+        ValueError: If a filter fails on the way, or is lost at its end, as one that has nothing to
+            tell it its heading.
     """
     batch = make(
         WIDTH,
@@ -92,6 +97,13 @@ def converged_covariance(
             f"filter_start must be 'cold' for these sensors: the filter fails within {WARM_UP:g} s "
             "of hovering"
         )
+    angle = float(np.abs(_attitude_errors(batch)).max())
+    if angle > LOST:
+        raise ValueError(
+            f"filter_start must be 'cold' for these sensors: after {WARM_UP:g} s of hovering the "
+            f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
+            "filter its heading, such as a baseline that is not vertical?"
+        )
     forward_I = quaternion_to_dcm(batch.read("q"))[:, 0]
     yaw = np.arctan2(forward_I[:, 1], forward_I[:, 0])
     turn = np.broadcast_to(np.eye(15), (WIDTH, 15, 15)).copy()
@@ -99,6 +111,12 @@ def converged_covariance(
         turn[:, block, block] = [_about_vertical(angle) for angle in yaw]
     P = turn.transpose(0, 2, 1) @ batch.covariance() @ turn
     return P.mean(axis=0)  # type: ignore[no-any-return]
+
+
+def _attitude_errors(batch: Any) -> Floats:
+    """(n, 3) Euler angles from the estimated to the true attitude [rad]."""
+    R_hat = batch.read("R_hat")
+    return dcm_to_euler(quaternion_to_dcm(batch.read("q")) @ R_hat.transpose(0, 2, 1))
 
 
 def _about_vertical(angle: float) -> Floats:

@@ -164,6 +164,17 @@ def test_nonsense_is_refused():
         QuadEnv("hover", filter_start=None)
 
 
+@pytest.mark.parametrize("camera", [True, False])
+def test_a_filter_that_cannot_know_its_heading_has_nothing_to_start_warm_with(camera):
+    """It claims some degrees after a while, and is wrong by up to half a turn."""
+    rtk = quad_gym.sensor_suite("rtk")
+    up = {"primary_antenna_B": (0.0, 0.0, 0.05), "secondary_antenna_B": (0.0, 0.0, 0.24)}
+    suite = rtk.replace(gnss=rtk.gnss.replace(**up), camera=rtk.camera if camera else None)
+    with pytest.raises(ValueError, match=r"filter_start must be 'cold' .* baseline"):
+        FlightBatch(1, sensors=suite, filter_start="warm")
+    FlightBatch(1, sensors=suite)  # cold it may fly
+
+
 # ---- the faces -------------------------------------------------------------------------------
 
 
