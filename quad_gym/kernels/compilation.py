@@ -61,7 +61,7 @@ def sources_digest() -> str:
 
 def _announce(name: str, cached_in: str) -> None:
     print(
-        f"quad_gym: compiling {name} for this machine (once, up to two minutes; {cached_in})",
+        f"quad_gym: compiling {name} for this machine (once, some minutes; {cached_in})",
         file=sys.stderr,
         flush=True,
     )
