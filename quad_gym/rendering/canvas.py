@@ -126,10 +126,14 @@ class Canvas:
             steps = np.linalg.norm(np.diff(run, axis=0), axis=1)
             length = np.concatenate([[0.0], np.cumsum(steps)])
             begin = np.arange(0.0, min(length[-1], 4.0 * _FAR), dash + gap)
+
+            def along(distance: Floats, run: Floats = run, length: Floats = length) -> Floats:
+                return np.stack([np.interp(distance, length, run[:, k]) for k in range(2)], axis=-1)
+
+            center = along(begin + 0.5 * dash) / (self.width, self.height)
+            begin = begin[(abs(center - 0.5) < 0.55).all(axis=1)]  # most may lie outside
             both = np.stack([begin, np.minimum(begin + dash, length[-1])], axis=1)
-            at = np.stack([np.interp(both, length, run[:, k]) for k in range(2)], axis=-1)
-            center = at.mean(axis=1) / (self.width, self.height)
-            self.segments(at[(abs(center - 0.5) < 0.55).all(axis=1)], color, width)
+            self.segments(along(both), color, width)
 
     def polygon(self, points: Floats, color: Color, opacity: float = 1.0) -> None:
         """A filled polygon with corners (n, 2) [pixels]; nothing if one of them is NaN."""
