@@ -9,6 +9,7 @@ from typing import Any
 from quad_gym import faults
 from quad_gym.distributions import LogUniform, Normal, Uniform
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all
+from quad_gym.filter_params import FilterParams
 from quad_gym.params import (
     ActionParams,
     Clocks,
@@ -21,7 +22,6 @@ from quad_gym.params import (
 from quad_gym.randomization import Randomization
 from quad_gym.sensor_params import (
     CameraParams,
-    FilterParams,
     GnssParams,
     ImuParams,
     NoisyObservationParams,

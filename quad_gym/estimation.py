@@ -70,12 +70,23 @@ class _KalmanFilter:
 
     # ---- the cycle ----------------------------------------------------------------------------
 
-    def initialize(self, gnss_position_G: ArrayLike, gnss_baseline_G: ArrayLike) -> None:
+    def initialize(
+        self,
+        gnss_position_G: ArrayLike,
+        gnss_baseline_G: ArrayLike,
+        heading: float | None = None,
+    ) -> None:
         """Start from a first fix: attitude by Wahba's problem, the body z axis taken as vertical.
+
+        A baseline within some degrees of the vertical tells the heading to no better than half a
+        radian; then `heading` does, with the deviation `placement.heading_sigma` of the suite.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
+            heading: Of the body x axis, from east toward north, for a steep baseline [rad]; None:
+                not known. The filter of a steep baseline then takes it for anything, and as it
+                linearises, it may be lost.
 
         Raises:
             ValueError: If an argument has another shape, is not finite, or the baseline is zero; or
@@ -84,8 +95,12 @@ class _KalmanFilter:
         self._require_gnss("initialize: start with set_state() instead")
         position = check.array("gnss_position_G", gnss_position_G, (3,))
         baseline = self._checked_baseline(gnss_baseline_G)
+        x_I = np.zeros(3)
+        if heading is not None:
+            angle = check.number("heading", heading)
+            x_I[:2] = np.cos(angle), np.sin(angle)
         self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
-        single.ukf_initialize(self._flight, self._params)
+        single.ukf_initialize(self._flight, self._params, x_I)
         self._running = True
 
     def set_state(

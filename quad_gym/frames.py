@@ -1,4 +1,4 @@
-"""Earth frames: ECEF (G, WGS-84) and the local east-north-up frame (I)."""
+"""The Earth: its frames ECEF (G, WGS-84) and the local east-north-up one (I), its gravity."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,6 +8,8 @@ from quad_gym import validation as check
 WGS84_SEMI_MAJOR_AXIS = 6378137.0
 """[m]"""
 WGS84_FLATTENING = 1.0 / 298.257223563
+GRAVITY = 9.8
+"""Standard gravity as the laboratory rounds it [m/s^2]."""
 
 
 def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from quad_gym.filter_params import FilterParams
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import STARTS, TASKS, ActionParams, Clocks, PDGains, TaskParams, VehicleParams
 from quad_gym.records import (
@@ -23,7 +24,7 @@ from quad_gym.records import (
     aligned_zeros,
 )
 from quad_gym.rotations import euler_to_dcm
-from quad_gym.sensor_params import FilterParams, SensorSuite, delay_ticks
+from quad_gym.sensor_params import SensorSuite, delay_ticks
 from quad_gym.world_packing import pack_world
 from quad_gym.world_params import WorldParams
 
@@ -89,6 +90,8 @@ def params_record(
         p["gnss_sigma"] = sensors.placement.position_sigma
         p["position_sigma"] = sensors.placement.position_sigma
         p["baseline_sigma"] = sensors.placement.heading_sigma
+
+    p["heading_sigma"] = sensors.placement.heading_sigma
 
     if sensors.camera is not None:
         camera = sensors.camera

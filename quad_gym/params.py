@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from quad_gym import validation as check
-from quad_gym.sensor_params import GRAVITY, SensorSuite
+from quad_gym.frames import GRAVITY
+from quad_gym.sensor_params import SensorSuite
 from quad_gym.validation import Checked, Matrix, Vector
 
 MAX_GATES = 8

@@ -11,20 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.fault_fields import (
-    FAULT_PARAMS_FIELDS,
-    FAULT_SETTINGS_FIELDS,
-    FAULT_STATE_FIELDS,
-)
-from quad_gym.late_fields import LATE_SETTINGS_FIELDS, LATE_STATE_FIELDS, LATE_WORK_FIELDS
+from quad_gym.fault_fields import FAULT_PARAMS_FIELDS, FAULT_STATE_FIELDS
+from quad_gym.late_fields import LATE_STATE_FIELDS, LATE_WORK_FIELDS
 from quad_gym.params import MAX_GATES
 from quad_gym.sensor_params import MAX_FEATURES
-from quad_gym.world_fields import (
-    WORLD_PARAMS_FIELDS,
-    WORLD_SETTINGS_FIELDS,
-    WORLD_STATE_FIELDS,
-    Field,
-)
+from quad_gym.settings_fields import SETTINGS_FIELDS
+from quad_gym.world_fields import WORLD_PARAMS_FIELDS, WORLD_STATE_FIELDS, Field
 
 WIDTH = 8
 """Flights in a block."""
@@ -40,8 +32,6 @@ FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES)
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 256
 """Numbers that an observation can hold."""
-WARM_DRAWS = 21
-"""Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""
 
 
 class FilterStatus(IntFlag):
@@ -299,6 +289,7 @@ PARAMS_FIELDS = (
     Field("drift_decay", (), "-", "of the slow position error between two measurements"),
     Field("drift_drive", (3,), "m", "sigma of its driving noise"),
     Field("baseline_sigma", (), "rad", "direction noise of the baseline"),
+    Field("heading_sigma", (), "rad", "of the heading that the place of the start tells"),
     Field("velocity_sigma", (), "m/s", "velocity noise per axis; 0: not measured"),
     Field("camera", (3,), "m", "projection centre in B"),
     Field("R_CB", (3, 3), "-", "body to camera"),
@@ -347,49 +338,6 @@ WORK_FIELDS = (
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
     *LATE_WORK_FIELDS,
-)
-
-SETTINGS_FIELDS = (
-    Field("substeps", (), "-", "Runge-Kutta steps in a tick", "i8"),
-    Field("ticks_per_step", (), "ticks", "in a control period", "i8"),
-    Field("gnss_ticks", (), "ticks", "between GNSS measurements; 0: none", "i8"),
-    Field("camera_ticks", (), "ticks", "between camera measurements; 0: none", "i8"),
-    Field("gnss_phase", (), "ticks", "from the start to the first GNSS measurement; -1: at random", "i8"),
-    Field("camera_phase", (), "ticks", "from the start to the first image; -1: at random", "i8"),
-    Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
-    Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),
-    Field("reuse_first_fix", (), "0 or 1", "whether the fix that starts the filter is its first measurement, too", "i8"),
-    Field("warm", (), "0 or 1", "whether the filter has converged before an episode begins", "i8"),
-    Field("feature_count", (), "-", "features in use", "i8"),
-    Field("form", (), "bits", "of the filter, see FilterForm", "i8"),
-    Field("imu_averages", (), "0 or 1", "whether IMU samples are averages over the tick", "i8"),
-    Field("source", (), "-", "what the controller sees, see Source", "i8"),
-    Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
-    Field("control", (), "-", "what the action means, see Control", "i8"),
-    Field("task", (), "-", "see Task", "i8"),
-    Field("layout", (), "-", "of the observation, see Layout", "i8"),
-    Field("include_covariance", (), "0 or 1", "whether the observation holds standard deviations", "i8"),
-    Field("privileged", (), "0 or 1", "whether the observation ends with the truth", "i8"),
-    Field("autoreset", (), "-", "see Autoreset", "i8"),
-    Field("start", (), "-", "how episodes begin, see Start", "i8"),
-    Field("randomize", (), "0 or 1", "whether the reference is drawn anew each episode", "i8"),
-    Field("max_steps", (), "steps", "time limit of an episode; 0: none", "f8"),
-    Field("out_of_bounds", (), "m", "largest distance from the reference"),
-    Field("ground", (), "m", "height below which the vehicle has crashed"),
-    Field("least_up", (), "-", "least cosine of the tilt"),
-    Field("radius", (), "m", "size of the reference"),
-    Field("period", (), "s", "period of the reference"),
-    Field("height", (), "m", "height of the reference"),
-    Field("max_speed", (), "m/s", "bound of a random reference"),
-    Field("max_acceleration", (), "m/s^2", "bound of a random reference"),
-    Field("gate_count", (), "-", "gates of a course"),
-    Field("gate_radius", (), "m", "distance at which a gate counts as passed"),
-    Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
-    Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
-    Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
-    *LATE_SETTINGS_FIELDS,
-    *WORLD_SETTINGS_FIELDS,
-    *FAULT_SETTINGS_FIELDS,
 )
 # fmt: on
 

@@ -17,9 +17,9 @@ import math
 import numpy as np
 
 from quad_gym import validation as check
+from quad_gym.filter_params import FilterParams
 from quad_gym.sensor_params import (
     CameraParams,
-    FilterParams,
     GnssParams,
     ImuParams,
     PlacementParams,

@@ -36,22 +36,13 @@ from quad_gym.records import (
 )
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
+from quad_gym.starts import checked_keys, checked_mask, checked_start
 from quad_gym.threads import resolve_threads, run_ranges
 from quad_gym.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.world_packing import pack_options
 from quad_gym.world_params import WorldParams, world_params
 
 _NO_BOUNDS = np.zeros(0)
-
-
-def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
-    """Draw the key of a flight's random stream, (2,) words."""
-    return rng.integers(0, 2**64, size=2, dtype=np.uint64, endpoint=False)
-
-
-def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
-    """Keys for flights seeded one by one, as Gymnasium seeds; None takes fresh entropy."""
-    return np.array([stream_key(np.random.Generator(np.random.PCG64(seed))) for seed in seeds])
 
 
 class FlightBatch:
@@ -149,16 +140,7 @@ class FlightBatch:
         self.threads = resolve_threads(threads)
         true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
         true_sensors = self.sensors if true_sensors is None else true_sensors
-        if true_sensors.imu.rate != self.sensors.imu.rate:
-            raise ValueError("true_sensors must have the IMU rate of sensors, as it is the tick")
-        if true_sensors.imu.samples != self.sensors.imu.samples:
-            raise ValueError(
-                "true_sensors must have the IMU samples of sensors, as they order the tick: "
-                f"{true_sensors.imu.samples!r} is not {self.sensors.imu.samples!r}"
-            )
-        for name in ("gnss", "camera"):
-            if (getattr(true_sensors, name) is None) != (getattr(self.sensors, name) is None):
-                raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
+        self.sensors.require_like(true_sensors)
         self.faults = faults_of(faults, true_sensors)
         self.innovations = check.flag("innovations", innovations)
         check.choice("filter_start", filter_start, FILTER_STARTS)
@@ -248,19 +230,10 @@ class FlightBatch:
         Raises:
             ValueError: If the arguments do not fit the number of flights; nothing has changed then.
         """
-        chosen = self._checked_mask(mask)
-        given = self._checked_start(position, velocity, yaw)
-        if seeds is not None:
-            if len(seeds) != self.count:
-                raise ValueError(f"seeds must hold {self.count} seeds, got {len(seeds)}")
-            keys = stream_keys(seeds)
-        if keys is not None:
-            words = np.asarray(keys)
-            if words.shape != (self.count, 2) or words.dtype != np.uint64:
-                raise ValueError(
-                    f"keys must be uint64 of shape ({self.count}, 2), got {words.dtype} of "
-                    f"{words.shape}"
-                )
+        chosen = checked_mask(self.count, mask)
+        given = checked_start(self.count, position, velocity, yaw)
+        words = checked_keys(self.count, seeds, keys)
+        if words is not None:
             for flight in np.flatnonzero(chosen):
                 block, lane = divmod(int(flight), WIDTH)
                 self._blocks["key"][block, :, lane] = words[flight]
@@ -422,42 +395,3 @@ class FlightBatch:
         if not fits:
             raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
         self._blocks[:] = snapshot
-
-    def _checked_start(
-        self, position: ArrayLike | None, velocity: ArrayLike | None, yaw: ArrayLike | None
-    ) -> NDArray[np.float64] | None:
-        """(count, 7) start values, NaN where they are to be drawn; None if all are."""
-        if position is None and velocity is None and yaw is None:
-            return None
-        given = np.full((self.count, 7), np.nan)
-        for name, value, columns in (
-            ("position", position, slice(0, 3)),
-            ("velocity", velocity, slice(3, 6)),
-            ("yaw", yaw, slice(6, 7)),
-        ):
-            if value is None:
-                continue
-            width = columns.stop - columns.start
-            try:
-                numbers = np.asarray(value, np.float64)
-            except (TypeError, ValueError):
-                raise ValueError(f"{name} must be numbers, got {value!r}") from None
-            if name == "yaw":
-                numbers = numbers[..., np.newaxis]
-            if numbers.shape not in ((width,), (self.count, width)):
-                shapes = "a number or (n,)" if name == "yaw" else "(3,) or (n, 3)"
-                raise ValueError(f"{name} must have shape {shapes}, got {np.shape(value)}")
-            if not np.isfinite(numbers).all():
-                raise ValueError(f"{name} must be finite, got {value!r}")
-            given[:, columns] = numbers
-        return given
-
-    def _checked_mask(self, mask: ArrayLike | None) -> NDArray[np.bool_]:
-        if mask is None:
-            return np.ones(self.count, bool)
-        chosen = np.asarray(mask)
-        if chosen.shape != (self.count,) or chosen.dtype != bool:
-            raise ValueError(
-                f"mask must be {self.count} booleans, got shape {chosen.shape} of {chosen.dtype}"
-            )
-        return chosen

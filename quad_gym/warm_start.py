@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import TaskParams, VehicleParams
-from quad_gym.records import WARM_DRAWS, WIDTH, Autoreset, Control, Source
+from quad_gym.records import WIDTH, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 from quad_gym.sensor_params import ImuParams, SensorSuite
+from quad_gym.settings_fields import WARM_DRAWS
 
 FILTER_STARTS = ("cold", "warm")
 """Values of the keyword `filter_start`."""
@@ -102,7 +103,7 @@ def converged_covariance(
         raise ValueError(
             f"filter_start must be 'cold' for these sensors: after {WARM_UP:g} s of hovering the "
             f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
-            "filter its heading, such as a baseline that is not vertical?"
+            "filter its heading, such as a level baseline or the mark of `placement`?"
         )
     forward_I = quaternion_to_dcm(batch.read("q"))[:, 0]
     yaw = np.arctan2(forward_I[:, 1], forward_I[:, 0])

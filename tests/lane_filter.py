@@ -19,7 +19,8 @@ STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
 
 @entry
 def initialize_lanes(blocks, params, work):
-    initialize(lanes_of(blocks[0]), lanes_of(params[0]), lanes_of(work[0]).begins > 0.0)
+    begins, unknown = lanes_of(work[0]).begins > 0.0, (0.0, 0.0, 0.0)
+    initialize(lanes_of(blocks[0]), lanes_of(params[0]), begins, unknown)
 
 
 @entry

@@ -21,7 +21,7 @@ from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
-from quad_gym.simulation import stream_keys
+from quad_gym.starts import stream_keys
 
 
 class QuadVecEnv(VecEnv):

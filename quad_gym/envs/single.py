@@ -17,7 +17,7 @@ from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
-from quad_gym.simulation import stream_key
+from quad_gym.starts import stream_key
 
 
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):

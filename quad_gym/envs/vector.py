@@ -14,7 +14,7 @@ from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_o
 from quad_gym.envs.single import seeds_of
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
-from quad_gym.simulation import stream_keys
+from quad_gym.starts import stream_keys
 
 _MODES = {
     AutoresetMode.NEXT_STEP: Autoreset.NEXT_STEP,

@@ -42,6 +42,7 @@ from quad_gym.kernels.sensors import (
     DRAW_PHASE,
     drift_biases,
     drift_gnss,
+    look_along_mark,
     measure_features,
     measure_gnss,
     measure_gnss_velocity,
@@ -169,7 +170,7 @@ def sense(flight, world, model, settings, work, mask, starting):
                 flight.feature_fresh[i] = select(seen, 1.0, flight.feature_fresh[i])
 
         if starting:
-            initialize(flight, model, mask)
+            initialize(flight, model, mask, look_along_mark(flight, world))
             if settings.warm:
                 start_warm(flight, settings, stream_of(flight), work, mask)
         if anything_late:

@@ -8,6 +8,7 @@ tests.
 import math
 
 from quad_gym.kernels.compilation import kernel
+from quad_gym.kernels.elementary import sin_cos
 from quad_gym.kernels.lanes import select
 from quad_gym.kernels.linalg import (
     add,
@@ -21,6 +22,7 @@ from quad_gym.kernels.linalg import (
     norm,
     scale,
     sub,
+    unit_or,
 )
 from quad_gym.kernels.random import normal_pair
 from quad_gym.kernels.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
@@ -33,7 +35,7 @@ from quad_gym.kernels.vehicle import (
 
 # numbers of the draws (of two normals each) within an instant
 DRAW_BIAS, DRAW_IMU, DRAW_GNSS, DRAW_NOISY, DRAW_FEATURE, DRAW_RESET = 0, 3, 6, 9, 16, 64
-DRAW_DRIFT, DRAW_PHASE, DRAW_VELOCITY = 512, 515, 516
+DRAW_DRIFT, DRAW_PHASE, DRAW_VELOCITY, DRAW_MARK = 512, 515, 516, 519
 
 
 @kernel
@@ -169,6 +171,17 @@ def measure_gnss_velocity(flight, p, mask):
     lever_B = cross(load3(flight.w), load3(p.antenna))
     v_I = add(load3(flight.v), apply_transposed(R_BI, lever_B))
     keep3(flight.gnss_velocity, mask, apply_transposed(R_IG, add(v_I, scale(p.velocity_sigma, n))))
+
+
+@kernel
+def look_along_mark(flight, p):
+    """Level direction in I of the body x axis, as well as the place of the start tells it."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    zero = 0.0 * p.dt
+    x_I = unit_or((R_BI[0][0], R_BI[0][1], zero), (zero + 1.0, zero, zero))
+    n, _ = normal_pair(stream_of(flight), DRAW_MARK)
+    s, c = sin_cos(p.heading_sigma * n)
+    return (c * x_I[0] - s * x_I[1], s * x_I[0] + c * x_I[1], zero)
 
 
 @kernel

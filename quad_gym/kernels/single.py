@@ -19,9 +19,9 @@ from quad_gym.kernels.wahba import wahba
 
 
 @entry
-def ukf_initialize(flights, params):
-    """Start the filter of flights[0] from its first fix."""
-    initialize(flights[0], params[0], True)
+def ukf_initialize(flights, params, x_I):
+    """Start the filter of flights[0] from its first fix; x_I is (3,), zero if it is not known."""
+    initialize(flights[0], params[0], True, load3(x_I))
 
 
 @entry

@@ -40,6 +40,7 @@ from quad_gym.kernels.linalg import (
     cholesky,
     cholesky33,
     cross,
+    dot,
     keep3,
     keep33,
     keep_block,
@@ -52,6 +53,7 @@ from quad_gym.kernels.linalg import (
     outer,
     scale,
     scale33,
+    select3,
     select33,
     solve_right33,
     store_block,
@@ -67,6 +69,7 @@ from quad_gym.records import FilterForm, FilterStatus
 
 _EKF, _MIDPOINT, _TURN = int(FilterForm.EKF), int(FilterForm.MIDPOINT), int(FilterForm.TURN)
 _NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
+_VAGUE_HEADING = 0.5  # rad, beyond which a filter that linearises cannot start
 _PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
 
 
@@ -343,27 +346,40 @@ def _tie_position_to_attitude(L, R_BI, lever_B, mask):
 
 
 @kernel
-def initialize(flight, p, mask):
+def initialize(flight, p, mask, x_I):
     """Start the filter from the first fix, where `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
     with equal weights, or level with the baseline's heading; position from the antenna; velocity
     and biases zero. A level start knows that its position hangs on its attitude. The heading is the
-    less certain the steeper the baseline, up to anywhere.
+    less certain the steeper the baseline. Where that would leave it vague, the body x axis joins in
+    Wahba's problem, or gives the heading; where nobody knows it either, the heading may be any.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
         p: Parameters as the filter believes them.
         mask: Which lanes.
+        x_I: Level direction in I of the body x axis, as the place of the start tells it; zero where
+            it tells none.
     """
+    inflation = math.sqrt(p.initial_scale)
+    attitude = inflation * p.baseline_sigma
+    baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
+    level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
+    heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
+    placed = (heading > _VAGUE_HEADING) & (dot(x_I, x_I) > 0.0)
+    heading = select(placed, inflation * p.heading_sigma, heading)
+
     R_IG = load33(p.R_IG)
     baseline_I = unit_or(apply(R_IG, load3(flight.gnss_baseline)), (1.0, 0.0, 0.0))
-    baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
-    profile = outer(baseline_B, baseline_I)
+    nothing = scale(0.0, x_I)
+    x_B = (nothing[0] + 1.0, nothing[1], nothing[2])
+    profile = add33(outer(baseline_B, baseline_I), outer(x_B, select3(placed, x_I, nothing)))
     profile = (profile[0], profile[1], (profile[2][0], profile[2][1], profile[2][2] + 1.0))
     R_BI, _ = wahba(profile)
     level = p.initial_tilt_sigma > 0.0
-    R_BI = select33(level, _level_attitude(baseline_B, baseline_I), R_BI)
+    ahead_B, ahead_I = select3(placed, x_B, baseline_B), select3(placed, x_I, baseline_I)
+    R_BI = select33(level, _level_attitude(ahead_B, ahead_I), R_BI)
     antenna_I = apply(R_IG, load3(flight.gnss_position))
     keep33(flight.R_hat, mask, R_BI)
     keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
@@ -378,10 +394,6 @@ def initialize(flight, p, mask):
     for i in range(15):
         for j in range(i + 1):
             L[i, j] = select(mask, 0.0, L[i, j])
-    inflation = math.sqrt(p.initial_scale)
-    attitude = inflation * p.baseline_sigma
-    level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
-    heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
     for i in range(3):
         L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
         L[V + i, V + i] = select(mask, math.sqrt(p.initial_velocity_variance), L[V + i, V + i])

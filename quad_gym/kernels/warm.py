@@ -27,7 +27,7 @@ from quad_gym.kernels.rotation import euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.sensors import six_normals
 from quad_gym.kernels.task import DRAW_FIRST_BIASES
 from quad_gym.kernels.vehicle import load4
-from quad_gym.records import WARM_DRAWS
+from quad_gym.settings_fields import WARM_DRAWS
 
 DRAW_WARM = 544
 """Number of the first of the eight draws of a warm start within an episode's first instant."""

@@ -192,6 +192,43 @@ def test_a_tilted_baseline_splits_its_angle_between_baseline_and_vertical():
     np.testing.assert_allclose(ukf.R_BI, expected, atol=1e-13)
 
 
+@pytest.mark.parametrize("name", ["lab", "rtk"])
+@pytest.mark.parametrize("heading", np.linspace(-3.0, 3.0, 5))
+def test_a_steep_baseline_leaves_the_heading_to_the_mark(name, heading):
+    suite = quad_gym.sensor_suite(name)
+    up = {"primary_antenna_B": (0.01, 0.02, 0.05), "secondary_antenna_B": (0.01, 0.02, 0.24)}
+    suite = suite.replace(
+        gnss=suite.gnss.replace(**up), placement=quad_gym.PlacementParams(heading_sigma=0.1)
+    )
+    fix = R_IG.T @ np.ones(3), R_IG.T @ (0.0, 0.0, 0.19)
+    R_BI = rotation_312(np.array([0.0, 0.0, heading]))
+    ukf = UnscentedKalmanFilter(suite)
+    ukf.initialize(*fix, heading=heading)
+    np.testing.assert_allclose(ukf.R_BI, R_BI, atol=1e-13)
+    np.testing.assert_allclose(ukf.position, 1.0 - R_BI.T @ (0.01, 0.02, 0.05), atol=1e-13)
+    variance = suite.estimator.initial_scale * 0.1**2
+    np.testing.assert_allclose(ukf.covariance[8, 8], variance, rtol=1e-12)
+    ukf.initialize(*fix)
+    np.testing.assert_allclose(ukf.covariance[8, 8], np.pi**2 / 3, rtol=1e-12)  # any
+
+
+def test_a_level_baseline_tells_the_heading_itself():
+    fix = RECORDING.gnss_position[0], RECORDING.gnss_baseline[0]
+    told, not_told = UnscentedKalmanFilter(LAB), UnscentedKalmanFilter(LAB)
+    told.initialize(*fix, heading=2.0)
+    not_told.initialize(*fix)
+    assert_same(estimate(not_told), estimate(told))
+
+
+@pytest.mark.parametrize("heading", [np.nan, np.inf, "north"])
+def test_a_heading_that_is_no_number_is_refused(heading):
+    ukf = running_filter()
+    before = estimate(ukf)
+    with pytest.raises(ValueError, match="heading must be"):
+        ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0], heading=heading)
+    assert_same(before, estimate(ukf))
+
+
 def test_initialize_starts_anew_and_forgets_failures():
     ukf = running_filter()
     with pytest.warns(RuntimeWarning, match="last good state"):

@@ -276,6 +276,24 @@ def test_the_place_of_the_start_is_as_uncertain_as_it_is_and_not_as_believed():
     np.testing.assert_allclose(errors[:, 8].std(), 0.15, rtol=0.06)
 
 
+@pytest.mark.parametrize("name", ["lab", "rtk"])
+def test_a_steep_baseline_leaves_the_heading_to_the_mark_of_the_start(name):
+    suite = quad_gym.sensor_suite(name)
+    up = {"primary_antenna_B": (0.0, 0.0, 0.05), "secondary_antenna_B": (0.0, 0.0, 0.24)}
+    suite = suite.replace(gnss=suite.gnss.replace(**up, phase=0.5, rate=10.0), camera=None)
+    batch = fly(
+        suite,
+        4000,
+        task="hover",
+        start="ground",
+        true_sensors=suite.replace(placement=PlacementParams(heading_sigma=0.2)),
+        randomization={"start_yaw": quad_gym.Uniform(-np.pi, np.pi)},
+    )
+    assert_normal(state_errors(batch)[:, 8:9], np.zeros(1), np.eye(1) * 0.2**2)
+    claimed = np.sqrt(suite.estimator.initial_scale) * 0.05
+    np.testing.assert_allclose(np.sqrt(batch.covariance()[:, 8, 8]), claimed, rtol=1e-9)
+
+
 def test_fixes_come_from_the_true_antenna_with_its_true_noise():
     true = RTK.replace(
         gnss=RTK.gnss.replace(

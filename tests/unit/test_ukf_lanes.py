@@ -58,7 +58,7 @@ def test_eight_different_flights_equal_the_scalar_filter_to_the_last_bits():
     scalars = [lanes.flight(lane) for lane in range(8)]
     lanes.initialize()
     for lane, flight in enumerate(scalars):
-        single.ukf_initialize(flight, params)
+        single.ukf_initialize(flight, params, np.zeros(3))
         assert_close(lanes, lane, flight)
 
     for k in range(TICKS):
