@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import signal
+import threading
 import time
 import zipfile
 from pathlib import Path
@@ -83,6 +84,7 @@ class Keeper(BaseCallback):
         self.last: dict[str, float] = {}
         self._since: float | None = None
         self._stop = False
+        self._handlers: dict[int, Any] = {}
         self._bar: Any = None
 
     # ---- Stable-Baselines3 calls these ----------------------------------------------------------
@@ -107,11 +109,10 @@ class Keeper(BaseCallback):
     # ---- the beginning and the end --------------------------------------------------------------
 
     def __enter__(self) -> "Keeper":
-        """Take over Ctrl-C, and show the bar."""
-        try:
-            self._handler = signal.signal(signal.SIGINT, self._interrupt)
-        except ValueError:  # in another thread than the main one, signals are not ours to take
-            self._handler = None
+        """Take over Ctrl-C and the request to terminate, and show the bar."""
+        if threading.current_thread() is threading.main_thread():  # else they are not ours to take
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(number, self._interrupt)
         if not self._quiet:
             from tqdm import tqdm
 
@@ -124,14 +125,14 @@ class Keeper(BaseCallback):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give Ctrl-C back."""
-        if self._handler is not None:
-            signal.signal(signal.SIGINT, self._handler)
+        """Give the signals back."""
+        while self._handlers:
+            signal.signal(*self._handlers.popitem())
         if self._bar is not None:
             self._bar.close()
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        """The first Ctrl-C stops at a checkpoint; a second one stops at once."""
+        """The first signal stops at a checkpoint; a second one stops at once."""
         if self._stop:
             raise KeyboardInterrupt
         self._stop = True

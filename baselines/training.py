@@ -183,7 +183,7 @@ def train(
 ) -> Training:
     """Train a policy, or go on with a training that was stopped.
 
-    Ctrl-C ends the run at the next step, after which it can be resumed.
+    Ctrl-C, or a request to terminate, ends the run at the next step; it can be resumed then.
 
     Args:
         plan: What to train.

@@ -32,6 +32,18 @@ def in_a_world(**changes: Any) -> dict[str, Any]:
     return {"world": quad_gym.WorldParams(**changes)}
 
 
+def arriving_late(name: str, gnss: float, camera: float) -> dict[str, Any]:
+    """A suite whose measurements reach the filter late [s], as a keyword of a batch."""
+    suite = quad_gym.sensor_suite(name)
+    assert suite.gnss is not None
+    assert suite.camera is not None
+    gnss_late, camera_late = (
+        suite.gnss.replace(latency=gnss),
+        suite.camera.replace(latency=camera),
+    )
+    return {"sensors": suite.replace(gnss=gnss_late, camera=camera_late)}
+
+
 OPTIONS: dict[str, dict[str, Any]] = {
     OFF: {},
     "extended Kalman filter": filter_form(kind="ekf"),
@@ -42,6 +54,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "images in portions at the start": filter_form(gradual_above=0.01),
     "innovations kept": {"innovations": True},
     "gate": filter_form(gate_false_alarm=1e-4),
+    "measurements 10 ms late": arriving_late("lab", gnss=0.01, camera=0.01),
     "wind and rotor drag": in_a_world(wind_I=(4.0, 0.0, 0.0), linear_drag_B=(0.4, 0.3, 0.0)),
     "gusts": in_a_world(gust_wind_speed=4.0),
     "ground effect": in_a_world(ground_effect=True),
@@ -52,6 +65,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "randomization": {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
     },
     **{f"suite {name}": {"sensors": name} for name in SUITES if name != "lab"},
+    "suite rtk, GNSS 110 ms and camera 60 ms late": arriving_late("rtk", gnss=0.11, camera=0.06),
 }
 """What is switched on, as keywords of `FlightBatch`."""
 

@@ -14,11 +14,12 @@ A comparison that was stopped goes on where it stopped when it is started again.
 """
 
 import multiprocessing
+import signal
 import time
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import gymnasium
 import numpy as np
@@ -157,6 +158,12 @@ def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
     """
     from tqdm import tqdm
 
+    def stop(number: int, frame: Any) -> NoReturn:
+        for process in multiprocessing.active_children():
+            process.terminate()  # a training keeps a checkpoint then; Ctrl-C reaches it by itself
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
     total = setting.steps * len(setting.plans)
     context = multiprocessing.get_context("spawn")  # compiled kernels and torch do not fork well
     with (
@@ -186,6 +193,8 @@ def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+        finally:
+            signal.signal(signal.SIGTERM, before)
     return {key: done[key] for key in setting.plans}
 
 

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +99,38 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
     other = compare(tmp_path, "--env", "duration=0.5")
     assert other.returncode == 2
     assert "holds another comparison" in other.stderr
+
+
+def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind(tmp_path):
+    line = [sys.executable, str(ROOT / "scripts/compare.py"), "--seeds", "1", "--jobs", "2"]
+    line += ["--steps", "1000000", "--env", "duration=1.0", "--output", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        line, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    wait_until(lambda: len(list(tmp_path.glob("out/runs/lab/*/seed_0/last.zip"))) >= 2)
+    assert process.poll() is None
+    process.terminate()
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    wait_until(lambda: nobody_is_in_group(process.pid), seconds=20.0)
+    for source in ("truth", "noisy"):
+        record = json.loads((tmp_path / f"out/runs/lab/{source}/seed_0/training.json").read_text())
+        assert not record["finished"]
+
+
+def wait_until(condition, seconds=1200.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def nobody_is_in_group(group):
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
 
 
 def test_compare_refuses_nonsense(tmp_path):

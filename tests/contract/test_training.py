@@ -113,7 +113,7 @@ def wait_for(condition, process, seconds=1200.0):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     folder = tmp_path / "run"
     line = script(folder, "--steps", "500000", "--evaluations", "400")
@@ -123,8 +123,9 @@ def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     wait_for(lambda: rows(folder) >= 3, process)
     process.send_signal(number)
     _, err = process.communicate(timeout=120)
-    assert process.returncode == (130 if number == signal.SIGINT else -signal.SIGKILL), err
-    if number == signal.SIGINT:
+    calm = number != signal.SIGKILL
+    assert process.returncode == (130 if calm else -signal.SIGKILL), err
+    if calm:
         assert "--resume" in err
     kept = rows(folder)
     model = algorithm_class("ppo").load(folder / "last.zip", device="cpu")
