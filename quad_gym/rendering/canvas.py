@@ -7,6 +7,7 @@ drawn at its own size, which keeps it sharp.
 
 import contextlib
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -210,6 +211,11 @@ class Canvas:
     def width_of(self, words: str, size: int) -> int:
         """Width of words [pixels]."""
         return int(self._word(words, size, INK).get_width())
+
+    def fitting(self, wordings: Sequence[str], size: int, width: float) -> str:
+        """The first of the wordings that is no wider than `width` [pixels], or the last of all."""
+        fits = (words for words in wordings if self.width_of(words, size) <= width)
+        return next(fits, wordings[-1])
 
     def line_height(self, size: int) -> int:
         """Distance between lines of text [pixels]."""

@@ -87,10 +87,11 @@ class Inset:
         """Name the features and say what the picture is."""
         canvas, box, image = self._canvas, self._box, last_image(flight)
         seen = np.isfinite(image["pixels"]).all(axis=1)
-        words = "camera" if seen.any() else "camera: no feature in view"
+        wordings = ["camera"] if seen.any() else ["camera: no feature in view", "no feature"]
         if (count := rejected_features(image).sum()) > 0:
-            words = f"camera: {count} rejected (grey)"
+            wordings = [f"camera: {count} rejected (grey)", f"{count} rejected"]
         top, size = box.top + box.height + 2.0, self._size
+        words = canvas.fitting(wordings, size, box.width - 4.0)
         width = canvas.width_of(words, size)
         canvas.veil(box.left, top, width + 8, canvas.line_height(size))
         canvas.text(words, box.left + 4.0, top + 1.0, size, INK if seen.any() else GREY)

@@ -151,20 +151,13 @@ class Strip:
         """Write titles, numbers and ticks, after the canvas is finished."""
         canvas, small, now = self._canvas, self._size - 2, flight.rows[-1]
         for plot, place in zip(PLOTS, self._boxes, strict=True):
-            x = place.left
-            for column, name, color in plot.curves:
-                if not shows(flight, column):
-                    words = "no filter runs" if plot is CONSISTENCY else ""
-                    canvas.text(words, x, self._title_y, self._size, GREY)
-                    continue
-                value = float(now[column])
-                number = f"{value:.0f}" if plot is CONSISTENCY else format_length(value)
-                words = f"{name} {'-' if np.isnan(value) else number}"
-                if plot is ERRORS and column == "position_error" and len(flight.stage.gates_I):
-                    words = f"to the gate {number}"
-                if plot is ERRORS and column == "estimation_error":
-                    words += " error" if canvas.width_of("0" * 45, small) < place.width else ""
-                x += canvas.text(words, x, self._title_y, self._size, color) + 0.04 * place.width
+            x, gap = place.left, 0.04 * place.width
+            titles = self._titles(flight, plot)
+            widths = [canvas.width_of(words, self._size) + gap for words, _ in titles]
+            if sum(widths) - gap > place.width:
+                titles = self._titles(flight, plot, named=False)
+            for words, color in titles:
+                x += canvas.text(words, x, self._title_y, self._size, color) + gap
             if plot is CONSISTENCY and flight.estimated:
                 words = f"({STATE_DIMENSION} if consistent)"
                 if x + canvas.width_of(words, small) < place.left + place.width:
@@ -174,10 +167,29 @@ class Strip:
                 canvas.text(words, place.left - 4.0, y, small, GREY, 1.0)
             self._write_times(place, now["time"], small)
         place = self._rotors
-        canvas.text("rotor speeds", place.left, self._title_y, self._size)
+        words = canvas.fitting(("rotor speeds", "rotors"), self._size, place.width)
+        canvas.text(words, place.left, self._title_y, self._size)
         for k in range(4):
             x = place.left + (k + 0.5) * place.width / 4
             canvas.text(str(k + 1), x, place.top + place.height + 1.0, small, GREY, 0.5)
+
+    def _titles(self, flight: Flight, plot: Plot, *, named: bool = True) -> list[tuple[str, Color]]:
+        """What a plot's curves show and their last values; without names the values alone."""
+        found: list[tuple[str, Color]] = []
+        roomy = self._canvas.width_of("0" * 45, self._size - 2) < self._boxes[0].width
+        for column, name, color in plot.curves:
+            if not shows(flight, column):
+                found.append(("no filter runs" if plot is CONSISTENCY else "", GREY))
+                continue
+            value = float(flight.rows[-1][column])
+            number = f"{value:.0f}" if plot is CONSISTENCY else format_length(value)
+            words = f"{name} {'-' if np.isnan(value) else number}"
+            if plot is ERRORS and column == "position_error" and len(flight.stage.gates_I):
+                words = f"to the gate {number}"
+            if plot is ERRORS and column == "estimation_error" and roomy:
+                words += " error"
+            found.append((words if named or plot is CONSISTENCY else number, color))
+        return found
 
     def _write_times(self, place: Box, now: float, size: int) -> None:
         y = place.top + place.height + 1.0
