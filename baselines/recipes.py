@@ -35,7 +35,9 @@ class Recipe(Checked):
     learning_rate: tuple[float, float] = (1e-3, 1e-4)
     """at the beginning and at the end; linear in between"""
     layers: tuple[int, ...] = (64, 64)
-    """units of each hidden layer, of the policy and of the value function"""
+    """units of each hidden layer of the policy"""
+    critic_layers: tuple[int, ...] = (64, 64)
+    """likewise of the value function, or of each critic"""
     activation: str = "relu"
     """one of ACTIVATIONS"""
     reward_scale: float = 10.0
@@ -57,9 +59,11 @@ class Recipe(Checked):
             raise ValueError(
                 f"Recipe.learning_rate must be greater than 0, got {self.learning_rate}"
             )
-        if not self.layers or any(isinstance(n, bool) or n < 1 for n in self.layers):
-            raise ValueError(f"Recipe.layers must be positive whole numbers, got {self.layers}")
-        self._set("layers", tuple(check.whole("Recipe.layers", n) for n in self.layers))
+        for name in ("layers", "critic_layers"):
+            sizes = getattr(self, name)
+            if not sizes:
+                raise ValueError(f"Recipe.{name} must be positive whole numbers, got {sizes}")
+            self._set(name, tuple(check.whole(f"Recipe.{name}", n) for n in sizes))
         for name in ("flights", "parameters", "policy"):
             self._set(name, MappingProxyType(dict(getattr(self, name))))
 
@@ -98,18 +102,21 @@ _RECURRENT_PPO = _PPO.replace(
 )
 
 _OFF_POLICY = {
-    "batch_size": 512,
+    "batch_size": 1024,
     "buffer_size": 500_000,
     "learning_starts": 5_000,
     "train_freq": 1,
-    "gradient_steps": 8,
+    "gradient_steps": 4,
     "gamma": 0.95,
     "tau": 0.01,
 }
 _SAC = Recipe(
     algorithm="sac",
-    steps=500_000,
-    n_envs=64,
+    # flights cost next to nothing beside gradient steps: many, each sample used 16 times
+    steps=1_500_000,
+    n_envs=256,
+    learning_rate=(1e-3, 1e-5),
+    critic_layers=(128, 128),
     flights={"start": "mixed", "randomize": True},
     # a step's reward is about 0.3: an entropy worth 1 at the start would hide it for long, and
     # noise as wide as the usual target's would blur what the last centimetres are worth

@@ -120,7 +120,10 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
     first, last = chosen.learning_rate
     activations = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
     policy = {
-        "net_arch": list(chosen.layers),
+        "net_arch": {
+            "pi": list(chosen.layers),
+            "vf" if "ppo" in chosen.algorithm else "qf": list(chosen.critic_layers),
+        },
         "activation_fn": activations[chosen.activation],
         **chosen.policy,
     }
