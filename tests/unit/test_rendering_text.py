@@ -40,4 +40,4 @@ def test_no_words_of_the_strip_cross_others(monkeypatch, size, task):
     for a, b in itertools.combinations(strip, 2):
         apart = a[2] <= b[1] or b[2] <= a[1] or a[4] <= b[3] or b[4] <= a[3]
         assert apart, (a, b)
-    assert all(0.0 <= left and right <= size[0] for _, left, right, _, _ in strip), strip
+    assert all(left >= 0.0 and right <= size[0] for _, left, right, _, _ in strip), strip
