@@ -113,7 +113,6 @@ _OFF_POLICY = {
 _SAC = Recipe(
     algorithm="sac",
     # flights cost next to nothing beside gradient steps: many, each sample used 16 times
-    steps=1_500_000,
     n_envs=256,
     learning_rate=(1e-3, 1e-5),
     critic_layers=(128, 128),
