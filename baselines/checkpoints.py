@@ -11,7 +11,7 @@ import time
 import zipfile
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,10 +21,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from baselines.plans import Plan
 from quad_gym.evaluation import Episodes, roll_out
-
-if TYPE_CHECKING:
-    from baselines.training import Plan
 
 LAST, BEST, EVALUATIONS = "last.zip", "best.zip", "evaluations.csv"
 EVALUATION_SEED = 1_000_000
@@ -69,7 +67,7 @@ class Keeper(BaseCallback):
 
     def __init__(
         self,
-        plan: "Plan",
+        plan: Plan,
         folder: Path,
         judge: gymnasium.vector.VectorEnv[Any, Any, Any],
         *,

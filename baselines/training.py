@@ -14,146 +14,17 @@ A run that is resumed goes on exactly where the last evaluation left it.
 
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
-import gymnasium
-import numpy as np
 import torch
-from stable_baselines3 import PPO, SAC, TD3
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-import quad_gym
 from baselines.checkpoints import Keeper, has_checkpoint, load_model
 from baselines.mlp import mlp_of
+from baselines.plans import Plan, algorithm_class, description, make_model
 from baselines.policies import interface_of
-from baselines.recipes import Recipe, recipe, unfreeze
-from quad_gym import validation as check
-from quad_gym.reports import as_json, versions, write_json
+from quad_gym.reports import versions, write_json
 from quad_gym.threads import resolve_threads
-from quad_gym.validation import Checked
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan(Checked):
-    """What is to be trained, and how it is watched."""
-
-    env_id: str = "QuadGym/Circle-v0"
-    """one of `quad_gym.IDS`"""
-    environment: Any = field(default_factory=dict)
-    """keywords of the environment, in training as in evaluation"""
-    recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
-    seed: int = 0
-    """of the networks, and of the first flight; flight i has seed + i"""
-    threads: int | None = None
-    """for flights and networks; None: as many as there are cores"""
-    evaluations: int = 20
-    """how often the policy is evaluated, and kept, over the run"""
-    episodes: int = 100
-    """flown in each evaluation"""
-
-    def __post_init__(self) -> None:
-        self._check(check.choice, "env_id", choices=tuple(quad_gym.IDS))
-        self._check(check.whole, "evaluations", "episodes")
-        self._check(check.whole, "seed", least=0)
-        check.instance("Plan.recipe", self.recipe, Recipe)
-        self._set("environment", MappingProxyType(dict(self.environment)))
-
-    def __reduce__(self) -> Any:
-        """Plans go to other processes."""
-        return unfreeze(self)
-
-    def make_flights(self) -> "ScaledReward":
-        """The flights to train on."""
-        env = quad_gym.make_sb3_vec_env(
-            self.env_id,
-            n_envs=self.recipe.n_envs,
-            seed=self.seed,
-            threads=self.threads,
-            **{**self.environment, **self.recipe.flights},
-        )
-        return ScaledReward(env, self.recipe.reward_scale)
-
-    def make_judge(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-        """The flights to evaluate on: the task as the id and the keywords have it."""
-        return gymnasium.make_vec(
-            self.env_id, num_envs=self.episodes, threads=self.threads, **self.environment
-        )
-
-
-class ScaledReward(VecEnvWrapper):
-    """Shows the algorithm a multiple of the reward; episode records keep the reward itself."""
-
-    def __init__(self, venv: VecEnv, scale: float) -> None:
-        super().__init__(venv)
-        self.scale = np.float32(scale)
-
-    def reset(self) -> Any:
-        """Begin an episode in every flight."""
-        return self.venv.reset()
-
-    def step_wait(self) -> Any:
-        """Fly the step."""
-        observations, rewards, dones, infos = self.venv.step_wait()
-        return observations, rewards * self.scale, dones, infos
-
-
-def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """The class of an algorithm, by its name in `recipes.ALGORITHMS`."""
-    if name in ("recurrent_ppo", "tqc"):
-        import sb3_contrib
-
-        return {"recurrent_ppo": sb3_contrib.RecurrentPPO, "tqc": sb3_contrib.TQC}[name]
-    return {"ppo": PPO, "sac": SAC, "td3": TD3}[name]
-
-
-def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> BaseAlgorithm:
-    """An untrained model as the plan's recipe has it.
-
-    Raises:
-        ValueError: If the algorithm does not know one of the recipe's parameters.
-    """
-    chosen = plan.recipe
-    first, last = chosen.learning_rate
-    activations = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
-    policy = {
-        "net_arch": {
-            "pi": list(chosen.layers),
-            "vf" if "ppo" in chosen.algorithm else "qf": list(chosen.critic_layers),
-        },
-        "activation_fn": activations[chosen.activation],
-        **chosen.policy,
-    }
-    kind = "MultiInput" if isinstance(env.observation_space, gymnasium.spaces.Dict) else "Mlp"
-    kind += "LstmPolicy" if chosen.algorithm == "recurrent_ppo" else "Policy"
-    try:
-        return algorithm_class(chosen.algorithm)(
-            kind,
-            env,
-            learning_rate=Linear(first, last),
-            policy_kwargs=policy,
-            seed=plan.seed,
-            device="cpu",
-            tensorboard_log=None if tensorboard is None else str(tensorboard),
-            **chosen.parameters,
-        )
-    except (TypeError, AssertionError) as error:
-        raise ValueError(f"recipe does not fit {chosen.algorithm}: {error}") from None
-
-
-@dataclass(frozen=True)
-class Linear:
-    """A number that goes linearly from its first to its last value while training."""
-
-    first: float
-    last: float
-
-    def __call__(self, remaining: float) -> float:
-        """The value when a share `remaining` of the training is still ahead."""
-        return self.last + (self.first - self.last) * remaining
 
 
 @dataclass(frozen=True)
@@ -256,13 +127,6 @@ def train(
     judge.close()
     env.close()
     return Training(folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best)
-
-
-def description(plan: Plan) -> dict[str, Any]:
-    """A plan as JSON has it."""
-    found: dict[str, Any] = as_json(plan)
-    del found["threads"]  # changes no result, but those of sums in other orders
-    return found
 
 
 def export(training: Training, file: Path) -> None:

@@ -79,7 +79,7 @@ def configure(args: Args) -> Setting:
     from baselines.recipes import recipe
 
     try:
-        from baselines.training import Plan, make_model
+        from baselines.plans import Plan, make_model
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     plots.require_matplotlib()

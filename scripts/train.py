@@ -68,7 +68,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     from quad_gym.reports import require_writable
 
     try:
-        from baselines.training import Plan, make_model
+        from baselines.plans import Plan, make_model
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     chosen = recipe(args.env_id, args.algorithm)

@@ -8,6 +8,7 @@ biases evolve, then measure and update at its end.
 import numpy as np
 
 from quad_gym.kernels.air import begin_world, fly_through_air, supply
+from quad_gym.kernels.alignment import initialize
 from quad_gym.kernels.compilation import kernel
 from quad_gym.kernels.control import act
 from quad_gym.kernels.draws import draw_parameters, impose
@@ -52,7 +53,7 @@ from quad_gym.kernels.sensors import (
     stream_of,
 )
 from quad_gym.kernels.task import draw_reference, draw_start
-from quad_gym.kernels.ukf import initialize, predict
+from quad_gym.kernels.ukf import predict
 from quad_gym.kernels.vehicle import integrate, load4, load_state
 from quad_gym.kernels.warm import start_warm
 from quad_gym.records import Control, FilterForm, Source

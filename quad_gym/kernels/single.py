@@ -1,6 +1,7 @@
 """Entries for one flight: the scalar instances behind the friendly classes."""
 
 from quad_gym.kernels.air import accelerations_in_air
+from quad_gym.kernels.alignment import initialize
 from quad_gym.kernels.compilation import entry
 from quad_gym.kernels.linalg import add_outer, load3, load33, scale, scale33, store3, store33
 from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
@@ -12,7 +13,7 @@ from quad_gym.kernels.sensors import (
     measure_imu,
     measure_imu_average,
 )
-from quad_gym.kernels.ukf import initialize, predict
+from quad_gym.kernels.ukf import predict
 from quad_gym.kernels.ukf_update import update
 from quad_gym.kernels.vehicle import accelerations, integrate, load4, load_state, store4
 from quad_gym.kernels.wahba import wahba

@@ -18,9 +18,10 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
+from baselines.plans import Plan, algorithm_class, make_model  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
 from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
-from baselines.training import Plan, algorithm_class, make_model, train  # noqa: E402
+from baselines.training import train  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 CIRCLE = "QuadGym/Circle-v0"
