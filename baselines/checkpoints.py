@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import os
 import pickle
 import signal
@@ -38,6 +37,10 @@ _COLUMNS = (
     "gates_passed",
     "training_return",
 )
+
+
+class RunError(ValueError):
+    """A folder does not hold the run that it should."""
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -130,7 +133,7 @@ class Keeper(BaseCallback):
             self._bar.close()
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        """The first signal stops at a checkpoint; a second one stops at once."""
+        """The first signal ends the run with the rollout's present step; a second one, at once."""
         if self._stop:
             raise KeyboardInterrupt
         self._stop = True
@@ -143,8 +146,6 @@ class Keeper(BaseCallback):
         if self.finished and self.steps < model.num_timesteps:
             self.steps = model.num_timesteps
             self._keep(model)
-        elif self.finished and self._stop:
-            self._stop = False
 
     # ---- keeping --------------------------------------------------------------------------------
 
@@ -260,7 +261,7 @@ def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) 
             custom_objects={"tensorboard_log": model.tensorboard_log},
         )
     except (zipfile.BadZipFile, KeyError, pickle.UnpicklingError) as error:
-        raise ValueError(f"the checkpoint in {folder} is damaged: {error}") from None
+        raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
     if state["replay"]:
         found.load_replay_buffer(folder / state["replay"])  # type: ignore[attr-defined]
     env.reset()
@@ -272,15 +273,3 @@ def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) 
         setattr(keeper, name, value)
     keeper.steps = found.num_timesteps
     return found
-
-
-def plan_of(folder: Path) -> dict[str, Any]:
-    """What `training.json` says of a run.
-
-    Raises:
-        ValueError: If there is none.
-    """
-    file = folder / "training.json"
-    if not file.exists():
-        raise ValueError(f"{folder} holds no training: there is no {file.name}")
-    return dict(json.loads(file.read_text(encoding="utf-8")))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import quad_gym
@@ -26,12 +27,12 @@ class Plan(Checked):
     env_id: str = "QuadGym/Circle-v0"
     """one of `quad_gym.IDS`"""
     environment: Any = field(default_factory=dict)
-    """keywords of the environment, in training as in evaluation"""
+    """keywords of the environment, in training as in evaluation, before those of the recipe"""
     recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
     seed: int = 0
     """of the networks, and of the first flight; flight i has seed + i"""
     threads: int | None = None
-    """for flights and networks; None: as many as there are cores"""
+    """for the flights; None: as many as there are cores; no result depends on them"""
     evaluations: int = 20
     """how often the policy is evaluated, and kept, over the run"""
     episodes: int = 100
@@ -55,7 +56,7 @@ class Plan(Checked):
             n_envs=self.recipe.n_envs,
             seed=self.seed,
             threads=self.threads,
-            **{**self.environment, **self.recipe.flights},
+            **{**self.recipe.flights, **self.environment},
         )
         return ScaledReward(env, self.recipe.reward_scale)
 
@@ -117,6 +118,7 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
             env,
             learning_rate=Linear(first, last),
             policy_kwargs=policy,
+            **_exploration(chosen, env),
             seed=plan.seed,
             device="cpu",
             tensorboard_log=None if tensorboard is None else str(tensorboard),
@@ -124,6 +126,14 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
         )
     except (TypeError, AssertionError) as error:
         raise ValueError(f"recipe does not fit {chosen.algorithm}: {error}") from None
+
+
+def _exploration(chosen: Recipe, env: VecEnv) -> dict[str, Any]:
+    """The noise on actions while learning, for TD3, whose policy has none of its own."""
+    if chosen.algorithm != "td3":
+        return {}
+    mean = np.zeros(env.action_space.shape or ())
+    return {"action_noise": NormalActionNoise(mean, np.full_like(mean, chosen.action_noise))}
 
 
 @dataclass(frozen=True)
@@ -141,5 +151,5 @@ class Linear:
 def description(plan: Plan) -> dict[str, Any]:
     """A plan as JSON has it."""
     found: dict[str, Any] = as_json(plan)
-    del found["threads"]  # changes no result, but those of sums in other orders
+    del found["threads"]  # changes no result
     return found

@@ -42,8 +42,11 @@ class Recipe(Checked):
     """one of ACTIVATIONS"""
     reward_scale: float = 10.0
     """the algorithm sees the reward times this; returns of about 100 are what its losses expect"""
+    action_noise: float = 0.1
+    """standard deviation of the noise on actions while learning; of TD3 alone, as the policies of
+    the other algorithms have noise of their own"""
     flights: Mapping[str, Any] = field(default_factory=lambda: {"start": "mixed"})
-    """keywords of the environment that hold in training alone"""
+    """keywords of the environment that hold in training alone, unless they are given"""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """further arguments of the algorithm's class"""
     policy: Mapping[str, Any] = field(default_factory=dict)
@@ -53,7 +56,7 @@ class Recipe(Checked):
         self._check(check.choice, "algorithm", choices=ALGORITHMS)
         self._check(check.choice, "activation", choices=ACTIVATIONS)
         self._check(check.whole, "steps", "n_envs")
-        self._check(check.positive, "reward_scale")
+        self._check(check.positive, "reward_scale", "action_noise")
         self._check(check.vector, "learning_rate", length=2)
         if min(self.learning_rate) <= 0.0:
             raise ValueError(

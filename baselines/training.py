@@ -4,7 +4,7 @@ The folder holds
 
 - `last.zip` and `best.zip`: the policy at the last evaluation and at the best one, as
   Stable-Baselines3 loads them; `last.zip` also holds what resuming needs: the flights, the random
-  number generators, the counters (and `replay_*.npz` beside it, for algorithms with a replay
+  number generators, the counters (and `replay_*.pickle` beside it, for algorithms with a replay
   buffer);
 - `training.json`: the plan, versions, seeds, wall time; `evaluations.csv`: errors while training;
 - TensorBoard's files.
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from baselines.checkpoints import Keeper, has_checkpoint, load_model
+from baselines.checkpoints import Keeper, RunError, has_checkpoint, load_model
 from baselines.mlp import mlp_of
 from baselines.plans import Plan, algorithm_class, description, make_model
 from baselines.policies import interface_of
@@ -40,11 +40,6 @@ class Training:
     """whether all steps were done"""
     best: dict[str, float]
     """of the best evaluation"""
-
-    @property
-    def last_policy(self) -> Path:
-        """The policy at the last evaluation."""
-        return self.folder / "last.zip"
 
     @property
     def best_policy(self) -> Path:
@@ -78,12 +73,12 @@ def train(
     described = description(plan)
     if has_checkpoint(folder):
         if not resume:
-            raise ValueError(f"folder {folder} holds a run already: resume it, or choose another")
+            raise RunError(f"folder {folder} holds a run already: resume it, or choose another")
         before = json.loads((folder / "training.json").read_text(encoding="utf-8"))
         if before["plan"] != described:
             differing = [k for k in described if before["plan"].get(k) != described[k]]
-            raise ValueError(
-                f"folder {folder} holds the run of another plan: {', '.join(differing)} differ"
+            raise RunError(
+                f"folder {folder} holds the run of another plan (different: {', '.join(differing)})"
             )
         if before["finished"]:
             return Training(

@@ -15,10 +15,11 @@ Wrong options end the program with one line on stderr and exit code 2, as is the
 import argparse
 import ast
 import dataclasses
+import shlex
 import sys
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn, TypeVar
 
@@ -109,13 +110,44 @@ def parse(
 
 
 @contextmanager
-def usage_errors() -> Iterator[None]:
-    """Turn what is raised while options are checked into one line on stderr and exit code 2."""
+def usage_errors(
+    kinds: tuple[type[Exception], ...] = (ValueError, OSError, ImportError),
+) -> Iterator[None]:
+    """Turn what is raised while options are checked into one line on stderr and exit code 2.
+
+    Args:
+        kinds: Errors that the user can mend.
+    """
     try:
         yield
-    except (ValueError, OSError, ImportError) as error:
+    except kinds as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
+
+
+def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[str, Any]:
+    """Keywords of an environment given by `--env`, none of which has an option of its own.
+
+    Args:
+        keywords: What was given.
+        options: Names of keywords, with the options that are there for them.
+
+    Raises:
+        ValueError: If one of them was given.
+    """
+    for name, instead in options.items():
+        if name in keywords:
+            raise ValueError(f"--env must leave {name} to {instead}")
+    return keywords
+
+
+def flying_options(keywords: Mapping[str, Any]) -> str:
+    """Options of `scripts/evaluate.py` for keywords of an environment, each after a space."""
+    rest = dict(keywords)
+    words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors") if k in rest]
+    if rest:
+        words.append("--env " + " ".join(shlex.quote(f"{k}={v}") for k, v in rest.items()))
+    return "".join(" " + word for word in words)
 
 
 def _help_of(field: "dataclasses.Field[Any]") -> str:

@@ -2,8 +2,9 @@
 
 Every environment and `FlightBatch` take `faults=`: one fault, several, or the names of presets. ::
 
-    import quad_gym
-    from quad_gym.faults import CameraOcclusion, GnssOutage, GnssOutliers
+    import gymnasium
+    from quad_gym import FlightBatch
+    from quad_gym.faults import CameraOcclusion, GnssOutage, GnssOutliers, WrongAssociations
 
     gymnasium.make("QuadGym/Circle-v0", sensors="rtk", faults="gnss_outage")
     gymnasium.make("QuadGym/Circle-v0", sensors="rtk", faults="gnss_outliers+rotor_loss")
@@ -29,6 +30,8 @@ from quad_gym import validation as check
 from quad_gym.fault_fields import FaultKind
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.validation import Checked, Vector
+
+_SENSORS = {"gnss": "GNSS", "camera": "a camera"}
 
 Span = float | tuple[float, float]
 """A number, or the ends of a range from which it is drawn uniformly each time a fault comes."""
@@ -109,8 +112,8 @@ class Fault(Checked):
         """
         if self.needs and getattr(sensors, self.needs) is None:
             raise ValueError(
-                f"faults must concern sensors that there are: {type(self).__name__} needs a "
-                f"{self.needs}, the sensor suite has none"
+                f"faults must concern sensors that there are: {type(self).__name__} needs "
+                f"{_SENSORS[self.needs]}, which this sensor suite does not have"
             )
 
 
@@ -266,7 +269,7 @@ class WrongAssociations(Fault):
         if sensors.camera is not None and len(sensors.camera.features_I) < 2:
             raise ValueError(
                 "faults must concern sensors that there are: WrongAssociations needs a camera that "
-                "knows two features at least"
+                "knows at least two features"
             )
 
 

@@ -52,14 +52,14 @@ class FilterParams(Checked):
     off by the square of the attitude's error, more than a precise camera's noise at a rough start
     """
     gate_false_alarm: float = 0.0
-    """probability that a sound measurement is rejected: a position, a baseline or a feature whose
-    normalised innovation squared exceeds the chi-square quantile of this alarm level is left out of
-    the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking
-    and Navigation, section 5.4); 0: everything is taken"""
+    """probability that a sound measurement is rejected: a position, baseline, velocity or feature
+    whose normalised innovation squared exceeds the chi-square quantile of this alarm level is left
+    out of the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to
+    Tracking and Navigation, section 5.4); 0: everything is taken"""
     gate_patience: int = 10
-    """positions, baselines or images rejected in a row after which the filter rather doubts itself:
-    it adds the square of the innovation to the covariance of what the sensor measures, and takes
-    the next one"""
+    """positions, baselines, velocities or images rejected in a row after which the filter rather
+    doubts itself: it adds the square of the innovation to the covariance of what the sensor
+    measures, and takes the next one"""
     gate_direction_sigma: float = 0.2
     """[rad] a gating filter leaves out features whose direction it predicts more vaguely than that,
     as after a long outage: what its model neglects, half the square, is ten times the noise of a
@@ -70,7 +70,7 @@ class FilterParams(Checked):
     to its time stamp over the IMU's samples since then, updates it there, and takes it on again;
     "as_fresh" ignores the time stamp"""
     gravity: float = GRAVITY
-    """[m/s^2] that the filter subtracts"""
+    """[m/s^2] that a filter which works by itself subtracts; in flights it is the vehicle's"""
 
     def __post_init__(self) -> None:
         self._check(

@@ -237,7 +237,8 @@ class TaskParams(Checked):
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
     "hover": hovering at rest within some decimetres of the reference; "mixed": either, by a coin"""
     randomize: bool = False
-    """draw phase, radius, period and sense of the reference anew each episode"""
+    """draw the reference anew each episode: phase, radius, period and sense of circle and
+    lemniscate, the heading of a random trajectory and of a course of gates"""
     duration: float = 10.0
     """time limit of an episode [s]; 0: none; report section 4.2"""
     out_of_bounds: float = 3.0

@@ -106,8 +106,9 @@ class Randomization:
 
     Args:
         parameters: Distributions by name.
-        known: Whether the filter and the controller know the world as it is, draws included. By
-            default they believe the nominal parameters.
+        known: Whether the filter and the controller know the vehicle and the sensors as they are,
+            draws included. By default they believe the nominal parameters. Of wind and ground they
+            never know.
 
     Raises:
         ValueError: If a name is unknown, or something is no distribution.
@@ -210,7 +211,7 @@ class DrawingTable:
     ) -> None:
         name = drawable.name
         if np.isnan(nominal):
-            raise ValueError(f"randomization of {name!r} needs a {_MISSING[name]}, there is none")
+            raise ValueError(f"randomization of {name!r} needs {_MISSING[name]}, there is none")
         if part is None:  # a component that stays among others that are drawn
             part = Uniform(nominal, nominal)
         if part.relative and nominal == 0.0:
@@ -246,8 +247,11 @@ def _range_in_words(drawable: Drawable) -> str:
 
 
 _CAMERA = ("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length")
-_MISSING = dict.fromkeys(_CAMERA, "camera") | dict.fromkeys(
-    ("battery_charge", "battery_resistance"), "battery (WorldParams.battery)"
+_GNSS = ("position_sigma_I", "baseline_sigma", "primary_antenna_B", "secondary_antenna_B")
+_MISSING = (
+    dict.fromkeys(_CAMERA, "a camera")
+    | dict.fromkeys(_GNSS, "GNSS")
+    | dict.fromkeys(("battery_charge", "battery_resistance"), "a battery (WorldParams.battery)")
 )
 
 
@@ -271,6 +275,7 @@ def nominal_values(
         "camera_rotation": math.nan if camera is None else 0.0,
         "pixel_sigma": math.nan if camera is None else camera.pixel_sigma,
         "focal_length": math.nan if camera is None else camera.focal_length,
+        **(dict.fromkeys(_GNSS, math.nan) if gnss is None else {}),
     }
     values = np.zeros(DRAWN_SIZE)
     for drawable in DRAWABLES:

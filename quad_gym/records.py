@@ -220,7 +220,6 @@ FLIGHT_FIELDS = (
     Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
     # the course of gates
     Field("gates", (MAX_GATES, 3), "m", "gate centres in I"),
-    Field("gate_count", (), "-", "gates of this course"),
     Field("gate_next", (), "-", "gates passed so far"),
     # the task
     Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
@@ -232,7 +231,7 @@ FLIGHT_FIELDS = (
     Field("needs_reset", (), "0 or 1", "the episode is over; the next step begins a new one"),
     Field("reward", (), "-", "of the last step"),
     Field("terminated", (), "0 or 1", "the last step ended the episode by a crash or at the goal"),
-    Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit"),
+    Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit or a failed filter"),
     Field("ending", (), "-", "why the episode ended, see Ending"),
     Field("position_error", (), "m", "distance of the true position from the reference"),
     Field("estimation_error", (), "m", "distance of the seen from the true position"),

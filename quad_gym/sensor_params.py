@@ -304,7 +304,7 @@ class SensorSuite(Checked):
 
         Raises:
             ValueError: If a rate is not positive or not a whole division of the IMU's, or there is
-                no GNSS that could have the rate given for it.
+                no GNSS, or no camera, that could have the rate given for it.
         """
         imu_rate = self.imu.rate if imu is None else check.positive("imu_rate", imu)
 
@@ -324,12 +324,14 @@ class SensorSuite(Checked):
             camera_params = camera_params.replace(
                 rate=rate_of("camera_rate", camera, camera_params.rate)
             )
+        elif camera is not None:
+            raise ValueError(f"camera_rate must not be given without a camera, got {camera} Hz")
         return self.replace(  # type: ignore[no-any-return]
             imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params
         )
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
-        """A copy whose white noise is `factor` times as large; the filter knows of it."""
+        """A copy whose white noise is `factor` times as large, as a filter of this suite knows."""
         check.positive("factor", factor)
         gnss, camera = self.gnss, self.camera
         if camera is not None:

@@ -52,7 +52,11 @@ class Args:
     threads: int | None = option(None, "most threads to use; if not given, one per core")
     cold: bool = option(False, "measure the first use with an empty cache too: a minute or more")
 
-    quick: bool = option(False, "2 short repeats: to see that it runs", group="how to measure")
+    quick: bool = option(
+        False,
+        "2 short repeats in place of --repeats and --seconds: to see that it runs",
+        group="how to measure",
+    )
     repeats: int = option(7, "repeats of each measurement, of which the best counts")
     seconds: float = option(0.3, "length of a repeat [s]")
     output: Path = option(

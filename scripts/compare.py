@@ -27,12 +27,15 @@ from compare_flights import Floats, Flown, fly
 from compare_report import Comparison, Setting, conclusions, matrix_text, write_figures, write_page
 
 from quad_gym import IDS, plots
-from quad_gym.cli import option, parse, usage_errors
+from quad_gym import validation as check
+from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.reports import as_json, require_writable, versions, write_csv, write_json
+from quad_gym.sensor_suites import SUITES
 from quad_gym.threads import resolve_threads
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200
 FLOWN_ON = ("truth", "estimate")
+SOURCES = ("truth", "noisy", "estimate")
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,15 @@ class Args:
         f"what to fly: {', '.join(i for i in IDS if 'Way' not in i)}",
         positional=True,
     )
-    sensors: tuple[str, ...] = option(("lab",), "sensor suites", group="what to compare")
-    train_on: tuple[str, ...] = option(("truth", "noisy", "estimate"), "what to train on")
+    sensors: tuple[str, ...] = option(
+        ("lab",), f"sensor suites: {', '.join(SUITES)}", group="what to compare"
+    )
+    train_on: tuple[str, ...] = option(SOURCES, f"what to train on, of {', '.join(SOURCES)}")
     seeds: int = option(5, "training seeds")
     quick: bool = option(
         False,
-        f"{QUICK_SEEDS} seed and {QUICK_EPISODES} episodes: shows that it works, proves nothing",
+        f"{QUICK_SEEDS} seed and {QUICK_EPISODES} episodes in place of --seeds and --episodes: "
+        "shows that it works, proves nothing",
     )
 
     algorithm: Literal["ppo", "sac", "td3", "tqc"] = option("ppo", "how to learn", group="training")
@@ -90,8 +96,9 @@ def configure(args: Args) -> Setting:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     if args.jobs is not None and args.jobs < 1:
         raise ValueError(f"--jobs must be at least 1, got {args.jobs}")
-    if {"observation", "sensors"} & set(args.env):
-        raise ValueError("--env must leave observation and sensors to --train-on and --sensors")
+    for source in args.train_on:
+        check.choice("--train-on", source, SOURCES)
+    leave(args.env, {"observation": "--train-on", "sensors": "--sensors", "threads": "--jobs"})
     chosen = recipe(args.env_id, args.algorithm)
     if args.steps is not None:
         chosen = chosen.replace(steps=args.steps)
@@ -145,8 +152,8 @@ def _require_same(setting: Setting) -> None:
     differing = [k for k in described if before.get(k) != described[k]]
     if differing:
         raise ValueError(
-            f"folder {setting.folder} holds another comparison ({', '.join(differing)} differ): "
-            "choose another --output"
+            f"folder {setting.folder} holds another comparison (different: "
+            f"{', '.join(differing)}): choose another --output"
         )
 
 
@@ -160,7 +167,7 @@ def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
 
     def stop(number: int, frame: Any) -> NoReturn:
         for process in multiprocessing.active_children():
-            process.terminate()  # a training keeps a checkpoint then; Ctrl-C reaches it by itself
+            process.terminate()  # as Ctrl-C, which reaches them by itself: it ends their rollout
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)

@@ -30,7 +30,7 @@ MANY_CRASHES = 0.01
 """Share of episodes beyond which errors of those that crashed distort the mean."""
 ONE_SEED = (
     "One training seed proves nothing: another seed may turn any of these differences round. "
-    "Run without --quick for intervals."
+    "Run with five for intervals."
 )
 
 

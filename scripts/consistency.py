@@ -33,7 +33,7 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.plots import house_style, require_matplotlib, save_figure
 from quad_gym.records import Source
 from quad_gym.reports import text_table, versions, write_json
-from quad_gym.sensor_suites import FIELD_FILTER
+from quad_gym.sensor_suites import FIELD_FILTER, SUITES
 from quad_gym.simulation import FlightBatch
 
 
@@ -62,7 +62,7 @@ class Args:
         None, "threads; if not given, as many as there are cores; results do not depend on it"
     )
 
-    suite: str = option("rtk", "sensor suite", group="sensors and filter")
+    suite: str = option("rtk", f"sensor suite, of {', '.join(SUITES)}", group="sensors and filter")
     form: Literal["suite", "report", "mended"] = option(
         "suite", "form of filter and IMU: as the suite has it, the report's, or with all mends"
     )

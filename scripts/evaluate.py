@@ -17,13 +17,14 @@ import gymnasium
 
 from baselines.policies import load_policy, task_of
 from quad_gym import IDS, plots
-from quad_gym.cli import option, parse, usage_errors
+from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.metrics import bootstrap_interval
 from quad_gym.recording import Tracer
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.sensor_suites import SUITES
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Args:
     observation: tuple[str, ...] = option(
         ("truth", "estimate"), "what to fly on: estimate, truth, noisy"
     )
-    sensors: str = option("lab", "sensor suite")
+    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}")
     env: dict[str, Any] = option(
         {}, "further keywords of the environment, such as camera=false gnss_rate=10"
     )
@@ -87,13 +88,17 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
 
 def make_flights(args: Args, observation: str, count: int) -> Any:
     """The environment of an observation."""
+    keywords = leave(
+        args.env,
+        {"observation": "--observation", "sensors": "--sensors", "threads": "--threads"},
+    )
     return gymnasium.make_vec(
         args.env_id,
         num_envs=count,
         observation=observation,
         sensors=args.sensors,
         threads=args.threads,
-        **args.env,
+        **keywords,
     )
 
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from baselines.policies import load_policy
 from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
-from quad_gym.cli import option, parse, usage_errors
+from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.evaluation import Policy
 from quad_gym.fault_presets import PRESETS, faults_of
 from quad_gym.faults import Fault
@@ -35,6 +35,7 @@ from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
 from quad_gym.reports import require_writable
+from quad_gym.sensor_suites import SUITES
 from quad_gym.simulation import FlightBatch
 
 ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
@@ -65,7 +66,7 @@ class Args:
         {}, "further keywords of the environment, such as control_rate=100 estimator=ekf"
     )
 
-    sensors: str = option("lab", "sensor suite", group="sensors")
+    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}", group="sensors")
     camera: bool = option(True, "measure with the camera")
     gnss_rate: float | None = option(None, "GNSS fixes per second [Hz]; if not given, the suite's")
     camera_rate: float | None = option(None, "images per second [Hz]; if not given, the suite's")
@@ -164,6 +165,9 @@ def make_env(args: Args) -> Any:
     Raises:
         ValueError: If an option makes no sense.
     """
+    options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
+    named = {name: f"--{name.replace('_', '-')}" for name in options}
+    keywords = leave(args.env, {**named, "faults": "--fault"})
     return gymnasium.make_vec(
         ID_OF_TASK[args.task],
         num_envs=1,
@@ -176,7 +180,7 @@ def make_env(args: Args) -> Any:
         camera_rate=args.camera_rate,
         duration=args.duration,
         faults=faults_of_args(args),
-        **args.env,
+        **keywords,
     )
 
 

@@ -25,6 +25,7 @@ from quad_gym.consistency import PARTS
 from quad_gym.consistency_flights import ASTRAY, Findings, endless, put_to_the_test
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.reports import text_table, versions, write_json
+from quad_gym.sensor_suites import SUITES
 from quad_gym.simulation import FlightBatch
 from quad_gym.validation import Vector
 from quad_gym.world_params import world_params
@@ -35,7 +36,7 @@ class Args:
     """Options of the tables."""
 
     table: Literal["models", "filters"] = option("models", "which table", positional=True)
-    suite: str = option("rtk", "sensor suite")
+    suite: str = option("rtk", f"sensor suite, of {', '.join(SUITES)}")
     flights: int = option(1000, "flights in each case")
     first_seed: int = option(0, "seed of the first flight; the others follow it")
     duration: float = option(10.0, "length of a flight [s]")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import IDS
-from quad_gym.cli import option, parse, usage_errors
+from quad_gym.cli import flying_options, option, parse, usage_errors
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Args:
     evaluations: int = option(20, "evaluations, and checkpoints, over the run")
     episodes: int = option(100, "flown in an evaluation")
     threads: int | None = option(
-        None, "threads; if not given, one per core; with 1, the same seed gives the same policy"
+        None, "threads of the flights; if not given, one per core; no result depends on them"
     )
     tensorboard: bool = option(True, "write files for TensorBoard")
     progress: bool = option(True, "show a progress bar")
@@ -91,6 +91,8 @@ def configure(args: Args) -> tuple[Any, Path]:
     require_writable("--output", folder)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
+    if args.export is not None and args.algorithm == "recurrent_ppo":
+        raise ValueError("--export takes no recurrent_ppo, whose policies have a memory")
     return plan, folder
 
 
@@ -99,12 +101,14 @@ def main(args: Args) -> None:
     from_start = time.perf_counter()
     with usage_errors():
         plan, folder = configure(args)
-        from baselines.training import export, train
+    from baselines.checkpoints import RunError
+    from baselines.training import export, train
 
-        print(
-            f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
-            f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
-        )
+    print(
+        f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
+        f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
+    )
+    with usage_errors((RunError,)):
         done = train(
             plan,
             folder,
@@ -120,12 +124,13 @@ def main(args: Args) -> None:
         f"{done.best['mean_error']:.4f} m, {done.best['crash_rate']:.1%} crashed."
     )
     if not done.finished:
-        print(f"Stopped before the end. Go on with: --resume --output {folder}", file=sys.stderr)
+        print("Stopped. Start the same command again with --resume to go on.", file=sys.stderr)
         raise SystemExit(130)
     if args.export is not None:
         export(done, args.export)
         print(f"Wrote {args.export}.")
-    print(f"Fly it: python scripts/evaluate.py {plan.env_id} --policy {done.best_policy}")
+    policy = f"--policy {done.best_policy}{flying_options(plan.environment)}"
+    print(f"Fly it: python scripts/evaluate.py {plan.env_id} {policy}")
 
 
 if __name__ == "__main__":

@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 
 from baselines.pd import PDPolicy
 from quad_gym import IDS, PDGains, pd_gains
-from quad_gym.cli import option, parse, usage_errors
+from quad_gym.cli import flying_options, leave, option, parse, usage_errors
 from quad_gym.evaluation import roll_out
 from quad_gym.metrics import paired_difference
 from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.sensor_suites import SUITES
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class Args:
         TRACKING, f"what to fly: {', '.join(TRACKING)}", group="what to tune for"
     )
     observation: Literal["estimate", "truth", "noisy"] = option("estimate", "what control sees")
-    sensors: str = option("lab", "sensor suite")
+    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}")
     env: dict[str, Any] = option(
         {}, "further keywords of the environment, such as action=wrench control_rate=200"
     )
@@ -159,8 +160,8 @@ def configure(args: Args) -> Search:
         if getattr(args, name) < least:
             option_name = name.replace("_", "-")
             raise ValueError(f"--{option_name} must be at least {least}, got {getattr(args, name)}")
-    if {"observation", "sensors"} & set(args.env):
-        raise ValueError("--env must leave observation and sensors to their own options")
+    names = ("observation", "sensors", "threads")
+    leave(args.env, {name: f"--{name}" for name in names})
     envs = make_envs(args, args.episodes)
     for env in envs.values():
         PDPolicy(env, gains=args.start)  # refuses actions and layouts that do not admit it
@@ -252,7 +253,8 @@ def main(args: Args) -> None:
     ]
     seconds = time.perf_counter() - began
     print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")
-    print(f"python scripts/evaluate.py {args.tasks[0]} --policy pd pd:{written[0]}")
+    same = flying_options({"sensors": args.sensors, **args.env})
+    print(f"python scripts/evaluate.py {args.tasks[0]} --policy pd pd:{written[0]}{same}")
 
 
 if __name__ == "__main__":

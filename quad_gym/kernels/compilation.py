@@ -46,6 +46,7 @@ def sources_digest() -> str:
     digest = hashlib.sha256()
     constants = (
         "records.py",
+        "settings_fields.py",
         "late_fields.py",
         "params.py",
         "sensor_params.py",

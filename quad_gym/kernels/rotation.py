@@ -156,10 +156,3 @@ def quaternion_rate(q, w_B):
         0.5 * (w * w_B[1] + z * w_B[0] - x * w_B[2]),
         0.5 * (w * w_B[2] + x * w_B[1] - y * w_B[0]),
     )
-
-
-@kernel
-def yaw_to_quaternion(yaw):
-    """The level attitude whose x axis points `yaw` from east."""
-    s, c = sin_cos(0.5 * yaw)
-    return (c, 0.0 * s, 0.0 * s, s)

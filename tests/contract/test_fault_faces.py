@@ -136,5 +136,5 @@ def test_bad_faults_are_refused_by_every_face():
             make(faults="storm")
         with pytest.raises(ValueError, match="faults must be faults or names of presets"):
             make(faults=3.0)
-        with pytest.raises(ValueError, match="needs a gnss, the sensor suite has none"):
+        with pytest.raises(ValueError, match="needs GNSS, which this sensor suite does not have"):
             make(sensors="indoor", faults=GnssOutage())

@@ -72,7 +72,28 @@ def test_the_same_seed_gives_the_same_policy_and_another_one_does_not(tmp_path):
     assert not np.array_equal(weights(tmp_path / "a")["action_net.weight"], other)
 
 
-@pytest.mark.parametrize(("algorithm", "steps"), [("ppo", 70), ("ppo", 20), ("sac", 75)])
+def test_keywords_of_the_environment_hold_in_training_too():
+    plan = small_plan()
+    assert plan.make_flights().unwrapped.flights.batch.task.start == "mixed"  # the recipe's
+    given = {"start": "ground", "randomize": False, "sensors": "rtk"}
+    batch = small_plan(environment=given).make_flights().unwrapped.flights.batch
+    assert (batch.task.start, batch.task.randomize) == ("ground", False)
+    assert batch.sensors == quad_gym.sensor_suite("rtk")
+
+
+def test_td3_explores():
+    """Its policy has no noise of its own: without any, actions would be what the policy says."""
+    plan = small_plan("td3")
+    model = make_model(plan, plan.make_flights())
+    model.learn(800)
+    noise = model.action_noise
+    drawn = np.concatenate([noise() for _ in range(200)])
+    assert 0.09 < drawn.std() < 0.11
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "steps"), [("ppo", 70), ("ppo", 20), ("sac", 75), ("td3", 75)]
+)
 def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, algorithm, steps):
     plan = small_plan(algorithm)
     train(plan, tmp_path / "whole", quiet=True, tensorboard=False)
@@ -135,7 +156,7 @@ def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     finished = train_again(folder, steps, tmp_path)
     assert "goes on" not in finished.stderr
     assert finished.returncode == 2  # another number of steps is another plan
-    assert "recipe differ" in finished.stderr
+    assert "different: recipe" in finished.stderr
 
 
 def train_again(folder, steps, where):

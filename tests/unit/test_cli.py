@@ -1,12 +1,13 @@
 """From dataclasses to command lines."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from quad_gym.cli import option, parse, parser_of, usage_errors
+from quad_gym.cli import flying_options, leave, option, parse, parser_of, usage_errors
 
 
 @dataclass(frozen=True)
@@ -66,3 +67,19 @@ def test_usage_errors_end_with_one_line(error, capsys):
 def test_bugs_are_not_taken_for_usage_errors():
     with pytest.raises(KeyError), usage_errors():
         raise KeyError("bug")
+
+
+def test_keywords_with_an_option_of_their_own_are_refused():
+    keywords = {"radius": 2.0, "sensors": "rtk"}
+    assert leave(keywords, {"faults": "--fault"}) == keywords
+    with pytest.raises(ValueError, match=r"^--env must leave sensors to --sensors$"):
+        leave(keywords, {"faults": "--fault", "sensors": "--sensors"})
+
+
+def test_keywords_become_options_that_are_parsed_as_they_were():
+    assert flying_options({}) == ""
+    assert flying_options({"sensors": "rtk"}) == " --sensors rtk"
+    keywords = {"camera": False, "faults": "gnss_jump+rotor_loss", "observation": "noisy"}
+    words = shlex.split(flying_options({**keywords, "world": "a b"}))
+    assert words[:3] == ["--observation", "noisy", "--env"]
+    assert words[3:] == ["camera=False", "faults=gnss_jump+rotor_loss", "world=a b"]

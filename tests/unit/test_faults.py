@@ -391,7 +391,7 @@ def test_the_gate_rejects_most_outliers_and_says_so():
         (lambda: faults_of(3, LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([3], LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([GnssOutage(), "gnss_outage"], LAB), "one of a kind, got two Gnss"),
-        (lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor")), "needs a gnss"),
+        (lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor")), "needs GNSS"),
         (lambda: faults_of(CameraOcclusion(), BLIND), "needs a camera"),
         (
             lambda: faults_of(

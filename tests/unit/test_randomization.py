@@ -389,6 +389,13 @@ def test_a_randomisation_that_makes_no_sense_is_refused(given, message):
         FlightBatch(1, randomization=given)
 
 
+def test_gnss_that_is_not_there_cannot_be_drawn():
+    for name in ("position_sigma_I", "baseline_sigma", "primary_antenna_B", "secondary_antenna_B"):
+        with pytest.raises(ValueError, match=f"'{name}' needs GNSS"):
+            FlightBatch(1, sensors="indoor", randomization={name: Uniform(0.1, 0.2)})
+    FlightBatch(1, sensors="indoor", randomization={"pixel_sigma": Uniform(1.0, 2.0)})
+
+
 def test_a_camera_that_is_not_there_cannot_be_drawn():
     for name in ("pixel_sigma", "camera_rotation", "camera_position_B", "focal_length"):
         with pytest.raises(ValueError, match=f"'{name}' needs a camera"):

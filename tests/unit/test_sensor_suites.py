@@ -196,6 +196,13 @@ def test_velocity_updates_the_friendly_filter():
     np.testing.assert_allclose(np.diag(ukf.covariance)[3:6], after, rtol=1e-9)
 
 
+def test_no_rate_can_be_given_for_a_sensor_that_is_not_there():
+    with pytest.raises(ValueError, match="gnss_rate must not be given without GNSS"):
+        quad_gym.QuadEnv("hover", sensors="indoor", gnss_rate=10.0)
+    with pytest.raises(ValueError, match="camera_rate must not be given without a camera"):
+        quad_gym.QuadEnv("hover", sensors="consumer", camera_rate=25.0)
+
+
 # ---- flying without GNSS ---------------------------------------------------------------------
 
 
