@@ -43,7 +43,7 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
     [
         (["--tasks", "QuadGym/Waypoints-v0"], "--tasks must be among"),
         (["--candidates", "0"], "--candidates must be at least 1"),
-        (["--env", "sensors=rtk"], "leave observation and sensors"),
+        (["--env", "sensors=rtk"], "leave sensors to --sensors"),
         (["--sensors", "sonar"], "sensors must be one of"),
         (["--env", "action=velocity"], 'layout="absolute"'),
         (["--output", "/dev/null/x"], "cannot write to --output"),
