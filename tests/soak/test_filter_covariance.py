@@ -16,11 +16,13 @@ from quad_gym.records import FilterStatus, Gate, Source
 from tests.field_flights import fly, measured_now
 
 UPDATES = int(float(os.environ.get("QUAD_GYM_SOAK_UPDATES", "1e6")))
-COUNT = 256
-SUITES = ("lab", "rtk", "consumer", "indoor")
+SHARES = {"lab": 0.55, "rtk": 0.25, "consumer": 0.1, "indoor": 0.1}
+"""Of the updates: sensors of the laboratory measure every 5 ms, the consumer's every 100 ms."""
+COUNTS = {"lab": 64, "rtk": 256, "consumer": 256, "indoor": 256}
+"""Flights at a time, so that each is some 10 s long or longer with the full number of updates."""
 CASES = [
     (suite, kind, fault)
-    for suite in SUITES
+    for suite in SHARES
     for kind in ("ukf", "ekf")
     for fault in (*PRESETS, "all")
     if fault == "all" or all(
@@ -82,9 +84,10 @@ def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fa
     number = CASES.index((name, kind, fault))
     source = Source.TRUTH if number % 2 else Source.ESTIMATE
     options = {"seed": 1000 * number, "source": source, "run_filter": True, "threads": 1}
-    batch = fly(suite, COUNT, faults=fault, **options)
-    goal, updates, ticks = UPDATES / len(CASES), 0, 0
-    failures, nis = np.zeros((2, COUNT)), batch.read("nis")
+    batch = fly(suite, COUNTS[name], faults=fault, **options)
+    cases = sum(case[0] == name for case in CASES)
+    goal, updates, ticks = UPDATES * SHARES[name] / cases, 0, 0
+    failures, nis = np.zeros((2, batch.count)), batch.read("nis")
     while updates < goal:
         batch.step()
         ticks += 1
