@@ -35,7 +35,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the centre | at rest on the ground below it, rotors stopped | 10 s |
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
-    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east | hovering near the origin | 20 s |
+    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
 
     ## Observation space
     A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and
