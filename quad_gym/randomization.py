@@ -7,6 +7,7 @@ depend on its flight's seed alone.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -150,7 +151,7 @@ class Randomization:
         """What a keyword may hold: a randomisation, distributions by name, or None for nothing."""
         return given if isinstance(given, Randomization) else cls({} if given is None else given)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """What is drawn, in the order of `DRAWABLES`."""
         return tuple(name for name in COLUMNS if name in self.parameters)
