@@ -78,8 +78,8 @@ class _KalmanFilter:
     ) -> None:
         """Start from a first fix: attitude by Wahba's problem, the body z axis taken as vertical.
 
-        A baseline within some degrees of the vertical tells the heading to no better than half a
-        radian; then `heading` does, with the deviation `placement.heading_sigma` of the suite.
+        A baseline within 12 degrees of the vertical hardly tells the heading; then `heading` does,
+        with the deviation `placement.heading_sigma` of the suite.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].

@@ -197,8 +197,8 @@ class PlacementParams(Checked):
 
     The vehicle is put down on a marked spot; the filter starts from where the spot is and whither
     the vehicle looks, with these errors, and takes the vehicle for level. Where there is GNSS whose
-    baseline is so steep that it tells the heading to no better than half a radian, whither the
-    vehicle looks is known from its mark, too.
+    baseline lies within 12 degrees of the vertical, so that it hardly tells the heading, whither
+    the vehicle looks is known from its mark, too.
     """
 
     position_sigma: float = 0.05

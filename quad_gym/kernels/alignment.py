@@ -38,7 +38,7 @@ from quad_gym.kernels.linalg import (
 from quad_gym.kernels.wahba import wahba
 
 _NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
-_VAGUE_HEADING = 0.5  # rad, beyond which a filter that linearises cannot start
+_STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that tells no heading
 
 
 @kernel
@@ -82,8 +82,8 @@ def initialize(flight, p, mask, x_I):
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
     with equal weights, or level with the baseline's heading; position from the antenna; velocity
     and biases zero. A level start knows that its position hangs on its attitude. The heading is the
-    less certain the steeper the baseline. Where that would leave it vague, the body x axis joins in
-    Wahba's problem, or gives the heading; where nobody knows it either, the heading may be any.
+    less certain the steeper the baseline. Where that tells none to speak of, the body x axis joins
+    in Wahba's problem, or gives the heading; where nobody knows it either, the heading may be any.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
@@ -97,7 +97,7 @@ def initialize(flight, p, mask, x_I):
     baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
     level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
     heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
-    placed = (heading > _VAGUE_HEADING) & (dot(x_I, x_I) > 0.0)
+    placed = (level_share < _STEEP) & (dot(x_I, x_I) > 0.0)
     heading = select(placed, inflation * p.heading_sigma, heading)
 
     R_IG = load33(p.R_IG)

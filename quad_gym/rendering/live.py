@@ -1,5 +1,6 @@
 """Rendering of environments while they fly: the render modes of Gymnasium, and a window."""
 
+import os
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -18,6 +19,9 @@ RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
 WINDOW_RATE = 50.0
 """The most pictures a second that a window shows [Hz]."""
 
+_INVISIBLE = ("offscreen", "dummy")
+"""Drivers that SDL falls back on where there is no display, and on which nobody sees a window."""
+
 
 class Window:
     """A window on the screen that shows frames at their pace.
@@ -30,6 +34,9 @@ class Window:
         self._pygame = load_pygame()
         try:
             self._pygame.display.init()
+            driver = self._pygame.display.get_driver()
+            if driver in _INVISIBLE and "SDL_VIDEODRIVER" not in os.environ:
+                raise self._pygame.error(f"no display was found, only the driver {driver!r}")
             self._screen = self._pygame.display.set_mode(size)
         except self._pygame.error as error:
             self._pygame.display.quit()

@@ -212,9 +212,12 @@ def test_a_steep_baseline_leaves_the_heading_to_the_mark(name, heading):
     np.testing.assert_allclose(ukf.covariance[8, 8], np.pi**2 / 3, rtol=1e-12)  # any
 
 
-def test_a_level_baseline_tells_the_heading_itself():
+@pytest.mark.parametrize("sigma", [0.05, 1.0])
+def test_a_level_baseline_tells_the_heading_itself(sigma):
+    """However noisy it is."""
     fix = RECORDING.gnss_position[0], RECORDING.gnss_baseline[0]
-    told, not_told = UnscentedKalmanFilter(LAB), UnscentedKalmanFilter(LAB)
+    suite = LAB.replace(gnss=LAB.gnss.replace(baseline_sigma=sigma))
+    told, not_told = UnscentedKalmanFilter(suite), UnscentedKalmanFilter(suite)
     told.initialize(*fix, heading=2.0)
     not_told.initialize(*fix)
     assert_same(estimate(not_told), estimate(told))
