@@ -223,7 +223,8 @@ def test_gymnasium_records_videos(tmp_path):
 
 
 def run_python(code, **environment):
-    clean = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    clean = {k: v for k, v in os.environ.items() if k not in hidden}
     return subprocess.run(
         [sys.executable, "-c", code],
         env=clean | environment,
@@ -310,6 +311,21 @@ except RuntimeError as error:
     print(error)
 """,
         SDL_VIDEODRIVER="x11",
+    )
+    assert "cannot open a window" in done.stdout, done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
+def test_no_window_is_opened_where_nobody_sees_it():
+    """SDL falls back on a driver without a display, silently, and a flight would go on for ever."""
+    done = run_python(
+        """
+from quad_gym.rendering.live import Window
+try:
+    Window((320, 240), "nobody")
+except RuntimeError as error:
+    print(error)
+"""
     )
     assert "cannot open a window" in done.stdout, done.stderr
 
