@@ -257,7 +257,7 @@ def open_window(args: Args) -> Window:
         OSError: If there is no screen.
     """
     try:
-        return Window(args.size, f"quad_gym: {args.task}")
+        return Window(args.size, f"quad_gym: {args.task}", watched=True)
     except RuntimeError as error:
         raise OSError(f"{error}; --output writes a video instead") from None
 

@@ -26,16 +26,21 @@ _INVISIBLE = ("offscreen", "dummy")
 class Window:
     """A window on the screen that shows frames at their pace.
 
+    Args:
+        size: Width and height [pixels].
+        title: Of the window.
+        watched: Whether it is there to be watched, so that one that nobody can see is refused.
+
     Raises:
         RuntimeError: If there is no screen to open a window on.
     """
 
-    def __init__(self, size: tuple[int, int], title: str) -> None:
+    def __init__(self, size: tuple[int, int], title: str, *, watched: bool = False) -> None:
         self._pygame = load_pygame()
         try:
             self._pygame.display.init()
             driver = self._pygame.display.get_driver()
-            if driver in _INVISIBLE and "SDL_VIDEODRIVER" not in os.environ:
+            if watched and driver in _INVISIBLE and "SDL_VIDEODRIVER" not in os.environ:
                 raise self._pygame.error(f"no display was found, only the driver {driver!r}")
             self._screen = self._pygame.display.set_mode(size)
         except self._pygame.error as error:

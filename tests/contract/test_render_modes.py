@@ -322,7 +322,8 @@ def test_no_window_is_opened_where_nobody_sees_it():
         """
 from quad_gym.rendering.live import Window
 try:
-    Window((320, 240), "nobody")
+    Window((320, 240), "unseen")
+    Window((320, 240), "unseen", watched=True)
 except RuntimeError as error:
     print(error)
 """
