@@ -92,7 +92,13 @@ def test_td3_explores():
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "steps"), [("ppo", 70), ("ppo", 20), ("sac", 75), ("td3", 75)]
+    ("algorithm", "steps"),
+    [
+        ("ppo", 70),
+        ("ppo", 20),
+        ("sac", 75),
+        pytest.param("td3", 75, marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, algorithm, steps):
     plan = small_plan(algorithm)
@@ -135,7 +141,10 @@ def wait_for(condition, process, seconds=1200.0):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+)
 def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     folder = tmp_path / "run"
     line = script(folder, "--steps", "500000", "--evaluations", "400")
