@@ -7,10 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from quad_gym import validation as check
+from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
 from quad_gym.validation import Checked
-
-FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3
-"""How the kernel draws a column of the table."""
 
 
 class Affine(NamedTuple):

@@ -337,7 +337,7 @@ class ExtendedKalmanFilter(_KalmanFilter):
     """An error-state EKF for one vehicle: the state, models, noise and use of the UKF.
 
     Its covariance follows from analytic derivatives of the models at the estimate, which cost less
-    than sigma points and leave out the second order; see `quad_gym.kernels.ekf`.
+    than sigma points and leave out the second order; see `quad_gym.kernels.filter.ekf`.
 
     Args:
         sensors: The sensor suite whose geometry and noise the filter believes in.

@@ -19,7 +19,7 @@ from quad_gym.faults import (
     WrongAssociations,
     ends,
 )
-from quad_gym.kernels.faults import NEVER
+from quad_gym.kernels.sensors.faults import NEVER
 
 
 def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.fault_fields import FAULT_KINDS
 from quad_gym.faults import (
     AccelBiasStep,
     BaselineLoss,
@@ -22,6 +21,7 @@ from quad_gym.faults import (
     RotorLoss,
     WrongAssociations,
 )
+from quad_gym.records import FAULT_KINDS
 from quad_gym.sensor_params import SensorSuite
 
 FaultsGiven = str | Fault | Iterable[str | Fault] | None

@@ -27,7 +27,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from quad_gym import validation as check
-from quad_gym.fault_fields import FaultKind
+from quad_gym.records import FaultKind
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.validation import Checked, Vector
 

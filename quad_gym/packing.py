@@ -8,7 +8,7 @@ from scipy import special
 
 from quad_gym.filter_params import FilterParams
 from quad_gym.frames import ecef_to_enu
-from quad_gym.params import STARTS, TASKS, ActionParams, Clocks, PDGains, TaskParams, VehicleParams
+from quad_gym.params import ActionParams, Clocks, PDGains, TaskParams, VehicleParams
 from quad_gym.records import (
     BASELINE_BLOCK,
     FREEDOMS,
@@ -21,6 +21,8 @@ from quad_gym.records import (
     FilterForm,
     Layout,
     Source,
+    Start,
+    Task,
     aligned_zeros,
 )
 from quad_gym.rotations import euler_to_dcm
@@ -206,7 +208,7 @@ def settings_record(
     s["source"], s["control"], s["layout"] = source, control, layout
     s["include_covariance"], s["privileged"] = include_covariance, privileged
     s["autoreset"], s["run_filter"] = autoreset, run_filter
-    s["task"], s["start"] = 1 + TASKS.index(task.kind), STARTS.index(task.start)
+    s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
     s["randomize"] = task.randomize
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground

@@ -15,17 +15,15 @@ import numpy as np
 
 from quad_gym import validation as check
 from quad_gym.frames import GRAVITY
+from quad_gym.records import MAX_GATES, Start, Task
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.validation import Checked, Matrix, Vector
 
-MAX_GATES = 8
-"""The most gates that a course can have."""
+TASKS = tuple(task.name.lower() for task in Task)
+"""Kinds of task."""
 
-TASKS = ("hover", "circle", "lemniscate", "random_trajectory", "waypoints")
-"""Kinds of task, in the order of `records.Task`."""
-
-STARTS = ("ground", "hover", "mixed")
-"""How episodes begin, in the order of `records.Start`."""
+STARTS = tuple(start.name.lower() for start in Start)
+"""How episodes begin."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,13 +11,8 @@ import numpy as np
 
 from quad_gym import validation as check
 from quad_gym.filter_params import FilterParams
+from quad_gym.records import MAX_FEATURES, MAX_UNDER_WAY
 from quad_gym.validation import Checked, Matrix, Vector
-
-MAX_FEATURES = 16
-"""The most features that a camera model can hold."""
-
-MAX_UNDER_WAY = 2
-"""The most measurements of a sensor that can be under way to the filter at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)

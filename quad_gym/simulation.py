@@ -10,6 +10,8 @@ from quad_gym import validation as check
 from quad_gym.fault_packing import pack_faults
 from quad_gym.fault_presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.batch import fly
+from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.packing import pack_latency, params_block, params_record, settings_record
 from quad_gym.params import (
     ActionParams,
@@ -20,8 +22,9 @@ from quad_gym.params import (
     pd_gains,
     vehicle_params,
 )
-from quad_gym.randomization import COLUMNS, DrawingTable, Given, Randomization
+from quad_gym.randomization import DrawingTable, Given, Randomization
 from quad_gym.records import (
+    COLUMNS,
     FLIGHT_BLOCK,
     RESULTS,
     WIDTH,
@@ -186,6 +189,7 @@ class FlightBatch:
                 task=self.task,
                 substeps=substeps,
             )
+        self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
@@ -264,6 +268,8 @@ class FlightBatch:
     def _run(self, command: Command) -> NDArray[np.float32]:
         observations = np.empty((self.count, self._low.size), np.float32)  # the kernel fills it
 
+        table = linked_table(self._stages)
+
         def part(number: int, first: int, last: int) -> None:
             fly(
                 self._blocks,
@@ -276,6 +282,7 @@ class FlightBatch:
                 self._model,
                 self._settings,
                 self._work[number],
+                table,
                 self._actions,
                 self._low,
                 self._high,

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import TaskParams, VehicleParams
-from quad_gym.records import WIDTH, Autoreset, Control, Source
+from quad_gym.records import WARM_DRAWS, WIDTH, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 from quad_gym.sensor_params import ImuParams, SensorSuite
-from quad_gym.settings_fields import WARM_DRAWS
 
 FILTER_STARTS = ("cold", "warm")
 """Values of the keyword `filter_start`."""

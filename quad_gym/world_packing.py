@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import VehicleParams
-from quad_gym.randomization import COLUMNS, DrawingTable, Randomization
-from quad_gym.records import SETTINGS
+from quad_gym.randomization import DrawingTable, Randomization
+from quad_gym.records import COLUMNS, SETTINGS, Supply
 from quad_gym.sensor_params import SensorSuite
-from quad_gym.world_fields import Supply
 from quad_gym.world_params import BatteryParams, WorldParams
 
 

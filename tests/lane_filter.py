@@ -6,11 +6,11 @@ file: after a change of an entry here, delete its files in `__pycache__`.
 
 import numpy as np
 
-from quad_gym.kernels.alignment import initialize
-from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import entry
-from quad_gym.kernels.ukf import predict
-from quad_gym.kernels.ukf_update import update
+from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.filter.align import initialize
+from quad_gym.kernels.filter.predict import predict
+from quad_gym.kernels.filter.update import update
+from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.packing import form_of, params_block, params_record
 from quad_gym.params import VehicleParams
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, WORK_BLOCK, aligned_zeros

@@ -12,8 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym import validation as check
-from quad_gym.randomization import COLUMNS
-from quad_gym.records import Control, Layout, Source
+from quad_gym.records import COLUMNS, Control, Layout, Source
 
 OBSERVATIONS = {
     "estimate": Source.ESTIMATE,

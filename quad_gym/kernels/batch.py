@@ -1,14 +1,26 @@
 """The one entry that flies: a step, or a reset, of a range of blocks."""
 
-from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import entry, kernel
-from quad_gym.kernels.draws import impose
-from quad_gym.kernels.faults import meet_rotors
+import numpy as np
+from numba import types
+from numba.np.numpy_support import from_dtype
+
+from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
+from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.flight import begin_episode, tick
-from quad_gym.kernels.judge import judge
-from quad_gym.kernels.lanes import any_of, logical_not, select
-from quad_gym.kernels.observe import observe
-from quad_gym.records import WIDTH, Autoreset, Command
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    PARAMS_BLOCK,
+    SETTINGS,
+    WIDTH,
+    WORK_BLOCK,
+    Autoreset,
+    Command,
+)
+
+_IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
+_JUDGE, _OBSERVE = int(Stage.JUDGE), int(Stage.OBSERVE)
 
 
 @kernel
@@ -55,7 +67,7 @@ def _write_results(block, results, index):
 
 
 @kernel
-def _fly_step(flight, world, model, settings, work):
+def _fly_step(flight, world, model, settings, work, stages):
     """Fly a control period and judge it; return which lanes begin and which ended an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
     flight.position_fresh = 0.0
@@ -64,17 +76,42 @@ def _fly_step(flight, world, model, settings, work):
         flight.feature_fresh[i] = 0.0
     instant = flight.instant
     for _ in range(settings.ticks_per_step):
-        tick(flight, world, model, settings, work)
+        tick(flight, world, model, settings, work, stages)
     # a step that begins an episode draws nothing before it
     flight.instant = select(resetting, instant, flight.instant)
-    judge(flight, model, settings, logical_not(resetting))
+    work.mask = select(resetting, 0.0, 1.0)
+    call_stage(stages, _JUDGE, flight, world, model, settings, work, 0)
     done = (flight.terminated + flight.truncated) > 0.0
     flight.needs_reset = select(done, 1.0, flight.needs_reset)
     same_step = settings.autoreset == Autoreset.SAME_STEP
     return resetting | (done & (same_step | (flight.idle > 0.0))), done
 
 
-@entry
+def _array(kind, dimensions=1):
+    return types.Array(from_dtype(np.dtype(kind)), dimensions, "C")
+
+
+_ARGUMENTS = (
+    _array(FLIGHT_BLOCK),
+    types.int64,
+    types.int64,
+    types.int64,
+    _array(np.uint8),
+    _array(PARAMS_BLOCK),
+    _array(PARAMS_BLOCK),
+    _array(PARAMS_BLOCK),
+    _array(SETTINGS),
+    _array(WORK_BLOCK),
+    _array(STAGE_TABLE),
+    _array(np.float64, 2),
+    _array(np.float64),
+    _array(np.float64),
+    _array(np.float32, 2),
+    _array(np.float32, 2),
+    _array(np.float64, 2),
+)
+
+
 def fly(
     blocks,
     first_block,
@@ -86,6 +123,7 @@ def fly(
     model,
     settings,
     work,
+    stage_table,
     actions,
     low,
     high,
@@ -106,6 +144,7 @@ def fly(
         model: (1,) PARAMS_BLOCK: parameters as the filter and the controller believe them.
         settings: (1,) SETTINGS.
         work: (1,) WORK_BLOCK, used by no other thread.
+        stage_table: (1,) STAGE_TABLE, which has the stages that the settings need.
         actions: (n, 4); for STEP.
         low, high: (n_observation,) bounds of the observation space.
         observations: (n, n_observation), written; with no columns nothing is observed.
@@ -114,6 +153,7 @@ def fly(
         results: (n, 12), written in a STEP: see `quad_gym.records.RESULTS`.
     """
     scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
+    stages = stage_table[0]
     differ = todo.randomized > 0 or todo.faults > 0
     true = lanes_of(own[0]) if differ else nominal
     believed = true if todo.known else lanes_of(model[0])
@@ -121,9 +161,9 @@ def fly(
     for index in range(first_block, last_block):
         block, flight = blocks[index], lanes_of(blocks[index])
         if todo.randomized:
-            impose(flight, nominal, true, todo)
+            call_stage(stages, _IMPOSE, flight, true, nominal, todo, scratch, 0)
         if todo.faults:
-            meet_rotors(flight, true, todo)
+            call_stage(stages, _MEET_ROTORS, flight, true, believed, todo, scratch, 0)
         if command == Command.RESET:
             for lane in range(WIDTH):
                 known = index * WIDTH + lane < resets.shape[0]
@@ -131,19 +171,22 @@ def fly(
             begins = scratch.begins > 0.0
         else:
             _load_actions(block, actions, index)
-            begins, done = _fly_step(flight, true, believed, todo, scratch)
+            begins, done = _fly_step(flight, true, believed, todo, scratch, stages)
             _write_results(block, results, index)
             if observing:
-                observe(flight, believed, todo, scratch.observation)
+                call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
                 scratch.begins = select(begins & done, 1.0, 0.0)
                 _write_rows(
                     work[0].observation, low, high, final_observations, index, work[0].begins
                 )
         beginning = any_of(begins)
         if beginning:
-            begin_episode(flight, nominal, true, believed, todo, scratch, begins)
+            begin_episode(flight, nominal, true, believed, todo, scratch, stages, begins)
         if observing:
             if beginning or command == Command.RESET:
-                observe(flight, believed, todo, scratch.observation)
+                call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
             scratch.begins = select(flight.tick >= 0.0, 1.0, 0.0)
             _write_rows(work[0].observation, low, high, observations, index, work[0].begins)
+
+
+fly = entry(fly, types.none(*_ARGUMENTS))

@@ -3,17 +3,22 @@
 from enum import IntEnum
 
 from quad_gym.kernels.batch import _write_rows
-from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import entry
-from quad_gym.kernels.control import act
-from quad_gym.kernels.judge import judge
-from quad_gym.kernels.lanes import select
-from quad_gym.kernels.observe import observe
-from quad_gym.kernels.reference import evaluate_reference
-from quad_gym.kernels.sensors import drift_biases, measure_features, measure_gnss, measure_imu
-from quad_gym.kernels.ukf import predict
-from quad_gym.kernels.ukf_update import update
-from quad_gym.kernels.vehicle import integrate
+from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.filter.predict import predict
+from quad_gym.kernels.filter.update import update
+from quad_gym.kernels.sensors.measure import (
+    drift_biases,
+    measure_features,
+    measure_gnss,
+    measure_imu,
+)
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.task.observation import observe
+from quad_gym.kernels.task.reference import evaluate_reference
+from quad_gym.kernels.task.reward import judge
+from quad_gym.kernels.vehicle.control import act
+from quad_gym.kernels.vehicle.dynamics import integrate
 
 
 class Part(IntEnum):

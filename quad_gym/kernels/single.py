@@ -1,11 +1,23 @@
 """Entries for one flight: the scalar instances behind the friendly classes."""
 
-from quad_gym.kernels.air import accelerations_in_air
-from quad_gym.kernels.alignment import initialize
-from quad_gym.kernels.compilation import entry
-from quad_gym.kernels.linalg import add_outer, load3, load33, scale, scale33, store3, store33
-from quad_gym.kernels.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
-from quad_gym.kernels.sensors import (
+from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.filter.align import initialize
+from quad_gym.kernels.filter.predict import predict
+from quad_gym.kernels.filter.update import update
+from quad_gym.kernels.filter.wahba import wahba
+from quad_gym.kernels.maths.linalg import (
+    add_outer,
+    load3,
+    load4,
+    load33,
+    scale,
+    scale33,
+    store3,
+    store4,
+    store33,
+)
+from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
+from quad_gym.kernels.sensors.measure import (
     drift_biases,
     drift_gnss,
     measure_features,
@@ -13,10 +25,8 @@ from quad_gym.kernels.sensors import (
     measure_imu,
     measure_imu_average,
 )
-from quad_gym.kernels.ukf import predict
-from quad_gym.kernels.ukf_update import update
-from quad_gym.kernels.vehicle import accelerations, integrate, load4, load_state, store4
-from quad_gym.kernels.wahba import wahba
+from quad_gym.kernels.vehicle.air import accelerations_in_air
+from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
 
 
 @entry

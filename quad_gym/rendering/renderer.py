@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import validation as check
-from quad_gym.fault_fields import FaultKind
 from quad_gym.flight_record import Flight
 from quad_gym.flight_stage import Stage
-from quad_gym.records import FilterStatus, Gate
+from quad_gym.records import FaultKind, FilterStatus, Gate
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import kernel
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.records import WIDTH, aligned_zeros
 
 

@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import quad_gym
-from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import kernel
-from quad_gym.kernels.control import act, allocate
-from quad_gym.kernels.linalg import load3
-from quad_gym.kernels.vehicle import store4
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.linalg import load3, store4
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.vehicle.control import act, allocate
 from quad_gym.packing import params_block, params_record
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, Control, aligned_zeros
 

@@ -10,7 +10,12 @@ from scipy import signal, stats
 from scipy.linalg import expm
 
 import quad_gym
-from quad_gym.kernels.dryden import first_order, gust_scales, second_order, sinh_less_argument
+from quad_gym.kernels.vehicle.gusts import (
+    first_order,
+    gust_scales,
+    second_order,
+    sinh_less_argument,
+)
 from quad_gym.records import Control, Source
 from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import ALARM, alarm_score, assert_normal

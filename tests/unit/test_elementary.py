@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quad_gym.kernels.elementary import atan2, exp, log, sin_cos, sin_cos_minus_one
+from quad_gym.kernels.maths.elementary import atan2, exp, log, sin_cos, sin_cos_minus_one
 from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
 

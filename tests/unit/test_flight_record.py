@@ -13,13 +13,12 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
-from quad_gym.fault_fields import FaultKind
 from quad_gym.faults import GnssOutage, GnssOutliers
 from quad_gym.flight_files import table
 from quad_gym.flight_record import COLUMNS
 from quad_gym.flight_stage import Stage
 from quad_gym.frames import ecef_to_enu
-from quad_gym.records import Gate
+from quad_gym.records import FaultKind, Gate
 from quad_gym.rendering import record_flight
 from quad_gym.rotations import quaternion_to_dcm
 

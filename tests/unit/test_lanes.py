@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quad_gym.kernels.bits import fused_multiply_add, one_to_two, rotate_left, round_to_even
-from quad_gym.kernels.elementary import clip, is_finite, maximum, minimum
-from quad_gym.kernels.lanes import all_of, any_of, logical_not, select
+from quad_gym.kernels.maths.elementary import clip, is_finite, maximum, minimum
+from quad_gym.kernels.simd.bits import fused_multiply_add, one_to_two, rotate_left, round_to_even
+from quad_gym.kernels.simd.lanes import all_of, any_of, logical_not, select
 from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quad_gym.kernels import linalg
-from quad_gym.kernels.linalg import (
+from quad_gym.kernels.maths.linalg import (
     cholesky,
     load3,
     load33,

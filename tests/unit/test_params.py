@@ -7,8 +7,7 @@ import pytest
 
 import quad_gym
 from quad_gym.packing import params_record
-from quad_gym.params import MAX_GATES
-from quad_gym.sensor_params import MAX_FEATURES
+from quad_gym.records import MAX_FEATURES, MAX_GATES
 
 CLASSES = [
     quad_gym.VehicleParams,

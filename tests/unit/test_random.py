@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from quad_gym.kernels.random import normal_pair, threefry, uniform_pair
+from quad_gym.kernels.maths.random import normal_pair, threefry, uniform_pair
 from tests.unit.compiled import Compiled
 
 ALARM = 1e-6  # probability that a sound generator fails one statistical test

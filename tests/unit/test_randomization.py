@@ -11,9 +11,9 @@ from scipy import special, stats
 import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
 from quad_gym.distributions import Distribution
-from quad_gym.kernels.draws import normal_quantile
-from quad_gym.randomization import COLUMNS, DRAWABLES, DRAWN_SIZE, nominal_values
-from quad_gym.records import Control, Source
+from quad_gym.kernels.task.draws import normal_quantile
+from quad_gym.randomization import nominal_values
+from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, Control, Source
 from quad_gym.rotations import euler_to_dcm
 from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import ALARM, alarm_score

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.kernels.blocks import lanes_of
-from quad_gym.kernels.compilation import kernel
-from quad_gym.kernels.linalg import store3
-from quad_gym.kernels.reference import evaluate_reference, position_on_reference
-from quad_gym.kernels.sensors import stream_of
-from quad_gym.kernels.task import draw_reference
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.linalg import store3
+from quad_gym.kernels.maths.random import stream_of
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.task.episode import draw_reference
+from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.packing import settings_record
 from quad_gym.records import (
     FLIGHT,

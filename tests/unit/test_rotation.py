@@ -7,16 +7,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quad_gym import rotations
-from quad_gym.kernels.compilation import kernel
-from quad_gym.kernels.linalg import load3, store3, store33
-from quad_gym.kernels.rotation import (
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.linalg import load3, store3, store4, store33
+from quad_gym.kernels.maths.rotation import (
     dcm_to_quaternion,
     euler_to_dcm,
     quaternion_rate,
     quaternion_to_dcm,
     split_rotation,
 )
-from quad_gym.kernels.vehicle import store4
 from tests.unit.compiled import Compiled
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quad_gym.estimation import solve_wahba
-from quad_gym.kernels.linalg import load33, store33
-from quad_gym.kernels.wahba import wahba
+from quad_gym.kernels.filter.wahba import wahba
+from quad_gym.kernels.maths.linalg import load33, store33
 from quad_gym.rotations import euler_to_dcm
 from tests.unit.compiled import Compiled
 

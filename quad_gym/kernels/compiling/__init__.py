@@ -1,0 +1,6 @@
+"""How kernels are compiled: decorators, linking, the cache, processes that compile side by side."""
+
+from quad_gym.kernels.compiling.decorators import entry, kernel, routine
+from quad_gym.kernels.compiling.stages import Stage, call_stage, stage
+
+__all__ = ["Stage", "call_stage", "entry", "kernel", "routine", "stage"]

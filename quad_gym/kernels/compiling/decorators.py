@@ -1,0 +1,81 @@
+"""The decorators `kernel`, `routine` and `entry`.
+
+No fast-math flag is set: what is fused into a multiply-add is fused where numbers are lowered, see
+`kernels/simd/lanes.py`, so that a result does not depend on what surrounds its computation.
+"""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba.core.registry import CPUDispatcher
+
+from quad_gym.kernels.compiling.cache import cache_of
+
+_OPTIONS: dict[str, Any] = {"nopython": True, "boundscheck": None, "error_model": "numpy"}
+
+try:
+    if os.environ.get("QUAD_GYM_ORDINARY_NUMBA"):  # for tests of the fallback
+        raise ImportError
+    from quad_gym.kernels.compiling.linking import (
+        EntryCompiler,
+        KernelCompiler,
+        KernelDispatcher,
+    )
+except (ImportError, AttributeError):  # another Numba: slower to compile, the same flights
+    LEAN = False
+else:
+    LEAN = True
+"""Whether kernels stay IR until an entry links them."""
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile `function` into the compiled code that calls it, inlined: for small functions."""
+    if LEAN:
+        return _kernel(function, forceinline=True)
+    return numba.njit(forceinline=True, error_model="numpy")(function)
+
+
+def routine(function: Callable[..., Any]) -> Any:
+    """Compile `function` into the compiled code that calls it, out of line: for large functions."""
+    return _kernel(function) if LEAN else numba.njit(error_model="numpy")(function)
+
+
+def _kernel(function: Callable[..., Any], **options: Any) -> Any:
+    return KernelDispatcher(
+        py_func=function, targetoptions=_OPTIONS | options, pipeline_class=KernelCompiler
+    )
+
+
+class EntryDispatcher(CPUDispatcher):  # type: ignore[misc]
+    """Compiled code that Python calls: cached on disk, compiled by one process at a time."""
+
+    signature: Any = None
+    """the only types of arguments that it takes, if there is only one"""
+
+    def compile(self, signature: Any) -> Any:
+        """Load the compiled code for a signature, or compile it and keep it in the cache."""
+        arguments, _ = numba.core.sigutils.normalize_signature(signature)
+        if self.overloads.get(tuple(arguments)) is not None:
+            return super().compile(signature)
+        with self._cache.compiling_alone(signature, self.targetctx):
+            return super().compile(signature)
+
+    def is_cached(self) -> bool:
+        """Whether the code for its signature is loaded, or in the cache."""
+        return bool(self.overloads) or self._cache.holds(self.signature, self.targetctx)
+
+
+def entry(function: Callable[..., Any], signature: Any = None) -> Any:
+    """Compile `function` for calls from Python: cached on disk, running without the GIL.
+
+    Args:
+        function: What to compile.
+        signature: The Numba types of its arguments, so that it can be compiled ahead of a call.
+    """
+    lean = {"pipeline_class": EntryCompiler} if LEAN else {}
+    dispatcher = EntryDispatcher(py_func=function, targetoptions=_OPTIONS | {"nogil": True}, **lean)
+    dispatcher._cache = cache_of(function)
+    dispatcher.signature = signature
+    return dispatcher

@@ -1,0 +1,148 @@
+"""What relies on Numba's internals: kernels that stay LLVM IR until compiled code links them.
+
+Numba makes a library of every jitted function: it links what the function calls, optimizes the
+whole, and emits machine code and two wrappers for it, even if nothing but other jitted functions
+ever calls it. Nested kernels are so optimized and emitted once for every level above them. Here the
+library of a kernel is its unoptimized IR. An entry, the only thing that Python calls, links each
+kernel that it reaches once, and is the only thing that is optimized and emitted.
+
+A kernel's code therefore exists inside entries only, as a symbol that is internal to the entry's
+module: a large kernel can stand out of line without a second copy that another process might call.
+
+`AVAILABLE` says whether this Numba has the internals that this file needs. Where it has not,
+`decorators.py` uses ordinary `numba.njit`: slower to compile, the same flights.
+"""
+
+from typing import Any
+
+import llvmlite.binding as llvm
+from numba.core import codegen, compiler, typed_passes
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
+from numba.core.registry import CPUDispatcher
+
+
+class KernelLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+    """The IR of a kernel, and the libraries that it calls."""
+
+    def add_llvm_module(self, ll_module: Any) -> None:
+        """Keep the IR of a module as it is."""
+        ll_module.data_layout = self._codegen._data_layout
+        self._final_module.link_in(ll_module)
+
+    def finalize(self) -> None:
+        """Close the library; there is nothing to optimize or to emit."""
+        self._raise_if_finalized()
+        for library in self._linking_libraries:
+            self._reload_init.update(library._reload_init)
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def reached(self, seen: dict[Any, None]) -> None:
+        """Add all libraries below this one to `seen`, callees before callers."""
+        for library in self._linking_libraries:
+            if library not in seen:
+                if isinstance(library, KernelLibrary):
+                    library.reached(seen)
+                seen[library] = None
+
+
+class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+    """The code of an entry with all kernels that it reaches."""
+
+    def finalize(self) -> None:
+        """Link the kernels, optimize, and emit machine code."""
+        seen: dict[Any, None] = {}
+        for library in self._linking_libraries:
+            if isinstance(library, KernelLibrary):
+                library.reached(seen)
+            seen[library] = None
+        # callers first: LLVM links a function that may exist elsewhere only if it is wanted already
+        self._linking_libraries = list(seen)[::-1]
+        self._kernels = {
+            function.name
+            for library in seen
+            if isinstance(library, KernelLibrary)
+            for function in library._final_module.functions
+            if not function.is_declaration
+        }
+        super().finalize()
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if function.name in self._kernels and not function.is_declaration:
+                function.linkage = llvm.Linkage.internal
+        # one run: the cheap one before it, which Numba makes to prune reference counts, has nothing
+        # to prune in kernels
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class KernelLowering(typed_passes.NativeLowering):  # type: ignore[misc]
+    """Lower to IR, and stop there."""
+
+    _name = "quad_gym_kernel_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """Lower one kernel."""
+        state.library = KernelLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        flags = state.flags.copy()
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        state.flags = flags
+        super().run_pass(state)
+        lowered = state["cr"]
+        state.library._ensure_finalized()
+        handle = [].append  # a callable like no other: Numba finds the overload by its identity
+        state.targetctx.insert_user_function(handle, lowered.fndesc, [state.library])
+        state["cr"] = compiler._LowerResult(
+            lowered.fndesc, lowered.call_helper, cfunc=handle, env=lowered.env
+        )
+        return True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class EntryLowering(typed_passes.NativeLowering):  # type: ignore[misc]
+    """Lower, link, optimize and emit."""
+
+    _name = "quad_gym_entry_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """Compile one entry."""
+        flags = state.flags.copy()
+        flags.no_cfunc_wrapper = True
+        state.flags = flags
+        state.library = EntryLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return bool(super().run_pass(state))
+
+
+def _compiler_with(lowering: type) -> type:
+    class Compiler(CompilerBase):  # type: ignore[misc]
+        def define_pipelines(self) -> list[Any]:
+            passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+            for i, (kind, description) in enumerate(passes.passes):
+                if kind is typed_passes.NativeLowering:
+                    passes.passes[i] = (lowering, description)
+            passes.finalize()
+            return [passes]
+
+    return Compiler
+
+
+KernelCompiler, EntryCompiler = _compiler_with(KernelLowering), _compiler_with(EntryLowering)
+
+
+class KernelDispatcher(CPUDispatcher):  # type: ignore[misc]
+    """A kernel: other compiled code calls it, Python must not."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Refuse: a kernel has no machine code of its own.
+
+        Raises:
+            TypeError: Always.
+        """
+        raise TypeError(
+            f"{self.py_func.__name__} is a kernel, which only compiled code can call; "
+            "call it from a function decorated with quad_gym's `entry`"
+        )

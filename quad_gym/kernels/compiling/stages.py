@@ -1,0 +1,187 @@
+"""Stages: what a flight is made of, each compiled by itself and only where a flight needs it.
+
+A stage is a compiled function of fixed arguments that other compiled code calls through a table of
+addresses. What follows from it:
+
+* What a configuration lacks - faults, late measurements, moving air, the filter - is not compiled.
+* There are no variants: a stage is the same machine code whatever it is combined with, so a flight
+  has the same bits in every configuration that does not change it.
+* Stages compile side by side, and an edit of a kernel compiles the stages again that reach it.
+
+A call costs a few nanoseconds for all flights of a block together.
+"""
+
+from collections.abc import Callable
+from enum import IntEnum, auto
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numba.np.numpy_support import from_dtype
+
+from quad_gym.kernels.compiling.decorators import entry, kernel
+from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, Supply
+
+
+class Stage(IntEnum):
+    """The stages, by their places in the table of addresses."""
+
+    CONTROL = 0
+    SUPPLY = auto()
+    MOVE = auto()
+    MOVE_IN_AIR = auto()
+    BEGIN_IN_AIR = auto()
+    DRIFT_BIASES = auto()
+    AVERAGE_IMU = auto()
+    SAMPLE = auto()
+    BEGIN_FAULTS = auto()
+    ADVANCE_FAULTS = auto()
+    MEET_ROTORS = auto()
+    SATURATE_IMU = auto()
+    CORRUPT_GNSS = auto()
+    CORRUPT_FEATURES = auto()
+    PREDICT = auto()
+    UPDATE = auto()
+    ALIGN = auto()
+    WARM = auto()
+    BEGIN_LATE = auto()
+    INCREMENT = auto()
+    SET_ASIDE = auto()
+    EXCHANGE = auto()
+    LATE_UPDATE = auto()
+    BEGIN = auto()
+    DRAW = auto()
+    IMPOSE = auto()
+    LOOK = auto()
+    JUDGE = auto()
+    OBSERVE = auto()
+
+
+class Source(NamedTuple):
+    """Where a stage is, and which settings need it."""
+
+    module: str
+    function: str
+    needed: Callable[[Any], bool]
+
+
+def _always(s: Any) -> bool:
+    return True
+
+
+def _filter(s: Any) -> bool:
+    return bool(s["run_filter"])
+
+
+def _air(s: Any) -> bool:
+    return bool(s["air"])
+
+
+def _faults(s: Any) -> bool:
+    return bool(s["faults"])
+
+
+def _corrupts(s: Any) -> bool:
+    return bool(s["faults"] and s["run_filter"])
+
+
+def _late(s: Any) -> bool:
+    return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
+
+
+def _drawn(s: Any) -> bool:
+    return bool(s["randomized"])
+
+
+SOURCES = {
+    Stage.UPDATE: Source("filter.update", "update_stage", _filter),
+    Stage.PREDICT: Source("filter.predict", "predict_stage", _filter),
+    Stage.LATE_UPDATE: Source(
+        "filter.late", "late_update_stage", lambda s: _late(s) and s["rewinds"] > 0
+    ),
+    Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
+    Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
+    Stage.IMPOSE: Source("task.draws", "impose_stage", _drawn),
+    Stage.BEGIN: Source("task.episode", "begin_stage", _always),
+    Stage.MOVE_IN_AIR: Source("vehicle.air", "move_in_air_stage", _air),
+    Stage.ALIGN: Source("filter.align", "align_stage", _filter),
+    Stage.OBSERVE: Source("task.observation", "observe_stage", _always),
+    Stage.ADVANCE_FAULTS: Source("sensors.faults", "advance_faults_stage", _faults),
+    Stage.BEGIN_FAULTS: Source("sensors.faults", "begin_faults_stage", _faults),
+    Stage.CONTROL: Source("vehicle.control", "control_stage", _always),
+    Stage.MOVE: Source("vehicle.dynamics", "move_stage", lambda s: not _air(s)),
+    Stage.BEGIN_IN_AIR: Source("vehicle.air", "begin_in_air_stage", _air),
+    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _filter(s) and s["warm"] > 0),
+    Stage.AVERAGE_IMU: Source(
+        "sensors.measure", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
+    ),
+    Stage.CORRUPT_FEATURES: Source("sensors.faults", "corrupt_features_stage", _corrupts),
+    Stage.CORRUPT_GNSS: Source("sensors.faults", "corrupt_gnss_stage", _corrupts),
+    Stage.EXCHANGE: Source("filter.late", "exchange_stage", _late),
+    Stage.INCREMENT: Source("filter.late", "increment_stage", _late),
+    Stage.LOOK: Source("task.look", "look_stage", _always),
+    Stage.JUDGE: Source("task.reward", "judge_stage", _always),
+    Stage.DRIFT_BIASES: Source("sensors.measure", "drift_biases_stage", _filter),
+    Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
+    Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
+    Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),
+    Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
+    Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
+}
+"""Every stage; those that take longest to compile come first."""
+
+STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
+"""The addresses of the stages, 0 where one is not there."""
+
+
+def needed_stages(settings: Any) -> frozenset[Stage]:
+    """The stages that a batch of these settings (a SETTINGS record) flies through."""
+    return frozenset(stage for stage, source in SOURCES.items() if source.needed(settings))
+
+
+_DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)
+_ARGUMENTS = (*map(from_dtype, _DTYPES), types.int64)
+SIGNATURE = types.none(*_ARGUMENTS)
+"""Of every stage: flight, world, model, settings, work, stages, flag."""
+
+
+def stage(function: Callable[..., Any]) -> Any:
+    """Compile `function` as a stage.
+
+    Its arguments are a block of flights, the parameters as they are and as they are believed to be,
+    the settings, the workspace, the table of stages, and a number whose meaning is the stage's own.
+    `work.mask` holds the lanes that it is to work on.
+    """
+    return entry(function, SIGNATURE)
+
+
+@intrinsic
+def _call(typing_context, address, flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        kind = context.call_conv.get_function_type(types.none, _ARGUMENTS)
+        pointers = [
+            builder.bitcast(value, context.get_value_type(wanted))
+            for value, wanted in zip(args[1:7], _ARGUMENTS, strict=False)
+        ]
+        last = context.cast(builder, args[7], sig.args[7], types.int64)
+        context.call_conv.call_function(
+            builder,
+            builder.inttoptr(args[0], ir.PointerType(kind)),
+            types.none,
+            _ARGUMENTS,
+            [*pointers, last],
+        )
+        return context.get_dummy_value()
+
+    return types.none(address, flight, world, model, settings, work, stages, flag), lower
+
+
+@kernel
+def call_stage(stages, number, flight, world, model, settings, work, flag):
+    """Call a stage; the records are those that it is compiled for."""
+    address = stages.address[number]
+    if address == 0:
+        raise RuntimeError("a stage that the settings need is missing from the table")
+    _call(address, flight, world, model, settings, work, stages, flag)

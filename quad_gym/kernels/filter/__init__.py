@@ -1,0 +1,1 @@
+"""The unscented and the extended Kalman filter. Imports maths, vehicle and sensors."""

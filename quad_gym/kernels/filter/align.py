@@ -1,0 +1,148 @@
+"""The filter's start from its first fix: alignment, as navigators call it.
+
+Source: report section 3.4.2; heading of the mark and level starts are ours.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
+from quad_gym.kernels.filter.innovations import forget_innovations
+from quad_gym.kernels.filter.wahba import wahba
+from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.linalg import (
+    add33,
+    apply,
+    apply_transposed,
+    cholesky33,
+    dot,
+    keep3,
+    keep33,
+    keep_block,
+    load3,
+    load33,
+    load_block,
+    lower33,
+    multiply,
+    outer,
+    scale,
+    scale33,
+    select3,
+    select33,
+    solve_right33,
+    sub,
+    transpose,
+    unit_or,
+)
+from quad_gym.kernels.sensors.measure import look_along_mark
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import FilterForm
+
+_WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
+_NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
+_STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that tells no heading
+
+
+@kernel
+def _level_attitude(baseline_B, baseline_I):
+    """The level attitude R_BI in which a baseline has the heading it is seen to have."""
+    zero = 0.0 * baseline_B[0]
+    east = (zero + 1.0, zero, zero)
+    b = unit_or((baseline_B[0], baseline_B[1], zero), east)
+    i = unit_or((baseline_I[0], baseline_I[1], zero), east)
+    c, s = b[0] * i[0] + b[1] * i[1], b[0] * i[1] - b[1] * i[0]
+    return ((c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0))
+
+
+@kernel
+def _tie_position_to_attitude(L, R_BI, lever_B, mask):
+    """Put into L that the start's position hangs on its attitude, where `mask`.
+
+    The antenna was measured, and r = antenna - R^T l: with R = R(e) R_hat the error of the position
+    is that of the fix and J e, J = R_hat^T [l x].
+    """
+    zero = 0.0 * lever_B[0]
+    x, y, z = lever_B
+    J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
+    root_r, root_e = load_block(L, R, R), load_block(L, E, E)  # diagonal
+    tied = multiply(J, root_e)
+    factor, diagonal, _ = cholesky33(
+        add33(multiply(root_r, root_r), multiply(tied, transpose(tied)))
+    )
+    L_er = solve_right33(multiply(root_e, transpose(tied)), factor)
+    keep_block(L, R, R, mask, lower33(factor, diagonal))
+    keep_block(L, E, R, mask, L_er)
+    rest = scale33(-1.0, multiply(L_er, transpose(L_er)))
+    factor, diagonal, _ = cholesky33(add33(multiply(root_e, root_e), rest))
+    keep_block(L, E, E, mask, lower33(factor, diagonal))
+
+
+@kernel
+def initialize(flight, p, mask, x_I):
+    """Start the filter from the first fix, where `mask`.
+
+    Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
+    with equal weights, or level with the baseline's heading; position from the antenna; velocity
+    and biases zero. A level start knows that its position hangs on its attitude. The heading is the
+    less certain the steeper the baseline. Where that tells none to speak of, the body x axis joins
+    in Wahba's problem, or gives the heading; where nobody knows it either, the heading may be any.
+
+    Args:
+        flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
+        p: Parameters as the filter believes them.
+        mask: Which lanes.
+        x_I: Level direction in I of the body x axis, as the place of the start tells it; zero where
+            it tells none.
+    """
+    inflation = math.sqrt(p.initial_scale)
+    attitude = inflation * p.baseline_sigma
+    baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
+    level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
+    heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
+    placed = (level_share < _STEEP) & (dot(x_I, x_I) > 0.0)
+    heading = select(placed, inflation * p.heading_sigma, heading)
+
+    R_IG = load33(p.R_IG)
+    baseline_I = unit_or(apply(R_IG, load3(flight.gnss_baseline)), (1.0, 0.0, 0.0))
+    nothing = scale(0.0, x_I)
+    x_B = (nothing[0] + 1.0, nothing[1], nothing[2])
+    profile = add33(outer(baseline_B, baseline_I), outer(x_B, select3(placed, x_I, nothing)))
+    profile = (profile[0], profile[1], (profile[2][0], profile[2][1], profile[2][2] + 1.0))
+    R_BI, _ = wahba(profile)
+    level = p.initial_tilt_sigma > 0.0
+    ahead_B, ahead_I = select3(placed, x_B, baseline_B), select3(placed, x_I, baseline_I)
+    R_BI = select33(level, _level_attitude(ahead_B, ahead_I), R_BI)
+    antenna_I = apply(R_IG, load3(flight.gnss_position))
+    keep33(flight.R_hat, mask, R_BI)
+    keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
+    keep3(flight.v_hat, mask, (0.0, 0.0, 0.0))
+    keep3(flight.b_a_hat, mask, (0.0, 0.0, 0.0))
+    keep3(flight.b_g_hat, mask, (0.0, 0.0, 0.0))
+    flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
+    flight.prediction_failures = select(mask, 0.0, flight.prediction_failures)
+    flight.update_failures = select(mask, 0.0, flight.update_failures)
+
+    L = flight.L
+    for i in range(15):
+        for j in range(i + 1):
+            L[i, j] = select(mask, 0.0, L[i, j])
+    for i in range(3):
+        L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
+        L[V + i, V + i] = select(mask, math.sqrt(p.initial_velocity_variance), L[V + i, V + i])
+        angle = heading if i == 2 else select(level, p.initial_tilt_sigma, attitude)
+        L[E + i, E + i] = select(mask, angle, L[E + i, E + i])
+        L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
+        L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])
+    _tie_position_to_attitude(L, R_BI, load3(p.antenna), mask & level)
+
+
+@stage
+def align_stage(flight, world, model, settings, work, stages, flag):
+    """Start the filter from its first fix."""
+    flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
+    if (settings.form & _WATCH) != 0:
+        forget_innovations(flying, settings.feature_count, mask)
+    initialize(flying, lanes_of(model), mask, look_along_mark(flying, lanes_of(world)))

@@ -1,0 +1,358 @@
+"""Innovations block by block: their size, how large they were expected, and the gate.
+
+A block is a position, a baseline, a velocity or a feature. With the columns A and E of `ukf_update`
+and the block's measurement noise R its innovation has the covariance `S = A A^T + E E^T + (beta -
+alpha^2) mu mu^T + R` (3 x 3). A direction has two degrees of freedom: its innovation is taken
+across the predicted direction, for along it the length of a unit vector tells nothing.
+
+A block whose normalised innovation squared, chi-square in a filter that is right, lies beyond the
+gate is masked as if the flight lacked it. So is a feature whose predicted direction is too
+uncertain for a linear model: as a direction's error is bounded it would pass any gate, and its
+update would be wrong and sure of itself. Where one kind of measurement has been rejected
+`gate_patience` times in a row, the filter is likelier wrong than the sensor: `reopen_gates` adds
+the square of the innovation to the covariance of what the sensor measures, so that the next
+measurement passes and moves the estimate there, while all else keeps its covariance.
+
+Source: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 2001, sections 5.4 and 11.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.elementary import maximum
+from quad_gym.kernels.maths.linalg import (
+    add33,
+    add_outer,
+    add_to_diagonal,
+    apply,
+    cholesky,
+    cross,
+    dot,
+    load3,
+    load33,
+    load_block,
+    scale,
+    store_block,
+    sum_of_outers,
+    sum_of_outers_of_rows,
+    unit_or,
+)
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import (
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
+    POSITION_BLOCK,
+    VELOCITY_BLOCK,
+    FilterForm,
+    FilterStatus,
+    Gate,
+)
+
+_REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
+_FAILED, _UNSURE = float(Gate.FAILED), float(Gate.UNSURE)
+_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
+_GATE = int(FilterForm.GATE)
+
+
+@kernel
+def _covariance(p, work, k):
+    """S of the block that begins at row k of the stacked measurement."""
+    S = add33(
+        sum_of_outers_of_rows(work.A, work.A, k, k, 9),
+        sum_of_outers_of_rows(work.E, work.E, k, k, 9),
+    )
+    mu = (work.mu[k], work.mu[k + 1], work.mu[k + 2])
+    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
+    return add33(add_outer(S, scale(excess, mu), mu), load_block(work.Rz, k, k))
+
+
+@kernel
+def _nis_of_triple(S, nu):
+    """nu^T S^-1 nu by the Cholesky factor of S."""
+    l00 = math.sqrt(S[0][0])
+    l10, l20 = S[1][0] / l00, S[2][0] / l00
+    l11 = math.sqrt(S[1][1] - l10 * l10)
+    l21 = (S[2][1] - l20 * l10) / l11
+    l22 = math.sqrt(S[2][2] - l20 * l20 - l21 * l21)
+    y0 = nu[0] / l00
+    y1 = (nu[1] - l10 * y0) / l11
+    y2 = (nu[2] - l20 * y0 - l21 * y1) / l22
+    return y0 * y0 + y1 * y1 + y2 * y2
+
+
+@kernel
+def _across(u, S, nu):
+    """Innovation and covariance of a direction, across u: (side, up), (S_ss, S_us, S_uu)."""
+    side = unit_or((-u[1], u[0], 0.0 * u[0]), (1.0, 0.0, 0.0))  # vertical x u
+    up = cross(u, side)
+    S_side, S_up = apply(S, side), apply(S, up)
+    return (dot(side, nu), dot(up, nu)), (dot(side, S_side), dot(up, S_side), dot(up, S_up))
+
+
+@kernel
+def _nis_of_direction(S, nu):
+    """nu^T S^-1 nu of two numbers."""
+    l00 = math.sqrt(S[0])
+    l10 = S[1] / l00
+    y0 = nu[0] / l00
+    y1 = (nu[1] - l10 * y0) / math.sqrt(S[2] - l10 * l10)
+    return y0 * y0 + y1 * y1
+
+
+@kernel
+def _keep_block(flight, s, has, nu, sigma, nis, rejected, unsure):
+    """Write what is known of block s, where a lane has measured it."""
+    for i in range(3):
+        flight.innovation[s, i] = select(has, nu[i], flight.innovation[s, i])
+        flight.innovation_sigma[s, i] = select(has, sigma[i], flight.innovation_sigma[s, i])
+    flight.block_nis[s] = select(has, nis, flight.block_nis[s])
+    decision = select(unsure, _UNSURE, select(rejected, _REJECTED, _ACCEPTED))
+    flight.gate[s] = select(has, decision, flight.gate[s])
+    flight.rejections[s] = select(has & rejected, flight.rejections[s] + 1.0, flight.rejections[s])
+
+
+@kernel
+def _mask_block(work, k, rejected):
+    """Leave the block at row k out of the update, where `rejected`."""
+    for i in range(k, k + 3):
+        for j in range(9):
+            work.A[j, i] = select(rejected, 0.0, work.A[j, i])
+            work.E[j, i] = select(rejected, 0.0, work.E[j, i])
+        work.mu[i] = select(rejected, 0.0, work.mu[i])
+        work.z[i] = select(rejected, 0.0, work.z[i])
+        for j in range(k, k + 3):
+            work.Rz[i, j] = select(rejected, 1.0 if i == j else 0.0, work.Rz[i, j])
+
+
+@kernel
+def _count_in_row(flight, group, measured, rejected, again):
+    """Count a group's rejections in a row; an acceptance begins anew."""
+    row = select(rejected, flight.rejected_in_row[group] + 1.0, 0.0)
+    measured = measured & logical_not(again)
+    flight.rejected_in_row[group] = select(measured, row, flight.rejected_in_row[group])
+
+
+@kernel
+def _decide(flight, s, has, wanting, again, decision):
+    """Where a block is decided upon: as it is wanting or, in a later portion, as in the first."""
+    return has & ((wanting & logical_not(again)) | (again & (flight.gate[s] == decision)))
+
+
+@kernel
+def _judge_triple(flight, p, work, k, s, has, again, gating):
+    """Keep the innovation of a position or velocity; return where it is rejected."""
+    S = _covariance(p, work, k)
+    nu = (work.z[k], work.z[k + 1], work.z[k + 2])
+    nis = _nis_of_triple(S, nu)
+    rejected = _decide(flight, s, has, (nis > p.gate_position) & gating, again, _REJECTED)
+    sigma = (math.sqrt(S[0][0]), math.sqrt(S[1][1]), math.sqrt(S[2][2]))
+    nowhere = rejected & logical_not(rejected)
+    _keep_block(flight, s, has & logical_not(again), nu, sigma, nis, rejected, nowhere)
+    return rejected
+
+
+@kernel
+def _judge_direction(flight, p, work, k, s, has, again, gating, most):
+    """Keep the innovation of a direction; return where it is rejected, and where too uncertain.
+
+    Too uncertain is one whose predicted variances add up to more than `most`.
+    """
+    S = _covariance(p, work, k)
+    u = (work.h[k], work.h[k + 1], work.h[k + 2])
+    nu, S2 = _across(u, S, (work.z[k], work.z[k + 1], work.z[k + 2]))
+    nis = _nis_of_direction(S2, nu)
+    unsure = _decide(flight, s, has, (S2[0] + S2[2] > most) & gating, again, _UNSURE)
+    beyond = (nis > p.gate_direction) & gating & logical_not(unsure)
+    rejected = _decide(flight, s, has, beyond, again, _REJECTED)
+    none = np.nan + 0.0 * nis
+    sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), none)
+    has = has & logical_not(again)
+    _keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
+    return rejected, unsure
+
+
+@kernel
+def judge_innovations(
+    flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask, again
+):
+    """Keep the innovations of the present measurements and mask those beyond the gate.
+
+    Where measurements are taken in portions, the first decides for all.
+
+    Args:
+        flight: Record; keeps innovations, NIS, decisions and counters.
+        p: Parameters as the filter believes them.
+        work: Workspace, with `z` the innovation and `Rz` the measurement noise alone.
+        feature_count: Features in use.
+        use_position, use_baseline, use_velocity: Whether any lane has them.
+        form: A `FilterForm`.
+        mask: Which lanes.
+        again: Which lanes take a later portion of measurements that they have met before.
+
+    Returns:
+        How many measurements were masked in each lane.
+    """
+    gating = (form & _GATE) != 0
+    zero = 0.0 * p.sigma_beta
+    left_out = zero
+    k = 0
+    if use_position:
+        has = mask & (flight.position_valid > 0.0)
+        rejected = _judge_triple(flight, p, work, k, POSITION_BLOCK, has, again, gating)
+        if gating:
+            _mask_block(work, k, rejected)
+            _count_in_row(flight, POSITION_BLOCK, has, rejected, again)
+            left_out = left_out + select(rejected, 3.0, 0.0)
+        k += 3
+    if use_baseline:
+        has = mask & (flight.baseline_valid > 0.0)
+        rejected, _ = _judge_direction(
+            flight, p, work, k, BASELINE_BLOCK, has, again, gating, np.inf
+        )
+        if gating:
+            _mask_block(work, k, rejected)
+            _count_in_row(flight, BASELINE_BLOCK, has, rejected, again)
+            left_out = left_out + select(rejected, 3.0, 0.0)
+        k += 3
+    if use_velocity:
+        has = mask & (flight.velocity_valid > 0.0)
+        rejected = _judge_triple(flight, p, work, k, VELOCITY_BLOCK, has, again, gating)
+        if gating:
+            _mask_block(work, k, rejected)
+            _count_in_row(flight, VELOCITY_BLOCK, has, rejected, again)
+            left_out = left_out + select(rejected, 3.0, 0.0)
+        k += 3
+    seen, refused = zero, zero
+    for i in range(feature_count):
+        if any_of(flight.feature_valid[i] > 0.0):
+            has = mask & (flight.feature_valid[i] > 0.0)
+            s = FEATURE_BLOCKS + i
+            rejected, unsure = _judge_direction(
+                flight, p, work, k, s, has, again, gating, p.gate_uncertainty
+            )
+            if gating:
+                _mask_block(work, k, rejected | unsure)
+                left_out = left_out + select(rejected | unsure, 3.0, 0.0)
+                seen = seen + select(has & logical_not(unsure), 1.0, 0.0)
+                refused = refused + select(rejected, 1.0, 0.0)
+            k += 3
+    if gating and feature_count > 0:
+        _count_in_row(flight, FEATURE_BLOCKS, seen > 0.0, refused >= seen, again)
+    return left_out
+
+
+@kernel
+def _mark_block(flight, s, failed):
+    flight.gate[s] = select(failed, _FAILED, flight.gate[s])
+
+
+@kernel
+def mark_failed(flight, feature_count, failed):
+    """Say of the blocks of an update that failed as a whole that none was taken."""
+    _mark_block(flight, POSITION_BLOCK, failed & (flight.position_valid > 0.0))
+    _mark_block(flight, BASELINE_BLOCK, failed & (flight.baseline_valid > 0.0))
+    _mark_block(flight, VELOCITY_BLOCK, failed & (flight.velocity_valid > 0.0))
+    for i in range(feature_count):
+        _mark_block(flight, FEATURE_BLOCKS + i, failed & (flight.feature_valid[i] > 0.0))
+
+
+@kernel
+def _squares(nu, mask):
+    """The squares of an innovation on a diagonal, where `mask`, else zeros."""
+    x, y, z = select(mask, nu[0], 0.0), select(mask, nu[1], 0.0), select(mask, nu[2], 0.0)
+    zero = 0.0 * x
+    return ((x * x, zero, zero), (zero, y * y, zero), (zero, zero, z * z))
+
+
+@kernel
+def _add_to_covariance(flight, work, D_r, D_v, D_e, mask):
+    """P + D, with D of position, velocity and attitude error, where `mask`; return where it failed.
+
+    There the covariance stays as it was.
+    """
+    L, P = flight.L, work.P
+    for i in range(0, 15, 3):
+        for j in range(0, i + 3, 3):
+            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
+    store_block(P, 0, 0, add33(load_block(P, 0, 0), D_r))
+    store_block(P, 3, 3, add33(load_block(P, 3, 3), D_v))
+    store_block(P, 6, 6, add33(load_block(P, 6, 6), D_e))
+    ok = mask & (cholesky(P, 15, work.inverse_diagonal) > 0.0)
+    for i in range(15):
+        for j in range(i + 1):
+            L[i, j] = select(ok, P[i, j], L[i, j])
+    return mask & logical_not(ok)
+
+
+@kernel
+def reopen_gates(flight, p, work, feature_count, mask):
+    """Add the innovation's square to what a sensor measures, where it was rejected too long.
+
+    A position is doubted along its innovation's components; a baseline about the vertical and about
+    the horizontal apart; features put both the attitude and the position, at their distance, in
+    doubt.
+    """
+    patience = p.gate_patience
+    row = flight.rejected_in_row
+    position = mask & (row[POSITION_BLOCK] >= patience)
+    baseline = mask & (row[BASELINE_BLOCK] >= patience)
+    velocity = mask & (row[VELOCITY_BLOCK] >= patience)
+    camera = mask & (row[FEATURE_BLOCKS] >= patience)
+    doubtful = position | baseline | velocity | camera
+    if any_of(doubtful):
+        zero = 0.0 * p.sigma_beta
+        nu = flight.innovation
+        nothing = (zero, zero, zero)
+        D_e = (nothing, nothing, nothing)
+        D_r = _squares(nu[POSITION_BLOCK], position)
+        D_v = _squares(nu[VELOCITY_BLOCK], velocity)
+
+        R_BI = load33(flight.R_hat)
+        vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+        side = select(baseline, nu[BASELINE_BLOCK, 0], 0.0)
+        up = select(baseline, nu[BASELINE_BLOCK, 1], 0.0)
+        D_e = add_to_diagonal(D_e, up * up)
+        D_e = add_outer(D_e, scale(side * side - up * up, vertical), vertical)
+
+        angle, offset = zero, zero
+        for i in range(feature_count):
+            s = FEATURE_BLOCKS + i
+            seen = camera & (flight.feature_valid[i] > 0.0)
+            square = nu[s, 0] * nu[s, 0] + nu[s, 1] * nu[s, 1]
+            square = select(seen, square, 0.0)
+            to_feature = load3(p.features[i])
+            dx = to_feature[0] - flight.r_hat[0]
+            dy = to_feature[1] - flight.r_hat[1]
+            dz = to_feature[2] - flight.r_hat[2]
+            angle = maximum(angle, square)
+            offset = maximum(offset, square * (dx * dx + dy * dy + dz * dz))
+        D_e, D_r = add_to_diagonal(D_e, angle), add_to_diagonal(D_r, offset)
+        failed = _add_to_covariance(flight, work, D_r, D_v, D_e, doubtful)
+        flight.filter_status = select(
+            failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
+        )
+        flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
+        for group in range(4):
+            done = mask & (flight.rejected_in_row[group] >= patience)
+            flight.reopened[group] = select(
+                done, flight.reopened[group] + 1.0, flight.reopened[group]
+            )
+            flight.rejected_in_row[group] = select(done, 0.0, flight.rejected_in_row[group])
+
+
+@kernel
+def forget_innovations(flight, feature_count, mask):
+    """Begin an episode without innovations, where `mask`."""
+    for s in range(FEATURE_BLOCKS + feature_count):
+        flight.block_nis[s] = select(mask, np.nan, flight.block_nis[s])
+        flight.gate[s] = select(mask, 0.0, flight.gate[s])
+        flight.rejections[s] = select(mask, 0.0, flight.rejections[s])
+        for i in range(3):
+            flight.innovation[s, i] = select(mask, np.nan, flight.innovation[s, i])
+            flight.innovation_sigma[s, i] = select(mask, np.nan, flight.innovation_sigma[s, i])
+    for group in range(4):
+        flight.rejected_in_row[group] = select(mask, 0.0, flight.rejected_in_row[group])
+        flight.reopened[group] = select(mask, 0.0, flight.reopened[group])

@@ -1,0 +1,385 @@
+"""Measurements that reach the filter some time after they were taken, with their time stamps.
+
+A measurement waits in a flight's record, with what the IMU had summed up when it was taken. When
+it arrives, the estimate is taken back to that instant over the IMU's samples since then
+(`preintegration.py`), updated as ever, and taken on again. For the covariance the white noise of
+these samples is taken out on the way back and put in on the way on: it has nothing to do with the
+measurement. That neglects what measurements taken in between have told about this noise, and the
+drift of the biases in the meantime; filtering all over again from the time stamp, with every sample
+stored, would not.
+
+Source: Y. Bar-Shalom, H. Chen and M. Mallick, "One-step solution for the multistep out-of-sequence-
+measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 40(1), 2004.
+"""
+
+import numpy as np
+
+from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.filter.preintegration import (
+    NOISE,
+    add_increment,
+    begin_increments,
+    put_noise,
+    take_columns,
+    take_mean,
+)
+from quad_gym.kernels.maths.linalg import (
+    add_outer,
+    cholesky,
+    keep3,
+    keep33,
+    load3,
+    load33,
+    load_column3,
+    multiply,
+    scale,
+    store3,
+    store33,
+    store_block,
+    sub,
+    sum_of_outers,
+)
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import MAX_UNDER_WAY, FilterStatus
+
+_GNSS, _CAMERA, _PRESENT = 0, 1, 2
+_UPDATE = int(Stage.UPDATE)
+_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
+
+
+# ---- waiting ---------------------------------------------------------------------------------
+
+
+@kernel
+def begin_without_waiting(flight, mask):
+    """Begin an episode with nothing under way, where `mask`."""
+    begin_increments(flight, mask)
+    for sensor in range(2):
+        for slot in range(MAX_UNDER_WAY):
+            tick = flight.stamp_tick[sensor, slot]
+            flight.stamp_tick[sensor, slot] = select(mask, np.nan, tick)
+
+
+@kernel
+def set_aside(flight, work, settings):
+    """Keep what has arrived so far, before something new is measured."""
+    store3(work.kept_position, load3(flight.gnss_position))
+    store3(work.kept_baseline, load3(flight.gnss_baseline))
+    store3(work.kept_velocity, load3(flight.gnss_velocity))
+    for i in range(settings.feature_count):
+        work.kept_pixels[i, 0], work.kept_pixels[i, 1] = flight.pixels[i, 0], flight.pixels[i, 1]
+
+
+@kernel
+def _stamp(flight, sensor, taken):
+    """Move the stamps of a sensor on by a place and stamp the first with now, where `taken`."""
+    tick, turn, rates = flight.stamp_tick, flight.stamp_turn, flight.stamp_rates
+    velocity, position = flight.stamp_velocity, flight.stamp_position
+    gain = flight.stamp_bias_gain
+    for slot in range(MAX_UNDER_WAY - 1, 0, -1):
+        tick[sensor, slot] = select(taken, tick[sensor, slot - 1], tick[sensor, slot])
+        keep33(turn[sensor, slot], taken, load33(turn[sensor, slot - 1]))
+        keep33(gain[sensor, slot], taken, load33(gain[sensor, slot - 1]))
+        keep3(velocity[sensor, slot], taken, load3(velocity[sensor, slot - 1]))
+        keep3(position[sensor, slot], taken, load3(position[sensor, slot - 1]))
+        keep3(rates[sensor, slot], taken, load3(rates[sensor, slot - 1]))
+    tick[sensor, 0] = select(taken, flight.tick, tick[sensor, 0])
+    keep33(turn[sensor, 0], taken, load33(flight.imu_turn))
+    keep33(gain[sensor, 0], taken, load33(flight.imu_bias_gain))
+    keep3(velocity[sensor, 0], taken, load3(flight.imu_velocity))
+    keep3(position[sensor, 0], taken, load3(flight.imu_position))
+    keep3(rates[sensor, 0], taken, load3(flight.w_meas))
+
+
+@kernel
+def _exchange_gnss(flight, work, settings, mask, starting):
+    """Let GNSS measurements of now wait, and those of `gnss_delay` ticks ago arrive."""
+    wait = flight.late_valid
+    zero = 0.0 * flight.tick
+    p, b, v = zero, zero, zero
+    for slot in range(MAX_UNDER_WAY):
+        here = mask & (flight.stamp_tick[_GNSS, slot] == flight.tick - settings.gnss_delay)
+        keep3(work.kept_position, here, load3(flight.late_position[slot]))
+        keep3(work.kept_baseline, here, load3(flight.late_baseline[slot]))
+        keep3(work.kept_velocity, here, load3(flight.late_velocity[slot]))
+        p = select(here, wait[slot, 0], p)
+        b = select(here, wait[slot, 1], b)
+        v = select(here, wait[slot, 2], v)
+    flags = (flight.position_valid, flight.baseline_valid, flight.velocity_valid)
+    taken = mask & (flags[0] + flags[1] + flags[2] > 0.0)
+    if any_of(taken):
+        _stamp(flight, _GNSS, taken)
+        for slot in range(MAX_UNDER_WAY - 1, 0, -1):
+            keep3(flight.late_position[slot], taken, load3(flight.late_position[slot - 1]))
+            keep3(flight.late_baseline[slot], taken, load3(flight.late_baseline[slot - 1]))
+            keep3(flight.late_velocity[slot], taken, load3(flight.late_velocity[slot - 1]))
+            keep3(wait[slot], taken, load3(wait[slot - 1]))
+        keep3(flight.late_position[0], taken, load3(flight.gnss_position))
+        keep3(flight.late_baseline[0], taken, load3(flight.gnss_baseline))
+        keep3(flight.late_velocity[0], taken, load3(flight.gnss_velocity))
+        keep3(wait[0], taken, flags)
+    flight.position_valid = select(mask, p, flight.position_valid)
+    flight.baseline_valid = select(mask, b, flight.baseline_valid)
+    flight.velocity_valid = select(mask, v, flight.velocity_valid)
+    if not starting:  # a first fix has started the filter
+        store3(flight.gnss_position, load3(work.kept_position))
+        store3(flight.gnss_baseline, load3(work.kept_baseline))
+        store3(flight.gnss_velocity, load3(work.kept_velocity))
+        flight.position_fresh = select(p > 0.0, 1.0, flight.position_fresh)
+        flight.baseline_fresh = select(b > 0.0, 1.0, flight.baseline_fresh)
+
+
+@kernel
+def _keep_image(pixels, seen, slot, mask, new_pixels, new_seen, count):
+    for i in range(count):
+        for axis in range(2):
+            pixels[slot, i, axis] = select(mask, new_pixels[i, axis], pixels[slot, i, axis])
+        seen[slot, i] = select(mask, new_seen[i], seen[slot, i])
+
+
+@kernel
+def _exchange_camera(flight, work, settings, mask):
+    """Let the image of now wait, and the one of `camera_delay` ticks ago arrive."""
+    pixels, seen, count = flight.late_pixels, flight.late_seen, settings.feature_count
+    arrived = work.kept_seen
+    for i in range(count):
+        arrived[i] = 0.0 * flight.tick
+    for slot in range(MAX_UNDER_WAY):
+        here = mask & (flight.stamp_tick[_CAMERA, slot] == flight.tick - settings.camera_delay)
+        if any_of(here):
+            for i in range(count):
+                arrived[i] = select(here, seen[slot, i], arrived[i])
+                for axis in range(2):
+                    kept = work.kept_pixels[i, axis]
+                    work.kept_pixels[i, axis] = select(here, pixels[slot, i, axis], kept)
+    features = 0.0 * flight.tick
+    for i in range(count):
+        features = features + flight.feature_valid[i]
+    taken = mask & (features > 0.0)
+    if any_of(taken):
+        _stamp(flight, _CAMERA, taken)
+        for slot in range(MAX_UNDER_WAY - 1, 0, -1):
+            _keep_image(pixels, seen, slot, taken, pixels[slot - 1], seen[slot - 1], count)
+        _keep_image(pixels, seen, 0, taken, flight.pixels, flight.feature_valid, count)
+    for i in range(count):
+        flight.feature_valid[i] = select(mask, arrived[i], flight.feature_valid[i])
+        fresh = mask & (arrived[i] > 0.0)
+        flight.feature_fresh[i] = select(fresh, 1.0, flight.feature_fresh[i])
+        for axis in range(2):
+            flight.pixels[i, axis] = select(mask, work.kept_pixels[i, axis], flight.pixels[i, axis])
+
+
+@kernel
+def exchange(flight, work, settings, mask, starting):
+    """Let what late sensors measure now wait, and what they measured before arrive, where `mask`.
+
+    The measurements and flags of validity in the record become those that arrive.
+    """
+    if settings.gnss_delay > 0:
+        _exchange_gnss(flight, work, settings, mask, starting)
+    if settings.camera_delay > 0:
+        _exchange_camera(flight, work, settings, mask)
+
+
+# ---- arriving --------------------------------------------------------------------------------
+
+
+@kernel
+def _keep_estimate(flight, work):
+    """Copy the estimate, for lanes in which nothing arrives or an update fails."""
+    store3(work.kept_r, load3(flight.r_hat))
+    store3(work.kept_v, load3(flight.v_hat))
+    store33(work.kept_R, load33(flight.R_hat))
+    store3(work.kept_b_a, load3(flight.b_a_hat))
+    store3(work.kept_b_g, load3(flight.b_g_hat))
+    store3(work.kept_rates, load3(flight.w_meas))
+    work.kept_failures = flight.update_failures
+    for i in range(15):
+        for j in range(i + 1):
+            work.kept_L[i, j] = flight.L[i, j]
+
+
+@kernel
+def _find_stamp(flight, p, work, sensor, delay, arrived):
+    """Fill work.since_* with the instant at which was measured what arrives, else with now."""
+    store33(work.since_turn, load33(flight.imu_turn))
+    store33(work.since_bias_gain, load33(flight.imu_bias_gain))
+    store3(work.since_velocity, load3(flight.imu_velocity))
+    store3(work.since_position, load3(flight.imu_position))
+    for slot in range(MAX_UNDER_WAY):
+        here = arrived & (flight.stamp_tick[sensor, slot] == flight.tick - delay)
+        keep33(work.since_turn, here, load33(flight.stamp_turn[sensor, slot]))
+        keep33(work.since_bias_gain, here, load33(flight.stamp_bias_gain[sensor, slot]))
+        keep3(work.since_velocity, here, load3(flight.stamp_velocity[sensor, slot]))
+        keep3(work.since_position, here, load3(flight.stamp_position[sensor, slot]))
+        keep3(flight.w_meas, here, load3(flight.stamp_rates[sensor, slot]))
+    work.since_time = select(arrived, delay * p.dt, 0.0)
+    work.since_noise = select(arrived, 1.0, 0.0)
+    C_s, B_s = load33(work.since_turn), load33(work.since_bias_gain)
+    B = load33(flight.imu_bias_gain)
+    gain = (sub(B[0], B_s[0]), sub(B[1], B_s[1]), sub(B[2], B_s[2]))
+    store33(work.since_bias_gain, multiply(C_s, gain))
+
+
+@kernel
+def _factor_columns(flight, work, noise):
+    """L of the covariance of work.columns, whose noise counts `noise` times; its least pivot."""
+    M, P = work.columns, work.P
+    for i in range(0, 15, 3):
+        for j in range(0, i + 3, 3):
+            block = sum_of_outers(M, i, M, j, 15)
+            for k in range(NOISE, NOISE + 6):
+                block = add_outer(block, scale(noise, load_column3(M, i, k)), load_column3(M, j, k))
+            store_block(P, i, j, block)
+    pivot = cholesky(P, 15, work.inverse_diagonal)
+    for i in range(15):
+        for j in range(i + 1):
+            flight.L[i, j] = P[i, j]
+    return pivot
+
+
+@kernel
+def _load_factor(flight, work):
+    """Fill the first fifteen columns of work.columns with L."""
+    zero = 0.0 * work.since_time
+    for i in range(15):
+        for j in range(15):
+            work.columns[i, j] = flight.L[i, j] if j <= i else zero
+
+
+@kernel
+def _carry(flight, p, work, back):
+    """Take the estimate to the time stamp of what arrives, or from there to the present.
+
+    Where more noise than uncertainty would be left out on the way back, the noise is left in.
+
+    Returns:
+        Where the covariance stays positive definite.
+    """
+    _load_factor(flight, work)
+    R_s, dR, dv, dr = take_mean(flight, p, work, back)
+    put_noise(p, work, R_s, dR, dv)
+    take_columns(work, R_s, dR, dv, dr, back)
+    noise, sign = work.since_noise, -1.0 if back else 1.0
+    good = noise > 0.0
+    for _ in range(2):
+        good = _factor_columns(flight, work, sign * noise) > 0.0
+        if not any_of(logical_not(good)):
+            break
+        if back:
+            noise = select(good, noise, 0.0)
+    work.since_noise = noise
+    return good
+
+
+@kernel
+def _restore_estimate(flight, work, arrived, good):
+    """Undo what has happened but where something arrived and all went well."""
+    old = logical_not(arrived & good)
+    keep3(flight.r_hat, old, load3(work.kept_r))
+    keep3(flight.v_hat, old, load3(work.kept_v))
+    keep33(flight.R_hat, old, load33(work.kept_R))
+    keep3(flight.b_a_hat, old, load3(work.kept_b_a))
+    keep3(flight.b_g_hat, old, load3(work.kept_b_g))
+    for i in range(15):
+        for j in range(i + 1):
+            flight.L[i, j] = select(old, work.kept_L[i, j], flight.L[i, j])
+    store3(flight.w_meas, load3(work.kept_rates))
+    failed = arrived & old
+    status = flight.filter_status
+    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
+    failures = select(failed, work.kept_failures + 1.0, flight.update_failures)
+    flight.update_failures = failures
+
+
+@kernel
+def _count_arrived(flight, settings, sensor):
+    """How many measurements of a late sensor arrive now, lane by lane."""
+    if sensor == _GNSS:
+        return flight.position_valid + flight.baseline_valid + flight.velocity_valid
+    count = 0.0 * flight.tick
+    for i in range(settings.feature_count):
+        count = count + flight.feature_valid[i]
+    return count
+
+
+@kernel
+def update_in_turn(flight, p, work, settings, stages, mask):
+    """Update with what has arrived, where `mask`: late fixes, late images, then what is fresh.
+
+    Args:
+        flight: Record; reads the measurements and their validity, changes the estimate.
+        p: Parameters as the filter believes them.
+        work: Workspace.
+        settings: Which sensors are late.
+        stages: Has the update.
+        mask: Which lanes.
+    """
+    late_gnss, late_camera = settings.gnss_delay > 0, settings.camera_delay > 0
+    flags = (flight.position_valid, flight.baseline_valid, flight.velocity_valid)
+    for turn in range(_GNSS, _PRESENT + 1):
+        late = turn != _PRESENT
+        fixes = turn == (_GNSS if late_gnss else _PRESENT)
+        images = turn == (_CAMERA if late_camera else _PRESENT)
+        if not (fixes or images):
+            continue
+        share = 1.0 if fixes else 0.0
+        flight.position_valid = share * flags[0]
+        flight.baseline_valid = share * flags[1]
+        flight.velocity_valid = share * flags[2]
+        features = settings.feature_count if images else 0
+        arrived = mask
+        if late:
+            arrived = mask & (_count_arrived(flight, settings, turn) > 0.0)
+            if not any_of(arrived):
+                continue
+            _keep_estimate(flight, work)
+            delay = settings.gnss_delay if turn == _GNSS else settings.camera_delay
+            _find_stamp(flight, p, work, turn, delay, arrived)
+        good = arrived
+        for leg in range(2 if late else 1):  # loops, so that there is one copy of what is in them
+            if late:
+                good = good & _carry(flight, p, work, leg == 0)
+            if leg == 0:
+                work.mask = select(good, 1.0, 0.0)
+                call_stage(stages, _UPDATE, flight, p, p, settings, work, features)
+        if late:
+            good = good & (flight.update_failures == work.kept_failures)
+            _restore_estimate(flight, work, arrived, good)
+    flight.position_valid, flight.baseline_valid, flight.velocity_valid = flags
+
+
+# ---- stages ----------------------------------------------------------------------------------
+
+
+@stage
+def begin_late_stage(flight, world, model, settings, work, stages, flag):
+    """Begin an episode with no measurement under way."""
+    begin_without_waiting(lanes_of(flight), lanes_of(work).mask > 0.0)
+
+
+@stage
+def increment_stage(flight, world, model, settings, work, stages, flag):
+    """Add the tick's IMU sample to the sums that late measurements go back by."""
+    add_increment(lanes_of(flight), lanes_of(model), settings.form)
+
+
+@stage
+def set_aside_stage(flight, world, model, settings, work, stages, flag):
+    """Keep what has arrived so far, before something new is measured."""
+    set_aside(lanes_of(flight), lanes_of(work), settings)
+
+
+@stage
+def exchange_stage(flight, world, model, settings, work, stages, flag):
+    """Let new measurements wait and old ones arrive; `flag`: whether an episode begins."""
+    scratch = lanes_of(work)
+    exchange(lanes_of(flight), scratch, settings, scratch.mask > 0.0, flag > 0)
+
+
+@stage
+def late_update_stage(flight, world, model, settings, work, stages, flag):
+    """Update with what has arrived, late or fresh."""
+    scratch = lanes_of(work)
+    update_in_turn(lanes_of(flight), lanes_of(model), scratch, settings, stages, scratch.mask > 0.0)

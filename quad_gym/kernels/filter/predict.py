@@ -1,0 +1,305 @@
+"""The unscented Kalman filter of the report, with its structure used and its result unchanged.
+
+State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The
+filter stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are those of
+the augmented filter (27 columns in the prediction, 15 + n_z in the update), but
+
+* the augmented factor is block diagonal, so that noise which enters linearly contributes in closed
+  form, and so do the columns for states on which a model does not depend: 9 pairs of points remain;
+* a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and its half-sum less the
+  centre s, for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the
+  moments are
+      mean = f(x0) + mu,  mu = sum s / c^2
+      cov  = sum (a a^T + s s^T) / c^2 + (beta - alpha^2) mu mu^T + noise
+  in which nothing cancels, unlike in the usual weights near -1e6;
+* the update never forms P_zz. With A and E the columns a / c and s / c of the measurement, and Rz =
+  E E^T + (beta - alpha^2) mu mu^T + R its noise, so that P_zz = A A^T + Rz, the matrix inversion
+  lemma gives  P+ = L (I + C C^T)^-1 L^T  with  C = A^T Rz^-T/2  over the nine columns that matter.
+  The new factor is L times the factor of that inverse, lower triangular again, and stays accurate
+  when a measurement is 10^8 times as good as the prediction.
+
+Sources: report section 3.4; S. J. Julier and J. K. Uhlmann, Proc. IEEE 92(3), 2004.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
+from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
+from quad_gym.kernels.maths.elementary import is_finite
+from quad_gym.kernels.maths.linalg import (
+    add,
+    add33,
+    add_outer,
+    add_to_diagonal,
+    apply,
+    apply_transposed,
+    cholesky,
+    cross,
+    keep3,
+    keep33,
+    load3,
+    load33,
+    load_block,
+    load_column3,
+    multiply,
+    scale,
+    scale33,
+    store_block,
+    sub,
+    sum_of_outers,
+    sum_of_squares,
+)
+from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation, vector_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import FilterForm, FilterStatus
+
+_EKF, _MIDPOINT, _TURN = int(FilterForm.EKF), int(FilterForm.MIDPOINT), int(FilterForm.TURN)
+_PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
+
+
+@kernel
+def _euler_rate_parts(parts, w_B, dg):
+    """The parts odd and even in the sigma offset of S(e) (w_B - dg), the even one less w_B.
+
+    S(e) turns body rates into rates of the error Euler angles; e and dg change sign together.
+    """
+    s_phi, m_phi, s_th, m_th = parts
+    c_phi, c_th = 1.0 + m_phi, 1.0 + m_th
+    t_phi = s_phi / c_phi
+    odd = (
+        s_th * w_B[2] - c_th * dg[0],
+        -dg[1] - t_phi * (s_th * dg[0] + c_th * w_B[2]),
+        (-s_th * w_B[0] - c_th * dg[2]) / c_phi,
+    )
+    even = (
+        m_th * w_B[0] - s_th * dg[2],
+        t_phi * (s_th * w_B[0] + c_th * dg[2]),
+        (s_th * dg[0] + (m_th - m_phi) * w_B[2]) / c_phi,
+    )
+    return odd, even
+
+
+@kernel
+def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
+    """Offset of the measured force along c times column j of L, in the frame of the tick's start.
+
+    Halfway through the tick, an offset of the gyro's bias has turned the force by half its angle.
+    """
+    df = scale(c, load_column3(L, BA, j))
+    if midpoint:
+        dg = scale(c, load_column3(L, BG, j))
+        df = apply_transposed(half, add(df, scale(half_dt, cross(dg, f_B))))
+    return df
+
+
+@kernel
+def _propagate_columns(flight, p, work, f_B, w_B, half, form):
+    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's."""
+    L, F, S = flight.L, work.F, work.S
+    R_BI = load33(flight.R_hat)
+    dt = p.dt
+    half_dt, half_dt2 = 0.5 * dt, 0.5 * dt * dt
+    midpoint, extended = (form & _MIDPOINT) != 0, (form & _EKF) != 0
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 27.0)
+    inverse_c = 1.0 / c
+    zero = 0.0 * c
+    nothing = (zero, zero, zero)
+    mean_a, mean_e = nothing, nothing
+    f_start, full = f_B, half
+    if midpoint:
+        f_start, full = apply_transposed(half, f_B), multiply(half, half)
+
+    for j in range(9):
+        if extended:
+            df = _force_offset(L, j, 1.0, f_B, half, half_dt, midpoint)
+            a_odd, a_even = acceleration_column(L, j, R_BI, f_start, df), nothing
+            e_odd, e_even = angle_column(L, j, w_B, dt), nothing
+        else:
+            d, dg = scale(c, load_column3(L, E, j)), scale(c, load_column3(L, BG, j))
+            df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
+            even, odd, parts = split_rotation(d)
+            # a_I = R^T R(e)^T (f - b_a) - g: its odd part in the offset, its even less the centre
+            odd_B = sub(sub(apply_transposed(odd, f_start), df), apply_transposed(even, df))
+            even_B = sub(apply_transposed(even, f_start), apply_transposed(odd, df))
+            a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
+            a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
+            rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
+            e_odd = scale(inverse_c, add(d, scale(dt, rate_odd)))
+            e_even = scale(dt * inverse_c, rate_even)
+        if midpoint:
+            e_odd, e_even = _turned_angles(L, j, full, half, dt), nothing
+
+        v_j = load_column3(L, V, j)
+        r_j = add(load_column3(L, R, j), scale(dt, v_j))
+        for i in range(3):
+            F[R + i, j] = r_j[i] + half_dt2 * a_odd[i]
+            F[V + i, j] = v_j[i] + dt * a_odd[i]
+            F[E + i, j] = e_odd[i]
+            S[R + i, j] = half_dt2 * a_even[i]
+            S[V + i, j] = dt * a_even[i]
+            S[E + i, j] = e_even[i]
+        mean_a, mean_e = add(mean_a, a_even), add(mean_e, e_even)
+
+    for j in range(9, 15):  # offsets of the biases alone: linear
+        df = _force_offset(L, j, -1.0, f_B, half, half_dt, midpoint)
+        a_odd, e_odd = apply_transposed(R_BI, df), scale(-dt, load_column3(L, BG, j))
+        if midpoint:
+            e_odd = apply(half, e_odd)
+        for i in range(3):
+            F[R + i, j] = half_dt2 * a_odd[i]
+            F[V + i, j] = dt * a_odd[i]
+            F[E + i, j] = e_odd[i]
+
+    mean_a = scale(inverse_c, mean_a)
+    return scale(half_dt2, mean_a), scale(dt, mean_a), scale(inverse_c, mean_e)
+
+
+@kernel
+def _turned_angles(L, j, full, half, dt):
+    """Column j of the error angles about the new R_hat, R_half (R_half e - dt b_g)."""
+    turned = apply(full, load_column3(L, E, j))
+    return sub(turned, scale(dt, apply(half, load_column3(L, BG, j))))
+
+
+@kernel
+def _add_gyro_noise(P, p, R_BI, f_B, half):
+    """Add the gyro's white noise to P; half of the angle by which it errs turns the force."""
+    dt, sigma = p.dt, p.gyro_sigma
+    zero = 0.0 * dt
+    axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
+    for axis in axes:
+        dv = apply_transposed(R_BI, apply_transposed(half, cross(f_B, axis)))
+        dv = scale(0.5 * dt * dt, dv)
+        dr, de = scale(0.5 * dt, dv), scale(-dt, apply(half, axis))
+        store_block(P, R, R, add_outer(load_block(P, R, R), dr, dr))
+        store_block(P, V, R, add_outer(load_block(P, V, R), dv, dr))
+        store_block(P, V, V, add_outer(load_block(P, V, V), dv, dv))
+        store_block(P, E, R, add_outer(load_block(P, E, R), de, dr))
+        store_block(P, E, V, add_outer(load_block(P, E, V), de, dv))
+        store_block(P, E, E, add_outer(load_block(P, E, E), de, de))
+
+
+@kernel
+def _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form):
+    """Fill the lower triangle of work.P from the propagated pairs and the process noise.
+
+    The gyro's noise is added here only where it enters through the tick's start.
+    """
+    L, F, S, P = flight.L, work.F, work.S, work.P
+    dt = p.dt
+    half_dt2 = 0.5 * dt * dt
+    decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
+    accel_variance = p.accel_sigma * p.accel_sigma
+    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
+    extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
+    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
+
+    for i in range(0, 9, 3):
+        mean_i = mean_r if i == R else (mean_v if i == V else mean_e)
+        block = sum_of_squares(F, i, 15)
+        if not extended:
+            block = add33(block, sum_of_squares(S, i, 9))
+            block = add_outer(block, scale(excess, mean_i), mean_i)
+        store_block(P, i, i, block)
+        for j in range(0, i, 3):
+            mean_j = mean_r if j == R else mean_v
+            block = sum_of_outers(F, i, F, j, 15)
+            if not extended:
+                block = add33(block, sum_of_outers(S, i, S, j, 9))
+                block = add_outer(block, scale(excess, mean_i), mean_j)
+            store_block(P, i, j, block)
+    for i in range(3):
+        P[R + i, R + i] += half_dt2 * half_dt2 * accel_variance
+        P[V + i, R + i] += half_dt2 * dt * accel_variance
+        P[V + i, V + i] += dt * dt * accel_variance
+        P[E + i, E + i] += gyro_variance
+
+    # the biases are linear: their rows of the propagated columns are those of L times the decay
+    for j in range(0, 9, 3):
+        store_block(P, BA, j, scale33(decay_a, sum_of_outers(L, BA, F, j, 12)))
+        store_block(P, BG, j, scale33(decay_g, sum_of_outers(L, BG, F, j, 15)))
+    aa, ga, gg = (
+        sum_of_squares(L, BA, 12),
+        sum_of_outers(L, BG, L, BA, 12),
+        sum_of_squares(L, BG, 15),
+    )
+    drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
+    store_block(P, BA, BA, add_to_diagonal(scale33(decay_a * decay_a, aa), drive_a * drive_a))
+    store_block(P, BG, BA, scale33(decay_g * decay_a, ga))
+    store_block(P, BG, BG, add_to_diagonal(scale33(decay_g * decay_g, gg), drive_g * drive_g))
+
+
+@kernel
+def predict(flight, p, work, form=0):
+    """Carry the estimate over one tick with its IMU sample.
+
+    The report's form, with the sample as of the tick's start:
+    `a = R^T (f_meas - b_a - v_a) - g e3`, `r+ = r + v dt + a dt^2/2`, `v+ = v + a dt`,
+    `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`, where R_hat turns by R(mean e+).
+
+    With MIDPOINT, the sample as of the whole tick: R_hat turns by exp(-[dt w x]), and R in `a` is
+    the attitude halfway. The error angles count from the new R_hat at once: with R_half =
+    exp(-[dt w x] / 2), `e+ = R_half (R_half e - dt (b_g + v_g))`, and the force turns by half of
+    what the gyro's error turns the attitude.
+
+    With TURN, the covariance turns with the reset of e, see `error_state.py`; with EKF, derivatives
+    take the place of sigma points, see `ekf.py`.
+
+    A lane whose predicted covariance is not positive definite keeps its state and sets
+    PREDICTION_FAILED, and counts it.
+
+    Args:
+        flight: Record; reads gyro and accel, changes the estimate.
+        p: Parameters as the filter believes them.
+        work: Workspace.
+        form: A `FilterForm`.
+    """
+    dt = p.dt
+    midpoint = (form & _MIDPOINT) != 0
+    w_B = sub(load3(flight.gyro), load3(flight.b_g_hat))
+    f_B = sub(load3(flight.accel), load3(flight.b_a_hat))
+    R_BI = load33(flight.R_hat)
+    half = R_BI  # not read but with MIDPOINT
+    if midpoint:
+        half = vector_to_dcm(scale(0.5 * dt, w_B))
+    mean_r, mean_v, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form)
+    _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form)
+    turn = add(scale(dt, w_B), mean_e)
+    if midpoint:
+        _add_gyro_noise(work.P, p, R_BI, f_B, half)
+        R_pred, f_B = multiply(half, multiply(half, R_BI)), apply_transposed(half, f_B)
+    else:
+        R_pred = multiply(euler_to_dcm(turn), R_BI)
+        if (form & _TURN) != 0:
+            turn_covariance(work.P, reset_matrix(turn))
+    ok = cholesky(work.P, 15, work.inverse_diagonal) > 0.0
+
+    a_I = apply_transposed(R_BI, f_B)
+    a_I = (a_I[0], a_I[1], a_I[2] - p.gravity)
+    r, v = load3(flight.r_hat), load3(flight.v_hat)
+    r_pred = add(add(add(r, scale(dt, v)), scale(0.5 * dt * dt, a_I)), mean_r)
+    v_pred = add(add(v, scale(dt, a_I)), mean_v)
+    ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
+
+    keep3(flight.r_hat, ok, r_pred)
+    keep3(flight.v_hat, ok, v_pred)
+    keep33(flight.R_hat, ok, R_pred)
+    keep3(flight.b_a_hat, ok, scale(p.accel_bias_decay, load3(flight.b_a_hat)))
+    keep3(flight.b_g_hat, ok, scale(p.gyro_bias_decay, load3(flight.b_g_hat)))
+    for i in range(15):
+        for j in range(i + 1):
+            flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    flight.filter_status = select(
+        ok, flight.filter_status, flight.filter_status | _PREDICTION_FAILED
+    )
+    flight.prediction_failures = flight.prediction_failures + select(ok, 0.0, 1.0)
+
+
+@stage
+def predict_stage(flight, world, model, settings, work, stages, flag):
+    """Carry the estimate over a tick."""
+    predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form)

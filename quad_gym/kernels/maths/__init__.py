@@ -1,0 +1,1 @@
+"""Elementary functions, small linear algebra, rotations and random numbers. Imports simd."""

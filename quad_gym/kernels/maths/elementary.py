@@ -1,0 +1,267 @@
+"""Elementary functions on any number type, within a few units in the last place of the C library.
+
+The polynomials are those of fdlibm (Sun Microsystems, 1993), the public-domain ancestor of most C
+libraries; here without branches, so that eight lanes can take them together.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.simd.bits import (
+    exponent_of,
+    fused_multiply_add,
+    library_cos,
+    library_sin,
+    mantissa_of,
+    power_of_two,
+    round_to_even,
+)
+from quad_gym.kernels.simd.lanes import any_of, select
+
+# pi/2 in three parts of 33 bits and a rest: k * part is exact for |k| < 2^20 (Cody and Waite)
+_PIO2_1, _PIO2_2, _PIO2_3 = (
+    1.57079632673412561417e00,
+    6.07710050630396597660e-11,
+    2.02226624871116645580e-21,
+)
+_PIO2_REST = 8.47842766036889956997e-32
+_REDUCIBLE = 1e6
+_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_SMALL_ANGLE = 0.05
+
+
+@kernel
+def minimum(a, b):
+    """The smaller of two numbers; `b` where either is NaN."""
+    return select(a < b, a, b)
+
+
+@kernel
+def maximum(a, b):
+    """The larger of two numbers; `b` where either is NaN."""
+    return select(a > b, a, b)
+
+
+@kernel
+def clip(x, low, high):
+    """`x` held within [low, high]."""
+    return minimum(maximum(x, low), high)
+
+
+@kernel
+def is_finite(x):
+    """Whether x is neither infinite nor NaN."""
+    return abs(x) <= 1.7976931348623157e308
+
+
+@kernel
+def sin_near_zero(x):
+    """Sin x for |x| <= pi/4."""
+    z = x * x
+    return x + x * z * (
+        -1.66666666666666324348e-01
+        + z
+        * (
+            8.33333333332248946124e-03
+            + z
+            * (
+                -1.98412698298579493134e-04
+                + z
+                * (
+                    2.75573137070700676789e-06
+                    + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)
+                )
+            )
+        )
+    )
+
+
+@kernel
+def cos_near_zero_minus_one(x):
+    """Cos x - 1 for |x| <= pi/4."""
+    z = x * x
+    return -0.5 * z + z * z * (
+        4.16666666666666019037e-02
+        + z
+        * (
+            -1.38888888888741095749e-03
+            + z
+            * (
+                2.48015872894767294178e-05
+                + z
+                * (
+                    -2.75573143513906633035e-07
+                    + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
+                )
+            )
+        )
+    )
+
+
+@kernel
+def quarter_turns(sine, cosine, quadrant):
+    """(sin, cos) of an angle, from those of the angle less `quadrant` (0 to 4) quarter turns."""
+    odd = (quadrant == 1.0) | (quadrant == 3.0)
+    turned_sine, turned_cosine = select(odd, cosine, sine), select(odd, sine, cosine)
+    return (
+        select((quadrant == 2.0) | (quadrant == 3.0), -turned_sine, turned_sine),
+        select((quadrant == 1.0) | (quadrant == 2.0), -turned_cosine, turned_cosine),
+    )
+
+
+@kernel
+def sin_cos(x):
+    """(sin x, cos x), for any x [rad]."""
+    turns = round_to_even(x * 0.63661977236758138243)
+    reduced = fused_multiply_add(-turns, _PIO2_1, x)
+    reduced = fused_multiply_add(-turns, _PIO2_2, reduced)
+    reduced = fused_multiply_add(-turns, _PIO2_3, reduced)
+    reduced = fused_multiply_add(-turns, _PIO2_REST, reduced)
+    quadrant = turns - 4.0 * round_to_even(0.25 * turns - 0.375)
+    sine, cosine = quarter_turns(
+        sin_near_zero(reduced), 1.0 + cos_near_zero_minus_one(reduced), quadrant
+    )
+    small_enough = abs(x) < _REDUCIBLE
+    if any_of(abs(x) >= _REDUCIBLE):
+        sine = select(small_enough, sine, library_sin(x))
+        cosine = select(small_enough, cosine, library_cos(x))
+    return sine, cosine
+
+
+@kernel
+def sin_cos_minus_one(x):
+    """(sin x, cos x - 1) without cancellation, fastest for |x| < 0.05 rad as of sigma points."""
+    z = x * x
+    sine = x + x * z * (-1.0 / 6.0 + z * (1.0 / 120.0 - z * (1.0 / 5040.0)))
+    rest = z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40320.0))))
+    if any_of(abs(x) >= _SMALL_ANGLE):
+        full_sine, _ = sin_cos(x)
+        half_sine, _ = sin_cos(0.5 * x)
+        small = abs(x) < _SMALL_ANGLE
+        sine = select(small, sine, full_sine)
+        rest = select(small, rest, -2.0 * half_sine * half_sine)
+    return sine, rest
+
+
+@kernel
+def exp(x):
+    """E ** x, with 0 and infinity beyond the range of float64 (subnormal results are 0)."""
+    k = round_to_even(clip(x, -746.0, 710.0) * 1.44269504088896338700)
+    high = fused_multiply_add(-k, _LN2_HIGH, x)
+    low = k * _LN2_LOW
+    r = high - low
+    z = r * r
+    c = r - z * (
+        1.66666666666666019037e-01
+        + z
+        * (
+            -2.77777777770155933842e-03
+            + z
+            * (
+                6.61375632143793436117e-05
+                + z * (-1.65339022054652515390e-06 + z * 4.13813679705723846039e-08)
+            )
+        )
+    )
+    mantissa = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
+    # two factors, as 2**k alone overflows at k = 1024
+    half = round_to_even(0.5 * k)
+    value = mantissa * power_of_two(half) * power_of_two(k - half)
+    value = select(x > 709.782712893384, math.inf, select(x < -708.396, 0.0, value))
+    return select(x == x, value, x)
+
+
+@kernel
+def log(x):
+    """Natural logarithm of a positive normal number; -inf at 0, NaN below."""
+    m, k = mantissa_of(x), exponent_of(x)
+    above = m > 1.41421356237309504880
+    m, k = select(above, 0.5 * m, m), select(above, k + 1.0, k)
+    f = m - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    r = z * (
+        6.666666666666735130e-01
+        + z
+        * (
+            3.999999999940941908e-01
+            + z
+            * (
+                2.857142874366239149e-01
+                + z
+                * (
+                    2.222219843214978396e-01
+                    + z
+                    * (
+                        1.818357216161805012e-01
+                        + z * (1.531383769920937332e-01 + z * 1.479819860511658591e-01)
+                    )
+                )
+            )
+        )
+    )
+    half_square = 0.5 * f * f
+    value = k * _LN2_HIGH - ((half_square - (s * (half_square + r) + k * _LN2_LOW)) - f)
+    value = select(x > 0.0, value, select(x == 0.0, -math.inf, math.nan))
+    return select(x == math.inf, x, value)
+
+
+@kernel
+def _atan_polynomial(x):
+    z = x * x
+    return x - x * z * (
+        3.33333333333329318027e-01
+        + z
+        * (
+            -1.99999999998764832476e-01
+            + z
+            * (
+                1.42857142725034663711e-01
+                + z
+                * (
+                    -1.11111104054623557880e-01
+                    + z
+                    * (
+                        9.09088713343650656196e-02
+                        + z
+                        * (
+                            -7.69187620504482999495e-02
+                            + z
+                            * (
+                                6.66107313738753120669e-02
+                                + z
+                                * (
+                                    -5.83357013379057348645e-02
+                                    + z
+                                    * (
+                                        4.97687799461593236017e-02
+                                        + z
+                                        * (
+                                            -3.65315727442169155270e-02
+                                            + z * 1.62858201153657823623e-02
+                                        )
+                                    )
+                                )
+                            )
+                        )
+                    )
+                )
+            )
+        )
+    )
+
+
+@kernel
+def atan2(y, x):
+    """The angle of the point (x, y) in [-pi, pi] rad; 0 at the origin."""
+    ay, ax = abs(y), abs(x)
+    large, little = maximum(ax, ay), minimum(ay, ax)
+    ratio = little / select(large > 0.0, large, 1.0)
+    # around tan(pi/8) < ratio <= 1 reduce by pi/4: atan t = pi/4 + atan((t - 1)/(t + 1))
+    steep = ratio > 0.41421356237309503
+    angle = _atan_polynomial(select(steep, (ratio - 1.0) / (ratio + 1.0), ratio))
+    angle = select(steep, angle + 3.06161699786838301793e-17 + 0.78539816339744827900, angle)
+    angle = select(ay > ax, 1.57079632679489655800 - angle, angle)
+    angle = select(x < 0.0, 3.14159265358979311600 - angle, angle)
+    angle = select(y < 0.0, -angle, angle)
+    return select((x == x) & (y == y), angle, math.nan)

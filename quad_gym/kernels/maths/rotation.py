@@ -1,0 +1,158 @@
+"""Attitude: 3-1-2 Euler angles, rotation matrices R_BI (v_B = R_BI v_I) and quaternions.
+
+Quaternions are Hamilton's, (w, x, y, z), and turn body components into inertial ones.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.elementary import atan2, sin_cos, sin_cos_minus_one
+from quad_gym.kernels.simd.lanes import select
+
+
+@kernel
+def euler_to_dcm(e):
+    """R(e) for e = (roll, pitch, yaw) [rad]: yaw about z, then roll about x, then pitch about y."""
+    s_phi, c_phi = sin_cos(e[0])
+    s_th, c_th = sin_cos(e[1])
+    s_psi, c_psi = sin_cos(e[2])
+    return (
+        (c_psi * c_th - s_phi * s_psi * s_th, c_th * s_psi + c_psi * s_phi * s_th, -c_phi * s_th),
+        (-c_phi * s_psi, c_phi * c_psi, s_phi),
+        (c_psi * s_th + c_th * s_phi * s_psi, s_psi * s_th - c_psi * c_th * s_phi, c_phi * c_th),
+    )
+
+
+@kernel
+def split_rotation(e):
+    """R(e) = I + even(e) + odd(e), which keep and change sign with e, free of cancellation.
+
+    A pair of sigma points sits at +e and -e, so its sum and difference need one evaluation of
+    these.
+
+    Returns:
+        (even, odd), and the sines and cosines less one of roll and pitch
+        (s_phi, c_phi - 1, s_th, c_th - 1), which the Euler-rate matrix needs again.
+    """
+    s_phi, m_phi = sin_cos_minus_one(e[0])
+    s_th, m_th = sin_cos_minus_one(e[1])
+    s_psi, m_psi = sin_cos_minus_one(e[2])
+    c_phi, c_th, c_psi = 1.0 + m_phi, 1.0 + m_th, 1.0 + m_psi
+    even = (
+        (m_psi * c_th + m_th, c_psi * s_phi * s_th, 0.0),
+        (0.0, m_psi * c_phi + m_phi, 0.0),
+        (c_th * s_phi * s_psi, s_psi * s_th, m_phi * c_th + m_th),
+    )
+    odd = (
+        (-s_phi * s_psi * s_th, c_th * s_psi, -c_phi * s_th),
+        (-c_phi * s_psi, 0.0, s_phi),
+        (c_psi * s_th, -c_psi * c_th * s_phi, 0.0),
+    )
+    return even, odd, (s_phi, m_phi, s_th, m_th)
+
+
+@kernel
+def quaternion_to_dcm(q):
+    """R_BI of the unit quaternion q (w, x, y, z)."""
+    w, x, y, z = q
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@kernel
+def vector_to_dcm(phi):
+    """exp(-[phi x]), the R_BI of a body that has turned by the rotation vector phi [rad] from I."""
+    angle = math.sqrt(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
+    sine, cosine = sin_cos(0.5 * angle)
+    turned = angle > 1e-100
+    per_angle = select(turned, sine / select(turned, angle, 1.0), 0.5)
+    return quaternion_to_dcm((cosine, per_angle * phi[0], per_angle * phi[1], per_angle * phi[2]))
+
+
+@kernel
+def dcm_to_quaternion(R_BI):
+    """The unit quaternion of R_BI with the sign that makes its largest component positive.
+
+    Each of the four squares 4 q_i^2 is a sum of diagonal entries; the largest is well conditioned
+    (S. W. Shepperd, J. Guidance and Control 1(3), 1978).
+    """
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = R_BI
+    square_w, square_x = 1.0 + r00 + r11 + r22, 1.0 + r00 - r11 - r22
+    square_y, square_z = 1.0 - r00 + r11 - r22, 1.0 - r00 - r11 + r22
+    wx, wy, wz = r12 - r21, r20 - r02, r01 - r10
+    xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
+    # each candidate is 4 q_i q, for one i
+    best, w, x, y, z = square_w, square_w, wx, wy, wz
+    better = square_x > best
+    w, x, y, z = (
+        select(better, wx, w),
+        select(better, square_x, x),
+        select(better, xy, y),
+        select(better, xz, z),
+    )
+    best = select(better, square_x, best)
+    better = square_y > best
+    w, x, y, z = (
+        select(better, wy, w),
+        select(better, xy, x),
+        select(better, square_y, y),
+        select(better, yz, z),
+    )
+    best = select(better, square_y, best)
+    better = square_z > best
+    w, x, y, z = (
+        select(better, wz, w),
+        select(better, xz, x),
+        select(better, yz, y),
+        select(better, square_z, z),
+    )
+    return normalize_quaternion((w, x, y, z))
+
+
+@kernel
+def normalize_quaternion(q):
+    """Q / |q|."""
+    inverse = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return (inverse * q[0], inverse * q[1], inverse * q[2], inverse * q[3])
+
+
+@kernel
+def mean_quaternion(a, b):
+    """The attitude halfway from a to b, two attitudes less than half a turn apart."""
+    # b and -b are the same attitude; halfway is meant along the shorter way
+    near = select(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0.0, -1.0, 1.0)
+    return normalize_quaternion(
+        (a[0] + near * b[0], a[1] + near * b[1], a[2] + near * b[2], a[3] + near * b[3])
+    )
+
+
+@kernel
+def rotation_between(a, b):
+    """The rotation vector [rad] in B of the turn from attitude a to attitude b, quaternions.
+
+    It is phi with b = a (cos |phi|/2, sin |phi|/2 phi/|phi|), less than half a turn.
+    """
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    x = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
+    y = a[0] * b[2] - a[2] * b[0] - a[3] * b[1] + a[1] * b[3]
+    z = a[0] * b[3] - a[3] * b[0] - a[1] * b[2] + a[2] * b[1]
+    near = select(w < 0.0, -1.0, 1.0)  # b and -b are the same attitude
+    sine = math.sqrt(x * x + y * y + z * z)
+    turned = sine > 1e-100
+    per_sine = near * select(turned, atan2(sine, near * w) / select(turned, sine, 1.0), 1.0)
+    return (2.0 * per_sine * x, 2.0 * per_sine * y, 2.0 * per_sine * z)
+
+
+@kernel
+def quaternion_rate(q, w_B):
+    """dq/dt = 1/2 q (0, w_B)."""
+    w, x, y, z = q
+    return (
+        0.5 * (-x * w_B[0] - y * w_B[1] - z * w_B[2]),
+        0.5 * (w * w_B[0] + y * w_B[2] - z * w_B[1]),
+        0.5 * (w * w_B[1] + z * w_B[0] - x * w_B[2]),
+        0.5 * (w * w_B[2] + x * w_B[1] - y * w_B[0]),
+    )

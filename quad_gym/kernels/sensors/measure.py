@@ -1,0 +1,214 @@
+"""What the sensors measure at the present instant: IMU, dual-antenna GNSS, camera.
+
+Every draw has a fixed number within its instant, so that a measurement does not depend on which
+others are taken. The noise-free parts are functions of their own, for the friendly classes and the
+tests.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    keep3,
+    load3,
+    load4,
+    load33,
+    norm,
+    scale,
+    sub,
+    unit_or,
+)
+from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of
+from quad_gym.kernels.maths.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.vehicle.dynamics import (
+    accelerations,
+    body_point_velocity,
+    imu_point_acceleration,
+    load_start,
+)
+from quad_gym.records import (
+    DRAW_BIAS,
+    DRAW_DRIFT,
+    DRAW_FEATURE,
+    DRAW_GNSS,
+    DRAW_IMU,
+    DRAW_MARK,
+    DRAW_VELOCITY,
+)
+
+
+@kernel
+def drift_biases(flight, p):
+    """Step the Gauss-Markov biases by one tick: b+ = alpha b + v_2 (report equations 6 and 7)."""
+    n_a, n_g = six_normals(stream_of(flight), DRAW_BIAS)
+    for i in range(3):
+        flight.b_a[i] = p.accel_bias_decay * flight.b_a[i] + p.accel_bias_drive * n_a[i]
+        flight.b_g[i] = p.gyro_bias_decay * flight.b_g[i] + p.gyro_bias_drive * n_g[i]
+
+
+@kernel
+def specific_force(flight, p, R_BI):
+    """f_B = R (a_I + g e3) at the accelerometer, without bias and noise (report equation 4)."""
+    w_B = load3(flight.w)
+    v_air_I = sub(load3(flight.v), load3(flight.wind))
+    d_I = add(load3(flight.disturbance), load3(flight.air_force))
+    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, load4(flight.rotor_speeds), d_I, p)
+    dw_B = add(dw_B, apply(load33(p.inertia_inverse), load3(flight.air_torque)))
+    a_I = imu_point_acceleration(R_BI, a_I, w_B, dw_B, load3(p.imu_lever_arm))
+    return apply(R_BI, (a_I[0], a_I[1], a_I[2] + p.gravity))
+
+
+@kernel
+def _sample_imu(flight, p, w_B, f_B, mask):
+    """Add biases and white noise to the filter's body rates and specific force, where `mask`.
+
+    Inner loops read the gyro at the present instant, with the same bias and noise.
+    """
+    n_a, n_g = six_normals(stream_of(flight), DRAW_IMU)
+    noise_g, b_g = scale(p.gyro_sigma, n_g), load3(flight.b_g)
+    f_B = add(f_B, load3(flight.b_a))
+    keep3(flight.accel, mask, add(f_B, scale(p.accel_sigma, n_a)))
+    keep3(flight.gyro, mask, add(add(w_B, b_g), noise_g))
+    keep3(flight.w_meas, mask, add(add(load3(flight.w), b_g), noise_g))
+
+
+@kernel
+def measure_imu(flight, p, mask):
+    """Sample accelerometer and gyro at this instant, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    _sample_imu(flight, p, load3(flight.w), specific_force(flight, p, R_BI), mask)
+
+
+@kernel
+def measure_imu_average(flight, p, start, mask):
+    """Sample the means of body rates and specific force over the tick that ends now, where `mask`.
+
+    As an IMU that integrates faster than it reports: the mean rate is that of the turn from the
+    body frame at the start to that at the end (coning corrected), and the mean specific force is
+    R_mid (dv_I + g dt e3) / dt with the change of the accelerometer's velocity and the attitude
+    halfway (sculling corrected; P. G. Savage, J. Guidance, Control, and Dynamics 21, 1998). Density
+    over sqrt(dt) is the standard deviation of white noise in a mean over dt.
+
+    Args:
+        flight: Record, with the true state at the tick's end and the biases of its start.
+        p: Parameters as they are.
+        start: The true state at the tick's start, as of `load_state`.
+        mask: Which lanes.
+    """
+    _, v_start, q_start, w_start, _ = start
+    q_end, rate, lever = load4(flight.q), 1.0 / p.dt, load3(p.imu_lever_arm)
+    v_before = body_point_velocity(quaternion_to_dcm(q_start), v_start, w_start, lever)
+    v_after = body_point_velocity(quaternion_to_dcm(q_end), load3(flight.v), load3(flight.w), lever)
+    a_I = scale(rate, sub(v_after, v_before))
+    R_mid = quaternion_to_dcm(mean_quaternion(q_start, q_end))
+    f_B = apply(R_mid, (a_I[0], a_I[1], a_I[2] + p.gravity))
+    _sample_imu(flight, p, scale(rate, rotation_between(q_start, q_end)), f_B, mask)
+
+
+@kernel
+def noisy_baseline(r_b, normals, sigma_b, floor, length):
+    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, known length.
+
+    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section
+    3.1).
+    """
+    size = norm(r_b)
+    u = scale(1.0 / size, r_b)
+    b = math.sqrt(floor)
+    a = math.sqrt((size * sigma_b) * (size * sigma_b) + floor)
+    along = dot(u, normals)
+    noisy = add(add(r_b, scale(a, normals)), scale((b - a) * along, u))
+    return scale(length / norm(noisy), noisy)
+
+
+@kernel
+def drift_gnss(flight, p, mask):
+    """Step the slow error of GNSS positions from one measurement to the next, where `mask`."""
+    n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
+    d, s = load3(flight.gnss_drift), load3(p.drift_drive)
+    drive = (s[0] * n[0], s[1] * n[1], s[2] * n[2])
+    keep3(flight.gnss_drift, mask, add(scale(p.drift_decay, d), drive))
+
+
+@kernel
+def measure_gnss(flight, p, mask):
+    """Measure antenna position and baseline in G, where `mask`."""
+    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+    n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
+    s = load3(p.gnss_sigma)
+    antenna_I = add(load3(flight.r), apply_transposed(R_BI, load3(p.antenna)))
+    noise_I = (s[0] * n_p[0], s[1] * n_p[1], s[2] * n_p[2])
+    noise_I = add(noise_I, load3(flight.gnss_drift))
+    keep3(flight.gnss_position, mask, apply_transposed(R_IG, add(antenna_I, noise_I)))
+    baseline_G = apply_transposed(R_IG, apply_transposed(R_BI, load3(p.baseline)))
+    measured = noisy_baseline(
+        baseline_G, n_b, p.baseline_sigma, p.direction_floor, p.baseline_length
+    )
+    keep3(flight.gnss_baseline, mask, measured)
+
+
+@kernel
+def measure_gnss_velocity(flight, p, mask):
+    """Measure the velocity of the antenna in G, where `mask`."""
+    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+    n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
+    lever_B = cross(load3(flight.w), load3(p.antenna))
+    v_I = add(load3(flight.v), apply_transposed(R_BI, lever_B))
+    keep3(flight.gnss_velocity, mask, apply_transposed(R_IG, add(v_I, scale(p.velocity_sigma, n))))
+
+
+@kernel
+def look_along_mark(flight, p):
+    """Level direction in I of the body x axis, as well as the place of the start tells it."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    zero = 0.0 * p.dt
+    x_I = unit_or((R_BI[0][0], R_BI[0][1], zero), (zero + 1.0, zero, zero))
+    n, _ = normal_pair(stream_of(flight), DRAW_MARK)
+    s, c = sin_cos(p.heading_sigma * n)
+    return (c * x_I[0] - s * x_I[1], s * x_I[0] + c * x_I[1], zero)
+
+
+@kernel
+def project(X_I, r_I, R_BI, p):
+    """Pixel of a point, and whether it is in front of the camera and inside the image."""
+    v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))
+    in_front = v_C[2] > 1e-9
+    per_depth = p.focal_length / select(in_front, v_C[2], 1.0)
+    x, y = per_depth * v_C[0], per_depth * v_C[1]
+    seen = in_front & (abs(x) <= p.half_image[0]) & (abs(y) <= p.half_image[1])
+    return x, y, seen
+
+
+@kernel
+def measure_features(flight, p, feature_count, mask):
+    """Project the features and mark those that the camera sees, where `mask`."""
+    stream = stream_of(flight)
+    R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
+    for i in range(feature_count):
+        x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
+        n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
+        seen = seen & mask
+        flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
+        flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
+        flight.feature_valid[i] = select(mask, select(seen, 1.0, 0.0), flight.feature_valid[i])
+
+
+@stage
+def drift_biases_stage(flight, world, model, settings, work, stages, flag):
+    """Let the true IMU biases drift over a tick."""
+    drift_biases(lanes_of(flight), lanes_of(world))
+
+
+@stage
+def average_imu_stage(flight, world, model, settings, work, stages, flag):
+    """Sample the means of the IMU over the tick that ends now."""
+    flying, scratch = lanes_of(flight), lanes_of(work)
+    measure_imu_average(flying, lanes_of(world), load_start(scratch), scratch.mask > 0.0)

@@ -1,0 +1,113 @@
+"""Records of eight flights, read by field name inside kernels.
+
+A block is a NumPy structured record whose every field ends in an axis of eight (`records.py`).
+`lanes_of(block)` is the same memory seen by a kernel: `block.mass` is a `Lanes`, `block.inertia` an
+array of `Lanes` of shape (3, 3). The scalar instance of a kernel gets a plain record of the same
+field names instead, where `record.mass` is a float and `record.inertia` a float array.
+"""
+
+import hashlib
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    infer_getattr,
+    intrinsic,
+    lower_getattr_generic,
+    lower_setattr_generic,
+    register_model,
+)
+from numba.np.arrayobj import make_array, populate_array
+
+from quad_gym.kernels.simd.lanes import WIDTH, lanes, vector_of, words
+
+
+class LaneRecord(types.Type):
+    """A pointer to a record of eight flights whose fields read as lanes."""
+
+    def __init__(self, record: types.Record) -> None:
+        self.record = record
+        # a digest, as the name of a record names all its fields and is part of every symbol
+        digest = hashlib.sha256(record.name.encode()).hexdigest()[:16]
+        super().__init__(name=f"LaneRecord({digest})")
+
+    def field(self, name: str) -> Any:
+        """The type of field `name`: lanes (or words), or an array of them."""
+        nested = self.record.typeof(name)
+        if not isinstance(nested, types.NestedArray) or nested.shape[-1] != WIDTH:
+            raise TypeError(f"field {name!r} of a block must end in an axis of {WIDTH}")
+        element = words if nested.dtype == types.uint64 else lanes
+        if nested.ndim == 1:
+            return element
+        # aligned=False: copies of a block may lie anywhere, and unaligned loads cost the same
+        return types.Array(element, nested.ndim - 1, "C", aligned=False)
+
+
+@register_model(LaneRecord)
+class _LaneRecordModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: LaneRecord) -> None:
+        super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
+
+
+@intrinsic
+def lanes_of(typing_context, record):  # type: ignore[no-untyped-def]
+    """The lanes of a block: the same memory, every field read eight flights at a time."""
+    if not isinstance(record, types.Record):
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.bitcast(args[0], ir.IntType(8).as_pointer())
+
+    return LaneRecord(record)(record), lower
+
+
+@infer_getattr
+class _LaneRecordAttributes(AttributeTemplate):
+    key = LaneRecord
+
+    def generic_resolve(self, block: LaneRecord, name: str) -> Any:
+        return block.field(name) if name in block.record.fields else None
+
+
+def _field_pointer(
+    builder: ir.IRBuilder, block: LaneRecord, pointer: Any, name: str, kind: Any
+) -> Any:
+    offset = ir.Constant(ir.IntType(64), block.record.offset(name))
+    return builder.bitcast(builder.gep(pointer, [offset]), kind.llvm_type.as_pointer())
+
+
+@lower_getattr_generic(LaneRecord)
+def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyped-def]
+    kind = block.field(name)
+    if not isinstance(kind, types.Array):
+        return builder.load(_field_pointer(builder, block, pointer, name, kind), align=8)
+
+    shape = block.record.typeof(name).shape[:-1]
+    strides, size = [], WIDTH * 8
+    for length in reversed(shape):
+        strides.insert(0, size)
+        size *= length
+    array = make_array(kind)(context, builder)
+    populate_array(
+        array,
+        data=_field_pointer(builder, block, pointer, name, kind.dtype),
+        shape=cgutils.pack_array(builder, [context.get_constant(types.intp, n) for n in shape]),
+        strides=cgutils.pack_array(builder, [context.get_constant(types.intp, s) for s in strides]),
+        itemsize=context.get_constant(types.intp, WIDTH * 8),
+        meminfo=None,
+        parent=None,
+    )
+    return array._getvalue()
+
+
+@lower_setattr_generic(LaneRecord)
+def _set_field(context, builder, sig, args, name):  # type: ignore[no-untyped-def]
+    block, source = sig.args
+    pointer, value = args
+    kind = block.field(name)
+    vector = vector_of(context, builder, value, source, kind)
+    builder.store(vector, _field_pointer(builder, block, pointer, name, kind), align=8)

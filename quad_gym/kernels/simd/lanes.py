@@ -1,0 +1,314 @@
+r"""The number type of the kernels: eight float64 that fly together.
+
+A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it
+serves the friendly classes and the tests; compiled for `Lanes` the same source flies eight flights
+on the SIMD unit. This file teaches Numba three value types and the operations on them:
+
+| type      | eight of | plain counterpart | operations                                           |
+|-----------|----------|-------------------|------------------------------------------------------|
+| `Lanes`   | float64  | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt`          |
+| `Mask`    | bool     | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`            |
+| `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `kernels.simd.bits`        |
+
+There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never
+sees its neighbours, so what a flight does is independent of who flies beside it, NaN included.
+
+LLVM lowers the eight-wide vectors to whatever registers the machine has (one AVX-512 register, two
+of AVX2, four of SSE2 or NEON). The only fast-math flag is `contract` (fused multiply-add): nothing
+is reassociated, so results do not depend on the batch.
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.imputils import lower_cast
+from numba.core.typeconv.castgraph import Conversion
+from numba.core.typeconv.rules import default_type_manager
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, overload, register_model
+
+WIDTH = 8
+"""Flights in a block: the float64 that one AVX-512 register holds."""
+
+_FLOATS = ir.VectorType(ir.DoubleType(), WIDTH)
+_WORDS = ir.VectorType(ir.IntType(64), WIDTH)
+_BITS = ir.VectorType(ir.IntType(1), WIDTH)
+
+
+class _VectorType(types.Type):
+    """A Numba type that is one LLVM vector; every instance of a class is the same type."""
+
+    llvm_type: ir.VectorType
+
+    def __init__(self) -> None:
+        super().__init__(name=type(self).__name__)
+
+
+class Lanes(_VectorType):
+    """Eight float64, one per flight of a block."""
+
+    llvm_type = _FLOATS
+
+
+class Words(_VectorType):
+    """Eight uint64, one per flight of a block."""
+
+    llvm_type = _WORDS
+
+
+class Mask(_VectorType):
+    """Eight booleans, one per flight of a block."""
+
+    llvm_type = _BITS
+
+
+lanes, words, mask = Lanes(), Words(), Mask()
+
+
+@register_model(Lanes)
+@register_model(Words)
+@register_model(Mask)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, numba_type: _VectorType) -> None:
+        super().__init__(manager, numba_type, numba_type.llvm_type)
+
+
+def splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
+    """The LLVM vector whose every lane is `scalar`."""
+    vector = ir.VectorType(scalar.type, WIDTH)
+    first = builder.insert_element(
+        ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0)
+    )
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
+
+
+def vector_of(
+    context: Any, builder: ir.IRBuilder, value: ir.Value, source: Any, target: Any
+) -> Any:
+    """`value` of Numba type `source` as the vector type `target`."""
+    if source == target:
+        return value
+    plain = {lanes: types.float64, words: types.uint64, mask: types.boolean}[target]
+    return splat(builder, context.cast(builder, value, source, plain))
+
+
+# ---- conversions: a plain number is eight equal lanes ----------------------------------------
+
+_PLAIN = {lanes: (types.Float, types.Integer), words: (types.Integer,), mask: (types.Boolean,)}
+
+
+@lower_cast(types.Float, lanes)
+@lower_cast(types.Integer, lanes)
+@lower_cast(types.Integer, words)
+@lower_cast(types.Boolean, mask)
+def _cast_to_vector(context, builder, source, target, value):  # type: ignore[no-untyped-def]
+    return vector_of(context, builder, value, source, target)
+
+
+default_type_manager.set_compatible(types.float64, lanes, Conversion.safe)
+default_type_manager.set_compatible(types.int64, lanes, Conversion.safe)
+default_type_manager.set_compatible(types.uint64, words, Conversion.safe)
+default_type_manager.set_compatible(types.boolean, mask, Conversion.safe)
+
+
+# ---- operators -------------------------------------------------------------------------------
+
+
+def _binary(
+    operation: Any, operand: Any, result: Any, emit: Callable[[ir.IRBuilder, Any, Any], Any]
+) -> None:
+    """Define `operation` where one side is the vector type `operand` and the other may be plain."""
+
+    @infer_global(operation)
+    class _Typing(AbstractTemplate):
+        def generic(self, args, kws):  # type: ignore[no-untyped-def]
+            fits = all(a == operand or isinstance(a, _PLAIN[operand]) for a in args)
+            if len(args) == 2 and operand in args and fits:
+                return signature(result, *args)
+            return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        left, right = (
+            vector_of(context, builder, value, source, operand)
+            for value, source in zip(args, sig.args, strict=True)
+        )
+        return emit(builder, left, right)
+
+    lower_builtin(operation, operand, operand)(lower)
+    for plain in _PLAIN[operand]:
+        lower_builtin(operation, operand, plain)(lower)
+        lower_builtin(operation, plain, operand)(lower)
+
+
+def _method(name: str, **flags: Any) -> Callable[[ir.IRBuilder, Any, Any], Any]:
+    return lambda builder, left, right: getattr(builder, name)(left, right, **flags)
+
+
+def _ordered(symbol: str) -> Callable[[ir.IRBuilder, Any, Any], Any]:
+    return lambda builder, left, right: builder.fcmp_ordered(symbol, left, right)
+
+
+def _is_product(value: Any) -> bool:
+    return isinstance(value, ir.Instruction) and value.opname == "fmul"
+
+
+def _add(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+    """Left + right; a product that is added is fused into the sum, the left one of two."""
+    if _is_product(left):
+        return call_llvm(builder, "llvm.fma", *left.operands, right)
+    if _is_product(right):
+        return call_llvm(builder, "llvm.fma", *right.operands, left)
+    return builder.fadd(left, right)
+
+
+def _subtract(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+    """Left - right, likewise."""
+    if _is_product(left):
+        return call_llvm(builder, "llvm.fma", *left.operands, builder.fneg(right))
+    if _is_product(right):
+        factor, other = right.operands
+        return call_llvm(builder, "llvm.fma", builder.fneg(factor), other, left)
+    return builder.fsub(left, right)
+
+
+for _operation, _in_place, _emit in (
+    (operator.add, operator.iadd, _add),
+    (operator.sub, operator.isub, _subtract),
+    (operator.mul, operator.imul, _method("fmul")),
+    (operator.truediv, operator.itruediv, _method("fdiv")),
+):
+    for _symbol in (_operation, _in_place):
+        _binary(_symbol, lanes, lanes, _emit)
+
+for _operation, _comparison in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+):
+    _binary(_operation, lanes, mask, _ordered(_comparison))
+
+for _operation, _name in (
+    (operator.add, "add"),
+    (operator.xor, "xor"),
+    (operator.and_, "and_"),
+    (operator.or_, "or_"),
+):
+    _binary(_operation, words, words, _method(_name))
+
+_binary(operator.eq, words, mask, lambda builder, a, b: builder.icmp_unsigned("==", a, b))
+
+for _operation, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
+    _binary(_operation, mask, mask, _method(_name))
+
+
+def _unary(operation: Any, emit: Callable[[Any, ir.IRBuilder, Any], Any]) -> None:
+    @infer_global(operation)
+    class _Typing(AbstractTemplate):
+        def generic(self, args, kws):  # type: ignore[no-untyped-def]
+            if args == (lanes,):
+                return signature(lanes, lanes)
+            return None
+
+    @lower_builtin(operation, lanes)
+    def _lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return emit(context, builder, args[0])
+
+
+def call_llvm(builder: ir.IRBuilder, name: str, value: ir.Value, *others: ir.Value) -> ir.Value:
+    """Call the LLVM intrinsic `name` (such as `llvm.sqrt`) at the type of its first argument."""
+    kind = value.type
+    scalar = "f64" if "double" in str(kind) else "i64"
+    suffix = f"v{WIDTH}{scalar}" if isinstance(kind, ir.VectorType) else scalar
+    arguments = (value, *others)
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(kind, [a.type for a in arguments]), f"{name}.{suffix}"
+    )
+    return builder.call(function, arguments)
+
+
+_unary(operator.neg, lambda context, builder, value: builder.fneg(value))
+_unary(math.sqrt, lambda context, builder, value: call_llvm(builder, "llvm.sqrt", value))
+_unary(abs, lambda context, builder, value: call_llvm(builder, "llvm.fabs", value))
+
+
+# ---- choosing and asking ---------------------------------------------------------------------
+
+
+@intrinsic
+def select(typing_context, chosen, if_true, if_false):  # type: ignore[no-untyped-def]
+    """`if_true` where `chosen`, else `if_false`, lane by lane (or for plain numbers)."""
+    vectors = [t for t in (if_true, if_false) if isinstance(t, _VectorType)]
+    if chosen == mask:
+        plain = {types.Boolean: mask, types.Float: lanes, types.Integer: lanes}
+        kind = vectors[0] if vectors else plain.get(type(if_true), lanes)
+    elif isinstance(chosen, types.Boolean) and not vectors:
+        kind = types.unliteral(if_true)
+        if kind not in (types.boolean, types.uint64):
+            kind = types.float64
+    else:
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        def as_kind(value, source):  # type: ignore[no-untyped-def]
+            if isinstance(kind, _VectorType):
+                return vector_of(context, builder, value, source, kind)
+            return context.cast(builder, value, source, kind)
+
+        return builder.select(args[0], as_kind(args[1], sig.args[1]), as_kind(args[2], sig.args[2]))
+
+    return kind(chosen, if_true, if_false), lower
+
+
+@intrinsic
+def logical_not(typing_context, asked):  # type: ignore[no-untyped-def]
+    """The other lanes."""
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.not_(args[0])
+
+    return asked(asked), lower
+
+
+@intrinsic
+def _bits_of_mask(typing_context, asked):  # type: ignore[no-untyped-def]
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return builder.zext(builder.bitcast(args[0], ir.IntType(WIDTH)), ir.IntType(64))
+
+    return types.uint64(asked), lower
+
+
+def any_of(asked: Any) -> bool:
+    """Whether any lane is set: the one question that a kernel may branch on, to skip idle work."""
+    raise NotImplementedError("any_of is available inside kernels only")
+
+
+def all_of(asked: Any) -> bool:
+    """Whether every lane is set."""
+    raise NotImplementedError("all_of is available inside kernels only")
+
+
+@overload(any_of)
+def _any_of(asked):  # type: ignore[no-untyped-def]
+    if asked == mask:
+        return lambda asked: _bits_of_mask(asked) != 0
+    if isinstance(asked, types.Boolean):
+        return lambda asked: asked
+    return None
+
+
+@overload(all_of)
+def _all_of(asked):  # type: ignore[no-untyped-def]
+    if asked == mask:
+        return lambda asked: _bits_of_mask(asked) == (1 << WIDTH) - 1
+    if isinstance(asked, types.Boolean):
+        return lambda asked: asked
+    return None

@@ -1,0 +1,267 @@
+"""How an episode begins: its reference, its gates, its start."""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import atan2, clip, maximum, minimum, sin_cos
+from quad_gym.kernels.maths.linalg import add, keep3, load3, multiply, scale
+from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
+from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.task.reference import evaluate_reference
+from quad_gym.records import (
+    COLUMNS,
+    DRAW_COURSE,
+    DRAW_FIRST_BIASES,
+    DRAW_GATES,
+    DRAW_GROUND,
+    DRAW_PHASE,
+    DRAW_SERIES,
+    DRAW_START,
+    MAX_GATES,
+    MAX_HARMONICS,
+    Start,
+    Task,
+)
+
+START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
+"""Spread of a hovering start: [m], [rad], [rad], [m/s]."""
+GROUND_SHARE = 0.5
+"""Share of the mixed starts that are on the ground."""
+_POSITION, _VELOCITY = COLUMNS["start_position_I"].start, COLUMNS["start_velocity_I"].start
+_RATES, _YAW = COLUMNS["start_body_rates"].start, COLUMNS["start_yaw"].start
+_ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start
+HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY = 0.0, 1.0, 2.0
+
+
+@kernel
+def _keep(array, i, j, mask, value):
+    array[i, j] = select(mask, value, array[i, j])
+
+
+@kernel
+def _clear_reference(flight, mask, center, omega, rule, point):
+    keep3(flight.ref_center, mask, center)
+    keep3(flight.ref_heading_point, mask, point)
+    flight.ref_omega = select(mask, omega, flight.ref_omega)
+    flight.ref_heading_rule = select(mask, rule, flight.ref_heading_rule)
+    for k in range(MAX_HARMONICS):
+        keep3(flight.ref_cos[k], mask, (0.0, 0.0, 0.0))
+        keep3(flight.ref_sin[k], mask, (0.0, 0.0, 0.0))
+
+
+@kernel
+def _draw_series(flight, settings, stream, mask):
+    """A random flight: normal coefficients falling as 1/k^2, scaled to the bounds.
+
+    |r' | <= sum k w |c_k| and |r''| <= sum (k w)^2 |c_k|, so the bounds hold at every time.
+    """
+    omega = 2.0 * math.pi / settings.period
+    zero = 0.0 * flight.tick
+    speed, acceleration, extent = zero, zero, zero
+    for k in range(MAX_HARMONICS):
+        n_a, n_b = six_normals(stream, DRAW_SERIES + 3 * k)
+        fall = 1.0 / ((k + 1.0) * (k + 1.0))
+        rate = (k + 1.0) * omega
+        a = (fall * n_a[0], fall * n_a[1], 0.3 * fall * n_a[2])
+        b = (fall * n_b[0], fall * n_b[1], 0.3 * fall * n_b[2])
+        keep3(flight.ref_cos[k], mask, a)
+        keep3(flight.ref_sin[k], mask, b)
+        size = math.sqrt(
+            a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+        )
+        speed = speed + rate * size
+        acceleration = acceleration + rate * rate * size
+        extent = extent + size
+    shrink = minimum(settings.max_speed / speed, settings.max_acceleration / acceleration)
+    shrink = minimum(shrink, settings.radius / extent)
+    for k in range(MAX_HARMONICS):
+        for i in range(3):
+            _keep(flight.ref_cos, k, i, mask, shrink * flight.ref_cos[k, i])
+            _keep(flight.ref_sin, k, i, mask, shrink * flight.ref_sin[k, i])
+
+
+@kernel
+def _draw_gates(flight, settings, stream, mask):
+    """Gates around the origin, each at least sixty degrees further round than the one before."""
+    azimuth, _ = uniform_pair(stream, DRAW_GATES)
+    azimuth = 2.0 * math.pi * azimuth
+    x, y, z = load3(flight.ref_center)
+    for k in range(MAX_GATES):
+        turn, where = uniform_pair(stream, DRAW_GATES + 1 + 2 * k)
+        up, side = uniform_pair(stream, DRAW_GATES + 2 + 2 * k)
+        distance = settings.radius * (0.4 + 0.6 * where)
+        height = settings.height * (0.7 + 0.6 * up)
+        used = k < settings.gate_count
+        s, c = sin_cos(azimuth)
+        # places beyond the last gate repeat it, so that the preview ends there
+        x, y, z = (distance * c, distance * s, height) if used else (x, y, z)
+        keep3(flight.gates[k], mask, (x, y, z))
+        step = (1.0 / 3.0 + 2.0 / 3.0 * turn) * math.pi
+        azimuth = azimuth + select(side < 0.5, -step, step)
+    keep3(flight.ref_center, mask, load3(flight.gates[0]))
+    flight.gate_next = select(mask, 0.0, flight.gate_next)
+
+
+@kernel
+def draw_reference(flight, settings, stream, mask):
+    """Set the reference of a new episode, where `mask`; at random where the settings say so."""
+    u_phase, u_radius = uniform_pair(stream, DRAW_COURSE)
+    u_period, u_sense = uniform_pair(stream, DRAW_COURSE + 1)
+    zero = 0.0 * u_phase
+    radius, period, phase, sense = zero + settings.radius, zero + settings.period, zero, zero + 1.0
+    if settings.randomize:
+        phase = 2.0 * math.pi * u_phase
+        radius = radius * (0.5 + 0.75 * u_radius)
+        period = period * (0.8 + 0.7 * u_period)
+        sense = select(u_sense < 0.5, -1.0, 1.0)
+    s, c = sin_cos(phase)
+    omega = 2.0 * math.pi / period
+    over_origin = (zero, zero, zero + settings.height)
+    origin, ahead = (zero, zero, zero), (c, s, zero)
+
+    if settings.task == Task.HOVER:
+        place = (radius * c, radius * s, zero + settings.height)
+        _clear_reference(flight, mask, place, zero, HEADING_TOWARD, origin)
+    elif settings.task == Task.CIRCLE:
+        _clear_reference(flight, mask, over_origin, omega, HEADING_TOWARD, origin)
+        keep3(flight.ref_cos[0], mask, (radius * c, radius * s, zero))
+        keep3(flight.ref_sin[0], mask, (-sense * radius * s, sense * radius * c, zero))
+    elif settings.task == Task.LEMNISCATE:
+        # r(t) = radius (sin wt, sin(2wt)/2) turned by the phase
+        _clear_reference(flight, mask, over_origin, omega, HEADING_VELOCITY, origin)
+        half = 0.5 * sense * radius
+        keep3(flight.ref_sin[0], mask, (radius * c, radius * s, zero))
+        keep3(flight.ref_sin[1], mask, (-half * s, half * c, zero))
+    elif settings.task == Task.RANDOM_TRAJECTORY:
+        _clear_reference(flight, mask, over_origin, omega, HEADING_ALONG, ahead)
+        flight.ref_omega = select(mask, 2.0 * math.pi / settings.period, flight.ref_omega)
+        _draw_series(flight, settings, stream, mask)
+    else:
+        # a fixed heading: one that follows the gates would turn about from one to the next
+        _clear_reference(flight, mask, over_origin, zero, HEADING_ALONG, ahead)
+        _draw_gates(flight, settings, stream, mask)
+
+
+@kernel
+def _given_or(given, drawn):
+    """A start value that the caller gave, or the drawn one where it is NaN."""
+    return select(given == given, given, drawn)
+
+
+@kernel
+def draw_start(flight, p, model, settings, stream, mask):
+    """Set the true state at the start of an episode, where `mask`."""
+    (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick)
+    yaw = atan2(x_ref[1], x_ref[0])
+    zero = 0.0 * yaw
+    v_I = (zero, zero, zero)
+    roll, pitch, rotor_speed = zero, zero, zero
+    on_ground = mask
+    if settings.start != Start.GROUND:
+        n_r, n_v = six_normals(stream, DRAW_START)
+        n_roll, n_pitch = normal_pair(stream, DRAW_START + 3)
+        n_yaw, _ = normal_pair(stream, DRAW_START + 4)
+        u_ground, _ = uniform_pair(stream, DRAW_GROUND)
+        share = GROUND_SHARE if settings.start == Start.MIXED else 0.0
+        on_ground = u_ground < share
+        if settings.task == Task.WAYPOINTS:
+            x, y, z = load3(flight.gates[0])
+            x, y, z = 0.25 * x, 0.25 * y, zero + settings.height
+        r_I = (
+            x + START_POSITION_SIGMA * clip(n_r[0], -3.0, 3.0),
+            y + START_POSITION_SIGMA * clip(n_r[1], -3.0, 3.0),
+            maximum(z + START_POSITION_SIGMA * clip(n_r[2], -3.0, 3.0), 0.1),
+        )
+        x, y = select(on_ground, x, r_I[0]), select(on_ground, y, r_I[1])
+        z = r_I[2]
+        hovering = select(on_ground, 0.0, 1.0)
+        v_I = scale(hovering * START_VELOCITY_SIGMA, n_v)
+        roll = hovering * START_TILT_SIGMA * n_roll
+        pitch = hovering * START_TILT_SIGMA * n_pitch
+        yaw = yaw + hovering * START_YAW_SIGMA * n_yaw
+        rotor_speed = hovering * model.motor_gain * model.hover_voltage
+    z = select(on_ground, 0.0, z)
+    w_B = (zero, zero, zero)
+    if settings.randomized:
+        drawn = flight.drawn
+        x, y, z = x + drawn[_POSITION], y + drawn[_POSITION + 1], z + drawn[_POSITION + 2]
+        v_I = add(v_I, (drawn[_VELOCITY], drawn[_VELOCITY + 1], drawn[_VELOCITY + 2]))
+        w_B = (drawn[_RATES], drawn[_RATES + 1], drawn[_RATES + 2])
+        roll, pitch, yaw = roll + drawn[_ROLL], pitch + drawn[_PITCH], yaw + drawn[_YAW]
+    given = flight.start_given
+    x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
+    v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
+    yaw = _given_or(given[6], yaw)
+    keep3(flight.r, mask, (x, y, z))
+    keep3(flight.v, mask, v_I)
+    keep3(flight.w, mask, w_B)
+    keep3(flight.disturbance, mask, (zero, zero, zero))
+    q = dcm_to_quaternion(
+        multiply(euler_to_dcm((roll, pitch, zero)), euler_to_dcm((zero, zero, yaw)))
+    )
+    for i in range(4):
+        flight.q[i] = select(mask, q[i], flight.q[i])
+        flight.rotor_speeds[i] = select(mask, rotor_speed, flight.rotor_speeds[i])
+        flight.voltages[i] = select(mask, 0.0, flight.voltages[i])
+        flight.action[i] = select(mask, 0.0, flight.action[i])
+        flight.last_action[i] = select(mask, 0.0, flight.last_action[i])
+
+    n_a, n_g = six_normals(stream, DRAW_FIRST_BIASES)
+    for i in range(3):
+        flight.b_a[i] = select(mask, p.accel_bias_sigma * n_a[i], flight.b_a[i])
+        flight.b_g[i] = select(mask, p.gyro_bias_sigma * n_g[i], flight.b_g[i])
+
+
+@kernel
+def _first_wait(phase, period, share):
+    """Ticks to a sensor's first measurement: its phase, or at random within its period."""
+    ticks = 0.0 * share
+    for k in range(1, period):
+        ticks = ticks + select(share * period >= 1.0 * k, 1.0, 0.0)
+    if phase >= 0:
+        ticks = 0.0 * share + phase
+    return ticks
+
+
+@kernel
+def begin_clocks(flight, settings, stream, mask):
+    """Set when GNSS and camera measure first, where `mask`; nothing has been measured yet."""
+    gnss_share, camera_share = uniform_pair(stream, DRAW_PHASE)
+    wait = _first_wait(settings.gnss_phase, settings.gnss_ticks, gnss_share)
+    flight.gnss_wait = select(mask, wait, flight.gnss_wait)
+    wait = _first_wait(settings.camera_phase, settings.camera_ticks, camera_share)
+    flight.camera_wait = select(mask, wait, flight.camera_wait)
+    keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
+    flight.position_fresh = select(mask, 0.0, flight.position_fresh)
+    flight.baseline_fresh = select(mask, 0.0, flight.baseline_fresh)
+    for i in range(settings.feature_count):
+        flight.feature_fresh[i] = select(mask, 0.0, flight.feature_fresh[i])
+
+
+@kernel
+def begin_counters(flight, mask):
+    """Set what counts steps, rewards and errors of an episode to its start, where `mask`."""
+    flight.step = select(mask, 0.0, flight.step)
+    flight.episode = select(mask, flight.episode + 1.0, flight.episode)
+    flight.gate_next = select(mask, 0.0, flight.gate_next)
+    flight.needs_reset = select(mask, 0.0, flight.needs_reset)
+    flight.reward = select(mask, 0.0, flight.reward)
+    flight.terminated = select(mask, 0.0, flight.terminated)
+    flight.truncated = select(mask, 0.0, flight.truncated)
+    flight.ending = select(mask, 0.0, flight.ending)
+    flight.episode_return = select(mask, 0.0, flight.episode_return)
+    flight.episode_error = select(mask, 0.0, flight.episode_error)
+
+
+@stage
+def begin_stage(flight, world, model, settings, work, stages, flag):
+    """Set clocks, reference and true state at the start of an episode, and its counters."""
+    flying, true, believed = lanes_of(flight), lanes_of(world), lanes_of(model)
+    stream, mask = stream_of(flying), lanes_of(work).mask > 0.0
+    begin_clocks(flying, settings, stream, mask)
+    draw_reference(flying, settings, stream, mask)
+    draw_start(flying, true, believed, settings, stream, mask)
+    flying.charge = select(mask, true.battery_charge, flying.charge)
+    begin_counters(flying, mask)

@@ -1,0 +1,51 @@
+"""What the controller sees of the state: the truth, the estimate, or the truth with noise."""
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.linalg import (
+    add,
+    keep3,
+    keep33,
+    load3,
+    load4,
+    load33,
+    multiply,
+    norm,
+    scale,
+    sub,
+)
+from quad_gym.kernels.maths.random import six_normals, stream_of
+from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import DRAW_NOISY, Source
+
+
+@kernel
+def look(flight, model, settings, mask):
+    """Set what the controller sees from its source, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
+    if settings.source == Source.ESTIMATE or settings.source == Source.SENSORS:
+        r, v, R_BI = load3(flight.r_hat), load3(flight.v_hat), load33(flight.R_hat)
+        w_B = load3(flight.w_meas)
+        if settings.source == Source.ESTIMATE:
+            w_B = sub(w_B, load3(flight.b_g_hat))
+    elif settings.source == Source.NOISY:
+        stream = stream_of(flight)
+        s = load4(model.noisy_sigma)
+        n_r, n_v = six_normals(stream, DRAW_NOISY)
+        n_e, n_w = six_normals(stream, DRAW_NOISY + 3)
+        r, v = add(r, scale(s[0], n_r)), add(v, scale(s[1], n_v))
+        R_BI, w_B = multiply(euler_to_dcm(scale(s[2], n_e)), R_BI), add(w_B, scale(s[3], n_w))
+    keep3(flight.r_seen, mask, r)
+    keep3(flight.v_seen, mask, v)
+    keep33(flight.R_seen, mask, R_BI)
+    keep3(flight.w_seen, mask, w_B)
+    error = norm(sub(load3(flight.r_seen), load3(flight.r)))
+    flight.estimation_error = select(mask, error, flight.estimation_error)
+
+
+@stage
+def look_stage(flight, world, model, settings, work, stages, flag):
+    """Set what the controller sees."""
+    look(lanes_of(flight), lanes_of(model), settings, lanes_of(work).mask > 0.0)

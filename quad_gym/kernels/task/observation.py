@@ -1,0 +1,190 @@
+"""Observations, from what the controller sees alone; `envs.spaces` has them as a table."""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.linalg import apply, load3, load4, load33, scale, sub
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
+from quad_gym.records import DRAWN_SIZE, FIXED, MAX_GATES, Layout, Source, Task
+
+
+@kernel
+def _put3(row, k, v):
+    row[k] = v[0]
+    row[k + 1] = v[1]
+    row[k + 2] = v[2]
+    return k + 3
+
+
+@kernel
+def _upcoming_gate(flight, ahead):
+    """The gate that is `ahead` gates after the present one; the last one is repeated."""
+    x, y, z = load3(flight.gates[MAX_GATES - 1])
+    for k in range(MAX_GATES):
+        here = flight.gate_next + ahead == 1.0 * k
+        gate = flight.gates[k]
+        x, y, z = select(here, gate[0], x), select(here, gate[1], y), select(here, gate[2], z)
+    return (x, y, z)
+
+
+@kernel
+def _preview(flight, p, settings, i):
+    """The reference a little later: in time, or on a course the gates after the next."""
+    if settings.task == Task.WAYPOINTS:
+        return _upcoming_gate(flight, 1.0 + i)
+    return position_on_reference(flight, flight.tick * p.dt + settings.preview[i])
+
+
+@kernel
+def _put_relative(flight, p, settings, row, r, v, R_BI, w_B):
+    """Errors, directions and rates in the body frame."""
+    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+    k = _put3(row, 0, apply(R_BI, sub(r_ref, r)))
+    k = _put3(row, k, apply(R_BI, sub(v_ref, v)))
+    k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
+    k = _put3(row, k, apply(R_BI, x_ref))
+    k = _put3(row, k, w_B)
+    k = _put3(row, k, apply(R_BI, a_ref))
+    for i in range(2):
+        k = _put3(row, k, apply(R_BI, sub(_preview(flight, p, settings, i), r_ref)))
+    return k
+
+
+@kernel
+def _put_reference(flight, p, settings, row, k):
+    """The reference in I."""
+    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+    k = _put3(row, k, r_ref)
+    k = _put3(row, k, v_ref)
+    k = _put3(row, k, a_ref)
+    k = _put3(row, k, x_ref)
+    for i in range(2):
+        k = _put3(row, k, _preview(flight, p, settings, i))
+    return k
+
+
+@kernel
+def _put_absolute(flight, p, settings, row):
+    """The state in I and the reference in I; biases as far as the source knows them."""
+    k = _put3(row, 0, load3(flight.r_seen))
+    k = _put3(row, k, load3(flight.v_seen))
+    for i in range(3):
+        for j in range(3):
+            row[k + 3 * i + j] = flight.R_seen[i, j]
+    k += 9
+    b_a, b_g = load3(flight.b_a), load3(flight.b_g)
+    if settings.source == Source.ESTIMATE:
+        b_a, b_g = load3(flight.b_a_hat), load3(flight.b_g_hat)
+    elif settings.source == Source.NOISY:
+        b_a, b_g = scale(0.0, b_a), scale(0.0, b_g)
+    k = _put3(row, k, b_a)
+    k = _put3(row, k, b_g)
+    k = _put3(row, k, load3(flight.w_seen))
+    return _put_reference(flight, p, settings, row, k)
+
+
+@kernel
+def _put_sensors(flight, p, settings, row):
+    """The last IMU sample; GNSS and camera where they measured since the last step, else zeros."""
+    R_IG = load33(p.R_IG)
+    k = _put3(row, 0, load3(flight.gyro))
+    k = _put3(row, k, load3(flight.accel))
+    fresh = flight.position_fresh
+    k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_position))))
+    row[k] = fresh
+    baseline = apply(R_IG, load3(flight.gnss_baseline))
+    fresh = flight.baseline_fresh / p.baseline_length
+    k = _put3(row, k + 1, scale(fresh, baseline))
+    row[k] = flight.baseline_fresh
+    k += 1
+    if settings.gnss_velocity > 0:  # measured with every position
+        fresh = flight.position_fresh
+        k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_velocity))))
+        row[k] = fresh
+        k += 1
+    for i in range(settings.feature_count):
+        fresh = flight.feature_fresh[i]
+        row[k] = fresh * flight.pixels[i, 0] / p.half_image[0]
+        row[k + 1] = fresh * flight.pixels[i, 1] / p.half_image[1]
+        row[k + 2] = fresh
+        k += 3
+    return _put_reference(flight, p, settings, row, k)
+
+
+@kernel
+def _put_privileged(flight, p, settings, row, k):
+    """The truth, for critics: relative state, biases and rotor speeds."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    r_ref, v_ref, _, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+    k = _put3(row, k, apply(R_BI, sub(r_ref, load3(flight.r))))
+    k = _put3(row, k, apply(R_BI, sub(v_ref, load3(flight.v))))
+    k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
+    k = _put3(row, k, apply(R_BI, x_ref))
+    k = _put3(row, k, load3(flight.w))
+    k = _put3(row, k, load3(flight.b_a))
+    k = _put3(row, k, load3(flight.b_g))
+    hover = p.motor_gain * p.hover_voltage
+    for i in range(4):
+        row[k + i] = flight.rotor_speeds[i] / hover
+    return k + 4
+
+
+@kernel
+def _put_world(flight, settings, row, k):
+    """The air's velocity, and each draw as its deviation from the middle in units of its spread."""
+    k = _put3(row, k, apply(quaternion_to_dcm(load4(flight.q)), load3(flight.wind)))
+    for column in range(DRAWN_SIZE):
+        if settings.draw_kind[column] != FIXED:
+            deviation = flight.drawn[column] - settings.draw_center[column]
+            row[k] = deviation / settings.draw_spread[column]
+            k += 1
+
+
+@kernel
+def observe(flight, p, settings, row):
+    """Write the observation of the present instant.
+
+    Args:
+        flight: Record.
+        p: Nominal parameters.
+        settings: What the batch does.
+        row: (MAX_OBSERVATION,), receives it.
+    """
+    if settings.layout == Layout.SENSORS:
+        k = _put_sensors(flight, p, settings, row)
+    elif settings.layout == Layout.ABSOLUTE:
+        k = _put_absolute(flight, p, settings, row)
+    else:
+        k = _put_relative(
+            flight,
+            p,
+            settings,
+            row,
+            load3(flight.r_seen),
+            load3(flight.v_seen),
+            load33(flight.R_seen),
+            load3(flight.w_seen),
+        )
+    for i in range(4):
+        row[k + i] = flight.action[i]
+    k += 4
+    if settings.include_covariance:
+        for i in range(15):
+            variance = flight.L[i, 0] * flight.L[i, 0]
+            for j in range(1, i + 1):
+                variance = variance + flight.L[i, j] * flight.L[i, j]
+            row[k + i] = math.sqrt(variance)
+        k += 15
+    if settings.privileged:
+        k = _put_privileged(flight, p, settings, row, k)
+        if settings.observe_world:
+            _put_world(flight, settings, row, k)
+
+
+@stage
+def observe_stage(flight, world, model, settings, work, stages, flag):
+    """Fill the workspace's observation."""
+    observe(lanes_of(flight), lanes_of(model), settings, lanes_of(work).observation)

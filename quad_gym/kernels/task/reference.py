@@ -1,0 +1,60 @@
+"""References: a finite Fourier series per axis and a rule for the heading.
+
+`r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)`: hover has no terms, a circle one, a lemniscate
+two, a random flight several. One kernel evaluates them all, with exact derivatives.
+"""
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.linalg import load3, select3, sub, unit_or
+from quad_gym.records import MAX_HARMONICS
+
+
+@kernel
+def position_on_reference(flight, t):
+    """r*(t) in I [m]."""
+    s1, c1 = sin_cos(flight.ref_omega * t)
+    s, c = s1, c1
+    x, y, z = load3(flight.ref_center)
+    for k in range(MAX_HARMONICS):
+        a, b = flight.ref_cos[k], flight.ref_sin[k]
+        x, y, z = x + a[0] * c + b[0] * s, y + a[1] * c + b[1] * s, z + a[2] * c + b[2] * s
+        s, c = s * c1 + c * s1, c * c1 - s * s1
+    return (x, y, z)
+
+
+@kernel
+def heading(flight, r_ref, v_ref):
+    """x*: the horizontal unit direction that the body x axis is to point in."""
+    zero = 0.0 * r_ref[0]
+    east = (zero + 1.0, zero, zero)
+    point = load3(flight.ref_heading_point)
+    toward = sub(point, r_ref)
+    rule = flight.ref_heading_rule
+    direction = select3(rule == 1.0, point, select3(rule == 2.0, v_ref, toward))
+    return unit_or((direction[0], direction[1], zero), east)
+
+
+@kernel
+def evaluate_reference(flight, t):
+    """(r*, v*, a*, x*) in I at the time t of the episode [s]."""
+    omega = flight.ref_omega
+    s1, c1 = sin_cos(omega * t)
+    s, c = s1, c1
+    x, y, z = load3(flight.ref_center)
+    zero = 0.0 * x
+    vx, vy, vz, ax, ay, az = zero, zero, zero, zero, zero, zero
+    rate = omega
+    for k in range(MAX_HARMONICS):
+        a, b = flight.ref_cos[k], flight.ref_sin[k]
+        ex, ey, ez = a[0] * c + b[0] * s, a[1] * c + b[1] * s, a[2] * c + b[2] * s
+        x, y, z = x + ex, y + ey, z + ez
+        vx = vx + rate * (b[0] * c - a[0] * s)
+        vy = vy + rate * (b[1] * c - a[1] * s)
+        vz = vz + rate * (b[2] * c - a[2] * s)
+        square = rate * rate
+        ax, ay, az = ax - square * ex, ay - square * ey, az - square * ez
+        s, c = s * c1 + c * s1, c * c1 - s * s1
+        rate = rate + omega
+    r_ref, v_ref = (x, y, z), (vx, vy, vz)
+    return r_ref, v_ref, (ax, ay, az), heading(flight, r_ref, v_ref)

@@ -1,0 +1,1 @@
+"""The quadrotor, the air around it and its inner control loops. Imports maths."""

@@ -1,0 +1,206 @@
+"""What a world that is not calm does to a flight: moving air, rotor drag, ground effect, battery.
+
+A calm world never comes here. The air's velocity is held over a tick, as the motor voltages are.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    dot,
+    keep3,
+    load3,
+    load4,
+    load33,
+    scale,
+    sub,
+)
+from quad_gym.kernels.maths.random import stream_of
+from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.vehicle.dynamics import (
+    accelerations,
+    advance,
+    load_state,
+    rotor_lag,
+    store_state,
+)
+from quad_gym.kernels.vehicle.gusts import carry_gust, draw_gust, gust_velocity
+from quad_gym.records import Supply
+
+
+@kernel
+def ground_gain(height, radius):
+    """Thrust near the ground over that far from it, less one: 1 / (1 - (R / 4z)^2) - 1.
+
+    I. C. Cheeseman and W. E. Bennett, 1955, for hover. Heights below R/2 count as R/2.
+    """
+    ratio = 0.25 * radius / maximum(height, 0.5 * radius)
+    square = ratio * ratio
+    return square / (1.0 - square)
+
+
+@kernel
+def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
+    """Force in I [N] and torque in B [N m] that the air adds to thrust and disc drag.
+
+    Linear drag `-(D + D_W sum W_i) v_air` along the body axes (Faessler et al. 2018; Svacha et al.
+    2017), and each rotor's gain of thrust near the ground.
+
+    Args:
+        r_I: Position [m].
+        R_BI: Attitude.
+        v_air_I: Velocity relative to the air [m/s].
+        rotor_speeds: [rad/s].
+        p: True parameters.
+        settings: Which of both there are.
+    """
+    W = rotor_speeds
+    zero = 0.0 * r_I[0]
+    force_I, torque_B = (zero, zero, zero), (zero, zero, zero)
+    if settings.linear_drag:
+        v_B = apply(R_BI, v_air_I)
+        D, D_W, speed = p.linear_drag, p.rotor_drag, W[0] + W[1] + W[2] + W[3]
+        drag_B = (
+            (D[0] + D_W[0] * speed) * v_B[0],
+            (D[1] + D_W[1] * speed) * v_B[1],
+            (D[2] + D_W[2] * speed) * v_B[2],
+        )
+        force_I = sub(force_I, apply_transposed(R_BI, drag_B))
+    if settings.ground_effect:
+        up_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+        level = maximum(up_B[2], 0.0)
+        thrust, torque_x, torque_y = zero, zero, zero
+        for i in range(4):
+            height = r_I[2] - p.ground_height + dot(up_B, load3(p.rotors[i]))
+            gained = level * ground_gain(height, p.rotor_radius) * (p.kF * W[i] * W[i])
+            thrust = thrust + p.effectiveness[0, i] * gained
+            torque_x = torque_x + p.effectiveness[1, i] * gained
+            torque_y = torque_y + p.effectiveness[2, i] * gained
+        force_I = add(force_I, scale(thrust, R_BI[2]))
+        torque_B = (torque_x, torque_y, zero)
+    return force_I, torque_B
+
+
+@kernel
+def accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, wind_I, p, settings):
+    """As `vehicle.accelerations`, in air that moves with the velocity wind_I."""
+    v_air_I = sub(v_I, wind_I)
+    force_I, torque_B = air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings)
+    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, rotor_speeds, add(d_I, force_I), p)
+    return a_I, add(dw_B, apply(load33(p.inertia_inverse), torque_B))
+
+
+@kernel
+def _derivative(state, voltages, d_I, wind_I, p, settings):
+    r_I, v_I, q, w_B, W = state
+    R_BI = quaternion_to_dcm(q)
+    a_I, dw_B = accelerations_in_air(r_I, R_BI, v_I, w_B, W, d_I, wind_I, p, settings)
+    return v_I, a_I, quaternion_rate(q, w_B), dw_B, rotor_lag(W, voltages, p)
+
+
+@kernel
+def integrate_in_air(flight, p, settings):
+    """As `vehicle.integrate`, in the air that moves past the vehicle."""
+    h = p.dt / settings.substeps
+    voltages, d_I, wind_I = load4(flight.voltages), load3(flight.disturbance), load3(flight.wind)
+    for _ in range(settings.substeps):
+        start = load_state(flight)
+        k = _derivative(start, voltages, d_I, wind_I, p, settings)
+        end = advance(start, h / 6.0, k)
+        for part in range(3):  # a loop, as four copies of the derivative take long to compile
+            last = part == 2
+            k = _derivative(
+                advance(start, h if last else 0.5 * h, k), voltages, d_I, wind_I, p, settings
+            )
+            end = advance(end, h / 6.0 if last else h / 3.0, k)
+        r, v, q, w, W = end
+        store_state(flight, (r, v, normalize_quaternion(q), w, W))
+
+
+@kernel
+def meet_air(flight, p, settings, mask):
+    """Set the air's velocity and what it adds to the forces of the present instant, where `mask`.
+
+    The accelerometer feels these forces.
+    """
+    wind_I = load3(p.wind)
+    if settings.gusts:
+        wind_I = add(wind_I, gust_velocity(flight, p))
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    v_air_I = sub(load3(flight.v), wind_I)
+    force_I, torque_B = air_wrench(
+        load3(flight.r), R_BI, v_air_I, load4(flight.rotor_speeds), p, settings
+    )
+    keep3(flight.wind, mask, wind_I)
+    keep3(flight.air_force, mask, force_I)
+    keep3(flight.air_torque, mask, torque_B)
+
+
+@kernel
+def begin_in_air(flight, p, settings, stream, mask):
+    """Draw the gust and meet the air at the start of an episode, where `mask`."""
+    if settings.gusts:
+        draw_gust(flight, stream, mask)
+    meet_air(flight, p, settings, mask)
+
+
+@kernel
+def fly_through_air(flight, p, settings):
+    """Carry the true state and the gust over a tick, and meet the air at its end."""
+    integrate_in_air(flight, p, settings)
+    if settings.gusts:
+        carry_gust(flight, p)
+    meet_air(flight, p, settings, flight.tick >= 0.0)
+
+
+@kernel
+def battery_voltage(charge, power, p):
+    """Voltage U of the battery under an electrical power P: U = U0 - R P / U.
+
+    Beyond the most that it can deliver, U0^2 / (4 R), the voltage stays at U0 / 2. An empty battery
+    cuts off.
+    """
+    U0 = p.max_voltage * (p.battery_empty + (1.0 - p.battery_empty) * charge)
+    loaded = 0.5 * (U0 + math.sqrt(maximum(U0 * U0 - 4.0 * p.battery_resistance * power, 0.0)))
+    return select(charge > 0.0, loaded, 0.0)
+
+
+@kernel
+def supply(flight, p, settings):
+    """Hold the motor voltages to what there is, and take a tick's energy from the battery."""
+    limit = p.max_voltage
+    if settings.supply == Supply.BATTERY:
+        W = load4(flight.rotor_speeds)
+        power = 0.0 * W[0]
+        for i in range(4):
+            power = power + p.effectiveness[0, i] * p.kN * W[i] * W[i] * W[i]
+        power = power / p.motor_efficiency
+        limit = battery_voltage(flight.charge, power, p)
+        flight.charge = maximum(flight.charge - p.dt * power / p.battery_energy, 0.0)
+    for i in range(4):
+        flight.voltages[i] = minimum(flight.voltages[i], limit)
+
+
+@stage
+def move_in_air_stage(flight, world, model, settings, work, stages, flag):
+    """Carry the true state over a tick in a world that is not calm."""
+    fly_through_air(lanes_of(flight), lanes_of(world), settings)
+
+
+@stage
+def begin_in_air_stage(flight, world, model, settings, work, stages, flag):
+    """Draw the gust and meet the air at the start of an episode."""
+    flying = lanes_of(flight)
+    begin_in_air(flying, lanes_of(world), settings, stream_of(flying), lanes_of(work).mask > 0.0)
+
+
+@stage
+def supply_stage(flight, world, model, settings, work, stages, flag):
+    """Hold the motor voltages to what the battery supplies."""
+    supply(lanes_of(flight), lanes_of(world), settings)

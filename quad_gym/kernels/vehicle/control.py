@@ -1,0 +1,194 @@
+"""From what the controller sees to motor voltages: PD control and the actions' inner loops.
+
+All use the nominal parameters `p`, never the true ones.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    load3,
+    load4,
+    load33,
+    multiply,
+    scale,
+    store4,
+    sub,
+    transpose,
+    unit_or,
+)
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.task.reference import evaluate_reference
+from quad_gym.kernels.vehicle.dynamics import combine
+from quad_gym.records import Control
+
+
+@kernel
+def allocate(thrust, torque, p):
+    """Motor voltages for a total thrust [N] and a torque in B [N m].
+
+    The thrust is held to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha <= 1
+    that keeps every rotor force at most Fmax: with the forces f + alpha t that is the least (Fmax -
+    f_i) / t_i over the rotors that it loads. Negative forces are set to zero, and a rotor
+    that the thrust alone overloads, as unequal arms allow, is held to Fmax.
+    """
+    limit = p.max_rotor_force
+    zero = 0.0 * thrust
+    base = combine(p.allocation, (minimum(thrust, 3.6 * limit), zero, zero, zero))
+    turn = combine(p.allocation, (zero, torque[0], torque[1], torque[2]))
+    alpha = zero + 1.0
+    for i in range(4):
+        loaded = turn[i] > 0.0
+        alpha = select(
+            loaded, minimum(alpha, (limit - base[i]) / select(loaded, turn[i], 1.0)), alpha
+        )
+    alpha = maximum(alpha, 0.0)
+    return (
+        _voltage(base[0] + alpha * turn[0], p),
+        _voltage(base[1] + alpha * turn[1], p),
+        _voltage(base[2] + alpha * turn[2], p),
+        _voltage(base[3] + alpha * turn[3], p),
+    )
+
+
+@kernel
+def _voltage(force, p):
+    return math.sqrt(clip(force, 0.0, p.max_rotor_force) / p.kF) / p.motor_gain
+
+
+@kernel
+def pd_wrench(r, v, R_BI, w_B, reference, p):
+    """Thrust and torque of the report's PD controller.
+
+    `F_I = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F_I/|F_I|`, thrust `F_I . z_I`; with `b
+    = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and its antisymmetric part e,
+    `N = K e - Kd w + w x J w`.
+
+    Args:
+        r, v: Position [m] and velocity [m/s] in I.
+        R_BI: Attitude.
+        w_B: Body rates [rad/s].
+        reference: (r*, v*, a*, x*) in I.
+        p: Nominal parameters with the gains.
+    """
+    r_ref, v_ref, a_ref, x_ref = reference
+    F_I = add(
+        add(scale(p.gain_k, sub(r_ref, r)), scale(p.gain_kd, sub(v_ref, v))),
+        scale(p.mass, (a_ref[0], a_ref[1], a_ref[2] + p.gravity)),
+    )
+    z_I = R_BI[2]
+    z_ref = unit_or(F_I, z_I)
+    b = unit_or(cross(z_ref, x_ref), R_BI[1])
+    R_ref = (cross(b, z_ref), b, z_ref)
+    R_E = multiply(R_ref, transpose(R_BI))
+    e = (R_E[1][2] - R_E[2][1], R_E[2][0] - R_E[0][2], R_E[0][1] - R_E[1][0])
+    K, Kd = p.gain_K, p.gain_Kd
+    gyroscopic = cross(w_B, apply(load33(p.inertia), w_B))
+    torque = (
+        K[0] * e[0] - Kd[0] * w_B[0] + gyroscopic[0],
+        K[1] * e[1] - Kd[1] * w_B[1] + gyroscopic[1],
+        K[2] * e[2] - Kd[2] * w_B[2] + gyroscopic[2],
+    )
+    return dot(F_I, z_I), torque
+
+
+@kernel
+def rate_torque(w_wanted, w_B, p):
+    """Torque of the inner rate loop: J k_w (w* - w) + w x J w."""
+    J = load33(p.inertia)
+    wanted = apply(J, scale(p.rate_bandwidth, sub(w_wanted, w_B)))
+    return add(wanted, cross(w_B, apply(J, w_B)))
+
+
+@kernel
+def level_axes(R_BI):
+    """The axes of the level frame in I: x ahead along the body's heading, y to its left, z up."""
+    x_B_I = R_BI[0]
+    zero = 0.0 * x_B_I[0]
+    ahead = unit_or((x_B_I[0], x_B_I[1], zero), (1.0, 0.0, 0.0))
+    return (ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
+
+
+@kernel
+def tilt_rates(z_wanted_I, R_BI, yaw_rate, p):
+    """Body rates that turn the thrust axis toward a direction: k_a (e3 x R z*), and a yaw rate."""
+    z_wanted_B = apply(R_BI, z_wanted_I)
+    k = p.attitude_bandwidth
+    return (-k * z_wanted_B[1], k * z_wanted_B[0], yaw_rate)
+
+
+@kernel
+def act(flight, p, mode, reference):
+    """Set the motor voltages of the coming tick.
+
+    Args:
+        flight: Record; reads the action and what the controller sees, sets voltages.
+        p: Nominal parameters.
+        mode: What the action means, a `Control`.
+        reference: (r*, v*, a*, x*) in I, for `Control.PD`.
+    """
+    a = load4(flight.action)
+    R_BI, w_B = load33(flight.R_seen), load3(flight.w_seen)
+    weight = p.mass * p.gravity
+    thrust = weight * (1.0 + a[0])
+    if mode == Control.MOTOR:
+        hover, limit = p.hover_voltage, p.max_voltage
+        voltages = (
+            minimum(hover * (1.0 + a[0]), limit),
+            minimum(hover * (1.0 + a[1]), limit),
+            minimum(hover * (1.0 + a[2]), limit),
+            minimum(hover * (1.0 + a[3]), limit),
+        )
+    else:
+        torque = (0.0 * thrust, 0.0 * thrust, 0.0 * thrust)
+        if mode == Control.WRENCH:
+            scales = p.torque_scale
+            torque = (scales[0] * a[1], scales[1] * a[2], scales[2] * a[3])
+        elif mode == Control.CTBR:
+            rates = p.rate_scale
+            torque = rate_torque((rates[0] * a[1], rates[1] * a[2], rates[2] * a[3]), w_B, p)
+        elif mode == Control.ATTITUDE:
+            s_roll, c_roll = sin_cos(p.tilt_scale * a[1])
+            s_pitch, c_pitch = sin_cos(p.tilt_scale * a[2])
+            z_level = (s_pitch, -c_pitch * s_roll, c_pitch * c_roll)
+            z_I = apply_transposed(level_axes(R_BI), z_level)
+            rates_wanted = tilt_rates(z_I, R_BI, p.rate_scale[2] * a[3], p)
+            torque = rate_torque(rates_wanted, w_B, p)
+        elif mode == Control.VELOCITY:
+            level = level_axes(R_BI)
+            v_level = apply(level, load3(flight.v_seen))
+            s = p.velocity_scale
+            k = p.mass * p.velocity_bandwidth
+            F_level = (
+                clip(k * (s * a[0] - v_level[0]), -weight, weight),
+                clip(k * (s * a[1] - v_level[1]), -weight, weight),
+                weight + clip(k * (s * a[2] - v_level[2]), -0.5 * weight, weight),
+            )
+            F_I = apply_transposed(level, F_level)
+            thrust = dot(F_I, R_BI[2])
+            rates_wanted = tilt_rates(unit_or(F_I, R_BI[2]), R_BI, p.rate_scale[2] * a[3], p)
+            torque = rate_torque(rates_wanted, w_B, p)
+        else:
+            thrust, torque = pd_wrench(
+                load3(flight.r_seen), load3(flight.v_seen), R_BI, w_B, reference, p
+            )
+        voltages = allocate(thrust, torque, p)
+    store4(flight.voltages, voltages)
+
+
+@stage
+def control_stage(flight, world, model, settings, work, stages, flag):
+    """Set the motor voltages of a tick."""
+    flying, believed = lanes_of(flight), lanes_of(model)
+    nothing = load3(flying.disturbance)
+    reference = (nothing, nothing, nothing, nothing)
+    if settings.control == Control.PD:
+        reference = evaluate_reference(flying, flying.tick * believed.dt)
+    act(flying, believed, settings.control, reference)

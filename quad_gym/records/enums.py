@@ -1,0 +1,147 @@
+"""Every enumeration that records hold, once."""
+
+from enum import IntEnum, IntFlag
+
+
+class FilterStatus(IntFlag):
+    """What has gone wrong in a filter since its start; 0 when nothing has."""
+
+    PREDICTION_FAILED = 1
+    """The predicted covariance was not positive definite; the filter kept its last good state."""
+    UPDATE_FAILED = 2
+    """A measurement update was not finite; the filter kept the state before it."""
+
+
+class FilterForm(IntFlag):
+    """How a filter differs from the report's, and what it keeps; 0 is the report's UKF."""
+
+    EKF = 1
+    """derivatives of the models in place of sigma points"""
+    MIDPOINT = 2
+    """prediction turns the attitude exactly and the force with the attitude halfway"""
+    TURN = 4
+    """the covariance turns with the error angles when they are set to zero"""
+    INNOVATIONS = 8
+    """updates keep the innovations, their predicted deviations and their NIS, block by block"""
+    GATE = 16
+    """updates leave out blocks whose NIS is beyond the gate, and keep all of these, too"""
+    GRADUAL = 32
+    """updates take images in portions while the attitude is uncertain"""
+
+
+class Gate(IntEnum):
+    """What became of a block of the last measurement."""
+
+    NONE = 0
+    """not measured since the start of the episode"""
+    ACCEPTED = 1
+    REJECTED = 2
+    FAILED = 3
+    """the update that it was part of failed as a whole, see FilterStatus"""
+    UNSURE = 4
+    """a feature left out, as its direction was predicted too vaguely for a linear model"""
+
+
+class Source(IntEnum):
+    """Where the controller's view of the state comes from."""
+
+    TRUTH = 0
+    ESTIMATE = 1
+    NOISY = 2
+    SENSORS = 3
+
+
+class Control(IntEnum):
+    """What the four numbers of an action mean."""
+
+    MOTOR = 0
+    WRENCH = 1
+    CTBR = 2
+    ATTITUDE = 3
+    VELOCITY = 4
+    PD = 5
+    """No action: the report's controller follows the reference at every tick."""
+
+
+class Task(IntEnum):
+    """What a flight is to do."""
+
+    HOVER = 1
+    CIRCLE = 2
+    LEMNISCATE = 3
+    RANDOM_TRAJECTORY = 4
+    WAYPOINTS = 5
+
+
+class Start(IntEnum):
+    """How an episode begins."""
+
+    GROUND = 0
+    """At rest below the reference at height 0, rotors stopped: the report's."""
+    HOVER = 1
+    """Hovering, at rest, within some decimetres of the reference."""
+    MIXED = 2
+    """Either, by a coin: for training, as a policy that has learned to hover learns to take off."""
+
+
+class Layout(IntEnum):
+    """What an observation holds."""
+
+    RELATIVE = 0
+    ABSOLUTE = 1
+    SENSORS = 2
+
+
+class Autoreset(IntEnum):
+    """When a flight whose episode is over begins the next one."""
+
+    DISABLED = 0
+    NEXT_STEP = 1
+    SAME_STEP = 2
+
+
+class Ending(IntEnum):
+    """Why an episode ended."""
+
+    NONE = 0
+    TIME_LIMIT = 1
+    OUT_OF_BOUNDS = 2
+    TIPPED_OVER = 3
+    ON_THE_GROUND = 4
+    LAST_GATE = 5
+    FILTER_FAILED = 6
+
+
+class Command(IntEnum):
+    """What a call of the batch kernel does."""
+
+    STEP = 0
+    RESET = 1
+
+
+class Supply(IntEnum):
+    """What limits the motor voltages beside the controller."""
+
+    NOMINAL = 0
+    """nothing: the controller knows the largest voltage"""
+    LIMIT = 1
+    """a largest voltage that the controller does not know"""
+    BATTERY = 2
+    """a battery, see `quad_gym.BatteryParams`"""
+
+
+class FaultKind(IntEnum):
+    """What can go wrong; a flight has one fault of each kind at most, which may come again."""
+
+    GNSS_OUTAGE = 0
+    GNSS_OUTLIERS = 1
+    GNSS_RAMP = 2
+    GNSS_JUMP = 3
+    BASELINE_LOSS = 4
+    POSITION_JUMP = 5
+    CAMERA_OCCLUSION = 6
+    WRONG_ASSOCIATIONS = 7
+    ACCEL_BIAS_STEP = 8
+    GYRO_BIAS_STEP = 9
+    IMU_SATURATION = 10
+    ROTOR_LOSS = 11

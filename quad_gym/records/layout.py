@@ -1,0 +1,45 @@
+"""Records in memory: a flight by itself, and WIDTH flights side by side.
+
+In a block of flights (`block_dtype`) every field has a trailing axis of WIDTH. The scalar form
+(`scalar_dtype`) has the same fields without it. Kernels read both by field name.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.records.flight import FLIGHT_FIELDS
+from quad_gym.records.params import PARAMS_FIELDS
+from quad_gym.records.settings import SETTINGS_FIELDS
+from quad_gym.records.sizes import WIDTH, Field
+from quad_gym.records.work import WORK_FIELDS
+
+
+def scalar_dtype(fields: tuple[Field, ...]) -> np.dtype:
+    """The record of one flight."""
+    return np.dtype([(f.name, f.kind, f.shape) for f in fields], align=True)
+
+
+def block_dtype(fields: tuple[Field, ...]) -> np.dtype:
+    """The record of WIDTH flights: every field with a trailing axis of WIDTH."""
+    return np.dtype([(f.name, f.kind, (*f.shape, WIDTH)) for f in fields], align=True)
+
+
+FLIGHT, FLIGHT_BLOCK = scalar_dtype(FLIGHT_FIELDS), block_dtype(FLIGHT_FIELDS)
+PARAMS, PARAMS_BLOCK = scalar_dtype(PARAMS_FIELDS), block_dtype(PARAMS_FIELDS)
+WORK, WORK_BLOCK = scalar_dtype(WORK_FIELDS), block_dtype(WORK_FIELDS)
+SETTINGS = scalar_dtype(SETTINGS_FIELDS)
+
+
+def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:
+    """`count` zeroed records that begin on a cache line."""
+    raw = np.zeros(count * dtype.itemsize + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + count * dtype.itemsize].view(dtype)
+
+
+def field_of_flights(blocks: NDArray[Any], name: str, count: int) -> NDArray[Any]:
+    """One field of the first `count` flights, as an array (count, ...): a copy."""
+    values = np.moveaxis(blocks[name], -1, 1)
+    return values.reshape(-1, *values.shape[2:])[:count].copy()

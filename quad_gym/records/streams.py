@@ -1,0 +1,62 @@
+"""The numbers of all random draws: one table, so that no two quantities share a draw.
+
+A flight's random stream is counter-based: draw n of an instant is a function of the flight's key,
+the instant and n. Each quantity owns a range of numbers. A draw gives two numbers.
+"""
+
+from typing import NamedTuple
+
+from quad_gym.records.draws import DRAWN_SIZE
+from quad_gym.records.sizes import FAULT_KINDS, MAX_FEATURES, MAX_GATES, MAX_HARMONICS
+
+DRAWS_OF_FAULT = 8
+"""Draws of a kind of fault: when it comes (2), what it is (2), what it does to one sample (4)."""
+
+
+class DrawRange(NamedTuple):
+    """The draws of one quantity within an instant."""
+
+    quantity: str
+    first: int
+    count: int
+
+
+DRAW_RANGES: list[DrawRange] = []
+"""Every range; no two overlap."""
+
+
+def _claim(quantity: str, first: int, count: int) -> int:
+    """Give a quantity its draws; returns the first.
+
+    Raises:
+        ValueError: If another quantity has one of them.
+    """
+    for other in DRAW_RANGES:
+        if first < other.first + other.count and other.first < first + count:
+            raise ValueError(f"draws of {quantity!r} overlap those of {other.quantity!r}")
+    DRAW_RANGES.append(DrawRange(quantity, first, count))
+    return first
+
+
+# of every instant
+DRAW_BIAS = _claim("driving noise of the IMU biases", 0, 3)
+DRAW_IMU = _claim("white noise of the IMU", 3, 3)
+DRAW_GNSS = _claim("white noise of GNSS position and baseline", 6, 3)
+DRAW_NOISY = _claim("noise of noisy observations", 9, 6)
+DRAW_FEATURE = _claim("noise of pixels", 16, MAX_FEATURES)
+DRAW_GUST = _claim("gusts", 192, 3)
+DRAW_DRIFT = _claim("slow error of GNSS positions", 512, 3)
+DRAW_VELOCITY = _claim("noise of the GNSS velocity", 516, 3)
+DRAW_FAULTS = _claim("faults", 1024, DRAWS_OF_FAULT * FAULT_KINDS)
+DRAW_HIDDEN = _claim("features that an occlusion hides", 2048, MAX_FEATURES)
+# of an episode's first instant
+DRAW_COURSE = _claim("phase, radius, period and sense of the reference", 64, 2)
+DRAW_START = _claim("start", 66, 5)
+DRAW_FIRST_BIASES = _claim("IMU biases at the start", 71, 3)
+DRAW_GROUND = _claim("whether a mixed start is on the ground", 74, 1)
+DRAW_SERIES = _claim("coefficients of a random trajectory", 80, 3 * MAX_HARMONICS)
+DRAW_GATES = _claim("gates", 128, 1 + 2 * MAX_GATES)
+DRAW_PARAMETERS = _claim("randomized parameters", 256, DRAWN_SIZE)
+DRAW_PHASE = _claim("phases of GNSS and camera", 515, 1)
+DRAW_MARK = _claim("heading that the mark of the start tells", 519, 1)
+DRAW_WARM = _claim("errors of a warm start", 544, 8)

@@ -1,0 +1,54 @@
+"""The workspace of a thread: nothing in it outlasts a step."""
+
+from quad_gym.records.sizes import MAX_FEATURES, MAX_MEASUREMENTS, MAX_OBSERVATION, Field
+
+# fmt: off
+WORK_FIELDS = (
+    # the arguments of a stage
+    Field("mask", (), "0 or 1", "lanes that the stage works on"),
+    Field("start", (17,), "mixed", "true state at the start of the tick: r, v, q, w, rotor speeds"),
+    # prediction
+    Field("P", (15, 15), "mixed", "lower triangle of the predicted covariance; then its factor"),
+    Field("F", (9, 15), "mixed", "half-differences of the propagated sigma points / c; rows r, v, e"),
+    Field("S", (9, 9), "mixed", "half-sums of the propagated sigma points less the centre / c; rows r, v, e"),
+    # update; the nine columns of L that matter come last first
+    Field("X_B", (MAX_FEATURES, 3), "m", "features relative to the centre of mass, in B"),
+    Field("inverse_distance", (MAX_FEATURES,), "1/m", "of the features from the camera"),
+    Field("h", (MAX_MEASUREMENTS,), "mixed", "measurement predicted at the centre"),
+    Field("z", (MAX_MEASUREMENTS,), "mixed", "innovation; then whitened"),
+    Field("A", (9, MAX_MEASUREMENTS), "mixed", "half-differences of the measured sigma points / c; then whitened"),
+    Field("E", (9, MAX_MEASUREMENTS), "mixed", "half-sums of the measured sigma points less the centre / c"),
+    Field("mu", (MAX_MEASUREMENTS,), "mixed", "mean of the measured sigma points less the centre"),
+    Field("Rz", (MAX_MEASUREMENTS, MAX_MEASUREMENTS), "mixed", "noise, part even in the sigma points included; then its factor"),
+    Field("N", (9, 9), "-", "I + C C^T; then its factor"),
+    Field("t", (9,), "-", "C times the whitened innovation; then whitened by N"),
+    Field("L9", (15, 9), "mixed", "the nine columns of L; then of the updated factor"),
+    Field("inverse_diagonal", (MAX_MEASUREMENTS,), "mixed", "of a Cholesky factor"),
+    # the batch
+    Field("begins", (), "0 or 1", "lanes that begin an episode"),
+    Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
+    # what arrived before, while something new is measured
+    Field("kept_position", (3,), "m", "gnss_position"),
+    Field("kept_baseline", (3,), "m", "gnss_baseline"),
+    Field("kept_velocity", (3,), "m/s", "gnss_velocity"),
+    Field("kept_pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
+    Field("kept_seen", (MAX_FEATURES,), "0 or 1", "features that arrive now"),
+    # the estimate before a late update
+    Field("kept_r", (3,), "m", "r_hat"),
+    Field("kept_v", (3,), "m/s", "v_hat"),
+    Field("kept_R", (3, 3), "-", "R_hat"),
+    Field("kept_b_a", (3,), "m/s^2", "b_a_hat"),
+    Field("kept_b_g", (3,), "rad/s", "b_g_hat"),
+    Field("kept_L", (15, 15), "mixed", "L"),
+    Field("kept_rates", (3,), "rad/s", "w_meas"),
+    Field("kept_failures", (), "-", "update_failures"),
+    # the instant to which a late update goes back
+    Field("since_time", (), "s", "T since then"),
+    Field("since_turn", (3, 3), "-", "C of then"),
+    Field("since_velocity", (3,), "m/s", "V of then"),
+    Field("since_position", (3,), "m", "X of then"),
+    Field("since_bias_gain", (3, 3), "s", "B_s, gain of the biases since then"),
+    Field("since_noise", (), "0 or 1", "whether the noise since then was taken out"),
+    Field("columns", (15, 21), "mixed", "L and six columns of noise, taken back or on"),
+)
+# fmt: on
