@@ -9,6 +9,7 @@ import contextlib
 import functools
 import hashlib
 import inspect
+import os
 import pickle
 import sys
 import time
@@ -40,6 +41,14 @@ def cache_of(function: Callable[..., Any]) -> "CodeCache":
     return CodeCache(function)
 
 
+def where_cached(*folders: Path | None) -> str:
+    """Where the compiled code goes that is cached in these folders, for messages."""
+    known = [str(folder) for folder in folders if folder is not None]
+    if not known:
+        return "not cached: no folder can be written; set NUMBA_CACHE_DIR to one that can"
+    return f"once; cached in {os.path.commonpath(known)}"
+
+
 class CodeCache(caching._Cache):  # type: ignore[misc]
     """The compiled code of one function, by signature; what Numba asks a dispatcher's cache for."""
 
@@ -58,7 +67,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
         for kind in _LOCATORS:
             locator = kind.from_function(self._function, file)
             if locator is not None:
-                return Path(locator.get_cache_path())
+                return Path(locator.get_cache_path()).absolute()
         return None
 
     @functools.cached_property
@@ -177,14 +186,9 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
         path = None if self.folder is None else self.folder / self._name(signature, context)
         with locked(None if path is None else path.with_suffix(".lock")):
             if self.announcing and not self.holds(signature, context):
-                say(f"quad_gym: compiling {self._function.__name__} ({self.where()})")
+                where = where_cached(self.folder)
+                say(f"quad_gym: compiling {self._function.__name__} ({where})")
             yield
-
-    def where(self) -> str:
-        """Where compiled code goes, for messages."""
-        if self.folder is None:
-            return "not cached: no folder can be written; set NUMBA_CACHE_DIR to one that can"
-        return f"once; cached in {self.folder}"
 
     def _files(self, kind: str) -> list[Path]:
         return [] if self.folder is None else list(self.folder.glob(f"{self._stem}.*.{kind}"))

@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from typing import IO, Any
 
-from quad_gym.kernels.compiling.cache import CodeCache, cache_of
+from quad_gym.kernels.compiling.cache import CodeCache, cache_of, where_cached
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.kernels.compiling.locks import locked, say
 
@@ -190,7 +190,8 @@ class _Progress:
         self._running: list[str] = []
         self._start = time.monotonic()
         self._moves = sys.stderr is not None and sys.stderr.isatty()
-        where = dispatcher_of(names[0])._cache.where()
+        folders = [dispatcher_of(name)._cache.folder for name in names]
+        where = where_cached(*folders)
         say(f"quad_gym: compiling {self._count} parts for this machine ({where})")
 
     def begins(self, name: str) -> None:
