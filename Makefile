@@ -1,5 +1,6 @@
 # Every target sets up what it needs: a virtual environment in .venv, with the tested versions.
 PYTHON ?= python3
+JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
@@ -35,8 +36,8 @@ animation: setup  ## the animation of README
 compare: $(VENV)/.trainer  ## the comparison of the README: two sensor suites, 5 training seeds
 	$(BIN)/python scripts/compare.py --sensors lab rtk --output results/compare/circle
 
-test: setup  ## the tests, without the slow statistical and soak ones
-	$(BIN)/python -m pytest -m "not slow"
+test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 
 test-slow: setup  ## the slow statistical and soak tests
 	$(BIN)/python -m pytest -m slow

@@ -2,6 +2,10 @@
 
 from hypothesis import HealthCheck, settings
 
+from quad_gym.kernels.compiling.linked import names_of
+from quad_gym.kernels.compiling.stages import SOURCES
+from quad_gym.kernels.compiling.workers import prepare
+
 settings.register_profile(
     "quad_gym",
     deadline=None,
@@ -10,3 +14,9 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("quad_gym")
+
+
+def pytest_sessionstart(session):
+    """Compile all stages first where tests run in several processes, which then only load them."""
+    if getattr(session.config.option, "numprocesses", None):
+        prepare(names_of(frozenset(SOURCES)))

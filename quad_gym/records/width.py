@@ -2,9 +2,6 @@
 
 import os
 
-import llvmlite.binding as llvm
-from numba.core import config
-
 WIDTHS = (2, 4, 8)
 """Numbers of lanes that there can be."""
 
@@ -27,13 +24,24 @@ def lanes_of_machine() -> int:
 
 
 def _features() -> set[str]:
-    """The processor's features for which Numba compiles, as LLVM calls them."""
-    if config.CPU_FEATURES is not None:
-        names = config.CPU_FEATURES.split(",")
+    """The processor's features for which Numba compiles, as LLVM calls them.
+
+    As NumPy knows them: importing Numba for this takes a second.
+    """
+    if os.environ.get("NUMBA_CPU_FEATURES"):
+        names = os.environ["NUMBA_CPU_FEATURES"].split(",")
         return {name[1:] for name in names if name.startswith("+")}
-    if config.CPU_NAME:  # compiled for another processor: only what all of its kind have
+    if os.environ.get("NUMBA_CPU_NAME"):  # compiled for another one: only what all of its kind have
         return set()
-    return {name for name, present in llvm.get_host_cpu_features().items() if present}
+    try:
+        from numpy._core._multiarray_umath import (  # type: ignore[import-not-found]
+            __cpu_features__ as features,
+        )
+    except ImportError:
+        from llvmlite.binding import get_host_cpu_features
+
+        features = get_host_cpu_features()
+    return {name.lower() for name, present in features.items() if present}
 
 
 WIDTH = lanes_of_machine()

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 import quad_gym
 from quad_gym import threads
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.kernels.compiling import cores
 from tests.contract.comparing import actions_of, assert_same
 
 PATIENCE = 300
@@ -201,16 +202,15 @@ def test_a_kernel_is_compiled_once_and_loaded_ever_after(filled_cache):
 def test_two_processes_may_fill_an_empty_cache_at_once(tmp_path):
     both = [start(tmp_path) for _ in range(2)]
     outcomes = [outcome(process) for process in both]
-    assert all(outcomes)
+    assert sorted(outcomes) == [False, True]  # one compiles, the other waits and loads
     assert not outcome(start(tmp_path))
 
 
-@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
 @pytest.mark.parametrize("damage", ["emptied", "cut", "overwritten"])
-def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, ending, damage):
+def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, damage):
     cache = tmp_path / "cache"
     shutil.copytree(filled_cache, cache)
-    files = list(cache.rglob(f"*{ending}"))
+    files = list(cache.rglob("*.code"))
     assert files
     for file in files:
         content = file.read_bytes()
@@ -220,7 +220,7 @@ def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, ending, damage
     assert not outcome(start(cache))
 
 
-def test_a_change_in_any_kernel_means_compiling_anew(filled_cache, tmp_path):
+def test_a_change_in_a_kernel_that_it_reaches_means_compiling_anew(tmp_path):
     copy = tmp_path / "quad_gym"
     source = Path(quad_gym.__file__).parent
     shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -237,9 +237,15 @@ def test_a_change_in_any_kernel_means_compiling_anew(filled_cache, tmp_path):
         pytest.skip("the installed package comes before PYTHONPATH")
     assert run_in(tmp_path, anew)
     assert not run_in(tmp_path, anew)
-    with (copy / "kernels" / "reference.py").open("a") as file:
-        file.write("\n# changed\n")
-    assert run_in(tmp_path, anew)
+    for room, change, stale in (
+        ("maths/rotation.py", "# a comment", False),
+        ("task/reference.py", "_CHANGED = True", False),
+        ("maths/rotation.py", "_CHANGED = True", True),
+    ):
+        with (copy / "kernels" / room).open("a") as file:
+            file.write(f"\n{change}\n")
+        assert run_in(tmp_path, anew) == stale
+        assert not run_in(tmp_path, anew)
 
 
 def run_in(folder, begin):
@@ -293,12 +299,12 @@ def test_cores_are_limited_by_a_containers_quota(monkeypatch):
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     for quota, expected in ((None, 16), (4, 4), (64, 16)):
-        monkeypatch.setattr(threads, "_cgroup_cores", lambda quota=quota: quota)
-        assert threads.available_cores() == expected
+        monkeypatch.setattr(cores, "_cgroup_cores", lambda quota=quota: quota)
+        assert cores.available_cores() == expected
     for limit, expected in (("3", 3), ("0", 16), ("-2", 16), ("many", 16)):
-        monkeypatch.setattr(threads, "_cgroup_cores", lambda: None)
+        monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
         monkeypatch.setenv("NUMBA_NUM_THREADS", limit)
-        assert threads.available_cores() == expected
+        assert cores.available_cores() == expected
 
 
 def test_an_environment_takes_the_available_cores(monkeypatch):

@@ -73,8 +73,10 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
     @functools.cached_property
     def _folders(self) -> list[Path]:
         """Where files are looked for: also beside the kernels, where somebody else put them."""
-        beside = Path(inspect.getfile(self._function)).parent / "__pycache__"
-        return [folder for folder in (self.folder, beside) if folder is not None]
+        beside = Path(inspect.getfile(self._function)).absolute().parent / "__pycache__"
+        if self.folder is None:
+            return [beside]
+        return [self.folder] if config.CACHE_DIR else [self.folder, beside]
 
     @property
     def cache_path(self) -> str | None:
