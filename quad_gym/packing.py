@@ -1,11 +1,13 @@
 """Parameters as records: from the dataclasses that users write to the numbers that kernels read."""
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from quad_gym import portable
 from quad_gym.filter_params import FilterParams
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import ActionParams, Clocks, PDGains, TaskParams, VehicleParams
@@ -25,7 +27,6 @@ from quad_gym.records import (
     Task,
     aligned_zeros,
 )
-from quad_gym.rotations import euler_to_dcm
 from quad_gym.sensor_params import SensorSuite, delay_ticks
 from quad_gym.world_packing import pack_world
 from quad_gym.world_params import WorldParams
@@ -46,11 +47,11 @@ def params_record(
     p = record[0]
 
     p["gravity"], p["mass"] = vehicle.gravity, vehicle.mass
-    p["inertia"], p["inertia_inverse"] = vehicle.inertia, np.linalg.inv(vehicle.inertia)
+    p["inertia"], p["inertia_inverse"] = vehicle.inertia, portable.inverse(vehicle.inertia)
     p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
     p["kF"] = vehicle.thrust_coefficient
     p["effectiveness"] = p["sound_effectiveness"] = vehicle.effectiveness
-    p["allocation"] = np.linalg.inv(vehicle.effectiveness)
+    p["allocation"] = portable.inverse(vehicle.effectiveness)
     p["motor_tau"], p["motor_gain"] = vehicle.motor_time_constant, vehicle.motor_speed_per_volt
     p["max_voltage"], p["max_rotor_force"] = vehicle.max_voltage, vehicle.max_rotor_force
     p["hover_voltage"] = vehicle.hover_voltage
@@ -70,23 +71,23 @@ def params_record(
     p["torque_scale"] = vehicle.hover_torques
 
     p["dt"], p["imu_lever_arm"] = imu.dt, imu.lever_arm_B
-    p["accel_sigma"] = imu.accel_noise_density / np.sqrt(imu.dt)
-    p["gyro_sigma"] = imu.gyro_noise_density / np.sqrt(imu.dt)
+    p["accel_sigma"] = imu.accel_noise_density / math.sqrt(imu.dt)
+    p["gyro_sigma"] = imu.gyro_noise_density / math.sqrt(imu.dt)
     for sensor in ("accel", "gyro"):
         sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
         p[f"{sensor}_bias_sigma"] = sigma
-        p[f"{sensor}_bias_decay"] = np.exp(-imu.dt / tau)
-        p[f"{sensor}_bias_drive"] = sigma * np.sqrt(-np.expm1(-2.0 * imu.dt / tau))
+        p[f"{sensor}_bias_decay"] = math.exp(-imu.dt / tau)
+        p[f"{sensor}_bias_drive"] = sigma * math.sqrt(-math.expm1(-2.0 * imu.dt / tau))
 
     if gnss is not None:
         p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
         p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
-        p["baseline_length"] = np.linalg.norm(gnss.baseline_B)
+        p["baseline_length"] = portable.norm(gnss.baseline_B)
         p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
         p["position_sigma"], p["velocity_sigma"] = gnss.believed_sigma_I, gnss.velocity_sigma or 0.0
         period = 1.0 / (gnss.rate * gnss.drift_tau)
-        p["drift_decay"] = np.exp(-period)
-        p["drift_drive"] = np.array(gnss.drift_sigma_I) * np.sqrt(-np.expm1(-2.0 * period))
+        p["drift_decay"] = math.exp(-period)
+        p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
     else:  # the place of the start, as if its centre and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
         p["gnss_sigma"] = sensors.placement.position_sigma
@@ -97,7 +98,7 @@ def params_record(
 
     if sensors.camera is not None:
         camera = sensors.camera
-        p["camera"], p["R_CB"] = camera.position_B, euler_to_dcm(camera.attitude)
+        p["camera"], p["R_CB"] = camera.position_B, portable.euler_dcm(camera.attitude)
         p["pixel_size"], p["focal_length"] = camera.pixel_size, camera.focal_length
         p["half_image"] = np.array(camera.image_size) / 2
         p["pixel_sigma"] = camera.pixel_sigma
@@ -212,7 +213,7 @@ def settings_record(
     s["randomize"] = task.randomize
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
-    s["least_up"] = np.cos(task.max_tilt)
+    s["least_up"] = math.cos(task.max_tilt)
     s["radius"], s["period"], s["height"] = task.radius, task.period, task.height
     s["max_speed"], s["max_acceleration"] = task.max_speed, task.max_acceleration
     s["gate_count"], s["gate_radius"] = task.gate_count, task.gate_radius

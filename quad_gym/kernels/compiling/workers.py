@@ -92,7 +92,8 @@ def _feed(
     process: "subprocess.Popen[str]", todo: "queue.SimpleQueue[str]", progress: "_Progress"
 ) -> None:
     """Hand names to one worker, one after the other, until there are none or it dies."""
-    assert process.stdin is not None and process.stdout is not None
+    assert process.stdin is not None
+    assert process.stdout is not None
     while True:
         try:
             name = todo.get_nowait()
