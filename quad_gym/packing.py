@@ -14,6 +14,7 @@ from quad_gym.params import ActionParams, Clocks, PDGains, TaskParams, VehiclePa
 from quad_gym.records import (
     BASELINE_BLOCK,
     FREEDOMS,
+    MAX_HARMONICS,
     PARAMS,
     PARAMS_BLOCK,
     POSITION_BLOCK,
@@ -139,6 +140,10 @@ def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
     return form
 
 
+_HARMONICS = {Task.CIRCLE: 1, Task.LEMNISCATE: 2, Task.RANDOM_TRAJECTORY: MAX_HARMONICS}
+"""Terms of the series of a task's reference; none elsewhere."""
+
+
 def _phase_ticks(phase: float | None, period: int) -> int:
     """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
     return -1 if phase is None else min(round(phase * period), period - 1)
@@ -211,6 +216,7 @@ def settings_record(
     s["autoreset"], s["run_filter"] = autoreset, run_filter
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
     s["randomize"] = task.randomize
+    s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], 0)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
     s["least_up"] = math.cos(task.max_tilt)

@@ -202,7 +202,7 @@ class FlightBatch:
         self._actions = np.zeros((self.count, 4))
         self._resets = np.zeros(self.count, np.uint8)
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
-        self.results = np.zeros((self.count, len(RESULTS)))
+        self._results = np.zeros((len(RESULTS), self.count))
 
     # ---- flying -------------------------------------------------------------------------------
 
@@ -288,7 +288,7 @@ class FlightBatch:
                 self._high,
                 observations,
                 self.final_observations,
-                self.results,
+                self._results,
             )
 
         run_ranges(part, len(self._blocks), self.threads)
@@ -359,9 +359,14 @@ class FlightBatch:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
 
+    @property
+    def results(self) -> NDArray[np.float64]:
+        """(count, 12) of the last step, in the columns of `RESULTS`; the next step overwrites it."""
+        return self._results.T
+
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
-        return self.results[:, RESULTS.index(name)].copy()
+        return self._results[RESULTS.index(name)].copy()
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """What the present episodes have drawn, by name: (count,) or (count, components)."""

@@ -1,7 +1,7 @@
 """The golden flights: what flies, and its digest.
 
-    python -m tests.golden.flights            # compare with the digests in flights.json
-    python -m tests.golden.flights --renew    # make them anew
+python -m tests.golden.flights            # compare with the digests in flights.json
+python -m tests.golden.flights --renew    # make them anew
 """
 
 import argparse
