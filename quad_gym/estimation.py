@@ -10,7 +10,7 @@ from quad_gym import validation as check
 from quad_gym.kernels import single
 from quad_gym.packing import form_of, params_record
 from quad_gym.params import VehicleParams
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterForm, FilterStatus
 from quad_gym.sensor_params import SensorSuite
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
@@ -61,10 +61,12 @@ class _KalmanFilter:
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         self._params = params_record(VehicleParams(), sensors)
         self._params["gravity"] = sensors.estimator.gravity
-        form = form_of(sensors.estimator.replace(kind=self._kind), innovations=True)
+        lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
+        estimator = sensors.estimator.replace(kind=self._kind)
+        form = form_of(estimator, innovations=True, lever_arm=lever_arm)
         self._form = int(form)
         self._flight = np.zeros(1, FLIGHT)
-        self._flight["block_nis"] = np.nan
+        self._flight["block_nis"] = self._flight["w_before"] = np.nan
         self._work = np.zeros(1, WORK)
         self._running = False
 
@@ -100,6 +102,7 @@ class _KalmanFilter:
             angle = check.number("heading", heading)
             x_I[:2] = np.cos(angle), np.sin(angle)
         self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
+        self._flight["w_before"] = np.nan
         single.ukf_initialize(self._flight, self._params, x_I)
         self._running = True
 
@@ -147,6 +150,7 @@ class _KalmanFilter:
         for name, value in zip(_STATE, values, strict=True):
             self._flight[name] = value
         self._flight["L"], self._flight["filter_status"] = L, 0
+        self._flight["w_before"] = np.nan
         self._running = True
 
     def update(
@@ -222,7 +226,10 @@ class _KalmanFilter:
         rates = check.array("gyro", gyro, (3,))
         force = check.array("accel", accel, (3,))
         self._flight["gyro"], self._flight["accel"] = rates, force
-        self._flight["w_meas"] = rates  # turns the lever arm of a velocity
+        # they turn the lever arms of a velocity and of the accelerometer
+        known = np.isfinite(self._flight["w_before"]).all()
+        self._flight["w_before"] = self._flight["w_meas"] if known else rates
+        self._flight["w_meas"] = rates
         before = self.status
         single.ukf_predict(self._flight, self._params, self._work, self._form)
         self._warn_of_news(before)

@@ -28,7 +28,7 @@ from quad_gym.records import (
     Task,
     aligned_zeros,
 )
-from quad_gym.sensor_params import SensorSuite, delay_ticks
+from quad_gym.sensor_params import ImuParams, SensorSuite, delay_ticks
 from quad_gym.world_packing import pack_world
 from quad_gym.world_params import WorldParams
 
@@ -124,8 +124,14 @@ def params_record(
     return record
 
 
-def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
-    """How a filter differs from the report's, and what it keeps, for the kernels."""
+def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
+    """How a filter differs from the report's, and what it keeps, for the kernels.
+
+    Args:
+        estimator: The filter.
+        innovations: Whether it keeps innovations.
+        lever_arm: How it takes the accelerometer's lever arm into account, see `lever_form`.
+    """
     form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
     if estimator.kind == "ekf":
         form |= FilterForm.EKF
@@ -137,7 +143,20 @@ def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
         form |= FilterForm.GATE
     if estimator.gradual_above is not None:
         form |= FilterForm.GRADUAL
-    return form
+    return FilterForm(form | lever_arm)
+
+
+def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
+    """How a filter takes the accelerometer's lever arm into account, where there is one.
+
+    Args:
+        imu: As the filter believes it.
+        drawn: Whether the filter knows a lever arm that each episode draws.
+    """
+    if not (drawn or any(imu.lever_arm_B)):
+        return FilterForm(0)
+    averages = imu.samples == "average"
+    return FilterForm.LEVER_AVERAGES if averages else FilterForm.LEVER_SAMPLES
 
 
 _HARMONICS = {Task.CIRCLE: 1, Task.LEMNISCATE: 2, Task.RANDOM_TRAJECTORY: MAX_HARMONICS}
@@ -194,12 +213,13 @@ def settings_record(
     run_filter: bool,
     innovations: bool = False,
     gnss_drifts: bool = False,
+    lever_drawn: bool = False,
 ) -> NDArray[Any]:
     """What a batch does, as one scalar record, shape (1,)."""
     record = np.zeros(1, SETTINGS)
     s = record[0]
     s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
-    s["form"] = form_of(sensors.estimator, innovations)
+    s["form"] = form_of(sensors.estimator, innovations, lever_form(sensors.imu, lever_drawn))
     s["imu_averages"] = sensors.imu.samples == "average"
     if sensors.gnss is not None:
         s["gnss_ticks"] = clocks.ticks_between("gnss")

@@ -169,6 +169,8 @@ class FlightBatch:
             autoreset=Autoreset(autoreset),
             run_filter=run_filter,
             innovations=innovations,
+            lever_drawn=self.randomization.known
+            and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
             gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
         )
         pack_options(

@@ -4,7 +4,7 @@ import numpy as np
 from numba import types
 from numba.np.numpy_support import from_dtype
 
-from quad_gym.kernels.compiling import Stage, call_stage, entry
+from quad_gym.kernels.compiling import call_stage, entry
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.predict import predict
 from quad_gym.kernels.filter.update import update

@@ -2,12 +2,12 @@
 
 from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
+    DELAY_SLOTS,
     FAULT_KINDS,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_GATES,
     MAX_HARMONICS,
-    DELAY_SLOTS,
     Field,
 )
 
@@ -33,6 +33,7 @@ FLIGHT_FIELDS = (
     Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.randomization`"),
     # the last measurements
     Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
+    Field("w_before", (3,), "rad/s", "w_meas one sample before"),
     Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
     Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
     Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
