@@ -207,7 +207,10 @@ class PlacementParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class NoisyObservationParams(Checked):
-    """Standard deviations of `observation="noisy"`: the size of the converged filter's errors."""
+    """Standard deviations of `observation="noisy"`: the size of the converged filter's errors.
+
+    The defaults are those of the laboratory's sensors; a suite of other sensors has its own.
+    """
 
     position: float = 0.0018
     """per axis [m]; measured on the laboratory's circle"""
