@@ -26,6 +26,7 @@ import numpy as np
 from compare_flights import Floats, Flown, fly
 from compare_report import Comparison, Setting, conclusions, matrix_text, write_figures, write_page
 
+from baselines.seeds import first_seed
 from quad_gym import IDS, plots
 from quad_gym import validation as check
 from quad_gym.cli import leave, option, parse, usage_errors
@@ -68,7 +69,9 @@ class Args:
     )
 
     episodes: int = option(1000, "flown with each policy on each observation", group="flights")
-    seed: int = option(0, "of the first episode, and of the first training")
+    seed: int = option(
+        0, "of the first episode, and of the first training; no training flies these episodes"
+    )
     output: Path | None = option(
         None, "folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"
     )
@@ -103,6 +106,7 @@ def configure(args: Args) -> Setting:
     if args.steps is not None:
         chosen = chosen.replace(steps=args.steps)
     seeds = QUICK_SEEDS if args.quick else args.seeds
+    episodes = QUICK_EPISODES if args.quick else args.episodes
     plans = {}
     for seed in range(args.seed, args.seed + seeds):  # the first seed is complete first
         for suite in args.sensors:
@@ -129,8 +133,8 @@ def configure(args: Args) -> Setting:
         suites=args.sensors,
         sources=args.train_on,
         seeds=tuple(range(args.seed, args.seed + seeds)),
-        episodes=QUICK_EPISODES if args.quick else args.episodes,
-        first_episode=args.seed,
+        episodes=episodes,
+        first_episode=first_seed("test", args.seed, episodes),
         environment=dict(args.env),
         plans=plans,
         folder=folder,

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import gymnasium
 
 from baselines.policies import load_policy, task_of
+from baselines.seeds import first_seed
 from quad_gym import IDS, plots
 from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.comparison_plots import error_over_time_figure, paths_figure
@@ -46,7 +47,9 @@ class Args:
         {}, "further keywords of the environment, such as camera=false gnss_rate=10"
     )
     episodes: int = option(1000, "flown in each case", group="how to measure")
-    seed: int = option(0, "of the first episode; the others follow it")
+    seed: int = option(
+        0, "of the first episode; the others follow it; no training has flown any of them"
+    )
     threads: int | None = option(None, "threads; if not given, one per core")
     video: Literal["none", "mp4", "gif", "webp"] = option(
         "none", "also write a video of the first episode of each case, of this kind"
@@ -73,6 +76,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     for name, least in (("episodes", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     cases: dict[Case, tuple[Policy, Any]] = {}
