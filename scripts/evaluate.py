@@ -21,11 +21,12 @@ from quad_gym import IDS, plots
 from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.evaluation import Episodes, Policy, roll_out
+from quad_gym.fault_presets import felt_without_sensors
 from quad_gym.metrics import bootstrap_interval
 from quad_gym.recording import Tracer
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.sensor_suites import SUITES
+from quad_gym.sensor_suites import SUITES, sensor_suite
 
 
 @dataclass(frozen=True)
@@ -92,10 +93,10 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
 
 def make_flights(args: Args, observation: str, count: int) -> Any:
     """The environment of an observation."""
-    keywords = leave(
-        args.env,
-        {"observation": "--observation", "sensors": "--sensors", "threads": "--threads"},
-    )
+    names = ("observation", "sensors", "threads")
+    keywords = dict(leave(args.env, {name: f"--{name}" for name in names}))
+    if observation in ("truth", "noisy") and "faults" in keywords:
+        keywords["faults"] = felt_without_sensors(keywords["faults"], sensor_suite(args.sensors))
     return gymnasium.make_vec(
         args.env_id,
         num_envs=count,
