@@ -15,6 +15,9 @@ from quad_gym.sensor_params import SensorSuite
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
+FARTHEST_FIX = 1e6
+"""From the reference antenna [m]; positions from the center of the Earth are farther."""
+
 
 def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[np.float64]:
     """The rotation that best turns vectors in I into the same vectors seen in B.
@@ -49,6 +52,16 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
     return R_BI
 
 
+def _require_relative(position_G: NDArray[np.float64]) -> None:
+    """Refuse a first fix that is no place near the reference antenna."""
+    if np.abs(position_G).max() > FARTHEST_FIX:
+        raise ValueError(
+            "gnss_position_G must be relative to the reference antenna "
+            f"(GnssParams.reference_antenna_G), within {FARTHEST_FIX:g} m of it, got "
+            f"{position_G}; from an absolute position in ECEF subtract that of the antenna"
+        )
+
+
 class _KalmanFilter:
     """What the filters have in common: their interface, and all but the kind of their kernels."""
 
@@ -57,6 +70,7 @@ class _KalmanFilter:
     def __init__(self, sensors: SensorSuite) -> None:
         if not isinstance(sensors, SensorSuite):
             raise ValueError(f"sensors must be a SensorSuite, got {type(sensors).__name__}")
+        sensors.require_filter()
         self.sensors = sensors
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         self._params = params_record(VehicleParams(), sensors)
@@ -91,11 +105,13 @@ class _KalmanFilter:
                 linearises, it may be lost.
 
         Raises:
-            ValueError: If an argument has another shape, is not finite, or the baseline is zero; or
-                the suite has no GNSS.
+            ValueError: If an argument has another shape or is not finite, the position is farther
+                than FARTHEST_FIX from the reference antenna, or the baseline is zero; or the suite
+                has no GNSS.
         """
         self._require_gnss("initialize: start with set_state() instead")
         position = check.array("gnss_position_G", gnss_position_G, (3,))
+        _require_relative(position)
         baseline = self._checked_baseline(gnss_baseline_G)
         x_I = np.zeros(3)
         if heading is not None:
@@ -334,7 +350,8 @@ class UnscentedKalmanFilter(_KalmanFilter):
         sensors: The sensor suite whose geometry and noise the filter believes in.
 
     Raises:
-        ValueError: If `sensors` is not a sensor suite.
+        ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
+            for something else, see `SensorSuite.require_filter`.
     """
 
     _kind = "ukf"
@@ -350,7 +367,8 @@ class ExtendedKalmanFilter(_KalmanFilter):
         sensors: The sensor suite whose geometry and noise the filter believes in.
 
     Raises:
-        ValueError: If `sensors` is not a sensor suite.
+        ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
+            for something else, see `SensorSuite.require_filter`.
 
     Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about
     an estimated attitude.

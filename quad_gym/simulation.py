@@ -19,10 +19,11 @@ from quad_gym.params import (
     PDGains,
     TaskParams,
     VehicleParams,
+    check_limit,
     pd_gains,
     vehicle_params,
 )
-from quad_gym.randomization import DrawingTable, Given, Randomization
+from quad_gym.randomization import DrawingTable, Given, Randomization, check_draws
 from quad_gym.records import (
     COLUMNS,
     FLIGHT_BLOCK,
@@ -140,6 +141,7 @@ class FlightBatch:
         self.source, self.control = Source(source), Control(control)
         rate = self.sensors.imu.rate if control_rate is None else control_rate
         self.clocks = Clocks.of(self.sensors, rate, substeps)
+        check_limit(self.task, self.clocks.imu_rate)
         self.threads = resolve_threads(threads)
         true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
         true_sensors = self.sensors if true_sensors is None else true_sensors
@@ -151,8 +153,11 @@ class FlightBatch:
             needed = include_covariance or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = run_filter
+        if run_filter:
+            self.sensors.require_filter()
 
         draws = DrawingTable(self.randomization, true_vehicle, true_sensors, self.world)
+        check_draws(draws, true_vehicle, self.clocks)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
         self._model, self._world = params_block(model), params_block(true)
@@ -203,6 +208,7 @@ class FlightBatch:
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._actions = np.zeros((self.count, 4))
         self._resets = np.zeros(self.count, np.uint8)
+        self._begun = False
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
         self._results = np.zeros((len(RESULTS), self.count))
 
@@ -237,7 +243,7 @@ class FlightBatch:
             ValueError: If the arguments do not fit the number of flights; nothing has changed then.
         """
         chosen = checked_mask(self.count, mask)
-        given = checked_start(self.count, position, velocity, yaw)
+        given = checked_start(self.count, position, velocity, yaw, self.task)
         words = checked_keys(self.count, seeds, keys)
         if words is not None:
             for flight in np.flatnonzero(chosen):
@@ -263,9 +269,24 @@ class FlightBatch:
 
         Returns:
             (count, n_observation) float32 observations; `results` holds the rest.
+
+        Raises:
+            ValueError: If flights have never been reset; it is a RuntimeError, too.
         """
+        if not self._begun:
+            self._require_begun()
         self._actions[:] = self.read("action") if actions is None else actions
         return self._run(Command.STEP)
+
+    def _require_begun(self) -> None:
+        """Refuse to step flights that have no state; looked at until all flights have one."""
+        waiting = (self._blocks["episode"] == 0.0) & (self._blocks["idle"] == 0.0)
+        if waiting.any():
+            raise check.NotResetError(
+                f"call reset() before step(): {int(waiting.sum())} of {self.count} flights have "
+                "never been reset"
+            )
+        self._begun = True
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         observations = np.empty((self.count, self._low.size), np.float32)  # the kernel fills it
@@ -409,3 +430,4 @@ class FlightBatch:
         if not fits:
             raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
         self._blocks[:] = snapshot
+        self._begun = False  # it may have been taken before a reset
