@@ -1,8 +1,4 @@
-"""The filter's kernels for eight flights at once, and how flights get into their block.
-
-The entries are cached on disk by the sources of the package's kernels, which do not include this
-file: after a change of an entry here, delete its files in `__pycache__`.
-"""
+"""The filter's kernels for blocks of flights, and how flights get into their blocks."""
 
 import numpy as np
 
@@ -13,8 +9,18 @@ from quad_gym.kernels.filter.update import update
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.packing import form_of, params_block, params_record
 from quad_gym.params import VehicleParams
-from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, WORK_BLOCK, aligned_zeros
+from quad_gym.records import (
+    FLIGHT,
+    FLIGHT_BLOCK,
+    PARAMS_BLOCK,
+    WIDTH,
+    WORK_BLOCK,
+    aligned_zeros,
+    field_of_flights,
+)
 
+EIGHT = 8
+"""Filters that fly together: one block or more, as lanes are 2, 4 or 8."""
 STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
 
 
@@ -37,37 +43,46 @@ def predict_lanes(blocks, params, work, form):
 
 
 class LaneFilter:
-    """Eight filters in one block."""
+    """EIGHT filters in as many blocks as they fill."""
 
     def __init__(self, sensors):
         self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         self.form = int(form_of(sensors.estimator))
-        self.params = params_block(params_record(VehicleParams(), sensors))
-        self.block = aligned_zeros(1, FLIGHT_BLOCK)
+        self.params = aligned_zeros(EIGHT // WIDTH, PARAMS_BLOCK)
+        self.params[:] = params_block(params_record(VehicleParams(), sensors))
+        self.blocks = aligned_zeros(EIGHT // WIDTH, FLIGHT_BLOCK)
         self.work = aligned_zeros(1, WORK_BLOCK)
 
-    def put(self, lane, **values):
+    def put(self, number, **values):
         """Set fields of one flight."""
+        block, lane = divmod(number, WIDTH)
         for name, value in values.items():
-            self.block[name][0, ..., lane] = value
+            self.blocks[name][block, ..., lane] = value
+
+    def put_params(self, number, **values):
+        """Set parameters of one flight."""
+        block, lane = divmod(number, WIDTH)
+        for name, value in values.items():
+            self.params[name][block, ..., lane] = value
 
     def get(self, name):
-        """A field of all flights, (8, ...)."""
-        return np.moveaxis(self.block[name][0], -1, 0).copy()
+        """A field of all flights, (EIGHT, ...)."""
+        return field_of_flights(self.blocks, name, EIGHT)
 
-    def flight(self, lane):
+    def flight(self, number):
         """One flight as a scalar record."""
+        block, lane = divmod(number, WIDTH)
         record = np.zeros(1, FLIGHT)
         for name in FLIGHT.names:
-            record[name][0] = self.block[name][0, ..., lane]
+            record[name][0] = self.blocks[name][block, ..., lane]
         return record
 
-    def measure(self, lane, recording, k, *, position=True, baseline=True, camera=True):
+    def measure(self, number, recording, k, *, position=True, baseline=True, camera=True):
         """Hand one flight what a recording holds at tick k; what is not measured becomes NaN."""
         pixels = recording.pixels[k]
         seen = np.isfinite(pixels).all(axis=1) & camera
         self.put(
-            lane,
+            number,
             gnss_position=recording.gnss_position[k] if position else np.nan,
             gnss_baseline=recording.gnss_baseline[k] if baseline else np.nan,
             position_valid=float(position),
@@ -75,16 +90,25 @@ class LaneFilter:
             gyro=recording.gyro[k],
             accel=recording.accel[k],
         )
-        self.block["feature_valid"][0, : self.features, lane] = seen
-        self.block["pixels"][0, : self.features, :, lane] = np.where(seen[:, None], pixels, np.nan)
+        block, lane = divmod(number, WIDTH)
+        self.blocks["feature_valid"][block, : self.features, lane] = seen
+        shown = np.where(seen[:, None], pixels, np.nan)
+        self.blocks["pixels"][block, : self.features, :, lane] = shown
 
-    def initialize(self, mask=(True,) * WIDTH):
-        self.work["begins"][0] = mask
-        initialize_lanes(self.block, self.params, self.work)
+    def initialize(self, mask=(True,) * EIGHT):
+        for block, params in self._each(mask):
+            initialize_lanes(block, params, self.work)
 
-    def update(self, mask=(True,) * WIDTH):
-        self.work["begins"][0] = mask
-        update_lanes(self.block, self.params, self.work, self.features, self.form)
+    def update(self, mask=(True,) * EIGHT):
+        for block, params in self._each(mask):
+            update_lanes(block, params, self.work, self.features, self.form)
 
     def predict(self):
-        predict_lanes(self.block, self.params, self.work, self.form)
+        for block, params in self._each((True,) * EIGHT):
+            predict_lanes(block, params, self.work, self.form)
+
+    def _each(self, mask):
+        """Blocks and their parameters, one by one, the part of a mask that is theirs in force."""
+        for k, begins in enumerate(np.reshape(mask, (-1, WIDTH))):
+            self.work["begins"][0] = begins
+            yield self.blocks[k : k + 1], self.params[k : k + 1]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling import entry, kernel
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.records import WIDTH, aligned_zeros
 
@@ -18,12 +18,12 @@ class Compiled:
     def __init__(self, body, **fields):
         body = kernel(body)
 
-        @kernel
+        @entry
         def on_records(records, option):
             for i in range(len(records)):
                 body(records[i], option)
 
-        @kernel
+        @entry
         def on_blocks(blocks, option):
             for i in range(len(blocks)):
                 body(lanes_of(blocks[i]), option)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import quad_gym
-from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling import entry
 from quad_gym.kernels.maths.linalg import load3, store4
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.control import act, allocate
@@ -29,7 +29,7 @@ FMAX = LAB.max_rotor_force
 seeds = st.integers(0, 2**32 - 1)
 
 
-@kernel
+@entry
 def allocate_all(demands, params, voltages):
     for i in range(len(demands)):
         demand = demands[i]
@@ -37,13 +37,13 @@ def allocate_all(demands, params, voltages):
         store4(voltages[i], allocate(demand[0], torque, params[0]))
 
 
-@kernel
+@entry
 def act_on_floats(flights, params, mode, ref):
     reference = (load3(ref[0]), load3(ref[1]), load3(ref[2]), load3(ref[3]))
     act(flights[0], params[0], mode, reference)
 
 
-@kernel
+@entry
 def act_on_lanes(blocks, params, mode, ref):
     one = 1.0 + 0.0 * lanes_of(blocks[0]).tick
     reference = (

@@ -10,12 +10,13 @@ from quad_gym.records import (
     FEATURE_BLOCKS,
     POSITION_BLOCK,
     VELOCITY_BLOCK,
+    WIDTH,
     FilterForm,
     FilterStatus,
     Gate,
 )
 from tests.circle_flight import record_circle
-from tests.lane_filter import STATE, LaneFilter
+from tests.lane_filter import EIGHT, STATE, LaneFilter
 
 LAB = quad_gym.sensor_suite("lab")
 LAB = LAB.replace(gnss=LAB.gnss.replace(velocity_sigma=0.05))
@@ -50,10 +51,10 @@ def filters_with(blocks, sensors, form):
     """Eight filters that have just measured some blocks."""
     filters = LaneFilter(sensors)
     filters.form |= int(form)
-    for lane in range(8):
+    for lane in range(EIGHT):
         filters.measure(lane, RECORDING, TICK)
     filters.initialize()
-    for lane in range(8):
+    for lane in range(EIGHT):
         names = ("position", "baseline")
         chosen = {name: name in blocks for name in names} | {"camera": "features" in blocks}
         filters.measure(lane, RECORDING, TICK, **chosen)
@@ -76,14 +77,16 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
     filters, free = (filters_with(blocks, sensors, form) for _ in range(2))
     last = blocks[-1]
     if how in ("nan", "infinity"):
-        filters.block[VALUES[last]][0, ..., BAD] = np.nan if how == "nan" else np.inf
+        filters.put(BAD, **{VALUES[last]: np.nan if how == "nan" else np.inf})
     elif how == "singular":  # neither the estimate nor the measurements have any noise
         for name in ("position_sigma", "baseline_sigma", "velocity_sigma", "pixel_sigma"):
-            filters.params[name][0, ..., BAD] = 0.0
-        filters.params["direction_floor"][0, BAD] = 0.0
-        filters.block["L"][0, ..., BAD] = 0.0
+            filters.put_params(BAD, **{name: 0.0})
+        filters.put_params(BAD, direction_floor=0.0)
+        filters.put(BAD, L=0.0)
     else:
-        filters.block["L"][0, 8, 1, BAD] = np.nan
+        factor = filters.get("L")[BAD]
+        factor[8, 1] = np.nan
+        filters.put(BAD, L=factor)
     before = {name: filters.get(name) for name in KEPT}
     filters.update()
     free.update()
@@ -104,9 +107,9 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
 
     # with a sound measurement the filter goes on as if nothing had been
     if how in ("nan", "infinity"):
-        filters.block[VALUES[last]][0, ..., BAD] = filters.block[VALUES[last]][0, ..., 0]
+        filters.put(BAD, **{VALUES[last]: filters.get(VALUES[last])[0]})
         for name in STATE:
-            filters.block[name][0, ..., 0] = filters.block[name][0, ..., BAD]
+            filters.put(0, **{name: filters.get(name)[BAD]})
         filters.update()
         for name in STATE:
             np.testing.assert_array_equal(filters.get(name)[BAD], filters.get(name)[0])
@@ -118,9 +121,9 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
 @pytest.mark.parametrize("field", ["gyro", "accel", "L"])
 def test_a_failed_prediction_changes_nothing(field, sensors, form):
     filters, free = (filters_with(("position",), sensors, form) for _ in range(2))
-    filters.block[field][0, ..., BAD] = np.nan
+    filters.put(BAD, **{field: np.nan})
     if field == "L":
-        filters.block["L"][0, ..., BAD] = 1e200 * np.tri(15)  # squares overflow
+        filters.put(BAD, L=1e200 * np.tri(15))  # squares overflow
     before = {name: filters.get(name) for name in STATE}
     for lanes in (filters, free):
         lanes.predict()
@@ -140,7 +143,7 @@ def test_an_environment_tells_of_a_failed_filter_and_begins_anew():
     env.reset(seed=1)
     batch = env.flights.batch
     flights = batch.snapshot()
-    flights["L"][0, 4, 4, 3] = np.nan
+    flights["L"][3 // WIDTH, 4, 4, 3 % WIDTH] = np.nan
     batch.restore(flights)
     *_, truncated, info = env.step(np.zeros((9, 4)))
     np.testing.assert_array_equal(np.flatnonzero(truncated), [3])

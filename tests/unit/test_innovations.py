@@ -17,7 +17,7 @@ from quad_gym.records import (
 )
 from tests.circle_flight import record_circle
 from tests.field_flights import fly, measured_now, state_errors, steps
-from tests.lane_filter import STATE, LaneFilter
+from tests.lane_filter import EIGHT, STATE, LaneFilter
 from tests.reference_ukf import PlainUKF
 
 LAB = quad_gym.sensor_suite("lab")
@@ -155,7 +155,7 @@ def test_a_lane_gates_for_itself():
     """The neighbours of a flight with a wild position update as they would without a gate."""
     filters, free = LaneFilter(GATED), LaneFilter(HONEST)
     for lanes in (filters, free):
-        for lane in range(8):
+        for lane in range(EIGHT):
             lanes.measure(lane, RECORDING, 0)
         lanes.initialize()
         if lanes is filters:
@@ -183,16 +183,18 @@ def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, s
     filters, free = LaneFilter(sensors), LaneFilter(sensors)
     for lanes in (filters, free):
         lanes.form |= int(form)
-        for lane in range(8):
+        for lane in range(EIGHT):
             lanes.measure(lane, RECORDING, 0)
         lanes.initialize()
     if field == "position_sigma":  # neither prior nor measurement have any noise: singular
-        filters.params["position_sigma"][0, :, 2] = 0.0
-        filters.block["L"][0, :, :, 2] = 0.0
+        filters.put_params(2, position_sigma=0.0)
+        filters.put(2, L=0.0)
     elif field == "L":
-        filters.block["L"][0, 4, 4, 2] = np.nan
+        factor = filters.get("L")[2]
+        factor[4, 4] = np.nan
+        filters.put(2, L=factor)
     else:
-        filters.block[field][0, ..., 2] = np.nan
+        filters.put(2, **{field: np.nan})
     before = {name: filters.get(name) for name in STATE}
     for lanes in (filters, free):
         lanes.update()

@@ -175,8 +175,8 @@ def test_a_kernel_may_ask_whether_any_or_every_lane_is_set():
     asked = asking_on.on_lanes(x=-pattern.ravel().astype(float), y=np.zeros(256 * WIDTH))
     any_less = asked["any_less"].reshape(256, WIDTH)
     all_less = asked["all_less"].reshape(256, WIDTH)
-    np.testing.assert_array_equal(any_less, np.repeat(pattern.any(axis=1)[:, np.newaxis], 8, 1))
-    np.testing.assert_array_equal(all_less, np.repeat(pattern.all(axis=1)[:, np.newaxis], 8, 1))
+    np.testing.assert_array_equal(any_less, np.repeat(pattern.any(axis=1)[:, np.newaxis], WIDTH, 1))
+    np.testing.assert_array_equal(all_less, np.repeat(pattern.all(axis=1)[:, np.newaxis], WIDTH, 1))
 
 
 @pytest.mark.parametrize("instance", INSTANCES)

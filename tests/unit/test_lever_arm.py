@@ -62,7 +62,7 @@ def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind):
         R_BI=np.eye(3),
         accel_bias=np.zeros(3),
         gyro_bias=np.zeros(3),
-        covariance=1e-6 * np.eye(15),
+        covariance=1e-14 * np.eye(15),
     )
     w_before = None
     for tick in range(200):

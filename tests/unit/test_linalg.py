@@ -6,7 +6,7 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quad_gym.kernels import linalg
+from quad_gym.kernels.maths import linalg
 from quad_gym.kernels.maths.linalg import (
     cholesky,
     load3,

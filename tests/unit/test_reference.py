@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling import entry
 from quad_gym.kernels.maths.linalg import store3
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.simd.blocks import lanes_of
@@ -25,14 +25,14 @@ from quad_gym.records import (
 )
 
 
-@kernel
+@entry
 def draw_in_lanes(blocks, settings):
     for i in range(len(blocks)):
         flight = lanes_of(blocks[i])
         draw_reference(flight, settings[0], stream_of(flight), flight.tick >= 0.0)
 
 
-@kernel
+@entry
 def evaluate_on_floats(flights, times, out):
     for i in range(len(flights)):
         for k in range(len(times)):

@@ -58,7 +58,7 @@ def test_the_inset_is_drawn_where_the_camera_measured(flight):
 
 def test_an_image_is_shown_until_the_next_one_is_due():
     options = {"camera_rate": 10.0, "max_episode_steps": 30}
-    flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
+    flight = record_flight(Still(), "QuadGym/Hover-v0", seed=2, **options)
     images = np.flatnonzero(np.isfinite(flight["pixels"]).all(axis=(1, 2)))
     np.testing.assert_array_equal(images, np.arange(0, 31, 5))
     for k in range(31):

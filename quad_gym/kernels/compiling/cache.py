@@ -1,8 +1,8 @@
 """Compiled code on disk: found by what it was compiled from, written by one process at a time.
 
-A file holds the code of one function for one signature. Its name ends in a digest of everything
-that shapes the code: the sources, the signature, Numba, the processor. A stale file is therefore
-never found; a damaged one counts as none.
+A file holds the code of one function for one signature, and a checksum. Its name ends in a digest
+of everything that shapes the code: the sources, what the function closes over, the signature,
+Numba, the processor. A stale file is therefore never found; a damaged one counts as none.
 """
 
 import contextlib
@@ -20,10 +20,12 @@ from typing import Any
 
 import llvmlite
 import numba
-from numba.core import caching, compiler
+from numba.core import caching, compiler, config
 from numba.core.serialize import dumps
 
-from quad_gym.kernels.compiling.digest import digest_of
+from quad_gym.kernels.compiling.digest import closure_of, digest_of_function
+from quad_gym.kernels.compiling.locks import locked, say
+from quad_gym.records import WIDTH
 
 KEPT = 8
 """Files of a function that are kept: of other sources, processors or signatures, the latest."""
@@ -39,24 +41,40 @@ def cache_of(function: Callable[..., Any]) -> "CodeCache":
     return CodeCache(function)
 
 
+def where_cached(*folders: Path | None) -> str:
+    """Where the compiled code goes that is cached in these folders, for messages."""
+    known = [str(folder) for folder in folders if folder is not None]
+    if not known:
+        return "not cached: no folder can be written; set NUMBA_CACHE_DIR to one that can"
+    return f"once; cached in {os.path.commonpath(known)}"
+
+
 class CodeCache(caching._Cache):  # type: ignore[misc]
     """The compiled code of one function, by signature; what Numba asks a dispatcher's cache for."""
 
     announcing = True
     """whether to say that something is compiled; a process that compiles for another does not"""
+    complaining = True
+    """whether to say that code cannot be cached; once is enough"""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
 
     @functools.cached_property
     def folder(self) -> Path | None:
-        """Where the files are; None where no folder can be written."""
+        """Where files are written; None where no folder can be written."""
         file = inspect.getfile(self._function)
         for kind in _LOCATORS:
             locator = kind.from_function(self._function, file)
             if locator is not None:
-                return Path(locator.get_cache_path())
+                return Path(locator.get_cache_path()).absolute()
         return None
+
+    @functools.cached_property
+    def _folders(self) -> list[Path]:
+        """Where files are looked for: also beside the kernels, where somebody else put them."""
+        beside = Path(inspect.getfile(self._function)).parent / "__pycache__"
+        return [folder for folder in (self.folder, beside) if folder is not None]
 
     @property
     def cache_path(self) -> str | None:
@@ -65,61 +83,86 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     @functools.cached_property
     def _stem(self) -> str:
+        """The beginning of the names of all files of this function, whatever its sources say."""
         module = Path(inspect.getfile(self._function)).stem
         name = self._function.__qualname__.replace("<", "").replace(">", "")
-        return f"{module}.{name}.py{sys.version_info[0]}{sys.version_info[1]}"
+        stem = f"{module}.{name}.py{sys.version_info[0]}{sys.version_info[1]}"
+        closed_over = [
+            f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
+            for value in closure_of(self._function)
+        ]
+        if closed_over:  # functions of one piece of source keep their files apart
+            stem += f".{hashlib.sha256(' '.join(closed_over).encode()).hexdigest()[:8]}"
+        return stem
 
     @functools.cached_property
     def _sources(self) -> str:
-        return digest_of(Path(inspect.getfile(self._function)))
+        return digest_of_function(self._function)
 
-    def _path(self, signature: Any, context: Any) -> Path | None:
-        if self.folder is None:
-            return None
+    def _name(self, signature: Any, context: Any) -> str:
+        """The name of the file of a signature."""
         from quad_gym.kernels.compiling.decorators import LEAN
 
         arguments, _ = numba.core.sigutils.normalize_signature(signature)
+        options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
         parts = (
             self._sources,
             str(tuple(arguments)),
             str(context.codegen().magic_tuple()),
-            f"{numba.__version__} {llvmlite.__version__} {LEAN}",
+            f"{numba.__version__} {llvmlite.__version__} {LEAN} {WIDTH} {options}",
         )
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-        return self.folder / f"{self._stem}.{digest[:32]}.code"
+        return f"{self._stem}.{digest[:32]}.code"
+
+    def _content(self, signature: Any, context: Any) -> bytes | None:
+        """What the file of a signature holds; None where there is none, or a damaged one."""
+        if not self._folders:
+            return None
+        name = self._name(signature, context)
+        for folder in self._folders:
+            with contextlib.suppress(OSError):
+                content = (folder / name).read_bytes()
+                if hashlib.sha256(content[32:]).digest() == content[:32]:
+                    return content[32:]
+        return None
 
     # ---- what Numba calls -------------------------------------------------------------------
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled code of a signature, or None."""
         target_context.refresh()
-        path = self._path(sig, target_context)
-        if path is None or not path.is_file():
+        content = self._content(sig, target_context)
+        if content is None:
             return None
         try:
-            return compiler.CompileResult._rebuild(target_context, *pickle.loads(path.read_bytes()))
-        except Exception:  # whatever reading a damaged file raises, it is as good as none
+            return compiler.CompileResult._rebuild(target_context, *pickle.loads(content))
+        except Exception:  # whatever reading it raises, it is as good as none
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write the compiled code of a signature; where that fails, say so and go on."""
-        path = self._path(sig, data.target_context)
-        if path is None:
+        if self.folder is None:
             return
+        path = self.folder / self._name(sig, data.target_context)
+        content = dumps(data._reduce())
         temporary = path.with_suffix(f".{uuid.uuid4().hex[:12]}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(dumps(data._reduce()))
+            temporary.write_bytes(hashlib.sha256(content).digest() + content)
             temporary.replace(path)
         except OSError as error:
-            temporary.unlink(missing_ok=True)
-            print(f"quad_gym: the compiled code was not cached: {error}", file=sys.stderr)
+            if CodeCache.complaining:
+                CodeCache.complaining = False
+                say(f"quad_gym: compiled code cannot be cached in {self.folder}: {error.strerror}")
         else:
-            self._tidy(path)
+            self._tidy()
+        finally:  # also where Ctrl-C interrupts
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
     def flush(self) -> None:
         """Delete the files of this function."""
-        for path in self._files():
+        for path in self._files("code"):
             path.unlink(missing_ok=True)
 
     def enable(self) -> None:
@@ -131,67 +174,32 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
     # ---- who compiles -----------------------------------------------------------------------
 
     def holds(self, signature: Any, context: Any) -> bool:
-        """Whether there is a file for a signature."""
-        path = self._path(signature, context)
-        return path is not None and path.is_file()
+        """Whether there is an undamaged file for a signature."""
+        return self._content(signature, context) is not None
 
     @contextlib.contextmanager
     def compiling_alone(self, signature: Any, context: Any) -> Iterator[None]:
-        """Hold off other processes that want to compile the same; they load the result then.
-
-        A process that dies gives its lock back.
-        """
+        """Hold off other processes that want to compile the same; they load the result then."""
         if self.holds(signature, context):
             yield
             return
-        with contextlib.ExitStack() as held:
-            path = self._path(signature, context)
-            if path is not None:
-                held.enter_context(_locked(path.with_suffix(".lock")))
+        path = None if self.folder is None else self.folder / self._name(signature, context)
+        with locked(None if path is None else path.with_suffix(".lock")):
             if self.announcing and not self.holds(signature, context):
-                where = "not cached: no folder can be written; set NUMBA_CACHE_DIR"
-                where = where if self.folder is None else f"cached in {self.folder}"
-                print(
-                    f"quad_gym: compiling {self._function.__name__} (once; {where})",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                where = where_cached(self.folder)
+                say(f"quad_gym: compiling {self._function.__name__} ({where})")
             yield
 
-    def _files(self) -> list[Path]:
-        return [] if self.folder is None else list(self.folder.glob(f"{self._stem}.*.code"))
+    def _files(self, kind: str) -> list[Path]:
+        return [] if self.folder is None else list(self.folder.glob(f"{self._stem}.*.{kind}"))
 
-    def _tidy(self, latest: Path) -> None:
+    def _tidy(self) -> None:
         """Delete the oldest files of this function, and what killed processes left."""
         with contextlib.suppress(OSError):
-            others = sorted(self._files(), key=lambda path: path.stat().st_mtime, reverse=True)
-            for path in others[KEPT:]:
+            files = self._files("code")
+            files.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+            for path in files[KEPT:]:
                 path.unlink(missing_ok=True)
-            for path in latest.parent.glob(f"{self._stem}.*.tmp"):
+            for path in (*self._files("tmp"), *self._files("lock")):
                 if time.time() - path.stat().st_mtime > 3600.0:
                     path.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold a lock between processes; without one where the system or the folder has none."""
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system: two processes may compile the same
-        yield
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")  # noqa: SIM115 - closed below
-    except OSError:
-        yield
-        return
-    with file:
-        with contextlib.suppress(OSError):  # some network file systems have no locks
-            fcntl.flock(file, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            # others that wait for this file hold it open; the next one makes a new file
-            with contextlib.suppress(OSError):
-                os.unlink(path)

@@ -1,18 +1,31 @@
-"""Which sources compiled code depends on, as a digest that decides whether a cache is stale.
+"""What compiled code depends on, as a digest that decides whether a cache is stale.
 
 The digest of a module follows its imports through the package, so that nothing has to be listed by
 hand. Comments, docstrings and layout do not count: what is hashed is the syntax tree.
 """
 
 import ast
+import dis
 import functools
 import hashlib
+import inspect
+import os
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
 
 PACKAGE = __package__.partition(".")[0]
-_NO_CODE = {f"{__package__}.{name}" for name in ("cache", "digest", "linking_check", "workers")}
+_BASE = Path(__file__).resolve().parents[len(__package__.split("."))]
+"""The folder that the package lies in."""
+_NO_CODE = {f"{__package__}.{name}" for name in ("cache", "cores", "digest", "locks", "workers")}
 """Modules that decide when code is compiled, not what."""
+
+
+# ---- modules ---------------------------------------------------------------------------------
 
 
 def digest_of(path: Path) -> str:
@@ -31,8 +44,9 @@ def digest_of(path: Path) -> str:
             seen[file], imported = _read(file, file.stat().st_mtime_ns)
             todo += imported
     digest = hashlib.sha256(sys.version.encode())
-    for content in sorted(seen.values()):
-        digest.update(content.encode())
+    # with names, as two files may exchange what they hold; relative, as a package may be moved
+    for line in sorted(f"{os.path.relpath(file, _BASE)} {seen[file]}\n" for file in seen):
+        digest.update(line.encode())
     return digest.hexdigest()
 
 
@@ -51,20 +65,25 @@ def _imports(node: ast.AST, file: Path) -> list[str]:
     """Names of modules, and of what may be modules, that a statement imports."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
-    if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-        return [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return []
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    module = node.module or ""
+    if node.level > 0:
+        if _BASE not in file.parents:
+            return []
+        parts = file.relative_to(_BASE).parts[: -node.level]
+        module = ".".join([*parts, module]) if module else ".".join(parts)
+    return [module, *(f"{module}.{alias.name}" for alias in node.names)]
 
 
 def _path_of(name: str) -> Path | None:
     """The file of a module of the package, or of one beside it such as a test's helpers."""
     root = name.partition(".")[0]
-    if root != PACKAGE and not (root in sys.modules and root == "tests"):
-        return None
-    base = Path(__file__).resolve().parents[len(__package__.split("."))]
+    base = _BASE
     if root != PACKAGE:
-        module = sys.modules[root]
-        base = Path(module.__path__[0]).resolve().parent
+        if root != "tests" or root not in sys.modules:
+            return None
+        base = Path(sys.modules[root].__path__[0]).resolve().parent
     file = base.joinpath(*name.split("."))
     if (file / "__init__.py").is_file():
         return file / "__init__.py"
@@ -86,3 +105,75 @@ def _drop_docstring(node: ast.AST) -> None:
             )
         ]
         node.body = kept  # type: ignore[attr-defined]
+
+
+# ---- functions -------------------------------------------------------------------------------
+
+
+def digest_of_function(function: Callable[..., Any]) -> str:
+    """A digest of a function: its module with all that it imports, and what the function holds.
+
+    Functions that one piece of source makes differ in what they close over and in their defaults.
+    Functions among these count with their own modules, other values as they are.
+
+    Raises:
+        TypeError: If it closes over something that has no lasting identity.
+    """
+    return hashlib.sha256("\n".join(_function(function, ())).encode()).hexdigest()
+
+
+def closure_of(function: Callable[..., Any]) -> list[Any]:
+    """What a function closes over, functions in the place of what was compiled from them."""
+    return [_plain(cell.cell_contents) for cell in function.__closure__ or ()]  # type: ignore[attr-defined]
+
+
+def _plain(value: Any) -> Any:
+    """The function that a dispatcher or an intrinsic was made of; else the value itself."""
+    return getattr(value, "py_func", None) or getattr(value, "__wrapped__", value)
+
+
+def _function(function: Any, above: tuple[Any, ...]) -> Iterator[str]:
+    yield f"{function.__module__}:{function.__qualname__}"
+    if function in above:  # a function that calls itself
+        return
+    yield digest_of(Path(inspect.getfile(function)))
+    yield from _code(function.__code__)
+    held = (function.__defaults__, function.__kwdefaults__, closure_of(function))
+    yield from _value(held, (*above, function))
+
+
+def _code(code: CodeType) -> Iterator[str]:
+    """Instructions: what tells functions of one name and module apart, wherever they stand."""
+    for instruction in dis.get_instructions(code):
+        if isinstance(instruction.argval, CodeType):
+            yield from _code(instruction.argval)
+        else:
+            yield f"{instruction.opname} {instruction.argval!r}"
+
+
+def _value(value: Any, above: tuple[Any, ...]) -> Iterator[str]:
+    value = _plain(value)
+    if isinstance(value, FunctionType):
+        yield from _function(value, above)
+    elif isinstance(value, tuple | list):
+        yield f"{type(value).__name__} of {len(value)}"
+        for item in value:
+            yield from _value(item, above)
+    elif isinstance(value, dict):
+        yield from _value(list(value.items()), above)
+    elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        content = hashlib.sha256(value.tobytes()).hexdigest()
+        yield f"{value.dtype.descr} {value.shape} {content}"
+    elif isinstance(value, np.dtype):
+        yield f"dtype {value!r}"
+    elif value is None or isinstance(value, int | float | complex | str | bytes | np.generic):
+        yield f"{type(value).__qualname__} {value!r}"
+    elif isinstance(value, ModuleType):
+        yield f"module {value.__name__}"
+    elif isinstance(value, BuiltinFunctionType):
+        yield f"builtin {value.__module__}:{value.__qualname__}"
+    else:
+        raise TypeError(
+            f"compiled code cannot be cached that closes over {value!r}: "
+            "expected functions, numbers, strings, arrays, or tuples of these"
+        )

@@ -9,8 +9,8 @@ kernel that it reaches once, and is the only thing that is optimized and emitted
 A kernel's code therefore exists inside entries only, as a symbol that is internal to the entry's
 module: a large kernel can stand out of line without a second copy that another process might call.
 
-`AVAILABLE` says whether this Numba has the internals that this file needs. Where it has not,
-`decorators.py` uses ordinary `numba.njit`: slower to compile, the same flights.
+Where Numba lacks the internals that this file needs, importing it fails, and `decorators.py` uses
+ordinary `numba.njit`: slower to compile, the same flights.
 """
 
 from typing import Any
@@ -49,6 +49,8 @@ class KernelLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
 
 class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     """The code of an entry with all kernels that it reaches."""
+
+    _linking_libraries: list[Any]
 
     def finalize(self) -> None:
         """Link the kernels, optimize, and emit machine code."""
@@ -93,7 +95,9 @@ class KernelLowering(typed_passes.NativeLowering):  # type: ignore[misc]
         super().run_pass(state)
         lowered = state["cr"]
         state.library._ensure_finalized()
-        handle = [].append  # a callable like no other: Numba finds the overload by its identity
+        handle = list[
+            Any
+        ]().append  # a callable like no other: Numba finds the overload by its identity
         state.targetctx.insert_user_function(handle, lowered.fndesc, [state.library])
         state["cr"] = compiler._LowerResult(
             lowered.fndesc, lowered.call_helper, cfunc=handle, env=lowered.env

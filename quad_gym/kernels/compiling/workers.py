@@ -7,8 +7,8 @@ was compiling is not in the cache then.
 
 import gc
 import importlib
+import os
 import queue
-import signal
 import subprocess
 import sys
 import threading
@@ -16,11 +16,13 @@ import time
 from collections.abc import Sequence
 from typing import IO, Any
 
-from quad_gym.kernels.compiling.cache import CodeCache
+from quad_gym.kernels.compiling.cache import CodeCache, cache_of, where_cached
 from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.kernels.compiling.locks import locked, say
 
 MOST_WORKERS = 8
 _START = "import sys; sys.path[:] = {path!r}; from {module} import work; work()"
+_COMPILED = "compiled"
 
 
 def dispatcher_of(name: str) -> Any:
@@ -36,30 +38,61 @@ def prepare(names: Sequence[str], processes: int | None = None) -> None:
         names: "module:function" of entries that have a signature; what takes longest comes first.
         processes: Processes that compile; None: as many as there are cores.
     """
-    missing = [name for name in names if not dispatcher_of(name).is_cached()]
-    workers = min(available_cores() if processes is None else processes, MOST_WORKERS, len(missing))
-    shared = all(dispatcher_of(name)._cache.folder is not None for name in missing)
-    if workers > 1 and sys.executable and shared:
-        _compile_in_processes(missing, workers)
+    missing = _missing(names)
+    if missing:
+        folder = cache_of(prepare).folder
+        lock = None if folder is None else folder / "compiling.lock"
+        with locked(lock, "quad_gym: waiting for another process, which compiles"):
+            missing = _missing(names)
+            if missing:
+                _compile(missing, available_cores() if processes is None else processes)
     for name in names:  # what a worker could not compile, is compiled here and raises here
         dispatcher = dispatcher_of(name)
         dispatcher.compile(dispatcher.signature)
 
 
-def _compile_in_processes(names: Sequence[str], workers: int) -> None:
+def _missing(names: Sequence[str]) -> list[str]:
+    return [name for name in names if not dispatcher_of(name).is_cached()]
+
+
+def _compile(names: Sequence[str], processes: int) -> None:
+    """Compile `names`: into the cache by processes, else here."""
+    progress = _Progress(names)
+    workers = min(processes, MOST_WORKERS, len(names))
+    cached = all(dispatcher_of(name)._cache.folder is not None for name in names)
+    program = sys.executable and not getattr(sys, "frozen", False)
+    try:
+        if workers > 1 and program and cached:
+            _compile_in_processes(names, workers, progress)
+        announcing, CodeCache.announcing = CodeCache.announcing, False
+        try:
+            for name in _missing(names):
+                progress.begins(name)
+                progress.show()
+                dispatcher_of(name).compile(dispatcher_of(name).signature)
+                progress.ends(name, True)
+        finally:
+            CodeCache.announcing = announcing
+    finally:
+        progress.finish()
+
+
+def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progress") -> None:
     """Compile `names` into the cache, in processes; what fails is left out."""
     todo: queue.SimpleQueue[str] = queue.SimpleQueue()
     for name in names:
         todo.put(name)
-    progress = _Progress(names)
-    processes = [_started() for _ in range(workers)]
-    threads = [
-        threading.Thread(target=_feed, args=(process, todo, progress), daemon=True)
-        for process in processes
-    ]
+    processes: list[subprocess.Popen[str]] = []
+    threads = []
     try:
-        for thread in threads:
-            thread.start()
+        for _ in range(workers):
+            try:
+                processes.append(_started())
+            except OSError:  # no memory, or no processes left: fewer workers
+                break
+            arguments = (processes[-1], todo, progress)
+            threads.append(threading.Thread(target=_feed, args=arguments, daemon=True))
+            threads[-1].start()
         while any(thread.is_alive() for thread in threads):
             for thread in threads:
                 thread.join(timeout=0.25)
@@ -67,10 +100,13 @@ def _compile_in_processes(names: Sequence[str], workers: int) -> None:
     finally:  # also where Ctrl-C interrupts
         for process in processes:
             process.kill()
+        for process in processes:
             process.wait()
+        for thread in threads:
+            thread.join()
+        for process in processes:
             for pipe in (process.stdin, process.stdout):
                 _close(pipe)
-        progress.finish()
 
 
 def _close(pipe: IO[str] | None) -> None:
@@ -81,17 +117,22 @@ def _close(pipe: IO[str] | None) -> None:
         pass
 
 
-def _started() -> subprocess.Popen[str]:
-    code = _START.format(path=sys.path, module=__name__)
+def _started() -> "subprocess.Popen[str]":
+    path = [folder for folder in sys.path if isinstance(folder, str)]
+    code = _START.format(path=path, module=__name__)
     return subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C is for the parent, which ends its workers
     )
 
 
 def _feed(
     process: "subprocess.Popen[str]", todo: "queue.SimpleQueue[str]", progress: "_Progress"
 ) -> None:
-    """Hand names to one worker, one after the other, until there are none or it dies."""
+    """Hand names to one worker, one after the other, until there are none or it fails."""
     assert process.stdin is not None
     assert process.stdout is not None
     while True:
@@ -103,66 +144,79 @@ def _feed(
         try:
             process.stdin.write(name + "\n")
             process.stdin.flush()
-            answer = process.stdout.readline()
+            answer = process.stdout.readline().strip()
         except (OSError, ValueError):
             answer = ""
-        progress.ends(name)
-        if not answer:
+        progress.ends(name, answer == _COMPILED)
+        if answer != _COMPILED:  # it died, or cannot write: the parent finds out why
             return
 
 
 def work() -> None:
     """What a worker does."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what anything else prints is no answer
     gc.disable()  # compiling makes few cycles, and looking for them takes a tenth of the time
-    CodeCache.announcing = False
-    for line in sys.stdin:
-        dispatcher = dispatcher_of(line.strip())
+    CodeCache.announcing = CodeCache.complaining = False
+    names: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(names,), daemon=True).start()
+    while True:
+        dispatcher = dispatcher_of(names.get())
         try:
             dispatcher.compile(dispatcher.signature)
-            answer = "compiled"
+            held = dispatcher._cache.holds(dispatcher.signature, dispatcher.targetctx)
+            answer = _COMPILED if held else "not cached"
         except Exception as error:  # the parent compiles it again, and raises
             answer = f"failed: {type(error).__name__}"
-        print(answer, flush=True)
+        try:
+            print(answer, file=answers, flush=True)
+        except OSError:  # the parent is gone
+            os._exit(1)
+
+
+def _listen(names: "queue.SimpleQueue[str]") -> None:
+    """Pass on what comes on standard input; where it ends, end at once, whatever is compiled."""
+    for line in sys.stdin:
+        names.put(line.strip())
+    os._exit(0)
 
 
 class _Progress:
     """One line on standard error that says what is being compiled, and for how long."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._names, self._done = list(names), 0
+        self._count = len(names)
+        self._done: list[str] = []
         self._running: list[str] = []
         self._start = time.monotonic()
         self._moves = sys.stderr is not None and sys.stderr.isatty()
-        folder = dispatcher_of(names[0])._cache.folder
-        self._say(f"quad_gym: compiling {len(names)} parts for this machine, once ({folder})\n")
+        folders = [dispatcher_of(name)._cache.folder for name in names]
+        where = where_cached(*folders)
+        say(f"quad_gym: compiling {self._count} parts for this machine ({where})")
 
     def begins(self, name: str) -> None:
+        """Note that `name` is being compiled."""
         self._running.append(name)
 
-    def ends(self, name: str) -> None:
+    def ends(self, name: str, well: bool) -> None:
+        """Note that `name` is no longer being compiled, and whether it is in the cache."""
         self._running.remove(name)
-        self._done += 1
+        if well:
+            self._done.append(name)
 
     def show(self) -> None:
         """Move the line on, where somebody looks at it."""
         if self._moves:
             running = ", ".join(
-                name.partition(":")[2].removesuffix("_stage") for name in self._running
+                name.partition(":")[2].removesuffix("_stage") for name in list(self._running)
             )
-            text = f"quad_gym: {self._done} of {len(self._names)} parts, {self._seconds():.0f} s"
-            self._say(f"\r{text:<36} {running[:40]:<40}")
+            text = f"quad_gym: {len(self._done)} of {self._count} parts, {self._seconds():.0f} s"
+            say(f"\r{text:<36} {running[:40]:<40}", end="")
 
     def finish(self) -> None:
-        end = "\r" if self._moves else ""
-        text = f"quad_gym: compiled {self._done} of {len(self._names)} parts in {self._seconds():.0f} s"
-        self._say(f"{end}{text:<78}\n")
+        """Say how it ended."""
+        text = f"quad_gym: compiled {len(self._done)} of {self._count} parts"
+        say(f"{chr(13) if self._moves else ''}{f'{text} in {self._seconds():.0f} s':<78}".rstrip())
 
     def _seconds(self) -> float:
         return time.monotonic() - self._start
-
-    def _say(self, text: str) -> None:
-        if sys.stderr is not None:
-            sys.stderr.write(text)
-            sys.stderr.flush()

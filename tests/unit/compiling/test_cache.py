@@ -1,0 +1,198 @@
+"""Compiled code on disk: damaged files, folders that cannot be written, a disk that is full."""
+
+import importlib
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from quad_gym.kernels import single
+from quad_gym.kernels.compiling import cache as caches
+from quad_gym.kernels.compiling import entry, kernel, routine
+from quad_gym.kernels.maths.linalg import cross
+from tests.unit.compiled import Compiled
+from tests.unit.compiling.parts import PREPARE, RIGHT, Parts
+
+FULL_DISK = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))\n" + PREPARE
+
+
+@pytest.fixture
+def parts(tmp_path):
+    return Parts(tmp_path)
+
+
+@pytest.fixture
+def module(parts, monkeypatch):
+    """The module of entries, imported here."""
+    monkeypatch.syspath_prepend(parts.folder)
+    monkeypatch.setenv("NOTES", str(parts.notes))
+    monkeypatch.setattr(caches.config, "CACHE_DIR", "")
+    yield importlib.import_module("parts_of_test")
+    del sys.modules["parts_of_test"]
+
+
+def call(function):
+    """What an entry of the module makes of (0, 5)."""
+    x = np.array([0.0, 5.0])
+    function(x)
+    return x[0]
+
+
+# ---- kernels and entries -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("decorator", [kernel, routine])
+def test_python_cannot_call_a_kernel(decorator):
+    def grows(x):
+        return x + 1.0
+
+    with pytest.raises(TypeError, match=r"grows is a kernel.*`entry`"):
+        decorator(grows)(1.0)
+    with pytest.raises(TypeError, match=r"cross is a kernel, which only compiled code can call"):
+        cross((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+def test_an_entry_is_called_and_found_in_the_cache():
+    R_BI = np.empty((3, 3))
+    single.wahba_of_vectors(np.ones(2), np.eye(3)[:2], np.eye(3)[:2], R_BI)
+    np.testing.assert_allclose(R_BI, np.eye(3), atol=1e-15)
+    cache = single.wahba_of_vectors._cache
+    signature = next(iter(single.wahba_of_vectors.overloads))
+    assert cache.holds(signature, single.wahba_of_vectors.targetctx)
+
+
+# ---- damaged and missing files -----------------------------------------------------------------
+
+
+def flipped(content):
+    """One bit in the middle of the machine code is another one."""
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[:31],
+        lambda content: content[:-1],
+        lambda content: content + b"\0",
+        lambda content: bytes(len(content)),
+        lambda content: content[32:],
+        flipped,
+    ],
+    ids=["empty", "a few bytes", "cut off", "longer", "zeros", "no checksum", "one bit"],
+)
+def test_a_damaged_file_is_compiled_again_and_replaced(module, parts, damage, capfd):
+    assert call(module.a) == 11.0
+    (file,) = parts.files("code")
+    sound = file.read_bytes()
+    file.write_bytes(damage(sound))
+    capfd.readouterr()
+    fresh = entry(module.sources["a"], module.SIGNATURE)
+    assert not fresh.is_cached()
+    assert call(fresh) == 11.0
+    assert "compiling a (once; cached in" in capfd.readouterr().err
+    assert parts.compiled() == ["a", "a"]
+    assert fresh._cache.holds(module.SIGNATURE, fresh.targetctx)
+    assert len(file.read_bytes()) == len(sound)
+    assert call(entry(module.sources["a"], module.SIGNATURE)) == 11.0
+    assert parts.compiled() == ["a", "a"]
+
+
+def test_files_of_a_function_that_nobody_wants_any_more_are_deleted(module, parts):
+    call(module.a)
+    (file,) = parts.files("code")
+    old = [file.with_name(f"{file.name[: -len('.code') - 32]}{k:032x}.code") for k in range(12)]
+    for k, path in enumerate(old):
+        path.write_bytes(b"of older sources")
+        os.utime(path, (k, k))
+    left = file.with_name(file.name.replace(".code", ".0123456789ab.tmp"))
+    left.write_bytes(b"of a killed process")
+    os.utime(left, (0, 0))
+    call(module.b)
+    assert len(parts.files("code")) == 14  # another function's files are none of its business
+    module.a._cache.flush()
+    for path in old:
+        path.write_bytes(b"of older sources")
+        os.utime(path, (1 + old.index(path),) * 2)
+    call(entry(module.sources["a"], module.SIGNATURE))
+    files = [path for path in parts.files("code") if ".a." in path.name]
+    assert len(files) == caches.KEPT
+    assert file in files
+    assert old[-1] in files
+    assert old[0] not in files
+    assert not parts.files("tmp")
+
+
+# ---- where nothing can be written --------------------------------------------------------------
+
+
+def test_where_no_folder_can_be_written_parts_are_compiled_in_the_process(parts):
+    parts.cache.write_text("a file where the folder should be")
+    nowhere = parts.folder / "notes" / "below a file"
+    parts.notes.touch()
+    output, said = parts.run(XDG_CACHE_HOME=str(nowhere), NUMBA_CACHE_DIR=str(nowhere))
+    assert output == RIGHT
+    assert parts.compiled() == ["a", "b", "c"]
+    assert len(parts.compilers()) == 1
+    assert "not cached: no folder can be written; set NUMBA_CACHE_DIR" in said
+    assert len(said.splitlines()) == 2
+
+
+def test_where_the_package_cannot_be_written_the_users_folder_serves(parts):
+    parts.cache.write_text("a file where the folder should be")
+    elsewhere = parts.folder / "elsewhere"
+    for _ in range(2):
+        output, said = parts.run(XDG_CACHE_HOME=str(elsewhere))
+        assert output == RIGHT
+        assert parts.compiled() == ["a", "b", "c"]
+    assert said == ""
+    assert len(list(elsewhere.rglob("*.code"))) == 3
+
+
+def test_code_beside_the_package_is_found_by_those_who_cannot_write_there(parts, module):
+    assert module.results() == [11.0, 12.0, 13.0]
+    fresh = entry(module.sources["a"], module.SIGNATURE)
+    fresh._cache.folder = parts.folder / "elsewhere"
+    assert fresh.is_cached()
+    assert call(fresh) == 11.0
+    assert parts.compiled() == ["a", "b", "c"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no limits on the size of files")
+def test_a_full_disk_costs_one_line_and_the_cache(parts):
+    output, said = parts.run(FULL_DISK)
+    assert output == RIGHT
+    lines = [line for line in said.splitlines() if "compiled code cannot be cached in" in line]
+    assert len(lines) == 1
+    assert "File too large" in lines[0]
+    assert "Traceback" not in said
+    assert not parts.files("code")
+    assert not parts.files("tmp")
+    assert parts.run()[0] == RIGHT
+    assert len(parts.files("code")) == 3
+
+
+# ---- closures ----------------------------------------------------------------------------------
+
+
+def one(f, option):
+    f.y = f.x + 1.0
+
+
+def two(f, option):
+    f.y = f.x + 2.0
+
+
+def test_functions_of_one_piece_of_source_have_files_of_their_own():
+    """As many as are not deleted as old ones of each other."""
+    pairs = [(body, Compiled(body, x=(), y=())) for body in (one, two, one)]
+    x = np.arange(3.0)
+    for body, compiled in pairs:
+        for run in (compiled.on_floats, compiled.on_lanes):
+            np.testing.assert_array_equal(run(x=x)["y"], x + (1.0 if body is one else 2.0))
+    first, second, again = (compiled._on_records._cache for _, compiled in pairs)
+    assert first._stem == again._stem != second._stem
+    assert first._sources == again._sources != second._sources

@@ -1,0 +1,183 @@
+"""What compiled code depends on: every source that it reaches, and nothing else."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling.digest import digest_of_function
+
+ROOT = Path(__file__).parents[3]
+SCRIPT = """
+import json, sys
+from pathlib import Path
+import tests
+from quad_gym.kernels.compiling.digest import digest_of
+
+root = Path.cwd()
+looked_at = [root / name for name in json.loads(sys.argv[1])]
+found = []
+for name, old, new in [("", "", ""), *json.loads(sys.argv[2])]:
+    if not name:
+        found.append([digest_of(path) for path in looked_at])
+        continue
+    file = root / name
+    text = file.read_text()
+    assert old in text, (name, old)
+    file.write_text(text.replace(old, new, 1) if old else text + new)
+    found.append([digest_of(path) for path in looked_at])
+    file.write_text(text)
+print(json.dumps(found))
+"""
+MOVE, UPDATE, HELPER = (
+    "quad_gym/kernels/vehicle/dynamics.py",
+    "quad_gym/kernels/filter/update.py",
+    "tests/case.py",
+)
+STATEMENT, COMMENT, BLANK = "\n_MORE = 1\n", "\n# a comment\n", "\n\n\n"
+DOCSTRING = '"""Another docstring."""'
+EDITS = {
+    # what: (file, old, new, whether the code of MOVE, UPDATE and HELPER depends on it)
+    "a leaf kernel": ("quad_gym/kernels/maths/linalg.py", "", STATEMENT, (1, 1, 1)),
+    "the number type": ("quad_gym/kernels/simd/lanes.py", "", STATEMENT, (1, 1, 1)),
+    "a constant": (MOVE, "h / 6.0", "h / 7.0", (1, 0, 0)),
+    "a record's field": (
+        "quad_gym/records/flight.py",
+        'Field("r_hat", (3,)',
+        'Field("r_hat", (4,)',
+        (1, 1, 1),
+    ),
+    "an enumeration": ("quad_gym/records/enums.py", "", STATEMENT, (1, 1, 1)),
+    "a draw": ("quad_gym/records/streams.py", '"start", 66, 5', '"start", 67, 4', (1, 1, 1)),
+    "how it is linked": ("quad_gym/kernels/compiling/linking.py", "", STATEMENT, (1, 1, 1)),
+    "decorators": ("quad_gym/kernels/compiling/decorators.py", "", STATEMENT, (1, 1, 1)),
+    "its own file": (MOVE, "", STATEMENT, (1, 0, 0)),
+    "another room's": ("quad_gym/kernels/filter/ekf.py", "", STATEMENT, (0, 1, 0)),
+    "a test's own file": (HELPER, "", STATEMENT, (0, 0, 1)),
+    "a test's helper": ("tests/help.py", "", STATEMENT, (0, 0, 1)),
+    "a helper by a relative name": ("tests/near.py", "", STATEMENT, (0, 0, 1)),
+    "a comment": ("quad_gym/kernels/maths/linalg.py", "", COMMENT, (0, 0, 0)),
+    "blank lines": ("quad_gym/kernels/simd/lanes.py", "\n\n\n", "\n\n\n\n", (0, 0, 0)),
+    "a docstring at the end": ("quad_gym/kernels/maths/linalg.py", "", DOCSTRING, (0, 0, 0)),
+    "a docstring": (HELPER, "What it does.", "What it did.", (0, 0, 0)),
+    "a comment in a record": ("quad_gym/records/flight.py", "", COMMENT, (0, 0, 0)),
+    "metrics": ("quad_gym/metrics.py", "", STATEMENT, (0, 0, 0)),
+    "environments": ("quad_gym/envs/single.py", "", STATEMENT, (0, 0, 0)),
+    "parameters": ("quad_gym/params.py", "", STATEMENT, (0, 0, 0)),
+    "another test": ("tests/other.py", "", STATEMENT, (0, 0, 0)),
+    "who compiles": ("quad_gym/kernels/compiling/workers.py", "", STATEMENT, (0, 0, 0)),
+    "the cache": ("quad_gym/kernels/compiling/cache.py", "", STATEMENT, (0, 0, 0)),
+}
+TESTS = {
+    "__init__.py": "",
+    "case.py": '"""What it does."""\n'
+    "from quad_gym.kernels.maths.linalg import cross\n"
+    "from tests.help import helped\nfrom .near import nearby\n",
+    "help.py": "helped = 1\n",
+    "near.py": "nearby = 1\n",
+    "other.py": "other = 1\n",
+}
+
+
+@pytest.fixture(scope="module")
+def digests(tmp_path_factory):
+    """Digests of the three files in a copy of the package: as it is, then after each edit."""
+    folder = tmp_path_factory.mktemp("copy")
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "quad_gym", folder / "quad_gym", ignore=ignored)
+    (folder / "tests").mkdir()
+    for name, text in TESTS.items():
+        (folder / "tests" / name).write_text(text)
+    edits = [(file, old, new) for file, old, new, _ in EDITS.values()]
+    arguments = [json.dumps([MOVE, UPDATE, HELPER]), json.dumps(edits)]
+    process = subprocess.run(
+        [sys.executable, "-c", SCRIPT, *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert process.returncode == 0, process.stderr
+    first, *edited = json.loads(process.stdout)
+    return first, dict(zip(EDITS, edited, strict=True))
+
+
+@pytest.mark.parametrize("what", EDITS)
+def test_an_edit_makes_stale_what_depends_on_it_alone(digests, what):
+    first, edited = digests
+    stale = tuple(int(old != new) for old, new in zip(first, edited[what], strict=True))
+    assert stale == EDITS[what][-1]
+
+
+# ---- what functions hold -----------------------------------------------------------------------
+
+
+def holding(held, default=1.0):
+    def function(x, more=default):
+        return x + held
+
+    return function
+
+
+def calling(inner):
+    @kernel
+    def function(x):
+        return inner(x)
+
+    return function.py_func
+
+
+@kernel
+def plus(x):
+    return x + 1.0
+
+
+@kernel
+def minus(x):
+    return x - 1.0
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        (1.0, 2.0, 1, True, "1.0", None),
+        (0.0, -0.0, float("nan"), np.float64(0.0), np.float32(0.0)),
+        ((1, 2), (1, (2,)), (2, 1), ()),
+        (plus, minus, calling(plus), calling(minus)),
+        (np.zeros(3), np.zeros(4), np.zeros((3, 1)), np.zeros(3, np.float32), np.ones(3)),
+        (np.dtype("f8"), np.dtype([("a", "f8")]), np.dtype([("a", "f8", (2,))])),
+        (np.sin, abs, min),
+    ],
+    ids=["kinds", "floats", "tuples", "functions", "arrays", "dtypes", "builtins"],
+)
+def test_functions_differ_in_what_they_close_over(values):
+    if values[0] is np.sin:
+        values = values[1:]
+    digests = [digest_of_function(holding(value)) for value in values]
+    assert len(set(digests)) == len(values)
+    assert digests == [digest_of_function(holding(value)) for value in values]
+
+
+def test_functions_differ_in_their_defaults_and_in_their_code():
+    functions = [holding(1.0), holding(1.0, 2.0), lambda x: x + 1.0, lambda x: x - 1.0]
+    assert len({digest_of_function(function) for function in functions}) == 4
+
+
+def test_a_function_that_calls_itself_has_a_digest():
+    def again(x):
+        return again(x - 1.0) if x > 0.0 else 0.0
+
+    assert digest_of_function(again) == digest_of_function(again)
+
+
+def test_what_has_no_lasting_identity_cannot_be_closed_over():
+    with pytest.raises(TypeError, match="closes over <object object"):
+        digest_of_function(holding(object()))

@@ -1,0 +1,107 @@
+"""Processes that compile side by side: what they share, and what is left when one of them dies."""
+
+import signal
+import sys
+
+import pytest
+
+from tests.unit.compiling.parts import RIGHT, Parts, alive, wait_until
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="it reads /proc")
+TWENTY = """
+import os
+from multiprocessing import get_context
+import parts_of_test as parts
+from quad_gym.kernels.compiling.workers import prepare
+
+def work(barrier, answers):
+    barrier.wait()
+    {what}
+    answers.put(str(parts.results()))
+
+context = get_context("fork")
+barrier, answers = context.Barrier(20), context.Queue()
+twenty = [context.Process(target=work, args=(barrier, answers)) for _ in range(20)]
+for process in twenty:
+    process.start()
+found = [answers.get() for _ in twenty]
+for process in twenty:
+    process.join()
+print(*sorted(set(found)))
+"""
+
+
+@pytest.fixture
+def parts(tmp_path):
+    return Parts(tmp_path)
+
+
+def test_parts_are_compiled_once_and_by_processes_of_their_own(parts):
+    output, said = parts.run()
+    assert output == RIGHT
+    assert parts.compiled() == ["a", "b", "c"]
+    assert len(parts.compilers()) == 2
+    assert len(parts.files("code")) == 3
+    assert not parts.files("tmp")
+    assert not list(parts.cache.glob("*.lock"))
+    assert [line.split(" (")[0] for line in said.splitlines()][:1] == [
+        "quad_gym: compiling 3 parts for this machine"
+    ]
+    assert "compiled 3 of 3 parts" in said.splitlines()[-1]
+    assert parts.run() == (RIGHT, "")  # all of it comes from the cache
+    assert parts.compiled() == ["a", "b", "c"]
+
+
+def test_one_process_compiles_by_itself_and_says_as_much(parts):
+    output, said = parts.run(processes=1)
+    assert output == RIGHT
+    assert len(parts.compilers()) == 1
+    assert len(said.splitlines()) == 2
+
+
+@pytest.mark.parametrize("what", ["prepare(parts.NAMES, processes=2)", "pass"])
+def test_twenty_processes_that_begin_at_once_compile_each_part_once(parts, what):
+    """By `prepare`, or by calls that find nothing prepared."""
+    output, said = parts.run(TWENTY.replace("{what}", what))
+    assert output == RIGHT
+    assert parts.compiled() == ["a", "b", "c"]
+    assert len(parts.files("code")) == 3
+    lines = said.splitlines()
+    assert len([line for line in lines if "quad_gym: compiling" in line]) in (1, 3)
+
+
+def test_what_killed_workers_have_not_compiled_the_parent_compiles(parts):
+    output, _ = parts.run(MOOD="die")
+    assert output == RIGHT
+    assert parts.compiled() == ["a", "a", "b", "b", "c"]  # two workers died over a and b
+    assert len(parts.files("code")) == 3
+    assert not parts.files("tmp")
+    assert parts.run() == (RIGHT, "")
+
+
+def test_a_part_that_cannot_be_compiled_raises_in_the_parent(parts):
+    process = parts.start(MOOD="raise")
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "this part cannot be compiled" in said
+    assert not parts.files("code")
+    assert parts.run()[0] == RIGHT
+
+
+@linux
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_worker_outlives_a_parent_that_is_told_to_end(parts, how):
+    """Ctrl-C, a request to end, and a kill: no process and no damaged file is left."""
+    process = parts.start(MOOD="dawdle")
+    wait_until(lambda: len(parts.compilers()) == 2)
+    workers = parts.compilers()
+    process.send_signal(how)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode != 0
+    wait_until(lambda: not any(alive(worker) for worker in workers))
+    if how == signal.SIGINT:
+        assert said.rstrip().endswith("KeyboardInterrupt")
+        assert said.count("Traceback") == 1  # the workers say nothing
+    assert not parts.files("code")
+    assert not parts.files("tmp")
+    assert parts.run()[0] == RIGHT

@@ -1,0 +1,260 @@
+"""Who draws which numbers: no two quantities share a draw, so that all of them are independent."""
+
+import ast
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+import quad_gym.kernels
+from quad_gym.distributions import Normal, Uniform
+from quad_gym.faults import GnssJump, GnssOutage
+from quad_gym.params import TASKS, TaskParams
+from quad_gym.records import (
+    DRAW_FAULTS,
+    DRAW_RANGES,
+    DRAWS_OF_FAULT,
+    FAULT_KINDS,
+    MAX_FEATURES,
+    FaultKind,
+)
+from quad_gym.records.streams import _claim
+from quad_gym.simulation import FlightBatch
+from tests.unit.alarms import alarm_score
+
+COUNT = 10_000
+OUTAGE, JUMP = int(FaultKind.GNSS_OUTAGE), int(FaultKind.GNSS_JUMP)
+KERNELS = Path(quad_gym.kernels.__file__).parent
+
+
+# ---- the table -------------------------------------------------------------------------------
+
+
+def test_no_two_ranges_share_a_draw():
+    owners = {}
+    for quantity, first, count in DRAW_RANGES:
+        assert count > 0
+        for draw in range(first, first + count):
+            assert owners.setdefault(draw, quantity) == quantity
+    assert len({quantity for quantity, _, _ in DRAW_RANGES}) == len(DRAW_RANGES)
+
+
+@pytest.mark.parametrize("end", ["first", "last"])
+def test_a_draw_that_is_taken_is_refused(end):
+    before, taken = list(DRAW_RANGES), DRAW_RANGES[0]
+    first = taken.first - 2 if end == "first" else taken.first + taken[2] - 1
+    with pytest.raises(ValueError, match="'a test' overlap those of 'driving noise"):
+        _claim("a test", first, 3)
+    assert before == DRAW_RANGES
+
+
+# ---- what the kernels draw -------------------------------------------------------------------
+
+DRAWS_OF = {"uniform_pair": 1, "normal_pair": 1, "six_normals": 3, "_any_direction": 1}
+"""How many draws a function takes from the one on that is its second argument."""
+LARGEST = {"feature_count": MAX_FEATURES, "settings.feature_count": MAX_FEATURES}
+"""What kernels are told while they run, at its largest."""
+FAULTS = range(FAULT_KINDS)
+
+
+def loops_around(function, call):
+    """The loops of a function that a call stands in: (variable, its end as source)."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.For) and call in ast.walk(node):
+            yield node.target.id, ast.unparse(node.iter.args[-1])
+
+
+def draws_of_kernels():
+    """Every place where a kernel draws: (place, the sets of draws that it can be, one by one)."""
+    for file in sorted(KERNELS.rglob("*.py")):
+        name = ".".join(file.relative_to(KERNELS.parents[1]).with_suffix("").parts)
+        for function in ast.walk(ast.parse(file.read_text())):
+            if not isinstance(function, ast.FunctionDef) or function.name in DRAWS_OF:
+                continue
+            for call in ast.walk(function):
+                known = isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
+                if known and call.func.id in DRAWS_OF:
+                    yield f"{name}:{call.lineno}", draws_of_call(name, function, call)
+
+
+def draws_of_call(name, function, call):
+    """The draws that a call takes, for each value of the variables around it."""
+    scope = dict(vars(importlib.import_module(name)))
+    if "_draw_of" in scope:
+        scope["_draw_of"] = scope["_draw_of"].py_func
+    source, values = ast.unparse(call.args[1]), {}
+    for variable, end in loops_around(function, call):
+        values[variable] = range(LARGEST.get(end) or eval(end, scope))
+    if "_draw_of(k)" in source:
+        values["k"] = FAULTS
+    (variable, each) = next(iter(values.items()), ("_", [0]))
+    assert len(values) < 2
+    firsts = [int(eval(source, scope | {variable: value})) for value in each]
+    return [set(range(first, first + DRAWS_OF[call.func.id])) for first in firsts]
+
+
+PLACES = dict(draws_of_kernels())
+
+
+def range_of(draw):
+    (found,) = [r for r in DRAW_RANGES if draw in range(r.first, r.first + r[2])]
+    return found
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_kernel_draws_within_the_range_of_one_quantity(place):
+    ranges = {range_of(draw) for draws in PLACES[place] for draw in draws}
+    assert len(ranges) == 1
+    if "faults:" in place and ranges.pop().first == DRAW_FAULTS:  # each kind within its own
+        for kind, draws in enumerate(PLACES[place]):
+            first = DRAW_FAULTS + DRAWS_OF_FAULT * kind
+            assert draws <= set(range(first, first + DRAWS_OF_FAULT))
+
+
+def test_every_range_is_drawn_from():
+    drawn = {draw for sets in PLACES.values() for draws in sets for draw in draws}
+    for quantity, first, count in DRAW_RANGES:
+        taken = drawn & set(range(first, first + count))
+        assert first in taken, quantity
+        assert len(taken) >= 0.6 * count, quantity  # a fault leaves some of its draws to others
+
+
+# ---- what an episode begins with -------------------------------------------------------------
+
+
+def angle_of(vectors):
+    return np.arctan2(vectors[:, 1], vectors[:, 0])
+
+
+def wrapped(angle):
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def reference_of(batch, task):
+    """What the reference has drawn, by name; where it begins, and where the vehicle looks then."""
+    center, point = batch.read("ref_center"), batch.read("ref_heading_point")
+    cosines, sines = batch.read("ref_cos"), batch.read("ref_sin")
+    place, ahead = center + cosines.sum(axis=1), point
+    drawn = {"rate": batch.read("ref_omega")}
+    if task == "hover":
+        drawn |= {"phase": angle_of(center), "radius": np.hypot(*center.T[:2])}
+        ahead = -center
+    elif task == "circle":
+        drawn |= {"phase": angle_of(cosines[:, 0]), "radius": np.hypot(*cosines[:, 0].T[:2])}
+        drawn["sense"] = np.sign(np.cross(cosines[:, 0], sines[:, 0])[:, 2])
+        ahead = -place
+    elif task == "lemniscate":
+        drawn |= {"phase": angle_of(sines[:, 0]), "radius": np.hypot(*sines[:, 0].T[:2])}
+        drawn["sense"] = np.sign(np.cross(sines[:, 0], sines[:, 1])[:, 2])
+        ahead = sines[:, 0] + 2.0 * sines[:, 1]
+    elif task == "random_trajectory":
+        drawn["heading"] = angle_of(point)
+        for k in range(6):
+            for i in range(3):
+                drawn[f"odd cos {k}, {i}"] = cosines[:, k, i]
+                drawn[f"odd sin {k}, {i}"] = sines[:, k, i]
+    else:
+        gates = batch.read("gates")
+        azimuth = np.arctan2(gates[..., 1], gates[..., 0])
+        drawn |= {"heading": angle_of(point), "azimuth": azimuth[:, 0]}
+        for k in range(5):
+            drawn[f"distance {k}"] = np.hypot(gates[:, k, 0], gates[:, k, 1])
+            drawn[f"height {k}"] = gates[:, k, 2]
+            if k > 0:
+                drawn[f"turn {k}"] = wrapped(azimuth[:, k] - azimuth[:, k - 1])
+        place = gates[:, 0] * [0.25, 0.25, 0.0] + [0.0, 0.0, batch.task.height]
+    return drawn, place, angle_of(ahead)
+
+
+def quantities_of(batch, task):
+    """All that an episode draws when it begins, each by itself, by name: (COUNT,)."""
+    drawn, place, heading = reference_of(batch, task)
+    R = Rotation.from_quat(batch.read("q")[:, [1, 2, 3, 0]]).as_matrix()  # body to inertial
+    drawn |= {f"tilt {i}": R[:, 2, i] for i in range(2)}
+    drawn["yaw"] = wrapped(angle_of(R[:, :, 0]) - heading)
+    vectors = {
+        "start": batch.read("r") - place,
+        "velocity": batch.read("v"),
+        "accelerometer bias": batch.read("b_a"),
+        "gyro bias": batch.read("b_g"),
+        "gyro noise": batch.read("gyro") - batch.read("b_g"),
+        "mass": batch.read("mass")[:, np.newaxis],
+        "wind": np.stack([batch.read("wind_east"), batch.read("wind_up")], axis=1),
+        "outage and jump begin": batch.read("fault_from")[:, [OUTAGE, JUMP]],
+        "outage lasts": (batch.read("fault_until") - batch.read("fault_from"))[:, [OUTAGE]],
+        "jump": batch.read("fault_vector")[:, JUMP],
+        "first measurements": np.stack(
+            [batch.read("gnss_wait"), batch.read("camera_wait")], axis=1
+        ),
+    }
+    for name, values in vectors.items():
+        drawn |= {f"{name} {i}": values[:, i] for i in range(values.shape[1])}
+    return {name: values for name, values in drawn.items() if np.ptp(values) > 0.0}
+
+
+def features_of(quantities):
+    """Functions of the ranks of each quantity, centred, of unit length: (COUNT, n, 4).
+
+    They see whether one quantity is a function of another, be it an angle or its double.
+    """
+    columns = []
+    for name, values in quantities.items():
+        u = (stats.rankdata(values) - 0.5) / len(values)
+        even = 0.0 if name.startswith("odd") else 1.0  # their common scale is one of all
+        columns.append([u - 0.5, np.sin(2.0 * np.pi * u)])
+        columns[-1] += [even * np.cos(2.0 * np.pi * u), even * np.cos(4.0 * np.pi * u)]
+    features = np.moveaxis(np.array(columns), -1, 0)
+    features = features - features.mean(axis=0)
+    lengths = np.linalg.norm(features, axis=0)
+    return features / np.where(lengths > 1e-9, lengths, 1.0)
+
+
+def assert_independent(one, other, names, same):
+    """No feature of a quantity correlates with one of another; `same`: is it one and the same?"""
+    scores = np.einsum("nia,njb->ijab", one, other) * np.sqrt(COUNT)
+    if same:
+        scores[np.arange(len(names)), np.arange(len(names))] = 0.0
+    worst = np.unravel_index(np.abs(scores).argmax(), scores.shape)
+    pair = f"{names[worst[0]]} and {names[worst[1]]}"
+    assert np.abs(scores).max() < alarm_score(scores.size), pair
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_an_episode_begins_with_is_independent(task):
+    batch = FlightBatch(
+        COUNT,
+        sensors="consumer",
+        task=TaskParams(kind=task, randomize=True, start="hover", radius=3.0),
+        randomization={
+            "mass": Uniform(0.8, 1.2, relative=True),
+            "wind_east": Normal(0.0, 1.0),
+            "wind_up": Uniform(-0.5, 0.5),
+        },
+        faults=(GnssOutage(start=(1.0, 5.0), duration=(1.0, 2.0)), GnssJump(start=(1.0, 5.0))),
+        threads=2,
+    )
+    batch.reset(seeds=range(COUNT))
+    first = quantities_of(batch, task)
+    batch.reset()
+    second = quantities_of(batch, task)
+    assert first.keys() == second.keys()
+    assert len(first) > 22
+    names, now, later = list(first), features_of(first), features_of(second)
+    assert_independent(now, now, names, same=True)
+    assert_independent(now, later, names, same=False)
+
+
+def test_what_an_episode_draws_does_not_depend_on_the_length_of_the_last_one():
+    found = []
+    for steps in (0, 1, 37):
+        batch = FlightBatch(9, task=TaskParams(kind="waypoints", randomize=True, start="hover"))
+        batch.reset(seeds=range(9))
+        for _ in range(steps):
+            batch.step()
+        batch.reset()
+        np.testing.assert_array_equal(batch.read("instant"), np.uint64(2 * 2**32))
+        found.append([batch.read(name).tobytes() for name in ("r", "gates", "b_a", "gyro", "q")])
+    assert found[0] == found[1] == found[2]
