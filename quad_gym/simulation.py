@@ -96,7 +96,7 @@ class FlightBatch:
         count: int,
         *,
         vehicle: VehicleParams | str = "lab",
-        sensors: SensorSuite | str = "lab",
+        sensors: SensorSuite | str = "standard",
         gains: PDGains | str = "lab",
         actions: ActionParams | None = None,
         task: TaskParams | None = None,

@@ -50,7 +50,7 @@ class Args:
         positional=True,
     )
     sensors: tuple[str, ...] = option(
-        ("lab",), f"sensor suites: {', '.join(SUITES)}", group="what to compare"
+        ("standard",), f"sensor suites: {', '.join(SUITES)}", group="what to compare"
     )
     train_on: tuple[str, ...] = option(SOURCES, f"what to train on, of {', '.join(SOURCES)}")
     seeds: int = option(5, "training seeds")

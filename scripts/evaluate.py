@@ -43,7 +43,7 @@ class Args:
     observation: tuple[str, ...] = option(
         ("truth", "estimate"), "what to fly on: estimate, truth, noisy"
     )
-    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}")
+    sensors: str = option("standard", f"sensor suite, of {', '.join(SUITES)}")
     env: dict[str, Any] = option(
         {}, "further keywords of the environment, such as camera=false gnss_rate=10"
     )

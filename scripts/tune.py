@@ -49,7 +49,7 @@ class Args:
         TRACKING, f"what to fly: {', '.join(TRACKING)}", group="what to tune for"
     )
     observation: Literal["estimate", "truth", "noisy"] = option("estimate", "what control sees")
-    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}")
+    sensors: str = option("standard", f"sensor suite, of {', '.join(SUITES)}")
     env: dict[str, Any] = option(
         {}, "further keywords of the environment, such as action=wrench control_rate=200"
     )

@@ -111,7 +111,7 @@ class Flights:
         layout: str = "relative",
         include_covariance: bool = False,
         privileged: bool = False,
-        sensors: SensorSuite | str = "lab",
+        sensors: SensorSuite | str = "standard",
         vehicle: VehicleParams | str = "lab",
         actions: ActionParams | None = None,
         camera: bool = True,
@@ -144,8 +144,6 @@ class Flights:
             suite = suite.replace(camera=None)
         elif camera_is_wanted and suite.camera is None:
             raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
-        if feature_noise_across is None and sensors == "lab":
-            feature_noise_across = "predicted"
         if feature_noise_across is not None:
             choices = suite.estimator.replace(feature_noise_across=feature_noise_across)
             suite = suite.replace(estimator=choices)

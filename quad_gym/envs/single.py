@@ -124,16 +124,16 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or a
-            `SensorSuite`.
+        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or
+            a `SensorSuite`. "standard" has the laboratory's sensors and a consistent filter; "lab"
+            is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
             block by block; a suite whose filter gates keeps them for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
         feature_noise_across: "predicted", "projected" or "measured", see `quad_gym.FilterParams`.
-            None: as the suite has it; but for "lab" by name "predicted", as the report's own
-            "measured" makes some 6 circles in 1,000 crash in their first second.
+            None: as the suite has it.
         estimator: "ukf" or "ekf", in place of the suite's.
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
             no GNSS; "warm": it has been running for 10 s before the episode and has converged.
