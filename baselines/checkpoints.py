@@ -21,11 +21,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from baselines.plans import Plan
+from baselines.seeds import first_seed
 from quad_gym.evaluation import Episodes, roll_out
 
 LAST, BEST, EVALUATIONS = "last.zip", "best.zip", "evaluations.csv"
-EVALUATION_SEED = 1_000_000
-"""Seed of the first flight of an evaluation, far from those of training flights."""
 _STATE = "training_state.pickle"  # within last.zip, where Stable-Baselines3 passes over it
 _COLUMNS = (
     "steps",
@@ -79,6 +78,7 @@ class Keeper(BaseCallback):
         super().__init__()
         self._plan, self._folder, self._judge, self._quiet = plan, folder, judge, quiet
         self._interval = plan.recipe.steps / plan.evaluations
+        self._first_seed = first_seed("validation", plan.seed, plan.episodes)
         self.steps, self.seconds, self.finished = 0, 0.0, False
         self.rows: list[dict[str, float]] = []
         self.best: dict[str, float] = {}
@@ -153,7 +153,7 @@ class Keeper(BaseCallback):
         """Evaluate, and write a checkpoint."""
         now = time.perf_counter()
         self.seconds += now - (now if self._since is None else self._since)
-        episodes = roll_out(model, self._judge, seed=EVALUATION_SEED)
+        episodes = roll_out(model, self._judge, seed=self._first_seed)
         row = self._row(model, episodes)
         for name, value in row.items():
             model.logger.record(f"evaluation/{name}", value)

@@ -3,9 +3,11 @@
 import warnings
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.envs.spaces import policy_size
 from quad_gym.params import PDGains, pd_gains
 
 Array = NDArray[np.float64]
@@ -29,6 +31,29 @@ class _Seen(NamedTuple):
 
 
 _RELATIVE_FIELDS = _Seen._fields[:-1]
+
+
+def _require_plain_observations(env: Any) -> None:
+    """Refuse an environment that shows other observations than the one within it makes.
+
+    Raises:
+        ValueError: If a wrapper is one of observations, or changes their space.
+    """
+    layer = env
+    while True:
+        inner = getattr(layer, "env", None) or getattr(layer, "venv", None)
+        if inner is None:
+            return
+        changes = isinstance(
+            layer, (gymnasium.ObservationWrapper, gymnasium.vector.VectorObservationWrapper)
+        )
+        normalizes = getattr(layer, "norm_obs", False)  # VecNormalize of Stable-Baselines3
+        if changes or normalizes or layer.observation_space != inner.observation_space:
+            raise ValueError(
+                "env must show observations as they are, in metres and radians: "
+                f"{type(layer).__name__} changes them"
+            )
+        layer = inner
 
 
 class PDPolicy:
@@ -57,7 +82,8 @@ class PDPolicy:
             `Waypoints`, which are far apart, and unlimited elsewhere.
 
     Raises:
-        ValueError: If the environment's observation or action does not admit the controller.
+        ValueError: If the environment's observation or action does not admit the controller, or a
+            wrapper changes the observations, such as `NormalizeObservation`.
     """
 
     def __init__(
@@ -66,6 +92,7 @@ class PDPolicy:
         flights = getattr(getattr(env, "unwrapped", env), "flights", None)
         if flights is None:
             raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
+        _require_plain_observations(env)
         if flights.observation == "sensors":
             raise ValueError('env must observe a state: observation="sensors" holds none')
         if flights.action == "velocity" and flights.layout != "absolute":
@@ -80,6 +107,7 @@ class PDPolicy:
         self._scales = flights.batch.actions
         self._action, self._absolute = flights.action, flights.layout == "absolute"
         self._slices = {field.name: field.slice for field in flights.table}
+        self._widths = policy_size(flights.table), flights.table[-1].slice.stop
         on_course = flights.task.kind == "waypoints"
         self._reach = (
             (1.0 if on_course else np.inf) if max_position_error is None else max_position_error
@@ -102,9 +130,17 @@ class PDPolicy:
 
         Returns:
             (4,) or (n, 4) action in [-1, 1], and None.
+
+        Raises:
+            ValueError: If observations have another length than those of the environment.
         """
         flat = observation["policy"] if isinstance(observation, dict) else observation
         rows = np.atleast_2d(np.asarray(flat, np.float64))
+        if rows.ndim != 2 or rows.shape[1] not in self._widths:
+            raise ValueError(
+                f"observation must be (..., {self._widths[0]}) as that of the environment which "
+                f"the policy was made for, got shape {np.shape(flat)}"
+            )
         action = self._act(self._read(rows))
         clipped = np.clip(action, -1.0, 1.0).astype(np.float32)
         return (clipped if np.ndim(flat) == 2 else clipped[0]), None

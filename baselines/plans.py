@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import quad_gym
 from baselines.recipes import Recipe, recipe, unfreeze
+from baselines.seeds import MAX_SEED, first_seed
 from quad_gym import validation as check
 from quad_gym.reports import as_json
 from quad_gym.validation import Checked
@@ -30,7 +31,8 @@ class Plan(Checked):
     """keywords of the environment, in training as in evaluation, before those of the recipe"""
     recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
     seed: int = 0
-    """of the networks, and of the first flight; flight i has seed + i"""
+    """of the networks; the flights of training and validation have blocks of seeds that follow from
+    it, see `baselines.seeds`"""
     threads: int | None = None
     """for the flights; None: as many as there are cores; no result depends on them"""
     evaluations: int = 20
@@ -42,6 +44,8 @@ class Plan(Checked):
         self._check(check.choice, "env_id", choices=tuple(quad_gym.IDS))
         self._check(check.whole, "evaluations", "episodes")
         self._check(check.whole, "seed", least=0)
+        if self.seed > MAX_SEED:
+            raise ValueError(f"Plan.seed must be at most {MAX_SEED}, got {self.seed}")
         check.instance("Plan.recipe", self.recipe, Recipe)
         self._set("environment", MappingProxyType(dict(self.environment)))
 
@@ -54,7 +58,7 @@ class Plan(Checked):
         env = quad_gym.make_sb3_vec_env(
             self.env_id,
             n_envs=self.recipe.n_envs,
-            seed=self.seed,
+            seed=first_seed("training", self.seed, self.recipe.n_envs),
             threads=self.threads,
             **{**self.recipe.flights, **self.environment},
         )
@@ -113,7 +117,7 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
     kind = "MultiInput" if isinstance(env.observation_space, gymnasium.spaces.Dict) else "Mlp"
     kind += "LstmPolicy" if chosen.algorithm == "recurrent_ppo" else "Policy"
     try:
-        return algorithm_class(chosen.algorithm)(
+        model = algorithm_class(chosen.algorithm)(
             kind,
             env,
             learning_rate=Linear(first, last),
@@ -126,6 +130,9 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
         )
     except (TypeError, AssertionError) as error:
         raise ValueError(f"recipe does not fit {chosen.algorithm}: {error}") from None
+    # the algorithm has seeded the flights with its own seed, and so with those of a test
+    env.seed(first_seed("training", plan.seed, chosen.n_envs))
+    return model
 
 
 def _exploration(chosen: Recipe, env: VecEnv) -> dict[str, Any]:
@@ -152,4 +159,8 @@ def description(plan: Plan) -> dict[str, Any]:
     """A plan as JSON has it."""
     found: dict[str, Any] = as_json(plan)
     del found["threads"]  # changes no result
+    found["first_flights"] = {
+        "training": first_seed("training", plan.seed, plan.recipe.n_envs),
+        "validation": first_seed("validation", plan.seed, plan.episodes),
+    }
     return found

@@ -10,10 +10,13 @@ from quad_gym import validation as check
 from quad_gym.kernels import single
 from quad_gym.packing import form_of, params_record
 from quad_gym.params import VehicleParams
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterForm, FilterStatus
 from quad_gym.sensor_params import SensorSuite
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
+
+FARTHEST_FIX = 1e6
+"""From the reference antenna [m]; positions from the center of the Earth are farther."""
 
 
 def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[np.float64]:
@@ -49,6 +52,16 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
     return R_BI
 
 
+def _require_relative(position_G: NDArray[np.float64]) -> None:
+    """Refuse a first fix that is no place near the reference antenna."""
+    if np.abs(position_G).max() > FARTHEST_FIX:
+        raise ValueError(
+            "gnss_position_G must be relative to the reference antenna "
+            f"(GnssParams.reference_antenna_G), within {FARTHEST_FIX:g} m of it, got "
+            f"{position_G}; from an absolute position in ECEF subtract that of the antenna"
+        )
+
+
 class _KalmanFilter:
     """What the filters have in common: their interface, and all but the kind of their kernels."""
 
@@ -57,14 +70,17 @@ class _KalmanFilter:
     def __init__(self, sensors: SensorSuite) -> None:
         if not isinstance(sensors, SensorSuite):
             raise ValueError(f"sensors must be a SensorSuite, got {type(sensors).__name__}")
+        sensors.require_filter()
         self.sensors = sensors
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
         self._params = params_record(VehicleParams(), sensors)
         self._params["gravity"] = sensors.estimator.gravity
-        form = form_of(sensors.estimator.replace(kind=self._kind), innovations=True)
+        lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
+        estimator = sensors.estimator.replace(kind=self._kind)
+        form = form_of(estimator, innovations=True, lever_arm=lever_arm)
         self._form = int(form)
         self._flight = np.zeros(1, FLIGHT)
-        self._flight["block_nis"] = np.nan
+        self._flight["block_nis"] = self._flight["w_before"] = np.nan
         self._work = np.zeros(1, WORK)
         self._running = False
 
@@ -89,17 +105,20 @@ class _KalmanFilter:
                 linearises, it may be lost.
 
         Raises:
-            ValueError: If an argument has another shape, is not finite, or the baseline is zero; or
-                the suite has no GNSS.
+            ValueError: If an argument has another shape or is not finite, the position is farther
+                than FARTHEST_FIX from the reference antenna, or the baseline is zero; or the suite
+                has no GNSS.
         """
         self._require_gnss("initialize: start with set_state() instead")
         position = check.array("gnss_position_G", gnss_position_G, (3,))
+        _require_relative(position)
         baseline = self._checked_baseline(gnss_baseline_G)
         x_I = np.zeros(3)
         if heading is not None:
             angle = check.number("heading", heading)
             x_I[:2] = np.cos(angle), np.sin(angle)
         self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
+        self._flight["w_before"] = np.nan
         single.ukf_initialize(self._flight, self._params, x_I)
         self._running = True
 
@@ -147,6 +166,7 @@ class _KalmanFilter:
         for name, value in zip(_STATE, values, strict=True):
             self._flight[name] = value
         self._flight["L"], self._flight["filter_status"] = L, 0
+        self._flight["w_before"] = np.nan
         self._running = True
 
     def update(
@@ -222,7 +242,10 @@ class _KalmanFilter:
         rates = check.array("gyro", gyro, (3,))
         force = check.array("accel", accel, (3,))
         self._flight["gyro"], self._flight["accel"] = rates, force
-        self._flight["w_meas"] = rates  # turns the lever arm of a velocity
+        # they turn the lever arms of a velocity and of the accelerometer
+        known = np.isfinite(self._flight["w_before"]).all()
+        self._flight["w_before"] = self._flight["w_meas"] if known else rates
+        self._flight["w_meas"] = rates
         before = self.status
         single.ukf_predict(self._flight, self._params, self._work, self._form)
         self._warn_of_news(before)
@@ -327,7 +350,8 @@ class UnscentedKalmanFilter(_KalmanFilter):
         sensors: The sensor suite whose geometry and noise the filter believes in.
 
     Raises:
-        ValueError: If `sensors` is not a sensor suite.
+        ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
+            for something else, see `SensorSuite.require_filter`.
     """
 
     _kind = "ukf"
@@ -343,7 +367,8 @@ class ExtendedKalmanFilter(_KalmanFilter):
         sensors: The sensor suite whose geometry and noise the filter believes in.
 
     Raises:
-        ValueError: If `sensors` is not a sensor suite.
+        ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
+            for something else, see `SensorSuite.require_filter`.
 
     Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about
     an estimated attitude.

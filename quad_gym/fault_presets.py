@@ -86,6 +86,20 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
     return tuple(fault for fault in found if fault is not None)
 
 
+def needs_sensors(fault: Fault) -> bool:
+    """Whether a fault concerns measurements alone, and nothing where no sensors run."""
+    return not isinstance(fault, (PositionJump, RotorLoss))
+
+
+def felt_without_sensors(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
+    """Those of the faults that befall the vehicle itself, so that they are felt on the truth.
+
+    For comparisons of control on the estimate, which all of the faults befall, with control on the
+    truth, which sensor faults do not concern.
+    """
+    return tuple(fault for fault in faults_of(given, sensors) if not needs_sensors(fault))
+
+
 def _named(names: str, sensors: SensorSuite) -> Iterable[Fault]:
     """The faults of presets joined by "+"."""
     for name in names.split("+"):

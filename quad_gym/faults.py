@@ -27,6 +27,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from quad_gym import validation as check
+from quad_gym.portable import norm
 from quad_gym.records import FaultKind
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.validation import Checked, Vector
@@ -135,7 +136,7 @@ class _Directed(Fault):
     def unit(self) -> np.ndarray:
         """(3,) the given direction as a unit vector; zeros: drawn."""
         given = np.zeros(3) if self.direction is None else np.array(self.direction)
-        return given / (np.linalg.norm(given) or 1.0)
+        return given / (norm(given) or 1.0)
 
 
 # ---- GNSS --------------------------------------------------------------------------------------

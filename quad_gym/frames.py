@@ -1,9 +1,12 @@
 """The Earth: its frames ECEF (G, WGS-84) and the local east-north-up one (I), its gravity."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym import validation as check
+from quad_gym.portable import norm
 
 WGS84_SEMI_MAJOR_AXIS = 6378137.0
 """[m]"""
@@ -33,7 +36,7 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
 
 def _checked_place(name: str, value: ArrayLike) -> NDArray[np.float64]:
     place = check.array(name, value, (3,))
-    if np.linalg.norm(place) < 1e6:
+    if norm(place) < 1e6:
         raise ValueError(
             f"{name} must be a place near the Earth's surface in metres, got {value!r}"
         )
@@ -41,20 +44,20 @@ def _checked_place(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 def _geodetic(r_G: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = r_G
+    x, y, z = map(float, r_G)
     eccentricity2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING)
-    p = np.hypot(x, y)
-    lat = np.arctan2(z, p * (1.0 - eccentricity2))
+    p = math.hypot(x, y)
+    lat = math.atan2(z, p * (1.0 - eccentricity2))
     for _ in range(50):
-        sin_lat = np.sin(lat)
-        radius = WGS84_SEMI_MAJOR_AXIS / np.sqrt(1.0 - eccentricity2 * sin_lat**2)
-        previous, lat = lat, np.arctan2(z + eccentricity2 * radius * sin_lat, p)
+        sin_lat = math.sin(lat)
+        radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * sin_lat**2)
+        previous, lat = lat, math.atan2(z + eccentricity2 * radius * sin_lat, p)
         if lat == previous:
             break
-    sin_lat, cos_lat = np.sin(lat), np.cos(lat)
-    radius = WGS84_SEMI_MAJOR_AXIS / np.sqrt(1.0 - eccentricity2 * sin_lat**2)
+    sin_lat, cos_lat = math.sin(lat), math.cos(lat)
+    radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * sin_lat**2)
     height = p * cos_lat + z * sin_lat - WGS84_SEMI_MAJOR_AXIS**2 / radius
-    return float(lat), float(np.arctan2(y, x)), float(height)
+    return float(lat), float(math.atan2(y, x)), float(height)
 
 
 def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
@@ -73,7 +76,7 @@ def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `r0_G` is not three finite numbers on the Earth.
     """
     lat, lon, _ = _geodetic(_checked_place("r0_G", r0_G))
-    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
     return np.array(
         [
             [-sin_lon, cos_lon, 0.0],

@@ -1,17 +1,20 @@
 """Parameters as records: from the dataclasses that users write to the numbers that kernels read."""
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from quad_gym import portable
 from quad_gym.filter_params import FilterParams
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import ActionParams, Clocks, PDGains, TaskParams, VehicleParams
 from quad_gym.records import (
     BASELINE_BLOCK,
     FREEDOMS,
+    MAX_HARMONICS,
     PARAMS,
     PARAMS_BLOCK,
     POSITION_BLOCK,
@@ -25,8 +28,7 @@ from quad_gym.records import (
     Task,
     aligned_zeros,
 )
-from quad_gym.rotations import euler_to_dcm
-from quad_gym.sensor_params import SensorSuite, delay_ticks
+from quad_gym.sensor_params import ImuParams, SensorSuite, delay_ticks
 from quad_gym.world_packing import pack_world
 from quad_gym.world_params import WorldParams
 
@@ -46,11 +48,11 @@ def params_record(
     p = record[0]
 
     p["gravity"], p["mass"] = vehicle.gravity, vehicle.mass
-    p["inertia"], p["inertia_inverse"] = vehicle.inertia, np.linalg.inv(vehicle.inertia)
+    p["inertia"], p["inertia_inverse"] = vehicle.inertia, portable.inverse(vehicle.inertia)
     p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
     p["kF"] = vehicle.thrust_coefficient
     p["effectiveness"] = p["sound_effectiveness"] = vehicle.effectiveness
-    p["allocation"] = np.linalg.inv(vehicle.effectiveness)
+    p["allocation"] = portable.inverse(vehicle.effectiveness)
     p["motor_tau"], p["motor_gain"] = vehicle.motor_time_constant, vehicle.motor_speed_per_volt
     p["max_voltage"], p["max_rotor_force"] = vehicle.max_voltage, vehicle.max_rotor_force
     p["hover_voltage"] = vehicle.hover_voltage
@@ -70,23 +72,23 @@ def params_record(
     p["torque_scale"] = vehicle.hover_torques
 
     p["dt"], p["imu_lever_arm"] = imu.dt, imu.lever_arm_B
-    p["accel_sigma"] = imu.accel_noise_density / np.sqrt(imu.dt)
-    p["gyro_sigma"] = imu.gyro_noise_density / np.sqrt(imu.dt)
+    p["accel_sigma"] = imu.accel_noise_density / math.sqrt(imu.dt)
+    p["gyro_sigma"] = imu.gyro_noise_density / math.sqrt(imu.dt)
     for sensor in ("accel", "gyro"):
         sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
         p[f"{sensor}_bias_sigma"] = sigma
-        p[f"{sensor}_bias_decay"] = np.exp(-imu.dt / tau)
-        p[f"{sensor}_bias_drive"] = sigma * np.sqrt(-np.expm1(-2.0 * imu.dt / tau))
+        p[f"{sensor}_bias_decay"] = math.exp(-imu.dt / tau)
+        p[f"{sensor}_bias_drive"] = sigma * math.sqrt(-math.expm1(-2.0 * imu.dt / tau))
 
     if gnss is not None:
         p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
         p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
-        p["baseline_length"] = np.linalg.norm(gnss.baseline_B)
+        p["baseline_length"] = portable.norm(gnss.baseline_B)
         p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
         p["position_sigma"], p["velocity_sigma"] = gnss.believed_sigma_I, gnss.velocity_sigma or 0.0
         period = 1.0 / (gnss.rate * gnss.drift_tau)
-        p["drift_decay"] = np.exp(-period)
-        p["drift_drive"] = np.array(gnss.drift_sigma_I) * np.sqrt(-np.expm1(-2.0 * period))
+        p["drift_decay"] = math.exp(-period)
+        p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
     else:  # the place of the start, as if its centre and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
         p["gnss_sigma"] = sensors.placement.position_sigma
@@ -97,7 +99,7 @@ def params_record(
 
     if sensors.camera is not None:
         camera = sensors.camera
-        p["camera"], p["R_CB"] = camera.position_B, euler_to_dcm(camera.attitude)
+        p["camera"], p["R_CB"] = camera.position_B, portable.euler_dcm(camera.attitude)
         p["pixel_size"], p["focal_length"] = camera.pixel_size, camera.focal_length
         p["half_image"] = np.array(camera.image_size) / 2
         p["pixel_sigma"] = camera.pixel_sigma
@@ -122,8 +124,14 @@ def params_record(
     return record
 
 
-def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
-    """How a filter differs from the report's, and what it keeps, for the kernels."""
+def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
+    """How a filter differs from the report's, and what it keeps, for the kernels.
+
+    Args:
+        estimator: The filter.
+        innovations: Whether it keeps innovations.
+        lever_arm: How it takes the accelerometer's lever arm into account, see `lever_form`.
+    """
     form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
     if estimator.kind == "ekf":
         form |= FilterForm.EKF
@@ -135,7 +143,24 @@ def form_of(estimator: FilterParams, innovations: bool = False) -> FilterForm:
         form |= FilterForm.GATE
     if estimator.gradual_above is not None:
         form |= FilterForm.GRADUAL
-    return form
+    return FilterForm(form | lever_arm)
+
+
+def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
+    """How a filter takes the accelerometer's lever arm into account, where there is one.
+
+    Args:
+        imu: As the filter believes it.
+        drawn: Whether the filter knows a lever arm that each episode draws.
+    """
+    if not (drawn or any(imu.lever_arm_B)):
+        return FilterForm(0)
+    averages = imu.samples == "average"
+    return FilterForm.LEVER_AVERAGES if averages else FilterForm.LEVER_SAMPLES
+
+
+_HARMONICS = {Task.CIRCLE: 1, Task.LEMNISCATE: 2, Task.RANDOM_TRAJECTORY: MAX_HARMONICS}
+"""Terms of the series of a task's reference; none elsewhere."""
 
 
 def _phase_ticks(phase: float | None, period: int) -> int:
@@ -188,12 +213,13 @@ def settings_record(
     run_filter: bool,
     innovations: bool = False,
     gnss_drifts: bool = False,
+    lever_drawn: bool = False,
 ) -> NDArray[Any]:
     """What a batch does, as one scalar record, shape (1,)."""
     record = np.zeros(1, SETTINGS)
     s = record[0]
     s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
-    s["form"] = form_of(sensors.estimator, innovations)
+    s["form"] = form_of(sensors.estimator, innovations, lever_form(sensors.imu, lever_drawn))
     s["imu_averages"] = sensors.imu.samples == "average"
     if sensors.gnss is not None:
         s["gnss_ticks"] = clocks.ticks_between("gnss")
@@ -210,9 +236,10 @@ def settings_record(
     s["autoreset"], s["run_filter"] = autoreset, run_filter
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
     s["randomize"] = task.randomize
+    s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], 0)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
-    s["least_up"] = np.cos(task.max_tilt)
+    s["least_up"] = math.cos(task.max_tilt)
     s["radius"], s["period"], s["height"] = task.radius, task.period, task.height
     s["max_speed"], s["max_acceleration"] = task.max_speed, task.max_acceleration
     s["gate_count"], s["gate_radius"] = task.gate_count, task.gate_radius

@@ -1,7 +1,7 @@
 """What a flight is made of: vehicle, gains, actions, clocks, task; sensors are in `sensor_params`.
 
-All classes are frozen, keyword-only and check themselves: a value that makes no sense raises a
-ValueError that names it. Everything is SI (radians too); body frame B: x forward, z up along the
+All classes are frozen, keyword-only and check themselves: an invalid value raises a ValueError that
+names it. Everything is SI (radians too); body frame B: x forward, z up along the
 thrust.
 
 The laboratory's numbers come from the Aerial Robotics course (ASE 479W, The University of Texas at
@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quad_gym import validation as check
 from quad_gym.frames import GRAVITY
@@ -24,6 +25,16 @@ TASKS = tuple(task.name.lower() for task in Task)
 
 STARTS = tuple(start.name.lower() for start in Start)
 """How episodes begin."""
+
+FARTHEST = 1000.0
+"""Positions of references are observed within this [m]."""
+
+MIN_PERIOD = 0.01
+"""No vehicle follows a faster reference [s]."""
+
+RK4_LIMIT = 2.78
+"""Largest step of the classic Runge-Kutta method over the time constant of a decay, beyond which
+its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +97,7 @@ class VehicleParams(Checked):
                 "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
                 f"{smallest:g}"
             )
+        check_moments("VehicleParams.inertia", np.linalg.eigvalsh(inertia))
         if self.hover_voltage >= self.max_voltage:
             raise ValueError(
                 f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: it takes "
@@ -226,11 +238,11 @@ class TaskParams(Checked):
     kind: str = "circle"
     """one of TASKS"""
     radius: float = 4.0
-    """size of the reference [m]; report section 4.2"""
+    """size of the reference, at most 1000 [m]; report section 4.2"""
     period: float = 10.0
-    """of the reference [s]; report section 4.2"""
+    """of the reference, at least 0.01 [s]; report section 4.2"""
     height: float = 1.0
-    """of the reference [m]; report section 4.2"""
+    """of the reference, at most 1000 [m]; report section 4.2"""
     start: str = "ground"
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
     "hover": hovering at rest within some decimetres of the reference; "mixed": either, by a coin"""
@@ -238,7 +250,7 @@ class TaskParams(Checked):
     """draw the reference anew each episode: phase, radius, period and sense of circle and
     lemniscate, the heading of a random trajectory and of a course of gates"""
     duration: float = 10.0
-    """time limit of an episode [s]; 0: none; report section 4.2"""
+    """time limit of an episode [s], at least half a control period; 0: none; report section 4.2"""
     out_of_bounds: float = 3.0
     """distance from the reference at which an episode ends [m]"""
     ground: float = -0.5
@@ -261,15 +273,14 @@ class TaskParams(Checked):
         self._check(check.choice, "start", choices=STARTS)
         self._check(
             check.positive,
-            "radius",
-            "period",
-            "height",
             "out_of_bounds",
             "max_speed",
             "max_acceleration",
             "gate_radius",
         )
-        self._check(check.number, "duration", least=0.0)
+        self._check(check.positive, "radius", "height", most=FARTHEST)
+        self._check(check.number, "period", least=MIN_PERIOD)
+        self._check(check.number, "duration", least=0.0, most=1e9)
         self._check(check.number, "ground")
         self._check(check.flag, "randomize")
         self._check(check.vector, "preview", length=2)
@@ -282,6 +293,60 @@ class TaskParams(Checked):
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
         if min(self.preview) < 0.0:
             raise ValueError(f"TaskParams.preview must be at least 0, got {self.preview}")
+
+
+def check_moments(name: str, moments: ArrayLike) -> None:
+    """Refuse moments of inertia that no mass has: each is at most the sum of the other two.
+
+    Args:
+        name: What they belong to.
+        moments: (3,) about the principal axes, or about any three orthogonal ones [kg m^2].
+
+    Raises:
+        ValueError: If one is larger, by more than rounding.
+    """
+    values = np.asarray(moments, np.float64)
+    if 2.0 * values.max() > values.sum() * (1.0 + 1e-9):
+        raise ValueError(
+            f"{name} must be that of a body: no moment can be larger than the sum of the other "
+            f"two, got {', '.join(f'{value:g}' for value in values)} kg m^2"
+        )
+
+
+def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
+    """Refuse rotors that are too fast for the integration.
+
+    Args:
+        name: What the time constant belongs to.
+        time_constant: Of the rotors' lag [s].
+        clocks: Say how long a Runge-Kutta step is.
+
+    Raises:
+        ValueError: If the step is too long, so that the computed rotor speeds would diverge.
+    """
+    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    if step > RK4_LIMIT * time_constant:
+        raise ValueError(
+            f"{name} must be at least {step / RK4_LIMIT:.3g} s at {clocks.imu_rate:g} Hz with "
+            f"substeps={clocks.substeps}, where the integration is stable, got {time_constant:g} s"
+        )
+
+
+def check_limit(task: TaskParams, rate: float) -> None:
+    """Refuse a time limit of less than a step, which would round to none.
+
+    Args:
+        task: Has the limit.
+        rate: Of steps [Hz].
+
+    Raises:
+        ValueError: If it is.
+    """
+    if task.duration > 0.0 and round(task.duration * rate) == 0:
+        raise ValueError(
+            f"duration must be 0 (no limit) or at least one step of {1.0 / rate:g} s, got "
+            f"{task.duration:g} s"
+        )
 
 
 _VEHICLES = {"lab": VehicleParams()}

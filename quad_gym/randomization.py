@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from quad_gym import validation as check
 from quad_gym.distributions import Distribution, Uniform
-from quad_gym.params import VehicleParams
+from quad_gym.params import Clocks, VehicleParams, check_lag, check_moments
 from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, Drawable
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.world_params import BatteryParams, WorldParams
@@ -132,6 +132,8 @@ class DrawingTable:
                 for k, part in enumerate(randomization.distributions(drawable.name)):
                     self._fill(drawable, first + k, part, nominal[first + k])
         _check_hovering(self, vehicle, world)
+        if "inertia" in self.names:
+            _check_inertia(self)
 
     def _fill(
         self, drawable: Drawable, column: int, part: Distribution | None, nominal: float
@@ -235,6 +237,40 @@ def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldPar
             f"{mass * vehicle.gravity:.1f} N and its rotors lift {thrust:.1f} N; limit mass, "
             "max_voltage, motor_speed_per_volt, thrust_coefficient or rotor_efficiency"
         )
+
+
+def check_draws(table: DrawingTable, vehicle: VehicleParams, clocks: Clocks) -> None:
+    """Refuse rotors that are, or may be drawn, too fast for the integration.
+
+    Args:
+        table: What is drawn.
+        vehicle: As it is without draws.
+        clocks: Say how long a Runge-Kutta step is.
+
+    Raises:
+        ValueError: If they are.
+    """
+    name = "motor_time_constant"
+    if name in table.names:
+        least = float(table.low[COLUMNS[name]].min())
+        check_lag(f"randomization of {name!r} at its smallest draw", least, clocks)
+    else:
+        check_lag(name, vehicle.motor_time_constant, clocks)
+
+
+def _check_inertia(table: DrawingTable) -> None:
+    """Refuse a range of moments of inertia all of which no body has.
+
+    A range in which some draws break the rule that each moment is at most the sum of the other two
+    is taken: components are drawn independently, so that 20 % either way of flat vehicles has such
+    draws, and they fly as well as any. See `params.check_moments`.
+    """
+    columns = COLUMNS["inertia"]
+    low, high = table.low[columns], table.high[columns]
+    for k in range(3):
+        most = np.where(np.arange(3) == k, low, high)  # the others as large as they can be
+        if 2.0 * low[k] > most.sum() * (1.0 + 1e-9):
+            check_moments("randomization of 'inertia' at its most favorable draw", most)
 
 
 def _open_circuit(battery: BatteryParams, charge: float) -> float:

@@ -7,8 +7,7 @@ inertial.
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from quad_gym.kernels import single
+from scipy.spatial.transform import Rotation
 
 
 def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -24,6 +23,11 @@ def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.flo
     return array
 
 
+def _dcms(turns: Rotation, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """R_BI of SciPy's rotations, which turn vectors from B to I."""
+    return turns.as_matrix().transpose(0, 2, 1).reshape(*shape, 3, 3)  # type: ignore[no-any-return]
+
+
 def euler_to_dcm(e: ArrayLike) -> NDArray[np.float64]:
     """The rotation matrix of 3-1-2 Euler angles.
 
@@ -37,9 +41,8 @@ def euler_to_dcm(e: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `e` has another shape or is not finite.
     """
     angles = _rows("e", e, (3,))
-    R = np.empty((angles.size // 3, 3, 3))
-    single.dcms_of_eulers(angles.reshape(-1, 3), R)
-    return R.reshape(*angles.shape[:-1], 3, 3)
+    turns = Rotation.from_euler("ZXY", angles.reshape(-1, 3)[:, [2, 0, 1]])
+    return _dcms(turns, angles.shape[:-1])
 
 
 def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
@@ -85,9 +88,8 @@ def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
     norms = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     if (norms < 1e-12).any():
         raise ValueError("q must not be zero")
-    R = np.empty((quaternions.size // 4, 3, 3))
-    single.dcms_of_quaternions((quaternions / norms).reshape(-1, 4), R)
-    return R.reshape(*quaternions.shape[:-1], 3, 3)
+    turns = Rotation.from_quat((quaternions / norms).reshape(-1, 4), scalar_first=True)
+    return _dcms(turns, quaternions.shape[:-1])
 
 
 def dcm_to_quaternion(R_BI: ArrayLike) -> NDArray[np.float64]:
@@ -103,6 +105,7 @@ def dcm_to_quaternion(R_BI: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `R_BI` has another shape or is not finite.
     """
     R = _rows("R_BI", R_BI, (3, 3))
-    q = np.empty((R.size // 9, 4))
-    single.quaternions_of_dcms(R.reshape(-1, 3, 3), q)
-    return q.reshape(*R.shape[:-2], 4)
+    turns = Rotation.from_matrix(R.reshape(-1, 3, 3).transpose(0, 2, 1))
+    q = turns.as_quat(scalar_first=True)
+    largest = np.take_along_axis(q, np.abs(q).argmax(axis=1)[:, np.newaxis], axis=1)
+    return np.where(largest < 0.0, -q, q).reshape(*R.shape[:-2], 4)

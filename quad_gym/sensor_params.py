@@ -5,6 +5,7 @@ numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Au
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -207,7 +208,10 @@ class PlacementParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class NoisyObservationParams(Checked):
-    """Standard deviations of `observation="noisy"`: the size of the converged filter's errors."""
+    """Standard deviations of `observation="noisy"`: the size of the converged filter's errors.
+
+    The defaults are those of the laboratory's sensors; a suite of other sensors has its own.
+    """
 
     position: float = 0.0018
     """per axis [m]; measured on the laboratory's circle"""
@@ -269,8 +273,24 @@ class SensorSuite(Checked):
                 "CameraParams.latency", self.camera.latency, self.camera.rate, self.imu.rate
             )
 
+    def require_filter(self) -> None:
+        """Refuse a suite whose filter takes the IMU's samples for something else.
+
+        Raises:
+            ValueError: If it takes means over a tick for the motion at its start.
+        """
+        if self.imu.samples == "average" and self.estimator.integration == "euler":
+            raise ValueError(
+                "sensors must have FilterParams.integration='midpoint' with ImuParams.samples="
+                "'average': 'euler' takes a sample for the motion at the start of its tick"
+            )
+
     def require_like(self, true_sensors: "SensorSuite") -> None:
         """Refuse true sensors that a filter which believes in these cannot be flown with.
+
+        Noise, biases, drift, latency, placement and mounting may differ, and where the features
+        are. Which sensors there are, when and what they measure may not: both sides share a clock
+        and the measurements that the filter expects.
 
         Raises:
             ValueError: If they tick otherwise, or others are missing.
@@ -285,6 +305,26 @@ class SensorSuite(Checked):
         for name in ("gnss", "camera"):
             if (getattr(true_sensors, name) is None) != (getattr(self, name) is None):
                 raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
+        for what, true, believed in self._schedule(true_sensors):
+            if true != believed:
+                raise ValueError(
+                    f"true_sensors must have the {what} of sensors, {believed}, got {true}"
+                )
+
+    def _schedule(self, true: "SensorSuite") -> Iterator[tuple[str, object, object]]:
+        """What measures when, in words: as it is in `true`, and as it is here."""
+        if self.gnss is not None and true.gnss is not None:
+            here, there = self.gnss, true.gnss
+            yield "GNSS rate [Hz]", there.rate, here.rate
+            yield "GNSS phase", there.phase, here.phase
+            measured = [p.velocity_sigma is not None for p in (there, here)]
+            yield "presence of GNSS velocities (velocity_sigma)", measured[0], measured[1]
+        if self.camera is not None and true.camera is not None:
+            image, expected = true.camera, self.camera
+            yield "camera rate [Hz]", image.rate, expected.rate
+            yield "camera phase", image.phase, expected.phase
+            counts = [len(p.features_I) for p in (image, expected)]
+            yield "number of camera features", counts[0], counts[1]
 
     def with_rates(
         self,

@@ -19,10 +19,11 @@ from quad_gym.params import (
     PDGains,
     TaskParams,
     VehicleParams,
+    check_limit,
     pd_gains,
     vehicle_params,
 )
-from quad_gym.randomization import DrawingTable, Given, Randomization
+from quad_gym.randomization import DrawingTable, Given, Randomization, check_draws
 from quad_gym.records import (
     COLUMNS,
     FLIGHT_BLOCK,
@@ -95,7 +96,7 @@ class FlightBatch:
         count: int,
         *,
         vehicle: VehicleParams | str = "lab",
-        sensors: SensorSuite | str = "lab",
+        sensors: SensorSuite | str = "standard",
         gains: PDGains | str = "lab",
         actions: ActionParams | None = None,
         task: TaskParams | None = None,
@@ -140,6 +141,7 @@ class FlightBatch:
         self.source, self.control = Source(source), Control(control)
         rate = self.sensors.imu.rate if control_rate is None else control_rate
         self.clocks = Clocks.of(self.sensors, rate, substeps)
+        check_limit(self.task, self.clocks.imu_rate)
         self.threads = resolve_threads(threads)
         true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
         true_sensors = self.sensors if true_sensors is None else true_sensors
@@ -151,8 +153,11 @@ class FlightBatch:
             needed = include_covariance or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = run_filter
+        if run_filter:
+            self.sensors.require_filter()
 
         draws = DrawingTable(self.randomization, true_vehicle, true_sensors, self.world)
+        check_draws(draws, true_vehicle, self.clocks)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
         self._model, self._world = params_block(model), params_block(true)
@@ -169,6 +174,8 @@ class FlightBatch:
             autoreset=Autoreset(autoreset),
             run_filter=run_filter,
             innovations=innovations,
+            lever_drawn=self.randomization.known
+            and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
             gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
         )
         pack_options(
@@ -201,8 +208,9 @@ class FlightBatch:
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         self._actions = np.zeros((self.count, 4))
         self._resets = np.zeros(self.count, np.uint8)
+        self._begun = False
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
-        self.results = np.zeros((self.count, len(RESULTS)))
+        self._results = np.zeros((len(RESULTS), self.count))
 
     # ---- flying -------------------------------------------------------------------------------
 
@@ -235,7 +243,7 @@ class FlightBatch:
             ValueError: If the arguments do not fit the number of flights; nothing has changed then.
         """
         chosen = checked_mask(self.count, mask)
-        given = checked_start(self.count, position, velocity, yaw)
+        given = checked_start(self.count, position, velocity, yaw, self.task)
         words = checked_keys(self.count, seeds, keys)
         if words is not None:
             for flight in np.flatnonzero(chosen):
@@ -261,9 +269,24 @@ class FlightBatch:
 
         Returns:
             (count, n_observation) float32 observations; `results` holds the rest.
+
+        Raises:
+            ValueError: If flights have never been reset; it is a RuntimeError, too.
         """
+        if not self._begun:
+            self._require_begun()
         self._actions[:] = self.read("action") if actions is None else actions
         return self._run(Command.STEP)
+
+    def _require_begun(self) -> None:
+        """Refuse to step flights that have no state; looked at until all flights have one."""
+        waiting = (self._blocks["episode"] == 0.0) & (self._blocks["idle"] == 0.0)
+        if waiting.any():
+            raise check.NotResetError(
+                f"call reset() before step(): {int(waiting.sum())} of {self.count} flights have "
+                "never been reset"
+            )
+        self._begun = True
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         observations = np.empty((self.count, self._low.size), np.float32)  # the kernel fills it
@@ -288,7 +311,7 @@ class FlightBatch:
                 self._high,
                 observations,
                 self.final_observations,
-                self.results,
+                self._results,
             )
 
         run_ranges(part, len(self._blocks), self.threads)
@@ -359,9 +382,14 @@ class FlightBatch:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
 
+    @property
+    def results(self) -> NDArray[np.float64]:
+        """(count, 12) of the last step, in the columns of `RESULTS`; the next step overwrites it."""
+        return self._results.T
+
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
-        return self.results[:, RESULTS.index(name)].copy()
+        return self._results[RESULTS.index(name)].copy()
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """What the present episodes have drawn, by name: (count,) or (count, components)."""
@@ -402,3 +430,4 @@ class FlightBatch:
         if not fits:
             raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
         self._blocks[:] = snapshot
+        self._begun = False  # it may have been taken before a reset

@@ -15,6 +15,9 @@ from quad_gym.kernels.compiling.cores import available_cores
 MIN_BLOCKS_PER_THREAD = 4
 """Fewer blocks than this are not worth a hand-over to another thread (some 20 us)."""
 
+MAX_THREADS = 1024
+"""More than this is a mistake: each thread has memory of its own."""
+
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
@@ -22,9 +25,11 @@ def resolve_threads(threads: int | None) -> int:
     """`threads` checked, or the available cores where it is None.
 
     Raises:
-        ValueError: If `threads` is not a whole number of at least 1.
+        ValueError: If `threads` is not a whole number from 1 to MAX_THREADS.
     """
-    return available_cores() if threads is None else check.whole("threads", threads)
+    if threads is None:
+        return available_cores()
+    return check.whole("threads", threads, most=MAX_THREADS)
 
 
 def _pool(workers: int) -> ThreadPoolExecutor:

@@ -1,39 +1,85 @@
 """Checks of what users pass in: each raises a ValueError that names the argument."""
 
 import dataclasses
+import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-def number(name: str, value: Any, *, least: float = -math.inf, open_end: bool = False) -> float:
-    """`value` as a finite float that is at least `least` (above it, with `open_end`)."""
+class UnknownKeywordError(TypeError, ValueError):
+    """A keyword that nothing has; as Python's own a TypeError, and a ValueError as all checks."""
+
+
+class NotResetError(RuntimeError, ValueError):
+    """Something is to fly that has never been reset."""
+
+
+def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
+    """Refuse the first of `given` that is not `known`, and name the one that may be meant."""
+    for name in sorted(set(given) - set(known)):
+        close = difflib.get_close_matches(name, known, n=1)
+        meant = f"did you mean {close[0]}?" if close else f"it takes {', '.join(known)}"
+        raise UnknownKeywordError(f"{name} is not a keyword of {of}; {meant}")
+
+
+def _no_number(value: Any) -> bool:
+    """Whether a value that Python would turn into a float is none: text, truth, an array."""
+    return isinstance(value, (str, bytes, bytearray, bool, np.bool_)) or np.ndim(value) > 0
+
+
+def number(
+    name: str,
+    value: Any,
+    *,
+    least: float = -math.inf,
+    open_end: bool = False,
+    most: float = math.inf,
+) -> float:
+    """`value` as a finite float in [least, most] (above `least`, with `open_end`)."""
     try:
-        result = float(value)
+        result = math.nan if _no_number(value) else float(value)
+    except OverflowError:
+        result = math.inf
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, got {value!r}") from None
+    if _no_number(value):
+        raise ValueError(f"{name} must be a number, got {value!r}")
     if not math.isfinite(result):
         raise ValueError(f"{name} must be finite, got {value!r}")
     if result < least or (open_end and result == least):
         relation = "greater than" if open_end else "at least"
         raise ValueError(f"{name} must be {relation} {least:g}, got {value!r}")
+    if result > most:
+        raise ValueError(f"{name} must be at most {most:g}, got {value!r}")
     return result
 
 
-def positive(name: str, value: Any) -> float:
-    """`value` as a finite float above zero."""
-    return number(name, value, least=0.0, open_end=True)
+def positive(name: str, value: Any, *, most: float = math.inf) -> float:
+    """`value` as a finite float above zero, at most `most`."""
+    return number(name, value, least=0.0, open_end=True, most=most)
 
 
-def whole(name: str, value: Any, *, least: int = 1) -> int:
-    """`value` as an int that is at least `least`."""
-    if isinstance(value, bool) or int(number(name, value)) != value:
+def whole(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """`value` as an int that is at least `least` and at most `most`."""
+    if isinstance(value, (bool, np.bool_)) or int(number(name, value)) != value:
         raise ValueError(f"{name} must be a whole number, got {value!r}")
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be at most {most}, got {value!r}")
+    return int(value)
+
+
+def seed(name: str, value: Any) -> int | None:
+    """`value` as a seed: a whole number of at least 0, or None for fresh entropy."""
+    if value is None:
+        return None
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{name} must be a whole number of at least 0, or None, got {value!r}")
     return int(value)
 
 
@@ -62,7 +108,7 @@ def instance(name: str, value: Any, kind: type) -> None:
 
 def choice(name: str, value: Any, choices: Sequence[str]) -> str:
     """`value`, if it is one of `choices`."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
     return str(value)
 
@@ -72,8 +118,10 @@ def array(
 ) -> NDArray[np.float64]:
     """`value` as a new float64 array of `shape` (None: any length), finite or NaN if allowed."""
     try:
+        if _holds_no_numbers(value):
+            raise TypeError
         result = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be an array of numbers, got {value!r}") from None
     fits = result.ndim == len(shape) and all(
         want is None or have == want for have, want in zip(result.shape, shape, strict=False)
@@ -85,6 +133,15 @@ def array(
     if bad.any():
         raise ValueError(f"{name} must be finite, got {result[bad].flat[0]} among its values")
     return result
+
+
+def _holds_no_numbers(value: Any) -> bool:
+    """Whether text, truth values or nothing at all would be taken for numbers by NumPy."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind not in "iuf"
+    if isinstance(value, (list, tuple)):
+        return any(_holds_no_numbers(part) for part in value)
+    return value is None or isinstance(value, (str, bytes, bytearray, bool, np.bool_))
 
 
 def vector(name: str, value: Any, length: int) -> tuple[float, ...]:

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym import portable
 from quad_gym.params import TaskParams, VehicleParams
-from quad_gym.records import WARM_DRAWS, WIDTH, Autoreset, Control, Source
+from quad_gym.records import WARM_DRAWS, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 from quad_gym.sensor_params import ImuParams, SensorSuite
 
@@ -25,6 +26,9 @@ FILTER_STARTS = ("cold", "warm")
 WARM_UP = 10.0
 """How long a filter has been running at a warm start [s]: some correlation times of its velocity
 and attitude, as between switching a vehicle on and its take-off."""
+
+FLIGHTS = 8
+"""Flights whose covariances are averaged."""
 
 LOST = 0.35
 """Error of the attitude beyond which a filter is lost, whatever it claims [rad]: a linear model of
@@ -44,7 +48,7 @@ def pack_warm_start(settings: Any, make: Callable[..., Any], **configuration: An
     P = converged_covariance(make, **configuration)
     W = root_with_biases(P, configuration["sensors"].imu)
     settings["warm"] = True
-    settings["warm_root"], settings["warm_covariance"] = W, W @ W.T
+    settings["warm_root"], settings["warm_covariance"] = W, portable.product(W, W.T)
 
 
 @functools.lru_cache(maxsize=64)
@@ -73,7 +77,7 @@ def converged_covariance(
             tell it its heading.
     """
     batch = make(
-        WIDTH,
+        FLIGHTS,
         vehicle=vehicle,
         sensors=sensors,
         task=task.replace(start="hover"),
@@ -85,13 +89,13 @@ def converged_covariance(
         autoreset=Autoreset.DISABLED,
         threads=1,
     )
-    batch.reset(seeds=range(WIDTH))
+    batch.reset(seeds=range(FLIGHTS))
     if task.start == "ground":
-        at_rest = np.zeros((WIDTH, 3))
+        at_rest = np.zeros((FLIGHTS, 3))
         batch.reset(
-            seeds=range(WIDTH), position=batch.read("r") * (1.0, 1.0, 0.0), velocity=at_rest
+            seeds=range(FLIGHTS), position=batch.read("r") * (1.0, 1.0, 0.0), velocity=at_rest
         )
-    batch.step(np.zeros((WIDTH, 4)))  # one step, as long as the whole
+    batch.step(np.zeros((FLIGHTS, 4)))  # one step, as long as the whole
     if batch.read("filter_status").any():
         raise ValueError(
             f"filter_start must be 'cold' for these sensors: the filter fails within {WARM_UP:g} s "
@@ -104,13 +108,11 @@ def converged_covariance(
             f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
             "filter its heading, such as a level baseline or the mark of `placement`?"
         )
-    forward_I = quaternion_to_dcm(batch.read("q"))[:, 0]
-    yaw = np.arctan2(forward_I[:, 1], forward_I[:, 0])
-    turn = np.broadcast_to(np.eye(15), (WIDTH, 15, 15)).copy()
-    for block in (slice(0, 3), slice(3, 6)):
-        turn[:, block, block] = [_about_vertical(angle) for angle in yaw]
-    P = turn.transpose(0, 2, 1) @ batch.covariance() @ turn
-    return P.mean(axis=0)  # type: ignore[no-any-return]
+    mean = np.zeros((15, 15))
+    for q, L in zip(batch.read("q"), batch.read("L"), strict=True):
+        root = portable.product(_turned_east(q).T, L)
+        mean += portable.product(root, root.T) / FLIGHTS
+    return mean
 
 
 def _attitude_errors(batch: Any) -> Floats:
@@ -119,10 +121,15 @@ def _attitude_errors(batch: Any) -> Floats:
     return dcm_to_euler(quaternion_to_dcm(batch.read("q")) @ R_hat.transpose(0, 2, 1))
 
 
-def _about_vertical(angle: float) -> Floats:
-    """(3, 3) turn of components in I by an angle about the vertical."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def _turned_east(q: Floats) -> Floats:
+    """(15, 15) turn of positions and velocities in I from a vehicle that looks east to this one."""
+    w, x, y, z = map(float, q)
+    forward = (w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z))
+    c, s = (component / portable.norm(forward) for component in forward)
+    turn = np.eye(15)
+    for block in (slice(0, 3), slice(3, 6)):
+        turn[block, block] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    return turn
 
 
 def root_with_biases(P: Floats, imu: ImuParams) -> Floats:
@@ -141,9 +148,8 @@ def root_with_biases(P: Floats, imu: ImuParams) -> Floats:
     """
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
     with_biases = P[:, 9:] / sigma
-    values, vectors = np.linalg.eigh(P - with_biases @ with_biases.T)
-    # what the biases do not explain; rounding may leave eigenvalues a little below zero
-    rest = vectors * np.sqrt(np.maximum(values, 0.0))
+    # what the biases do not explain; where they explain everything, rounding leaves some of it
+    rest = portable.lower_root(P - portable.product(with_biases, with_biases.T), np.diag(P))
     W = np.zeros((15, WARM_DRAWS))
     W[:, :15], W[:, 15:] = rest, with_biases
     return W

@@ -47,7 +47,12 @@ def arriving_late(name: str, gnss: float, camera: float) -> dict[str, Any]:
 OPTIONS: dict[str, dict[str, Any]] = {
     OFF: {},
     "extended Kalman filter": filter_form(kind="ekf"),
-    "averaged IMU samples": {"sensors": LAB.replace(imu=LAB.imu.replace(samples="average"))},
+    "averaged IMU samples": {
+        "sensors": LAB.replace(
+            imu=LAB.imu.replace(samples="average"),
+            estimator=LAB.estimator.replace(integration="midpoint"),
+        )
+    },
     "midpoint integration": filter_form(integration="midpoint"),
     "covariance turns at its reset": filter_form(covariance_reset="turn"),
     "pixel noise as projected": filter_form(feature_noise_across="projected"),

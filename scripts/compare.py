@@ -26,11 +26,13 @@ import numpy as np
 from compare_flights import Floats, Flown, fly
 from compare_report import Comparison, Setting, conclusions, matrix_text, write_figures, write_page
 
+from baselines.seeds import first_seed
 from quad_gym import IDS, plots
 from quad_gym import validation as check
 from quad_gym.cli import leave, option, parse, usage_errors
+from quad_gym.fault_presets import felt_without_sensors
 from quad_gym.reports import as_json, require_writable, versions, write_csv, write_json
-from quad_gym.sensor_suites import SUITES
+from quad_gym.sensor_suites import SUITES, sensor_suite
 from quad_gym.threads import resolve_threads
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200
@@ -48,7 +50,7 @@ class Args:
         positional=True,
     )
     sensors: tuple[str, ...] = option(
-        ("lab",), f"sensor suites: {', '.join(SUITES)}", group="what to compare"
+        ("standard",), f"sensor suites: {', '.join(SUITES)}", group="what to compare"
     )
     train_on: tuple[str, ...] = option(SOURCES, f"what to train on, of {', '.join(SOURCES)}")
     seeds: int = option(5, "training seeds")
@@ -68,7 +70,9 @@ class Args:
     )
 
     episodes: int = option(1000, "flown with each policy on each observation", group="flights")
-    seed: int = option(0, "of the first episode, and of the first training")
+    seed: int = option(
+        0, "of the first episode, and of the first training; no training flies these episodes"
+    )
     output: Path | None = option(
         None, "folder; if not given, results/compare/TASK (with --quick, .../TASK_quick)"
     )
@@ -103,11 +107,14 @@ def configure(args: Args) -> Setting:
     if args.steps is not None:
         chosen = chosen.replace(steps=args.steps)
     seeds = QUICK_SEEDS if args.quick else args.seeds
+    episodes = QUICK_EPISODES if args.quick else args.episodes
     plans = {}
     for seed in range(args.seed, args.seed + seeds):  # the first seed is complete first
         for suite in args.sensors:
             for source in args.train_on:
-                environment = {**args.env, "observation": source, "sensors": suite}
+                environment = with_felt_faults(
+                    {**args.env, "observation": source, "sensors": suite}
+                )
                 plan = Plan(
                     env_id=args.env_id,
                     environment=environment,
@@ -129,14 +136,22 @@ def configure(args: Args) -> Setting:
         suites=args.sensors,
         sources=args.train_on,
         seeds=tuple(range(args.seed, args.seed + seeds)),
-        episodes=QUICK_EPISODES if args.quick else args.episodes,
-        first_episode=args.seed,
+        episodes=episodes,
+        first_episode=first_seed("test", args.seed, episodes),
         environment=dict(args.env),
         plans=plans,
         folder=folder,
     )
     _require_same(setting)
     return setting
+
+
+def with_felt_faults(keywords: dict[str, Any]) -> dict[str, Any]:
+    """Keywords of an environment without the faults of sensors where it has none running."""
+    if keywords["observation"] == "estimate" or "faults" not in keywords:
+        return keywords
+    suite = sensor_suite(keywords["sensors"])
+    return {**keywords, "faults": felt_without_sensors(keywords["faults"], suite)}
 
 
 def _require_same(setting: Setting) -> None:
@@ -236,12 +251,9 @@ def fly_all(setting: Setting) -> Comparison:
         for observation in FLOWN_ON:
             file = setting.run_folder(key) / f"flown_on_{observation}.npz"
             if not file.exists():
+                keywords = {**setting.environment, "observation": observation, "sensors": suite}
                 env = gymnasium.make_vec(
-                    setting.env_id,
-                    num_envs=setting.episodes,
-                    observation=observation,
-                    sensors=suite,
-                    **setting.environment,
+                    setting.env_id, num_envs=setting.episodes, **with_felt_faults(keywords)
                 )
                 file.parent.mkdir(parents=True, exist_ok=True)
                 fly(load_policy(name, env), env, setting.first_episode).save(file)

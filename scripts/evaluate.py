@@ -16,15 +16,17 @@ from typing import Any, Literal
 import gymnasium
 
 from baselines.policies import load_policy, task_of
+from baselines.seeds import first_seed
 from quad_gym import IDS, plots
 from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.evaluation import Episodes, Policy, roll_out
+from quad_gym.fault_presets import felt_without_sensors
 from quad_gym.metrics import bootstrap_interval
 from quad_gym.recording import Tracer
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.sensor_suites import SUITES
+from quad_gym.sensor_suites import SUITES, sensor_suite
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,14 @@ class Args:
     observation: tuple[str, ...] = option(
         ("truth", "estimate"), "what to fly on: estimate, truth, noisy"
     )
-    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}")
+    sensors: str = option("standard", f"sensor suite, of {', '.join(SUITES)}")
     env: dict[str, Any] = option(
         {}, "further keywords of the environment, such as camera=false gnss_rate=10"
     )
     episodes: int = option(1000, "flown in each case", group="how to measure")
-    seed: int = option(0, "of the first episode; the others follow it")
+    seed: int = option(
+        0, "of the first episode; the others follow it; no training has flown any of them"
+    )
     threads: int | None = option(None, "threads; if not given, one per core")
     video: Literal["none", "mp4", "gif", "webp"] = option(
         "none", "also write a video of the first episode of each case, of this kind"
@@ -73,6 +77,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     for name, least in (("episodes", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     cases: dict[Case, tuple[Policy, Any]] = {}
@@ -88,10 +93,10 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
 
 def make_flights(args: Args, observation: str, count: int) -> Any:
     """The environment of an observation."""
-    keywords = leave(
-        args.env,
-        {"observation": "--observation", "sensors": "--sensors", "threads": "--threads"},
-    )
+    names = ("observation", "sensors", "threads")
+    keywords = dict(leave(args.env, {name: f"--{name}" for name in names}))
+    if observation in ("truth", "noisy") and "faults" in keywords:
+        keywords["faults"] = felt_without_sensors(keywords["faults"], sensor_suite(args.sensors))
     return gymnasium.make_vec(
         args.env_id,
         num_envs=count,

@@ -66,7 +66,7 @@ class Args:
         {}, "further keywords of the environment, such as control_rate=100 estimator=ekf"
     )
 
-    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}", group="sensors")
+    sensors: str = option("standard", f"sensor suite, of {', '.join(SUITES)}", group="sensors")
     camera: bool = option(True, "measure with the camera")
     gnss_rate: float | None = option(None, "GNSS fixes per second [Hz]; if not given, the suite's")
     camera_rate: float | None = option(None, "images per second [Hz]; if not given, the suite's")

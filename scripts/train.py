@@ -36,7 +36,11 @@ class Args:
     set: dict[str, Any] = option(
         {}, "parameters of the algorithm in place of the recipe's, such as gamma=0.98"
     )
-    seed: int = option(0, "of the networks, and of the first flight")
+    seed: int = option(
+        0,
+        "of the networks, and of the flights in training and in its evaluations, which no other "
+        "seed shares and scripts/evaluate.py does not fly",
+    )
 
     output: Path | None = option(
         None,

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.pd import PDPolicy
+from baselines.seeds import first_seed
 from quad_gym import IDS, PDGains, pd_gains
 from quad_gym.cli import flying_options, leave, option, parse, usage_errors
 from quad_gym.evaluation import roll_out
@@ -48,7 +49,7 @@ class Args:
         TRACKING, f"what to fly: {', '.join(TRACKING)}", group="what to tune for"
     )
     observation: Literal["estimate", "truth", "noisy"] = option("estimate", "what control sees")
-    sensors: str = option("lab", f"sensor suite, of {', '.join(SUITES)}")
+    sensors: str = option("standard", f"sensor suite, of {', '.join(SUITES)}")
     env: dict[str, Any] = option(
         {}, "further keywords of the environment, such as action=wrench control_rate=200"
     )
@@ -56,7 +57,9 @@ class Args:
     candidates: int = option(400, "gains to try, at least")
     episodes: int = option(32, "that each candidate flies on each task")
     fresh_episodes: int = option(500, "flown at the end, with seeds that the search never saw")
-    seed: int = option(0, "of the search, and of the first episode")
+    seed: int = option(
+        0, "of the search, whose episodes follow from it, and of the first fresh episode"
+    )
     threads: int | None = option(None, "threads; if not given, one per core")
     output: Path = option(Path("results/tune"), "folder for gains and numbers")
 
@@ -93,7 +96,8 @@ class Search:
 
     envs: dict[str, Any]
     knobs: Knobs
-    seed: int
+    first_seed: int
+    """of the episodes that every candidate flies"""
     rows: list[dict[str, Any]] = field(default_factory=list)
     yardstick: dict[str, float] = field(default_factory=dict)
     """mean error of each task with the gains at the start [m]"""
@@ -103,7 +107,7 @@ class Search:
         gains = self.knobs.gains(np.asarray(x))
         logs = []
         for env_id, env in self.envs.items():
-            episodes = roll_out(PDPolicy(env, gains=gains), env, seed=self.seed)
+            episodes = roll_out(PDPolicy(env, gains=gains), env, seed=self.first_seed)
             fine = np.where(episodes.crashed, np.nan, episodes.mean_error)
             if env_id not in self.yardstick:  # the first candidate is the start itself
                 if episodes.crashed.all():
@@ -167,7 +171,9 @@ def configure(args: Args) -> Search:
         PDPolicy(env, gains=args.start)  # refuses actions and layouts that do not admit it
     require_writable("--output", args.output)
     torques = args.env.get("action") in ("motor", "wrench")
-    return Search(envs, Knobs(pd_gains(args.start), torques), args.seed)
+    first = first_seed("training", args.seed, args.episodes)
+    first_seed("test", args.seed, args.fresh_episodes)  # refuses too large seeds before the search
+    return Search(envs, Knobs(pd_gains(args.start), torques), first)
 
 
 def search(args: Args, found: Search) -> PDGains:
@@ -203,7 +209,7 @@ def search(args: Args, found: Search) -> PDGains:
 
 def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
     """Fly gains on fresh episodes: a table, and the numbers."""
-    first = args.seed + 1_000_000
+    first = first_seed("test", args.seed, args.fresh_episodes)
     rows, numbers = [], {}
     for env_id, env in make_envs(args, args.fresh_episodes).items():
         flown = {k: roll_out(PDPolicy(env, gains=g), env, seed=first) for k, g in gains.items()}

@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
 
+from quad_gym import validation as check
+
 if TYPE_CHECKING:
     from quad_gym.envs.sb3 import QuadVecEnv
 
@@ -44,12 +46,13 @@ def make_sb3_vec_env(
         The environment, ready for any Stable-Baselines3 algorithm.
 
     Raises:
-        ValueError: If the id or a keyword is unknown, or a value makes no sense.
+        ValueError: If the id or a keyword is unknown, or a value is invalid.
         ImportError: If Stable-Baselines3 is not installed.
     """
-    name = env_id.removeprefix("quad_gym:")
-    if name not in IDS:
+    name = env_id.removeprefix("quad_gym:") if isinstance(env_id, str) else env_id
+    if not isinstance(name, str) or name not in IDS:
         raise ValueError(f"env_id must be one of {', '.join(IDS)}, got {env_id!r}")
+    check.seed("seed", seed)
     try:
         from quad_gym.envs.sb3 import QuadVecEnv
     except ImportError as error:

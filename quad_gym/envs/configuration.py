@@ -1,5 +1,6 @@
 """From the keywords of an environment to its flights: the same for all three faces."""
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -18,13 +19,14 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
-from quad_gym.fault_presets import FaultsGiven
-from quad_gym.params import ActionParams, TaskParams, VehicleParams
+from quad_gym.fault_presets import FaultsGiven, faults_of, needs_sensors
+from quad_gym.params import ActionParams, TaskParams, VehicleParams, check_limit
 from quad_gym.randomization import Given, Randomization
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
 from quad_gym.simulation import FlightBatch
+from quad_gym.starts import checked_start
 from quad_gym.world_params import WorldParams, world_params
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
@@ -43,6 +45,24 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
 TASK_KEYWORDS = tuple(field.name for field in fields(TaskParams) if field.name != "kind")
 """Fields of `TaskParams` that an environment takes as keywords."""
 
+ONE_TASK_KEYWORDS = {
+    "max_speed": "random_trajectory",
+    "max_acceleration": "random_trajectory",
+    "gate_count": "waypoints",
+    "gate_radius": "waypoints",
+}
+"""Those that mean something to a single task."""
+
+FACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
+"""Keywords that the faces take themselves."""
+
+
+CONTROL_RATE = 50.0
+"""Actions per second unless a keyword says otherwise [Hz]."""
+
+MAX_STEPS = 10**9
+"""Longest time limit in steps; a duration of 0 has none."""
+
 
 class Flights:
     """The flights behind an environment, with its observation's table.
@@ -54,39 +74,55 @@ class Flights:
         keywords: The environment's keywords; see `QuadEnv`.
 
     Raises:
-        ValueError: If a keyword is unknown or its value makes no sense.
+        TypeError: If a keyword is unknown; it is a ValueError, too.
+        ValueError: If a keyword is another task's, or its value is invalid.
     """
 
     def __init__(self, task: str, count: int, autoreset: Autoreset, **keywords: Any) -> None:
         check.choice("task", task, tuple(TASK_DEFAULTS))
+        check.keywords(keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *FACE_KEYWORDS), "environments")
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
+        for name in given:
+            if ONE_TASK_KEYWORDS.get(name, task) != task:
+                raise ValueError(
+                    f"{name} belongs to the task {ONE_TASK_KEYWORDS[name]}, and must not be given "
+                    f"for {task}"
+                )
         self.task: TaskParams = TASK_DEFAULTS[task].replace(**given)
-        self._build(count, autoreset, **keywords)
+        steps = keywords.pop("max_episode_steps", None)
+        if steps is not None:
+            steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
+        if steps is not None and "duration" not in given:  # in place of the task's own limit
+            rate = check.positive("control_rate", keywords.get("control_rate", CONTROL_RATE))
+            self.task = self.task.replace(duration=steps / rate)
+        self._build(count, autoreset, camera_is_wanted="camera" in keywords, **keywords)
+        if steps is not None:
+            self.batch.limit(min(steps, self.batch.max_steps or steps))
 
     def _build(
         self,
         count: int,
         autoreset: Autoreset,
         *,
+        camera_is_wanted: bool,
         observation: str = "estimate",
         action: str = "ctbr",
         layout: str = "relative",
         include_covariance: bool = False,
         privileged: bool = False,
-        sensors: SensorSuite | str = "lab",
+        sensors: SensorSuite | str = "standard",
         vehicle: VehicleParams | str = "lab",
         actions: ActionParams | None = None,
         camera: bool = True,
         feature_noise_across: str | None = None,
         estimator: str | None = None,
         filter_start: str = "cold",
-        control_rate: float = 50.0,
+        control_rate: float = CONTROL_RATE,
         imu_rate: float | None = None,
         gnss_rate: float | None = None,
         camera_rate: float | None = None,
         substeps: int = 1,
-        max_episode_steps: int | None = None,
         innovations: bool = False,
         threads: int | None = None,
         true_vehicle: VehicleParams | None = None,
@@ -94,13 +130,7 @@ class Flights:
         world: WorldParams | str = "calm",
         randomization: Randomization | Mapping[str, Given] | None = None,
         faults: FaultsGiven = None,
-        **unknown: Any,
     ) -> None:
-        if unknown:
-            raise ValueError(
-                f"{sorted(unknown)[0]} is not a keyword of this environment; a task takes "
-                f"{', '.join(TASK_KEYWORDS)} besides those of QuadEnv"
-            )
         check.choice("observation", observation, tuple(OBSERVATIONS))
         check.choice("action", action, tuple(ACTIONS))
         check.choice("layout", layout, tuple(LAYOUTS))
@@ -112,8 +142,8 @@ class Flights:
             raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")
         if not camera:
             suite = suite.replace(camera=None)
-        if feature_noise_across is None and sensors == "lab":
-            feature_noise_across = "predicted"
+        elif camera_is_wanted and suite.camera is None:
+            raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
         if feature_noise_across is not None:
             choices = suite.estimator.replace(feature_noise_across=feature_noise_across)
             suite = suite.replace(estimator=choices)
@@ -122,6 +152,17 @@ class Flights:
             suite = suite.replace(estimator=suite.estimator.replace(kind=estimator))
         suite = suite.with_rates(imu=imu_rate, gnss=gnss_rate, camera=camera_rate)
 
+        if true_sensors is not None:
+            check.instance("true_sensors", true_sensors, SensorSuite)
+        befall = faults_of(faults, suite if true_sensors is None else true_sensors)
+        idle = observation in ("truth", "noisy") and not (include_covariance or innovations)
+        felt = [fault for fault in befall if needs_sensors(fault)]
+        if idle and felt:
+            raise ValueError(
+                f"faults must befall what is there: {type(felt[0]).__name__} concerns sensors, and "
+                f'none runs with observation="{observation}" (unless include_covariance or '
+                "innovations ask for the filter)"
+            )
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world
         features = 0 if suite.camera is None else len(suite.camera.features_I)
@@ -138,6 +179,7 @@ class Flights:
         self._split = policy_size(self.table) if privileged else None
         self.observation, self.action, self.layout = observation, action, layout
         self.control_rate = check.positive("control_rate", control_rate)
+        check_limit(self.task, self.control_rate)
         self.batch = FlightBatch(
             count,
             vehicle=vehicle,
@@ -160,11 +202,19 @@ class Flights:
             true_sensors=true_sensors,
             world=place,
             randomization=drawn,
-            faults=faults,
+            faults=befall,
         )
-        if max_episode_steps is not None:
-            steps = check.whole("max_episode_steps", max_episode_steps)
-            self.batch.limit(min(steps, self.batch.max_steps or steps))
+
+    def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
+        """The start values in the options of a reset, checked before anything changes.
+
+        Raises:
+            ValueError: If an option is unknown or invalid.
+        """
+        chosen = start_options(options)
+        position, velocity, yaw = (chosen.get(name) for name in ("position", "velocity", "yaw"))
+        checked_start(self.batch.count, position, velocity, yaw, self.task)
+        return chosen
 
     def split(self, observations: NDArray[np.float32]) -> Any:
         """Observations (..., n) as the space wants them: an array, or a Dict of parts."""
@@ -175,6 +225,16 @@ class Flights:
             "privileged": observations[..., self._split :].copy(),
         }
 
+
+_BUILT_WITH = (
+    *(
+        name
+        for name, parameter in inspect.signature(Flights._build).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name != "camera_is_wanted"
+    ),
+    "max_episode_steps",
+)
+"""Keywords of all tasks."""
 
 COLUMN = {name: column for column, name in enumerate(RESULTS)}
 """Columns of a batch's `results`, by name."""

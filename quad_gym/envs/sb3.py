@@ -9,6 +9,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from quad_gym import validation as check
 from quad_gym.envs.configuration import (
     COLUMN,
     ENDINGS,
@@ -41,7 +42,8 @@ class QuadVecEnv(VecEnv):
         keywords: Those of `QuadEnv`; `render_mode` may be "human" or "rgb_array".
 
     Raises:
-        ValueError: If a keyword is unknown or makes no sense.
+        TypeError: If a keyword is unknown; it is a ValueError, too.
+        ValueError: If a keyword is another task's, or its value is invalid.
     """
 
     def __init__(
@@ -149,7 +151,12 @@ class QuadVecEnv(VecEnv):
         }
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed flight i with seed + i at the next reset; None takes fresh entropy."""
+        """Seed flight i with seed + i at the next reset; None takes fresh entropy.
+
+        Raises:
+            ValueError: If the seed is no whole number of at least 0.
+        """
+        seed = check.seed("seed", seed)
         if seed is None:  # the base class would draw from NumPy's global generator
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         return super().seed(seed)

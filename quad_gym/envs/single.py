@@ -1,17 +1,20 @@
 """`QuadEnv`: one flight as a Gymnasium environment."""
 
+import copy
+import inspect
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec, make
 
+from quad_gym import validation as check
 from quad_gym.envs.configuration import (
     COLUMN,
     ENDINGS,
     Flights,
     checked_actions,
     drawn_info,
-    start_options,
 )
 from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
@@ -121,16 +124,16 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or a
-            `SensorSuite`.
+        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or
+            a `SensorSuite`. "standard" has the laboratory's sensors and a consistent filter; "lab"
+            is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
             block by block; a suite whose filter gates keeps them for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
         feature_noise_across: "predicted", "projected" or "measured", see `quad_gym.FilterParams`.
-            None: as the suite has it; but for "lab" by name "predicted", as the report's own
-            "measured" makes some 6 circles in 1,000 crash in their first second.
+            None: as the suite has it.
         estimator: "ukf" or "ekf", in place of the suite's.
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
             no GNSS; "warm": it has been running for 10 s before the episode and has converged.
@@ -139,14 +142,13 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         gnss_rate: In place of the suite's [Hz].
         camera_rate: In place of the suite's [Hz].
         substeps: Runge-Kutta steps in a tick.
-        max_episode_steps: Time limit in steps; the earlier of this and `duration` holds, as with
-            `gymnasium.make`, so pass a longer `duration` (or 0: none) to fly longer. (Where the
-            wrapper of `gymnasium.make` cuts, `info["ending"]` stays "none".)
+        max_episode_steps: Time limit in steps, in place of the task's own, be it longer or shorter;
+            with a `duration` given, too, the earlier of both holds.
         true_vehicle: What really flies, where the controller believes in `vehicle`.
         true_sensors: What really measures, where the filter believes in `sensors`.
         world: "calm", "breeze", "fresh_breeze", or `WorldParams`.
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
-        faults: What goes wrong with sensors and rotors: names of presets, such as "gnss_outage" or
+        faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as "gnss_outage" or
             "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
         radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
             max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
@@ -156,7 +158,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         render_size: Width and height of a frame [pixels].
 
     Raises:
-        ValueError: If a keyword is unknown or its value makes no sense.
+        TypeError: If a keyword is unknown; it is a ValueError, too.
+        ValueError: If a keyword is another task's, or its value is invalid.
 
     ## Version history
     - v0: first version.
@@ -168,6 +171,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         self, task: str = "circle", *, render_mode: str | None = None, **keywords: Any
     ) -> None:
         look = rendering_options(keywords)
+        keywords.setdefault("max_episode_steps", limit_asked_of_make())
         self.flights = Flights(task, 1, Autoreset.DISABLED, threads=1, **keywords)
         self.render_mode = render_mode
         self.rendering = rendering_of(self.flights, render_mode, **look)
@@ -175,6 +179,17 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         self.observation_space = self.flights.space
         self.action_space = action_space()
         self._seeded = self._over = False
+        self._spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's description of the environment, which knows the time limit in steps."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        """Take a description, and tell it the time limit: the environment's, no wrapper's."""
+        self._spec = with_limit(value, self.flights)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -189,10 +204,11 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             The observation and `info`.
 
         Raises:
-            ValueError: If an option is unknown or makes no sense.
+            ValueError: If an option is unknown or invalid, or the seed is no whole number of at
+                least 0; nothing has changed then.
         """
-        start = start_options(options)
-        super().reset(seed=seed)
+        start = self.flights.start(options)
+        super().reset(seed=check.seed("seed", seed))
         batch = self.flights.batch
         if seed is not None or not self._seeded:
             keys = stream_key(self.np_random)[np.newaxis]
@@ -283,16 +299,54 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             self.rendering.close()
 
 
+def with_limit(spec: EnvSpec | None, flights: Flights) -> EnvSpec | None:
+    """A copy of Gymnasium's description that knows the time limit of the flights."""
+    if spec is None:
+        return None
+    described = copy.copy(spec)
+    described.max_episode_steps = flights.batch.max_steps or None
+    return described
+
+
+ENTRY_POINT = "quad_gym.envs.single:QuadEnv"
+"""Where Gymnasium finds `QuadEnv`."""
+
+
+def limit_asked_of_make() -> int | None:
+    """The `max_episode_steps` of the `gymnasium.make` that is making an environment, if any.
+
+    Gymnasium keeps that argument to itself and wraps a `TimeLimit` around what it has made, which
+    can only cut an episode short: an environment with a time limit of its own would end before a
+    longer one, and nobody would be told. So it is read where it is, in the frame of `make`; the
+    wrapper then cuts at the same step as the environment.
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_code is make.__code__:
+            asked, spec = (frame.f_locals.get(name) for name in ("max_episode_steps", "env_spec"))
+            if getattr(spec, "entry_point", None) != ENTRY_POINT:
+                return None  # it makes an environment that uses this one
+            asked = spec.max_episode_steps if spec is not None and asked is None else asked
+            return None if asked == -1 else asked  # -1: no wrapper
+        frame = frame.f_back if frame.f_code.co_name in _MAKERS else None
+    return None
+
+
+_MAKERS = ("limit_asked_of_make", "__init__")
+"""Names of the functions between `gymnasium.make` and the look at its frame."""
+
+
 def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
     """One seed per flight: seed + i for a number, the list itself for a list.
 
     Raises:
-        ValueError: If a list has another length.
+        ValueError: If a seed is no whole number of at least 0, or a list has another length.
     """
     if seed is None:
         return [None] * count
-    if isinstance(seed, (int, np.integer)):
-        return [int(seed) + i for i in range(count)]
+    if not isinstance(seed, (list, tuple, np.ndarray)):
+        first = check.seed("seed", seed) or 0
+        return [first + i for i in range(count)]
     if len(seed) != count:
         raise ValueError(f"seed must be a number or {count} numbers, got {len(seed)} of them")
-    return [None if s is None else int(s) for s in seed]
+    return [check.seed("seed", s) for s in seed]

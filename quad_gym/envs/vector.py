@@ -4,14 +4,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions, start_options
+from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions
 from quad_gym.envs.flight_info import final_faults, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
-from quad_gym.envs.single import seeds_of
+from quad_gym.envs.single import seeds_of, with_limit
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
 from quad_gym.starts import stream_keys
@@ -40,7 +41,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         keywords: Those of `QuadEnv`.
 
     Raises:
-        ValueError: If a keyword is unknown or makes no sense.
+        TypeError: If a keyword is unknown; it is a ValueError, too.
+        ValueError: If a keyword is another task's, or its value is invalid.
     """
 
     def __init__(
@@ -69,9 +71,20 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seeded = False
+        self._spec: EnvSpec | None = None
         self._over = np.zeros(self.num_envs, bool)
         self._everyone = np.ones(self.num_envs, bool)
         self._no_ending = np.full(self.num_envs, ENDINGS[0], object)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's description of the environment, which knows the time limit in steps."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        """Take a description, and tell it the time limit: the environment's, no wrapper's."""
+        self._spec = with_limit(value, self.flights)
 
     def reset(
         self,
@@ -90,14 +103,14 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             Observations of all flights, and `info` of those that were reset.
 
         Raises:
-            ValueError: If an option is unknown or makes no sense, or the seeds do not fit.
+            ValueError: If an option is unknown or invalid, or the seeds do not fit.
             TypeError: If `reset_mask` is no array of booleans.
         """
         options = dict(options or {})
         mask = self._checked_mask(options.pop("reset_mask", None))
-        start = start_options(options)
+        start = self.flights.start(options)
         seeds = seeds_of(seed, self.num_envs)
-        if isinstance(seed, (int, np.integer)):
+        if seed is not None and not isinstance(seed, (list, tuple, np.ndarray)):
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(int(seed))
         batch = self.flights.batch
         if not self._seeded:

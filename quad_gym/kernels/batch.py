@@ -24,15 +24,16 @@ _JUDGE, _OBSERVE = int(Stage.JUDGE), int(Stage.OBSERVE)
 
 
 @kernel
-def _write_rows(source, low, high, out, block, mask):
+def _write_rows(source, low, high, out, block, begins):
     """Copy observations from lanes to the rows of an array, held within the space's bounds."""
     first = block * WIDTH
     for lane in range(min(WIDTH, out.shape[0] - first)):
-        if mask[lane] > 0.0:
+        if begins[lane] > 0.0:
+            row = out[first + lane]
             for k in range(out.shape[1]):
                 value = source[k, lane]
-                value = value if value > low[k] else low[k]
-                out[first + lane, k] = value if value < high[k] else high[k]
+                value = value if value > low[k] else low[k]  # also where it is NaN
+                row[k] = value if value < high[k] else high[k]
 
 
 @kernel
@@ -50,20 +51,20 @@ def _load_actions(block, actions, index):
 def _write_results(block, results, index):
     """What the caller wants to know of a step, before a new episode overwrites it."""
     first = index * WIDTH
-    for lane in range(min(WIDTH, results.shape[0] - first)):
-        row = results[first + lane]
-        row[0] = block.reward[lane]
-        row[1] = block.terminated[lane]
-        row[2] = block.truncated[lane]
-        row[3] = block.ending[lane]
-        row[4] = block.position_error[lane]
-        row[5] = block.estimation_error[lane]
-        row[6] = block.filter_status[lane]
-        row[7] = block.step[lane]
-        row[8] = block.episode_return[lane]
-        row[9] = block.episode_error[lane]
-        row[10] = block.gate_next[lane]
-        row[11] = block.faults[lane]
+    for lane in range(min(WIDTH, results.shape[1] - first)):
+        flight = first + lane
+        results[0, flight] = block.reward[lane]
+        results[1, flight] = block.terminated[lane]
+        results[2, flight] = block.truncated[lane]
+        results[3, flight] = block.ending[lane]
+        results[4, flight] = block.position_error[lane]
+        results[5, flight] = block.estimation_error[lane]
+        results[6, flight] = block.filter_status[lane]
+        results[7, flight] = block.step[lane]
+        results[8, flight] = block.episode_return[lane]
+        results[9, flight] = block.episode_error[lane]
+        results[10, flight] = block.gate_next[lane]
+        results[11, flight] = block.faults[lane]
 
 
 @kernel
@@ -150,7 +151,7 @@ def fly(
         observations: (n, n_observation), written; with no columns nothing is observed.
         final_observations: Likewise, written where one episode ends and the next begins in this
             step.
-        results: (n, 12), written in a STEP: see `quad_gym.records.RESULTS`.
+        results: (12, n), written in a STEP: a row for each of `quad_gym.records.RESULTS`.
     """
     scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
     stages = stage_table[0]

@@ -129,6 +129,6 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.faults:
         call_stage(stages, _BEGIN_FAULTS, flight, world, model, settings, work, 0)
     sense(flight, world, model, settings, work, stages, mask, 1)
-    r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick)
+    r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     error = norm(sub(r_ref, load3(flight.r)))
     flight.position_error = select(mask, error, flight.position_error)

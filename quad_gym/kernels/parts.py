@@ -1,78 +1,47 @@
-"""Entries that run one part of a tick on a range of blocks: for timing, not for flying."""
+"""Entries that run one stage on every block, or the filter alone: for timing, not for flying."""
 
-from enum import IntEnum
+import numpy as np
+from numba import types
+from numba.np.numpy_support import from_dtype
 
-from quad_gym.kernels.batch import _write_rows
-from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.compiling import call_stage, entry
+from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.predict import predict
 from quad_gym.kernels.filter.update import update
-from quad_gym.kernels.sensors.measure import (
-    drift_biases,
-    measure_features,
-    measure_gnss,
-    measure_imu,
-)
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import select
-from quad_gym.kernels.task.observation import observe
-from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.kernels.task.reward import judge
-from quad_gym.kernels.vehicle.control import act
-from quad_gym.kernels.vehicle.dynamics import integrate
+from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK
 
 
-class Part(IntEnum):
-    """A part of a tick; the filter has entries of its own."""
-
-    CONTROL = 0
-    """the reference, and the report's controller"""
-    DYNAMICS = 1
-    """Runge-Kutta step of the true state"""
-    SENSORS = 2
-    """biases, IMU, GNSS and camera with their random numbers"""
-    TASK = 3
-    """reward, endings and observation"""
-
-
-@entry
-def run_part(blocks, part, world, model, settings, work, low, high, observations):
-    """Run a part of a tick once for every block.
+def _run_stage(blocks, number, world, model, settings, work, table, flag):
+    """Run a stage once for every block.
 
     Args:
         blocks: (n_blocks,) FLIGHT_BLOCK.
-        part: A `Part`.
-        world, model, settings, work, low, high, observations: As for `fly`.
+        number: A `Stage`.
+        world, model, settings, work, table: As for `fly`.
+        flag: What the stage is called with.
     """
     true, believed = lanes_of(world[0]), lanes_of(model[0])
-    todo, scratch = settings[0], lanes_of(work[0])
+    scratch = lanes_of(work[0])
     for index in range(len(blocks)):
         flight = lanes_of(blocks[index])
-        everyone = flight.tick >= 0.0
-        if part == Part.CONTROL:
-            reference = evaluate_reference(flight, flight.tick * believed.dt)
-            act(flight, believed, todo.control, reference)
-        elif part == Part.DYNAMICS:
-            integrate(flight, true, todo.substeps)
-        elif part == Part.SENSORS:
-            drift_biases(flight, true)
-            measure_imu(flight, true, everyone)
-            measure_gnss(flight, true, everyone)
-            measure_features(flight, true, todo.feature_count, everyone)
-        else:
-            judge(flight, believed, todo, everyone)
-            observe(flight, believed, todo, scratch.observation)
-            scratch.begins = select(everyone, 1.0, 0.0)
-            _write_rows(work[0].observation, low, high, observations, index, work[0].begins)
+        scratch.mask = 1.0
+        call_stage(table[0], number, flight, true, believed, settings[0], scratch, flag)
 
 
-@entry
-def filter_cycle_of_blocks(blocks, model, work, feature_count, form):
-    """Update and predict the filters of every block, eight flights at a time."""
-    believed, scratch = lanes_of(model[0]), lanes_of(work[0])
-    for index in range(len(blocks)):
-        flight = lanes_of(blocks[index])
-        update(flight, believed, scratch, feature_count, flight.tick >= 0.0, form)
-        predict(flight, believed, scratch, form)
+def _array(dtype):
+    return types.Array(from_dtype(np.dtype(dtype)), 1, "C")
+
+
+run_stage = entry(
+    _run_stage,
+    types.none(
+        _array(FLIGHT_BLOCK),
+        types.int64,
+        *map(_array, (PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)),
+        types.int64,
+    ),
+)
 
 
 @entry

@@ -13,10 +13,8 @@ from quad_gym.kernels.maths.linalg import (
     scale,
     scale33,
     store3,
-    store4,
     store33,
 )
-from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.sensors.measure import (
     drift_biases,
     drift_gnss,
@@ -134,24 +132,3 @@ def wahba_of_vectors(weights, v_I, v_B, R_BI):
     rotation, uniqueness = wahba(profile)
     store33(R_BI, rotation)
     return uniqueness
-
-
-@entry
-def dcms_of_eulers(e, R):
-    """Write the rotation matrices of (n, 3) Euler angles."""
-    for i in range(len(e)):
-        store33(R[i], euler_to_dcm(load3(e[i])))
-
-
-@entry
-def dcms_of_quaternions(q, R_BI):
-    """Write the rotation matrices of (n, 4) quaternions."""
-    for i in range(len(q)):
-        store33(R_BI[i], quaternion_to_dcm(load4(q[i])))
-
-
-@entry
-def quaternions_of_dcms(R_BI, q):
-    """Write the quaternions of (n, 3, 3) rotation matrices."""
-    for i in range(len(q)):
-        store4(q[i], dcm_to_quaternion(load33(R_BI[i])))

@@ -55,6 +55,7 @@ from quad_gym.records.settings import (
 )
 from quad_gym.records.sizes import (
     BASELINE_BLOCK,
+    DELAY_SLOTS,
     FAULT_KINDS,
     FEATURE_BLOCKS,
     FREEDOMS,
@@ -153,6 +154,7 @@ __all__ = [
     "MAX_HARMONICS",
     "MAX_MEASUREMENTS",
     "MAX_OBSERVATION",
+    "DELAY_SLOTS",
     "MAX_UNDER_WAY",
     "PARAMS",
     "PARAMS_BLOCK",

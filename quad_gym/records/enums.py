@@ -25,6 +25,10 @@ class FilterForm(IntFlag):
     """updates keep the innovations, their predicted deviations and their NIS, block by block"""
     GATE = 16
     """updates leave out blocks whose NIS is beyond the gate, and keep all of these, too"""
+    LEVER_AVERAGES = 64
+    """the accelerometer is not at the center of mass, and samples are means over the tick"""
+    LEVER_SAMPLES = 128
+    """likewise, and samples are of the tick's start"""
     GRADUAL = 32
     """updates take images in portions while the attitude is uncertain"""
 

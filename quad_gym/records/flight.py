@@ -2,12 +2,12 @@
 
 from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
+    DELAY_SLOTS,
     FAULT_KINDS,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_GATES,
     MAX_HARMONICS,
-    MAX_UNDER_WAY,
     Field,
 )
 
@@ -33,6 +33,7 @@ FLIGHT_FIELDS = (
     Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.randomization`"),
     # the last measurements
     Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
+    Field("w_before", (3,), "rad/s", "w_meas one sample before"),
     Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
     Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
     Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
@@ -124,18 +125,18 @@ FLIGHT_FIELDS = (
     Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
     Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
     # the same when the measurements under way were taken, the latest first; of GNSS and camera
-    Field("stamp_tick", (2, MAX_UNDER_WAY), "ticks", "time stamp; NaN: none"),
-    Field("stamp_turn", (2, MAX_UNDER_WAY, 3, 3), "-", "C"),
-    Field("stamp_velocity", (2, MAX_UNDER_WAY, 3), "m/s", "V"),
-    Field("stamp_position", (2, MAX_UNDER_WAY, 3), "m", "X"),
-    Field("stamp_bias_gain", (2, MAX_UNDER_WAY, 3, 3), "s", "B"),
-    Field("stamp_rates", (2, MAX_UNDER_WAY, 3), "rad/s", "w_meas"),
+    Field("stamp_tick", (2, DELAY_SLOTS), "ticks", "time stamp; NaN: none"),
+    Field("stamp_turn", (2, DELAY_SLOTS, 3, 3), "-", "C"),
+    Field("stamp_velocity", (2, DELAY_SLOTS, 3), "m/s", "V"),
+    Field("stamp_position", (2, DELAY_SLOTS, 3), "m", "X"),
+    Field("stamp_bias_gain", (2, DELAY_SLOTS, 3, 3), "s", "B"),
+    Field("stamp_rates", (2, DELAY_SLOTS, 3), "rad/s", "w_meas"),
     # the measurements under way
-    Field("late_position", (MAX_UNDER_WAY, 3), "m", "gnss_position"),
-    Field("late_baseline", (MAX_UNDER_WAY, 3), "m", "gnss_baseline"),
-    Field("late_velocity", (MAX_UNDER_WAY, 3), "m/s", "gnss_velocity"),
-    Field("late_valid", (MAX_UNDER_WAY, 3), "0 or 1", "whether these were measured"),
-    Field("late_pixels", (MAX_UNDER_WAY, MAX_FEATURES, 2), "pixels", "feature projections"),
-    Field("late_seen", (MAX_UNDER_WAY, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
+    Field("late_position", (DELAY_SLOTS, 3), "m", "gnss_position"),
+    Field("late_baseline", (DELAY_SLOTS, 3), "m", "gnss_baseline"),
+    Field("late_velocity", (DELAY_SLOTS, 3), "m/s", "gnss_velocity"),
+    Field("late_valid", (DELAY_SLOTS, 3), "0 or 1", "whether these were measured"),
+    Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
+    Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
 )
 # fmt: on

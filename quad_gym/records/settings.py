@@ -22,6 +22,7 @@ SETTINGS_FIELDS = (
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
     Field("control", (), "-", "what the action means, see Control", "i8"),
     Field("task", (), "-", "see Task", "i8"),
+    Field("harmonics", (), "-", "terms of the reference's series in use", "i8"),
     Field("layout", (), "-", "of the observation, see Layout", "i8"),
     Field("include_covariance", (), "0 or 1", "whether the observation holds standard deviations", "i8"),
     Field("privileged", (), "0 or 1", "whether the observation ends with the truth", "i8"),

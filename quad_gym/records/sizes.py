@@ -12,7 +12,9 @@ MAX_GATES = 8
 MAX_FEATURES = 16
 """Features of a camera."""
 MAX_UNDER_WAY = 2
-"""Measurements of a sensor that can be on their way to the filter at a time."""
+"""Longest latency of a sensor, in its periods: so many measurements can be on their way."""
+DELAY_SLOTS = MAX_UNDER_WAY + 1
+"""Measurements that wait: at a latency of MAX_UNDER_WAY periods one is taken as another arrives."""
 MAX_BLOCKS = 3 + MAX_FEATURES
 """Blocks of the stacked measurement: antenna position, baseline, velocity, features."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS

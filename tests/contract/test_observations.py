@@ -247,7 +247,7 @@ def test_noisy_observations_have_the_stated_noise_and_no_memory():
 
 
 def test_observations_are_held_within_their_bounds():
-    env = QuadVectorEnv(2, "hover", observation="truth")
+    env = QuadVectorEnv(2, "hover", observation="truth", out_of_bounds=1e4)
     observation, _ = env.reset(
         seed=1, options={"position": [5e3, 0, -5e3], "velocity": [0, 1e4, 0]}
     )

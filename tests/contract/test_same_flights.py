@@ -21,7 +21,10 @@ SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 """Episodes end by the time limit and by tipping over, at different steps in different flights."""
 
 LAB = quad_gym.sensor_suite("lab")
-AVERAGES = LAB.replace(imu=LAB.imu.replace(samples="average"))
+AVERAGES = LAB.replace(
+    imu=LAB.imu.replace(samples="average"),
+    estimator=LAB.estimator.replace(integration="midpoint"),
+)
 
 
 def fly_single(task, flight, *, wait, **keywords):

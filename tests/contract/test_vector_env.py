@@ -266,7 +266,7 @@ def length_of_an_episode(step, limit):
     [
         (7, {}, 7),
         (499, {}, 499),
-        (501, {}, 500),  # the task's own ten seconds come earlier
+        (501, {}, 501),  # in place of the task's own ten seconds
         (501, {"duration": 0.0}, 501),
         (730, {"duration": 60.0}, 730),
         (60, {"duration": 1.0}, 50),
@@ -321,7 +321,7 @@ def test_options_set_the_start_of_one_episode_for_all_or_one_by_one():
     batch = env.flights.batch
     np.testing.assert_array_equal(batch.read("r"), np.tile(start["position"], (3, 1)))
     np.testing.assert_array_equal(batch.read("v"), np.tile(start["velocity"], (3, 1)))
-    each = np.arange(9.0).reshape(3, 3)
+    each = np.arange(9.0).reshape(3, 3) / 2.0
     env.reset(options={"position": each, "yaw": np.array([0.1, 0.2, 0.3])})
     np.testing.assert_array_equal(batch.read("r"), each)
     env.step(np.zeros((3, 4)))

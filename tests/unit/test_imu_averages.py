@@ -19,7 +19,10 @@ from tests.unit.alarms import assert_normal
 from tests.unit.test_imu import QUIET, random_state
 
 LAB = quad_gym.sensor_suite("lab")
-AVERAGE = LAB.replace(imu=LAB.imu.replace(samples="average"))
+AVERAGE = LAB.replace(
+    imu=LAB.imu.replace(samples="average"),
+    estimator=LAB.estimator.replace(integration="midpoint"),
+)
 # hardly any drag: it has a kink where the flow through the rotors turns, which quadrature feels
 VEHICLE = quad_gym.VehicleParams(disc_area=1e-9)
 LEVER = (0.05, -0.03, 0.02)

@@ -177,6 +177,37 @@ def test_with_a_quiet_imu_the_covariance_is_the_same(kind, plain):
     assert covariance < 1e-3, covariance
 
 
+@pytest.mark.parametrize(
+    ("gnss", "camera"), [(0.2, 0.08), (0.195, 0.075), (0.2, 0.06), (0.1, 0.08), (0.2, 0.0)]
+)
+def test_at_the_longest_latency_it_is_what_filtering_all_over_again_would_do(gnss, camera):
+    """Exactly two periods: one measurement is taken at the instant at which another arrives."""
+    suite = mended_lab("ukf", quiet=True, gnss=gnss, camera=camera)
+    mean, covariance = deviations_from_the_reference(suite, PlainUKF, seconds=1.5)
+    assert mean < 0.15, mean
+    assert covariance < 2e-3, covariance
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [
+        {"gnss": 20.0, "camera": 25.0},
+        {"gnss": 5.0, "camera": 50.0},
+        {"gnss": 200.0, "camera": 200.0},
+    ],
+)
+def test_nees_is_right_at_the_longest_latency_of_any_rate(rates):
+    """Means over 400 flights, five deviations wide, at 4 instants."""
+    latencies = {name: 2.0 / rate for name, rate in rates.items()}
+    batch = fly(late(RTK.with_rates(**rates), **latencies), 400, filter_start="warm")
+    means = []
+    for _ in range(4):
+        steps(batch, 0.5)
+        means.append(nees(batch).mean())
+    assert np.abs(np.array(means) - 15.0).max() < 5 * np.sqrt(2 * 15 / 400), means
+    assert not batch.read("filter_status").any()
+
+
 def test_taken_as_fresh_it_is_another():
     suite = mended_lab("ukf", gnss=0.1, camera=0.06)
     ignorant = late(suite, late_measurements="as_fresh")
@@ -312,7 +343,7 @@ def test_nonsense_is_refused():
         late(RTK, gnss=0.21)
     with pytest.raises(ValueError, match=r"CameraParams\.latency must be at most 2 periods"):
         late(INDOOR, camera=0.06).with_rates(camera=50.0)
-    with pytest.raises(ValueError, match=r"GnssParams\.latency"):
+    with pytest.raises(ValueError, match=r"true_sensors must have the GNSS rate"):
         fly(RTK.with_rates(gnss=20.0), 1, true_sensors=late(RTK, gnss=0.15))
     with pytest.raises(ValueError, match="late_measurements must be one of rewind, as_fresh"):
         RTK.estimator.replace(late_measurements="drop")

@@ -41,7 +41,7 @@ from quad_gym.kernels.maths.linalg import (
 )
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import MAX_UNDER_WAY, FilterStatus
+from quad_gym.records import DELAY_SLOTS, FilterStatus
 
 _GNSS, _CAMERA, _PRESENT = 0, 1, 2
 _UPDATE = int(Stage.UPDATE)
@@ -56,7 +56,7 @@ def begin_without_waiting(flight, mask):
     """Begin an episode with nothing under way, where `mask`."""
     begin_increments(flight, mask)
     for sensor in range(2):
-        for slot in range(MAX_UNDER_WAY):
+        for slot in range(DELAY_SLOTS):
             tick = flight.stamp_tick[sensor, slot]
             flight.stamp_tick[sensor, slot] = select(mask, np.nan, tick)
 
@@ -77,7 +77,7 @@ def _stamp(flight, sensor, taken):
     tick, turn, rates = flight.stamp_tick, flight.stamp_turn, flight.stamp_rates
     velocity, position = flight.stamp_velocity, flight.stamp_position
     gain = flight.stamp_bias_gain
-    for slot in range(MAX_UNDER_WAY - 1, 0, -1):
+    for slot in range(DELAY_SLOTS - 1, 0, -1):
         tick[sensor, slot] = select(taken, tick[sensor, slot - 1], tick[sensor, slot])
         keep33(turn[sensor, slot], taken, load33(turn[sensor, slot - 1]))
         keep33(gain[sensor, slot], taken, load33(gain[sensor, slot - 1]))
@@ -98,7 +98,7 @@ def _exchange_gnss(flight, work, settings, mask, starting):
     wait = flight.late_valid
     zero = 0.0 * flight.tick
     p, b, v = zero, zero, zero
-    for slot in range(MAX_UNDER_WAY):
+    for slot in range(DELAY_SLOTS):
         here = mask & (flight.stamp_tick[_GNSS, slot] == flight.tick - settings.gnss_delay)
         keep3(work.kept_position, here, load3(flight.late_position[slot]))
         keep3(work.kept_baseline, here, load3(flight.late_baseline[slot]))
@@ -110,7 +110,7 @@ def _exchange_gnss(flight, work, settings, mask, starting):
     taken = mask & (flags[0] + flags[1] + flags[2] > 0.0)
     if any_of(taken):
         _stamp(flight, _GNSS, taken)
-        for slot in range(MAX_UNDER_WAY - 1, 0, -1):
+        for slot in range(DELAY_SLOTS - 1, 0, -1):
             keep3(flight.late_position[slot], taken, load3(flight.late_position[slot - 1]))
             keep3(flight.late_baseline[slot], taken, load3(flight.late_baseline[slot - 1]))
             keep3(flight.late_velocity[slot], taken, load3(flight.late_velocity[slot - 1]))
@@ -145,7 +145,7 @@ def _exchange_camera(flight, work, settings, mask):
     arrived = work.kept_seen
     for i in range(count):
         arrived[i] = 0.0 * flight.tick
-    for slot in range(MAX_UNDER_WAY):
+    for slot in range(DELAY_SLOTS):
         here = mask & (flight.stamp_tick[_CAMERA, slot] == flight.tick - settings.camera_delay)
         if any_of(here):
             for i in range(count):
@@ -159,7 +159,7 @@ def _exchange_camera(flight, work, settings, mask):
     taken = mask & (features > 0.0)
     if any_of(taken):
         _stamp(flight, _CAMERA, taken)
-        for slot in range(MAX_UNDER_WAY - 1, 0, -1):
+        for slot in range(DELAY_SLOTS - 1, 0, -1):
             _keep_image(pixels, seen, slot, taken, pixels[slot - 1], seen[slot - 1], count)
         _keep_image(pixels, seen, 0, taken, flight.pixels, flight.feature_valid, count)
     for i in range(count):
@@ -207,7 +207,7 @@ def _find_stamp(flight, p, work, sensor, delay, arrived):
     store33(work.since_bias_gain, load33(flight.imu_bias_gain))
     store3(work.since_velocity, load3(flight.imu_velocity))
     store3(work.since_position, load3(flight.imu_position))
-    for slot in range(MAX_UNDER_WAY):
+    for slot in range(DELAY_SLOTS):
         here = arrived & (flight.stamp_tick[sensor, slot] == flight.tick - delay)
         keep33(work.since_turn, here, load33(flight.stamp_turn[sensor, slot]))
         keep33(work.since_bias_gain, here, load33(flight.stamp_bias_gain[sensor, slot]))

@@ -28,6 +28,7 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
+from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.linalg import (
     add,
@@ -266,6 +267,8 @@ def predict(flight, p, work, form=0):
     half = R_BI  # not read but with MIDPOINT
     if midpoint:
         half = vector_to_dcm(scale(0.5 * dt, w_B))
+    if (form & LEVER_ARM) != 0:
+        f_B = sub(f_B, lever_force(flight, p, form, half))
     mean_r, mean_v, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form)
     _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form)
     turn = add(scale(dt, w_B), mean_e)

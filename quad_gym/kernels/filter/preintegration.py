@@ -26,6 +26,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
+from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.maths.linalg import (
     add,
     add33,
@@ -67,14 +68,18 @@ def begin_increments(flight, mask):
 def add_increment(flight, p, form):
     """Add the tick's IMU sample, in the form in which the filter predicts with it."""
     dt, C = p.dt, load33(flight.imu_turn)
-    turn = scale(dt, load3(flight.gyro))
+    turn, half = scale(dt, load3(flight.gyro)), C
+    force = load3(flight.accel)
     if (form & _MIDPOINT) != 0:
         half = vector_to_dcm(scale(0.5, turn))
+    if (form & LEVER_ARM) != 0:
+        force = sub(force, lever_force(flight, p, form, half))
+    if (form & _MIDPOINT) != 0:
         C = multiply(half, C)
         store33(flight.imu_turn, multiply(half, C))
     else:
         store33(flight.imu_turn, multiply(euler_to_dcm(turn), C))
-    dv, v = scale(dt, apply_transposed(C, load3(flight.accel))), load3(flight.imu_velocity)
+    dv, v = scale(dt, apply_transposed(C, force)), load3(flight.imu_velocity)
     store3(flight.imu_velocity, add(v, dv))
     moved = add(scale(dt, v), scale(0.5 * dt, dv))
     store3(flight.imu_position, add(load3(flight.imu_position), moved))

@@ -77,6 +77,7 @@ def _sample_imu(flight, p, w_B, f_B, mask):
     f_B = add(f_B, load3(flight.b_a))
     keep3(flight.accel, mask, add(f_B, scale(p.accel_sigma, n_a)))
     keep3(flight.gyro, mask, add(add(w_B, b_g), noise_g))
+    keep3(flight.w_before, mask, load3(flight.w_meas))
     keep3(flight.w_meas, mask, add(add(load3(flight.w), b_g), noise_g))
 
 

@@ -1,6 +1,7 @@
 """Which sensors measure at the present instant, and when they measure next."""
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.maths.linalg import keep3, load3
 from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.measure import (
     drift_gnss,
@@ -17,9 +18,11 @@ _CORRUPT_GNSS, _CORRUPT_FEATURES = int(Stage.CORRUPT_GNSS), int(Stage.CORRUPT_FE
 
 
 @kernel
-def _sample_imu(flight, world, settings, work, stages, mask):
+def _sample_imu(flight, world, settings, work, stages, mask, starting):
     """Sample the IMU, where `mask`."""
     measure_imu(flight, world, mask)
+    if starting:
+        keep3(flight.w_before, mask, load3(flight.w_meas))
     if settings.faults:
         work.mask = select(mask, 1.0, 0.0)
         call_stage(stages, _SATURATE_IMU, flight, world, world, settings, work, 0)
@@ -84,7 +87,7 @@ def sample_stage(flight, world, model, settings, work, stages, flag):
     flying, true, scratch = lanes_of(flight), lanes_of(world), lanes_of(work)
     mask, starting = scratch.mask > 0.0, flag > 0
     if starting or not settings.imu_averages:  # at its start an average has nothing behind it
-        _sample_imu(flying, true, settings, scratch, stages, mask)
+        _sample_imu(flying, true, settings, scratch, stages, mask, starting)
     _sample_gnss(flying, true, settings, scratch, stages, mask, starting)
     if settings.camera_ticks > 0:
         _sample_camera(flying, true, settings, scratch, stages, mask)

@@ -1,21 +1,22 @@
-r"""The number type of the kernels: eight float64 that fly together.
+r"""The number type of the kernels: float64 of several flights that fly together.
 
 A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it
-serves the friendly classes and the tests; compiled for `Lanes` the same source flies eight flights
+serves the friendly classes and the tests; compiled for `Lanes` the same source flies WIDTH flights
 on the SIMD unit. This file teaches Numba three value types and the operations on them:
 
-| type      | eight of | plain counterpart | operations                                           |
+| type      | WIDTH of | plain counterpart | operations                                           |
 |-----------|----------|-------------------|------------------------------------------------------|
 | `Lanes`   | float64  | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt`          |
 | `Mask`    | bool     | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`            |
 | `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `kernels.simd.bits`        |
 
 There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never
-sees its neighbours, so what a flight does is independent of who flies beside it, NaN included.
+sees its neighbors, so what a flight does is independent of who flies beside it, NaN included.
 
-LLVM lowers the eight-wide vectors to whatever registers the machine has (one AVX-512 register, two
-of AVX2, four of SSE2 or NEON). The only fast-math flag is `contract` (fused multiply-add): nothing
-is reassociated, so results do not depend on the batch.
+Results are defined by the source alone. A product that is added or subtracted in the same
+expression is fused into a multiply-add, always, and nothing else is: no fast-math flag lets LLVM
+decide. They depend neither on WIDTH nor on what is inlined, nor on the processor, as long as it has
+fused multiply-adds (without, LLVM calls the C library's: the same bits, slowly).
 """
 
 import math
@@ -33,8 +34,7 @@ from numba.core.typeconv.rules import default_type_manager
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, overload, register_model
 
-WIDTH = 8
-"""Flights in a block: the float64 that one AVX-512 register holds."""
+from quad_gym.records import WIDTH
 
 _FLOATS = ir.VectorType(ir.DoubleType(), WIDTH)
 _WORDS = ir.VectorType(ir.IntType(64), WIDTH)

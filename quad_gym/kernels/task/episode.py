@@ -153,7 +153,7 @@ def _given_or(given, drawn):
 @kernel
 def draw_start(flight, p, model, settings, stream, mask):
     """Set the true state at the start of an episode, where `mask`."""
-    (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick)
+    (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     yaw = atan2(x_ref[1], x_ref[0])
     zero = 0.0 * yaw
     v_I = (zero, zero, zero)

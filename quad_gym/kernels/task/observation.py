@@ -35,13 +35,14 @@ def _preview(flight, p, settings, i):
     """The reference a little later: in time, or on a course the gates after the next."""
     if settings.task == Task.WAYPOINTS:
         return _upcoming_gate(flight, 1.0 + i)
-    return position_on_reference(flight, flight.tick * p.dt + settings.preview[i])
+    later = flight.tick * p.dt + settings.preview[i]
+    return position_on_reference(flight, later, settings.harmonics)
 
 
 @kernel
 def _put_relative(flight, p, settings, row, r, v, R_BI, w_B):
     """Errors, directions and rates in the body frame."""
-    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
     k = _put3(row, 0, apply(R_BI, sub(r_ref, r)))
     k = _put3(row, k, apply(R_BI, sub(v_ref, v)))
     k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
@@ -56,7 +57,7 @@ def _put_relative(flight, p, settings, row, r, v, R_BI, w_B):
 @kernel
 def _put_reference(flight, p, settings, row, k):
     """The reference in I."""
-    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
     k = _put3(row, k, r_ref)
     k = _put3(row, k, v_ref)
     k = _put3(row, k, a_ref)
@@ -118,7 +119,7 @@ def _put_sensors(flight, p, settings, row):
 def _put_privileged(flight, p, settings, row, k):
     """The truth, for critics: relative state, biases and rotor speeds."""
     R_BI = quaternion_to_dcm(load4(flight.q))
-    r_ref, v_ref, _, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+    r_ref, v_ref, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
     k = _put3(row, k, apply(R_BI, sub(r_ref, load3(flight.r))))
     k = _put3(row, k, apply(R_BI, sub(v_ref, load3(flight.v))))
     k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))

@@ -11,12 +11,12 @@ from quad_gym.records import MAX_HARMONICS
 
 
 @kernel
-def position_on_reference(flight, t):
+def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
     """r*(t) in I [m]."""
     s1, c1 = sin_cos(flight.ref_omega * t)
     s, c = s1, c1
     x, y, z = load3(flight.ref_center)
-    for k in range(MAX_HARMONICS):
+    for k in range(harmonics):
         a, b = flight.ref_cos[k], flight.ref_sin[k]
         x, y, z = x + a[0] * c + b[0] * s, y + a[1] * c + b[1] * s, z + a[2] * c + b[2] * s
         s, c = s * c1 + c * s1, c * c1 - s * s1
@@ -36,8 +36,11 @@ def heading(flight, r_ref, v_ref):
 
 
 @kernel
-def evaluate_reference(flight, t):
-    """(r*, v*, a*, x*) in I at the time t of the episode [s]."""
+def evaluate_reference(flight, t, harmonics=MAX_HARMONICS):
+    """(r*, v*, a*, x*) in I at the time t of the episode [s].
+
+    `harmonics`: how many terms of the series there are; the others are zero.
+    """
     omega = flight.ref_omega
     s1, c1 = sin_cos(omega * t)
     s, c = s1, c1
@@ -45,7 +48,7 @@ def evaluate_reference(flight, t):
     zero = 0.0 * x
     vx, vy, vz, ax, ay, az = zero, zero, zero, zero, zero, zero
     rate = omega
-    for k in range(MAX_HARMONICS):
+    for k in range(harmonics):
         a, b = flight.ref_cos[k], flight.ref_sin[k]
         ex, ey, ez = a[0] * c + b[0] * s, a[1] * c + b[1] * s, a[2] * c + b[2] * s
         x, y, z = x + ex, y + ey, z + ez

@@ -58,13 +58,13 @@ def judge(flight, p, settings, active):
     finished = active & (change < 0.0)  # nowhere, as yet
     if settings.task == Task.WAYPOINTS:
         passed, progress = _pass_gate(flight, settings, active)
-        _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+        _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
         reward = PROGRESS_WEIGHT * progress + select(passed, GATE_BONUS, 0.0)
         reward = reward + seconds * (HEADING_WEIGHT * dot(R_BI[0], x_ref) - costs)
         finished = active & (flight.gate_next >= settings.gate_count)
         error = norm(sub(load3(flight.ref_center), load3(flight.r)))
     else:
-        r_ref, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt)
+        r_ref, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
         error = norm(sub(r_ref, load3(flight.r)))
         closeness = NEAR_WEIGHT * exp(-2.0 * error) + FINE_WEIGHT * exp(-20.0 * error)
         reward = seconds * (closeness + HEADING_WEIGHT * dot(R_BI[0], x_ref) - costs)

@@ -190,5 +190,5 @@ def control_stage(flight, world, model, settings, work, stages, flag):
     nothing = load3(flying.disturbance)
     reference = (nothing, nothing, nothing, nothing)
     if settings.control == Control.PD:
-        reference = evaluate_reference(flying, flying.tick * believed.dt)
+        reference = evaluate_reference(flying, flying.tick * believed.dt, settings.harmonics)
     act(flying, believed, settings.control, reference)

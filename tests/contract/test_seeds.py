@@ -1,0 +1,152 @@
+"""Training, validation and test never fly the same flight; equal seeds keep flights in pairs."""
+
+import itertools
+
+import gymnasium
+import numpy as np
+import pytest
+
+from baselines.seeds import BLOCK, MAX_SEED, PURPOSES, TEST_END, first_seed, flight_seeds
+from quad_gym import FlightBatch, TaskParams
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Control
+
+SEEDS, COUNT = range(10), 256
+
+
+def keys_of(seeds):
+    """The streams of flights, drawn as Gymnasium seeds environments."""
+    generators = (gymnasium.utils.seeding.np_random(int(seed))[0] for seed in seeds)
+    return {tuple(g.integers(0, 2**64, size=2, dtype=np.uint64).tolist()) for g in generators}
+
+
+def keys_flown(batch):
+    return {tuple(key) for key in batch.read("key").tolist()}
+
+
+def assert_disjoint(sets):
+    for first, second in itertools.combinations(sets, 2):
+        assert not first & second
+
+
+def test_no_stream_is_shared_between_training_validation_and_test():
+    keys = {
+        (purpose, seed): keys_of(flight_seeds(purpose, seed, COUNT))
+        for purpose in PURPOSES
+        for seed in SEEDS
+    }
+    assert all(len(found) == COUNT for found in keys.values())
+    together = [set().union(*(keys[purpose, seed] for seed in SEEDS)) for purpose in PURPOSES]
+    assert_disjoint(together)
+    for purpose in ("training", "validation"):  # nor between two trainings, or their validations
+        assert_disjoint([keys[purpose, seed] for seed in SEEDS])
+
+
+def test_seeds_of_a_test_are_those_that_are_documented():
+    assert list(flight_seeds("test", 0, 1000)) == list(range(1000))
+    assert first_seed("test", 17, 5) == 17
+
+
+def test_blocks_end_before_the_next_begins_at_their_limits():
+    assert flight_seeds("test", TEST_END - 4, 4)[-1] < flight_seeds("training", 0, 1)[0]
+    assert flight_seeds("training", 3, BLOCK)[-1] < flight_seeds("training", 4, 1)[0]
+    assert flight_seeds("training", MAX_SEED, BLOCK)[-1] < flight_seeds("validation", 0, 1)[0]
+
+
+@pytest.mark.parametrize(
+    ("purpose", "seed", "count", "message"),
+    [
+        ("testing", 0, 1, "purpose must be one of training, validation, test"),
+        ("test", TEST_END - 4, 5, "seed must be at most"),
+        ("training", MAX_SEED + 1, 1, "seed must be at most"),
+        ("training", 0, BLOCK + 1, "count must be at most"),
+        ("validation", -1, 1, "seed must be at least 0"),
+        ("training", 1.5, 1, "seed must be a whole number"),
+        ("training", 0, 0, "count must be at least 1"),
+    ],
+)
+def test_refuses_seeds_out_of_their_block(purpose, seed, count, message):
+    with pytest.raises(ValueError, match=message):
+        flight_seeds(purpose, seed, count)
+
+
+def test_trainings_fly_their_own_flights_and_are_judged_on_others():
+    """The algorithm seeds its environment too, which must not bring other flights in."""
+    pytest.importorskip("stable_baselines3")
+    from baselines.checkpoints import Keeper
+    from baselines.plans import Plan, make_model
+    from baselines.recipes import recipe
+
+    flown = []
+    for seed in (0, 4):
+        plan = Plan(
+            recipe=recipe("QuadGym/Circle-v0").replace(n_envs=16),
+            environment={"duration": 0.1},
+            seed=seed,
+            threads=1,
+            episodes=8,
+        )
+        env, judge = plan.make_flights(), plan.make_judge()
+        model = make_model(plan, env)
+        env.reset()
+        trained = keys_flown(env.unwrapped.flights.batch)
+        assert trained == keys_of(flight_seeds("training", seed, 16))
+        keeper = Keeper(plan, None, judge, quiet=True)
+        from quad_gym.evaluation import roll_out
+
+        roll_out(model, judge, seed=keeper._first_seed)
+        judged = keys_flown(judge.unwrapped.flights.batch)
+        assert judged == keys_of(flight_seeds("validation", seed, 8))
+        flown += [trained, judged]
+    assert_disjoint([*flown, keys_of(range(1000))])
+
+
+# ---- pairs ---------------------------------------------------------------------------------------
+
+START = ("r", "v", "q", "w", "b_a", "b_g", "ref_cos", "ref_sin", "key")
+
+
+def starts_of(rng, episodes, count=11):
+    """What each episode began with; flights do what they like, for as long as they like."""
+    task = TaskParams(kind="random_trajectory", start="hover", randomize=True, duration=0.0)
+    batch = FlightBatch(count, task=task, sensors="rtk", control=Control.CTBR, control_rate=50.0)
+    batch.reset(seeds=range(300, 300 + count))
+    found = [{name: batch.read(name) for name in START}]
+    for _ in range(episodes - 1):
+        for _ in range(int(rng.integers(1, 30))):
+            batch.step(rng.uniform(-1.0, 1.0, (count, 4)))
+        batch.reset()
+        found.append({name: batch.read(name) for name in START})
+    return found
+
+
+def test_flights_of_equal_seeds_stay_in_pairs_to_the_tenth_episode():
+    first, second = (starts_of(np.random.default_rng(seed), 10) for seed in (1, 2))
+    for episode, (one, other) in enumerate(zip(first, second, strict=True)):
+        for name in START:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=f"{name} in {episode}")
+    assert len({start["r"].tobytes() for start in first}) == 10
+
+
+def test_pairs_last_where_episodes_end_by_themselves_at_other_times():
+    """With autoreset each flight comes to its tenth episode when its crashes have it so."""
+
+    def tenth(seed):
+        rng, count = np.random.default_rng(seed), 9
+        env = QuadVectorEnv(
+            count, "hover", autoreset_mode="SameStep", max_tilt=0.3, max_episode_steps=25
+        )
+        env.reset(seed=70)
+        batch = env.flights.batch
+        found, at = np.full((count, 10), np.nan), np.zeros(count, int)
+        for step in range(260):
+            _, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, (count, 4)))
+            begun = (terminated | truncated) & (batch.read("episode") == 10.0)
+            found[begun] = np.hstack([batch.read(name) for name in ("r", "q", "b_a")])[begun]
+            at[begun] = step
+        assert np.isfinite(found).all()
+        return found, at
+
+    (first, when), (second, then) = tenth(5), tenth(6)
+    np.testing.assert_array_equal(first, second)
+    assert (when != then).any()

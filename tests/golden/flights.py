@@ -1,0 +1,113 @@
+"""The golden flights: what flies, and its digest.
+
+python -m tests.golden.flights            # compare with the digests in flights.json
+python -m tests.golden.flights --renew    # make them anew
+"""
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+import quad_gym
+from quad_gym import Uniform
+from quad_gym.fault_presets import PRESETS
+from quad_gym.sensor_suites import SUITES
+
+DIGESTS = Path(__file__).with_name("flights.json")
+FLIGHTS, STEPS, SEED = 8, 300, 2026
+STATES = (
+    *("r", "v", "q", "w", "rotor_speeds", "b_a", "b_g"),
+    *("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L", "filter_status", "faults", "drawn"),
+)
+RANDOMIZATION = {
+    "mass": Uniform(0.8, 1.2, relative=True),
+    "center_of_mass_B": Uniform(-0.01, 0.01),
+    "wind_speed": Uniform(0.0, 3.0),
+    "pixel_sigma": Uniform(0.8, 1.5, relative=True),
+    "start_yaw": Uniform(-0.3, 0.3),
+}
+
+
+def _late(suite, gnss=0.1, camera=0.06):
+    suite = quad_gym.sensor_suite(suite)
+    late = suite.gnss.replace(latency=gnss)
+    return suite.replace(gnss=late, camera=suite.camera.replace(latency=camera))
+
+
+def cases():
+    """Keywords of the environments that fly, by name."""
+    found = {}
+    for task in ("Hover", "Circle", "Lemniscate", "RandomTrajectory", "Waypoints"):
+        for suite in SUITES:
+            found[f"{task}, {suite}"] = {"id": task, "sensors": suite, "randomize": True}
+    for observation in ("truth", "noisy", "sensors"):
+        found[f"observation {observation}"] = {"observation": observation}
+    for action in ("motor", "wrench", "attitude", "velocity"):
+        found[f"action {action}"] = {"action": action}
+    for fault in PRESETS:
+        suite = "indoor" if "camera" in fault else "rtk"
+        found[f"fault {fault}"] = {"sensors": suite, "faults": [fault], "start": "hover"}
+    rtk = {"sensors": "rtk", "start": "hover"}
+    return found | {
+        "late": {"sensors": _late("rtk"), "start": "hover"},
+        "late, not gated": {"sensors": _late("lab", 0.005, 0.005)},
+        "ekf": {"estimator": "ekf", "sensors": "rtk"},
+        "innovations": rtk | {"innovations": True},
+        "warm": rtk | {"filter_start": "warm"},
+        "breeze": rtk | {"world": "fresh_breeze"},
+        "battery": rtk | {"world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())},
+        "randomization": rtk | {"randomization": RANDOMIZATION},
+        "randomization known": rtk
+        | {"randomization": quad_gym.Randomization(RANDOMIZATION, known=True)},
+        "privileged": rtk | {"privileged": True, "include_covariance": True},
+        "absolute": rtk | {"layout": "absolute"},
+        "many options": {
+            **{"sensors": _late("rtk"), "world": "fresh_breeze", "randomization": RANDOMIZATION},
+            **{"faults": ["gnss_outage", "wrong_associations"], "innovations": True},
+        },
+    }
+
+
+def fly(case, flights=FLIGHTS, threads=None):
+    """The digest of the first FLIGHTS flights of a case, which must not depend on the others."""
+    keywords = dict(case)
+    name = f"QuadGym/{keywords.pop('id', 'Circle')}-v0"
+    env = gymnasium.make_vec(name, num_envs=flights, threads=threads, **keywords)
+    digest = hashlib.sha256()
+    observations, _ = env.reset(seed=SEED)
+    rng, batch = np.random.default_rng(SEED), env.unwrapped.flights.batch
+    for step in range(STEPS):
+        actions = np.resize(rng.uniform(-0.1, 0.1, (FLIGHTS, 4)), (flights, 4))
+        observations, rewards, *_ = env.step(actions)
+        if step % 30 == 29:
+            parts = observations.values() if isinstance(observations, dict) else (observations,)
+            for part in (*parts, rewards, *(batch.read(name) for name in STATES)):
+                digest.update(np.ascontiguousarray(part[:FLIGHTS]).tobytes())
+    env.close()
+    return digest.hexdigest()[:16]
+
+
+def differing():
+    """Names of the cases whose flights differ from the golden ones."""
+    golden = json.loads(DIGESTS.read_text())
+    return [name for name, case in cases().items() if fly(case) != golden.get(name)]
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Compare flights with the golden ones.")
+    parser.add_argument("--renew", action="store_true", help="make the digests anew instead")
+    if parser.parse_args().renew:
+        digests = {name: fly(case) for name, case in cases().items()}
+        DIGESTS.write_text(json.dumps(digests, indent=1) + "\n")
+    elif changed := differing():
+        raise SystemExit(f"these flights have changed: {', '.join(changed)}")
+    else:
+        print(f"{len(cases())} golden flights are as they were")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""The noise of `observation="noisy"` is as large as the errors of each suite's own filter."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from quad_gym import FlightBatch, TaskParams, sensor_suite
+from quad_gym.records import Source
+
+FLIGHTS, RATE, BEGIN, END = 256, 50.0, 20.0, 26.0
+
+
+def measured_errors(suite):
+    """Root mean square errors per axis of what control on the estimate sees, on the circle."""
+    task = TaskParams(kind="circle", start="hover", duration=0.0, out_of_bounds=100.0)
+    batch = FlightBatch(
+        FLIGHTS,
+        sensors=suite,
+        task=task,
+        source=Source.ESTIMATE,
+        control_rate=RATE,
+        gains="tuned",
+    )
+    batch.reset(seeds=range(91_000, 91_000 + FLIGHTS))
+    squares = []
+    for step in range(round(END * RATE)):
+        batch.step()
+        if step < BEGIN * RATE or step % 5:
+            continue
+        w, x, y, z = batch.read("q").T
+        to_inertial = Rotation.from_quat(np.stack([x, y, z, w], axis=1))
+        seen = Rotation.from_matrix(batch.read("R_seen"))  # inertial to body
+        errors = [batch.read(f"{name}_seen") - batch.read(name) for name in "rvw"]
+        errors.insert(2, (seen * to_inertial).as_rotvec())
+        squares.append([(error**2).mean() for error in errors])
+    assert not batch.read("filter_status").any()
+    return np.sqrt(np.mean(squares, axis=0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suite", ["rtk", "consumer", "indoor"])
+def test_the_noise_of_a_suite_is_the_error_of_its_own_converged_filter(suite):
+    noisy = sensor_suite(suite).noisy
+    stated = [noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates]
+    np.testing.assert_allclose(stated, measured_errors(suite), rtol=0.25)

@@ -1,0 +1,358 @@
+"""Values that were once taken silently are refused by name; those at the limit are taken."""
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym import FlightBatch, TaskParams, Uniform, UnscentedKalmanFilter
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.faults import GnssOutage, PositionJump, RotorLoss
+from quad_gym.records import Source
+
+LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk")
+VEHICLE = quad_gym.vehicle_params("lab")
+
+
+def refused(message, make, *arguments, kind=ValueError, **keywords):
+    with pytest.raises(kind, match=message):
+        make(*arguments, **keywords)
+
+
+# ---- sensors that are not what the filter believes -----------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "message"),
+    [
+        ("gnss", {"rate": 5.0}, r"GNSS rate \[Hz\] of sensors, 10\.0, got 5\.0"),
+        ("gnss", {"velocity_sigma": None}, "presence of GNSS velocities"),
+        ("gnss", {"phase": 0.5}, "GNSS phase of sensors, None, got 0.5"),
+        ("camera", {"rate": 50.0}, r"camera rate \[Hz\] of sensors, 25\.0, got 50\.0"),
+        ("camera", {"phase": 0.0}, "camera phase of sensors, None, got 0.0"),
+        ("camera", {"features_I": ((1.0, 2.0, 0.0),)}, "camera features of sensors, 12, got 1"),
+        ("imu", {"rate": 400.0}, "IMU rate"),
+        ("imu", {"samples": "instant"}, "IMU samples"),
+    ],
+)
+def test_true_sensors_that_measure_otherwise_are_refused(part, changes, message):
+    true = RTK.replace(**{part: getattr(RTK, part).replace(**changes)})
+    message = f"true_sensors must have the .*{message}"
+    refused(message, FlightBatch, 1, sensors=RTK, true_sensors=true)
+    refused(message, QuadEnv, "hover", sensors=RTK, true_sensors=true)
+
+
+def test_true_sensors_may_err_and_sit_and_wait_otherwise():
+    moved = tuple((x + 0.01, y, z) for x, y, z in RTK.camera.features_I)
+    true = RTK.scaled_noise(2.0)
+    true = true.replace(
+        imu=true.imu.replace(lever_arm_B=(0.01, 0.0, 0.0), gyro_bias_tau=50.0),
+        gnss=true.gnss.replace(latency=0.1, drift_sigma_I=(0.1, 0.1, 0.1)),
+        camera=true.camera.replace(features_I=moved, latency=0.04, focal_length=1700.0),
+    )
+    batch = FlightBatch(8, sensors=RTK, true_sensors=true)
+    batch.reset(seeds=range(8))
+    batch.step()
+    assert np.isfinite(batch.read("r_hat")).all()
+
+
+# ---- numbers that are none -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", ["3", b"3", True, np.True_, [3.0], np.array([3.0]), None, 3j])
+def test_text_truth_and_arrays_are_no_numbers(bad):
+    refused("TaskParams.radius must be a number", TaskParams, radius=bad)
+    refused("VehicleParams.mass must be a number", quad_gym.VehicleParams, mass=bad)
+    refused("Uniform.low must be a number", Uniform, bad, 4.0)
+    if bad is not None:
+        refused("GnssParams.latency must be a number", RTK.gnss.replace, latency=bad)
+        refused("TaskParams.radius must be a number", QuadEnv, "circle", radius=bad)
+
+
+@pytest.mark.parametrize(
+    "bad", [("1", "2", "3"), (True, 1.0, 1.0), "abc", (None, 1.0, 1.0), np.ones(3, bool), 5]
+)
+def test_text_and_truth_are_no_vectors(bad):
+    refused("PDGains.attitude must", quad_gym.PDGains, attitude=bad)
+
+
+@pytest.mark.parametrize("good", [3, 3.0, np.float32(3.0), np.int64(3), np.array(3.0)])
+def test_numbers_of_every_make_are_taken(good):
+    assert TaskParams(radius=good).radius == 3.0
+
+
+def test_numbers_too_large_for_a_float_are_infinite():
+    refused("TaskParams.period must be finite", TaskParams, period=10**400)
+    refused("control_rate must be finite", QuadEnv, control_rate=10**400)
+
+
+@pytest.mark.parametrize("bad", [np.array(["lab"]), ["circle"], 1, None])
+def test_choices_are_text(bad):
+    refused("TaskParams.start must be one of", TaskParams, start=bad)
+
+
+# ---- limits, at the limit ------------------------------------------------------------------------
+
+
+def test_a_duration_that_rounds_to_no_limit_is_refused():
+    for duration in (0.001, 0.0099):
+        refused("duration must be 0", QuadEnv, "hover", duration=duration)
+    refused("duration must be 0", FlightBatch, 1, task=TaskParams(duration=0.001))
+    assert QuadEnv("hover", duration=0.0101).flights.batch.max_steps == 1
+    assert QuadEnv("hover", duration=0.0).flights.batch.max_steps == 0
+
+
+def test_too_many_threads_are_refused():
+    refused("threads must be at most 1024", QuadVectorEnv, 8, "hover", threads=10**6)
+    refused("threads must be at most 1024", FlightBatch, 8, threads=1025)
+
+
+def amplification(z):
+    """Of one classic Runge-Kutta step along a decay: the series of exp(-z) to the fourth power."""
+    return abs(sum((-z) ** k / math.factorial(k) for k in range(5)))
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_rotors_too_fast_for_the_integration_are_refused(substeps):
+    step = 0.005 / substeps
+    slow, fast = step / 2.779, step / 2.8
+    assert amplification(step / slow) < 1.0 < amplification(step / fast)
+    fast_ones, slow_ones = (VEHICLE.replace(motor_time_constant=tau) for tau in (fast, slow))
+    message = f"motor_time_constant must be at least .*substeps={substeps}"
+    refused(message, FlightBatch, 1, vehicle=fast_ones, substeps=substeps)
+    refused(message, FlightBatch, 1, true_vehicle=fast_ones, substeps=substeps)
+    draws = {"motor_time_constant": Uniform(fast, 0.1)}
+    message = "randomization of 'motor_time_constant'"
+    refused(message, QuadEnv, "hover", randomization=draws, substeps=substeps)
+
+    batch = FlightBatch(1, vehicle=slow_ones, substeps=substeps, source=Source.TRUTH)
+    batch.reset(seeds=[1])
+    for _ in range(400):
+        batch.step()
+    top = VEHICLE.motor_speed_per_volt * VEHICLE.max_voltage
+    assert (abs(batch.read("rotor_speeds")) < 2.0 * top).all()
+    QuadEnv("hover", randomization={"motor_time_constant": Uniform(slow, 0.1)}, substeps=substeps)
+
+
+def test_moments_of_inertia_of_no_body_are_refused():
+    flat, rod = np.diag([1.0, 2.0, 3.0]), np.diag([1e-3, 1.0, 1.0])
+    for good in (flat, rod):
+        quad_gym.VehicleParams(inertia=good)
+    turned = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    for bad in (np.diag([1.0, 2.0, 3.001]), turned @ np.diag([1.0, 1.0, 2.1]) @ turned.T):
+        bad = (bad + bad.T) / 2.0
+        refused("VehicleParams.inertia must be that of a body", quad_gym.VehicleParams, inertia=bad)
+
+
+def test_randomized_moments_that_are_never_those_of_a_body_are_refused():
+    def drawn(*moments):
+        return {"inertia": [Uniform(low, high) for low, high in moments]}
+
+    one = (1e-3, 2e-3)
+    bad = drawn(one, one, (4.1e-3, 5e-3))
+    refused("randomization of 'inertia'", FlightBatch, 1, randomization=bad)
+    FlightBatch(1, randomization=drawn(one, one, (3.9e-3, 5e-3)))
+    FlightBatch(1, randomization={"inertia": Uniform(0.8, 1.2, relative=True)})
+
+
+def test_means_over_a_tick_are_not_for_the_prediction_of_an_instant():
+    suite = LAB.replace(imu=LAB.imu.replace(samples="average"))
+    message = "integration='midpoint'"
+    refused(message, FlightBatch, 1, sensors=suite)
+    refused(message, QuadEnv, "hover", sensors=suite)
+    refused(message, UnscentedKalmanFilter, suite)
+    FlightBatch(1, sensors=suite, source=Source.TRUTH)  # no filter runs
+
+
+@pytest.mark.parametrize("name", ["radius", "height"])
+def test_references_beyond_what_is_observed_are_refused(name):
+    refused(f"{name} must be at most 1000", QuadEnv, "circle", **{name: 1e9})
+    assert getattr(TaskParams(**{name: 1000.0}), name) == 1000.0
+
+
+# ---- starts and seeds ----------------------------------------------------------------------------
+
+
+def test_a_start_that_is_out_of_all_bounds_is_refused_and_changes_nothing():
+    env, vector = QuadEnv("hover"), QuadVectorEnv(2, "hover")
+    for one in (env, vector):
+        one.reset(seed=1)
+        before = one.flights.batch.snapshot(), one.np_random.bit_generator.state
+        for options, message in (
+            ({"position": [1e12, 0.0, 0.0]}, "position must be .* out_of_bounds=3 m"),
+            ({"position": [1e300, 0.0, 0.0]}, "position must be .* out_of_bounds=3 m"),
+            ({"velocity": [0.0, 1e9, 0.0]}, "velocity must be at most"),
+            ({"yaw": 1e300}, "yaw must be at most"),
+            ({"position": ["1", "2", "3"]}, "position must be numbers"),
+        ):
+            refused(message, one.reset, seed=5, options=options)
+            assert one.flights.batch.snapshot().tobytes() == before[0].tobytes()
+            assert one.np_random.bit_generator.state == before[1]
+    wide = QuadEnv("hover", out_of_bounds=1e6)
+    assert np.isfinite(wide.reset(seed=1, options={"position": [9e5, 0.0, 0.0]})[0]).all()
+
+
+@pytest.mark.parametrize("seed", [1.5, "a", -1, True, (), {}])
+def test_seeds_that_are_none_are_refused(seed):
+    for env in (QuadEnv("hover"), QuadVectorEnv(2, "hover")):
+        refused("seed must be", env.reset, seed=seed)
+    if seed != ():
+        refused("seed must be", QuadVectorEnv(1, "hover").reset, seed=[seed])
+    refused("seed must be", quad_gym.make_sb3_vec_env, "QuadGym/Hover-v0", seed=seed)
+    refused("seeds must be", FlightBatch(2).reset, seeds=[seed, 1])
+    refused("seeds must hold 2", FlightBatch(2).reset, seeds=seed)
+
+
+def test_seeds_of_numpy_are_those_of_python():
+    env = QuadEnv("hover")
+    np.testing.assert_array_equal(env.reset(seed=np.int64(7))[0], env.reset(seed=7)[0])
+
+
+def test_flights_that_never_began_are_not_flown():
+    for kind in (ValueError, RuntimeError):
+        refused("call reset", FlightBatch(3).step, kind=kind)
+    batch = FlightBatch(3)
+    batch.reset(seeds=[1, 2, 3], mask=[True, False, True])
+    refused("1 of 3 flights have never been reset", batch.step)
+    empty = batch.snapshot()
+    batch.reset(mask=[False, True, False])
+    batch.step()
+    batch.restore(empty)
+    refused("1 of 3 flights", batch.step)
+
+
+def test_an_absolute_position_does_not_start_a_filter():
+    ukf = UnscentedKalmanFilter(LAB)
+    baseline = np.array([0.1, 0.1, 0.0])
+    absolute = np.array(LAB.gnss.reference_antenna_G) + 1.0
+    refused("gnss_position_G must be relative", ukf.initialize, absolute, baseline)
+    refused("call initialize", ukf.predict, np.zeros(3), np.zeros(3), kind=RuntimeError)
+    ukf.initialize([1.0, 2.0, 3.0], baseline)
+
+
+# ---- keywords ------------------------------------------------------------------------------------
+
+MAKERS = {
+    "make": lambda **k: gymnasium.make("QuadGym/Circle-v0", **k),
+    "make_vec": lambda **k: gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2, **k),
+    "make_sb3_vec_env": lambda **k: quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", 2, **k),
+}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_keywords_that_do_not_belong_there_are_refused(maker):
+    make = MAKERS[maker]
+    for kind in (TypeError, ValueError):
+        refused(
+            "gyro_rate is not a keyword .* did you mean gnss_rate?", make, kind=kind, gyro_rate=1
+        )
+        refused("observations .* did you mean observation?", make, kind=kind, observations="truth")
+        refused("xyzzy is not a keyword .* it takes observation", make, kind=kind, xyzzy=1)
+    refused("gate_count belongs to the task waypoints", make, gate_count=3)
+    refused("max_speed belongs to the task random_trajectory", make, max_speed=1.0)
+    refused("camera must not be True", make, camera=True, sensors="consumer")
+    make(camera=False, sensors="consumer")
+    make(camera=True, sensors="rtk")
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("observation", ["truth", "noisy"])
+def test_faults_of_sensors_need_sensors(maker, observation):
+    make = MAKERS[maker]
+    message = f'GnssOutage concerns sensors, and none runs with observation="{observation}"'
+    for faults in ("gnss_outage", (RotorLoss(), GnssOutage())):
+        refused(message, make, observation=observation, faults=faults)
+    make(observation=observation, faults=(RotorLoss(), PositionJump()))
+    make(observation=observation, faults="gnss_outage", innovations=True)
+    make(observation="sensors", faults="gnss_outage")
+
+
+# ---- policies ------------------------------------------------------------------------------------
+
+
+def test_pd_control_is_not_shown_other_observations():
+    from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+    single = gymnasium.make("QuadGym/Circle-v0")
+    vector = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=2)
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", 2)
+    wrappers, vector_wrappers = gymnasium.wrappers, gymnasium.wrappers.vector
+    for wrapped in (
+        wrappers.NormalizeObservation(single),
+        wrappers.TransformObservation(single, lambda x: 2.0 * x, None),
+        wrappers.FrameStackObservation(single, 2),
+        wrappers.TimeLimit(wrappers.NormalizeObservation(single), 10),
+        vector_wrappers.NormalizeObservation(vector),
+        VecNormalize(sb3),
+        VecFrameStack(sb3, 2),
+    ):
+        refused("env must show observations as they are", PDPolicy, wrapped)
+    for plain in (
+        wrappers.TimeLimit(single, 10),
+        wrappers.RecordEpisodeStatistics(single),
+        vector_wrappers.RecordEpisodeStatistics(vector),
+        VecNormalize(sb3, norm_obs=False),
+    ):
+        PDPolicy(plain)
+
+
+def test_pd_control_knows_the_length_of_its_observations():
+    policy = PDPolicy(QuadEnv("hover"))
+    wide = QuadEnv("hover", include_covariance=True)
+    refused(r"observation must be \(\.\.\., 28\)", policy.predict, wide.reset(seed=1)[0])
+    privileged = PDPolicy(QuadEnv("hover", privileged=True))
+    assert privileged.predict({"policy": np.zeros(28)})[0].shape == (4,)
+
+
+# ---- time limits ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "steps"),
+    [
+        ({"max_episode_steps": 1000}, 1000),
+        ({"max_episode_steps": 20}, 20),
+        ({"max_episode_steps": 1000, "control_rate": 100.0}, 1000),
+        ({"max_episode_steps": 30, "duration": 0.4}, 20),
+        ({"max_episode_steps": 10, "duration": 0.4}, 10),
+        ({"duration": 0.4}, 20),
+        ({}, 500),
+    ],
+)
+def test_a_limit_in_steps_holds_in_every_face_and_its_description(given, steps):
+    still = {"observation": "truth", "action": "velocity", **given}
+    single = gymnasium.make("QuadGym/Hover-v0", **still)
+    vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **still)
+    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 2, **still)
+    for env in (single.unwrapped, vector, sb3):
+        assert env.flights.batch.max_steps == steps
+    assert single.unwrapped.spec.max_episode_steps == vector.spec.max_episode_steps == steps
+    again = gymnasium.make(single.spec)
+    assert again.unwrapped.flights.batch.max_steps == steps
+    single.reset(seed=1)
+    for k in range(1, steps + 1):
+        _, _, terminated, truncated, info = single.step(np.zeros(4))
+        assert not terminated
+        assert truncated == (k == steps)
+    assert info["ending"] == "time_limit"
+
+
+def test_without_any_limit_the_description_has_none():
+    env = gymnasium.make("QuadGym/Hover-v0", duration=0.0, max_episode_steps=-1)
+    assert env.unwrapped.flights.batch.max_steps == 0
+    assert env.spec.max_episode_steps is None
+
+
+def test_an_environment_within_another_keeps_its_own_limit():
+    class Outer(gymnasium.Env):
+        def __init__(self):
+            self.inner = QuadEnv("hover")
+
+    gymnasium.register("OuterForLimits-v0", entry_point=Outer, max_episode_steps=7)
+    outer = gymnasium.make("OuterForLimits-v0", disable_env_checker=True)
+    assert outer.unwrapped.inner.flights.batch.max_steps == 500
+    del gymnasium.registry["OuterForLimits-v0"]
