@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak lint benchmark clean
+.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark clean
 
 setup: $(VENV)/.developer
 
@@ -44,6 +44,9 @@ test-slow: setup  ## the slow statistical and soak tests
 
 soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults
 	QUAD_GYM_SOAK_STEPS=100000000 QUAD_GYM_SOAK_UPDATES=10000000 $(BIN)/python -m pytest -s -m slow tests/soak
+
+golden: setup  ## after flights have changed on purpose: their digests anew
+	$(BIN)/python -m tests.golden.flights --renew
 
 lint: setup  ## style, types and import rules
 	$(BIN)/ruff format --check .

@@ -1,0 +1,45 @@
+"""Flights are what they were, to the bit, whatever they fly with: `tests.golden`."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from quad_gym.records.width import WIDTHS
+from tests.golden.flights import DIGESTS, FLIGHTS, cases, fly
+
+GOLDEN, CASES = json.loads(DIGESTS.read_text()), cases()
+SOME = ("Circle, rtk", "Waypoints, indoor", "late", "breeze", "many options")
+
+
+def test_every_case_has_a_digest_and_every_digest_a_case():
+    assert GOLDEN.keys() == CASES.keys()
+    assert set(SOME) <= CASES.keys()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_flights_are_what_they_were(name):
+    assert fly(CASES[name]) == GOLDEN[name], "changed on purpose? see tests/golden/__init__.py"
+
+
+@pytest.mark.parametrize(("flights", "threads"), [(FLIGHTS + 1, 1), (5 * FLIGHTS, 2)])
+@pytest.mark.parametrize("name", SOME)
+def test_they_do_not_depend_on_who_flies_beside_them(name, flights, threads):
+    assert fly(CASES[name], flights=flights, threads=threads) == GOLDEN[name]
+
+
+@pytest.mark.slow  # each compiles everything anew
+@pytest.mark.parametrize("lanes", WIDTHS)
+def test_they_do_not_depend_on_the_number_of_lanes(lanes):
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.golden.flights"],
+        cwd=Path(__file__).parents[2],
+        env=os.environ | {"QUAD_GYM_LANES": str(lanes)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
