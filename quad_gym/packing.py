@@ -239,6 +239,7 @@ def settings_record(
     s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], 0)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
+    s["end_when_lost"] = task.end_when_lost
     s["least_up"] = math.cos(task.max_tilt)
     s["radius"], s["period"], s["height"] = task.radius, task.period, task.height
     s["max_speed"], s["max_acceleration"] = task.max_speed, task.max_acceleration

@@ -255,6 +255,8 @@ class TaskParams(Checked):
     """distance from the reference at which an episode ends [m]"""
     ground: float = -0.5
     """height at which an episode ends [m]; below 0, for flights sag while the rotors spin up"""
+    end_when_lost: bool = False
+    """whether an episode is truncated where the filter finds that it is lost"""
     max_tilt: float = math.radians(100.0)
     """angle between the body z axis and the vertical at which an episode ends [rad]"""
     max_speed: float = 2.5
@@ -289,6 +291,7 @@ class TaskParams(Checked):
             raise ValueError(
                 f"TaskParams.gate_count must be at most {MAX_GATES}, got {self.gate_count}"
             )
+        check.flag("TaskParams.end_when_lost", self.end_when_lost)
         if not 0.0 < check.number("TaskParams.max_tilt", self.max_tilt) <= math.pi:
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
         if min(self.preview) < 0.0:

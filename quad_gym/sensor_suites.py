@@ -174,6 +174,9 @@ STANDARD = SensorSuite(
     # the laboratory's pixels are coarse, so that images need not be taken in steps, and no
     # measurement of it is corrupted, so that none has to be rejected
     estimator=FIELD_FILTER.replace(gradual_above=None, gate_false_alarm=0.0),
+    noisy=NoisyObservationParams(
+        position=0.0020, velocity=0.0150, attitude=0.0011, body_rates=0.0124
+    ),
 )
 """The environments' default: the laboratory's sensors, and a filter that is consistent."""
 

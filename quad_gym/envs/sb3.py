@@ -141,6 +141,7 @@ class QuadVecEnv(VecEnv):
             "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > 0.0),
             "ending": ENDINGS[int(row[COLUMN["ending"]])],
             "filter_status": int(row[COLUMN["filter_status"]]),
+            "filter_lost": bool(row[COLUMN["filter_lost"]] > 0.0),
             "gates_passed": int(row[COLUMN["gates_passed"]]),
             "episode": {
                 "r": float(row[COLUMN["episode_return"]]),

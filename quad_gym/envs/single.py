@@ -101,7 +101,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;
-    `filter_status`, 0 while all is well; `gates_passed`. With `randomization` also `drawn`, the
+    `filter_status`, 0 while all is well; `filter_lost`, whether a filter that gates (or keeps
+    its innovations) finds that its covariance does not explain what it measures; `gates_passed`. With `randomization` also `drawn`, the
     parameters of the episode by name. With `faults` also `faults`: whether each is there now, by
     name. With `innovations=True` also `innovations`: the last innovations of the filter, their
     squares (NIS) and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
@@ -224,6 +225,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "estimation_error": float(batch.read("estimation_error")[0]),
             "ending": ENDINGS[0],
             "filter_status": int(batch.read("filter_status")[0]),
+            "filter_lost": bool(batch.read("lost")[0] > 0.0),
             "gates_passed": 0,
             **drawn_info(batch.drawn(), 0),
             **info_of_flight(flight_info(batch, batch.read("faults")), 0),
@@ -265,6 +267,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
                 "estimation_error": row[COLUMN["estimation_error"]],
                 "ending": ENDINGS[int(row[COLUMN["ending"]])],
                 "filter_status": int(row[COLUMN["filter_status"]]),
+                "filter_lost": row[COLUMN["filter_lost"]] > 0.0,
                 "gates_passed": int(row[COLUMN["gates_passed"]]),
                 **drawn_info(batch.drawn(), 0),
                 **info_of_flight(flight_info(batch, batch.results[:, COLUMN["faults"]]), 0),

@@ -132,6 +132,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "estimation_error": batch.read("estimation_error"),
             "ending": np.full(self.num_envs, ENDINGS[0], object),
             "filter_status": batch.read("filter_status").astype(np.int64),
+            "filter_lost": batch.read("lost") > 0.0,
             "gates_passed": np.zeros(self.num_envs, np.int64),
             **self._drawn(),
             **flight_info(batch, batch.read("faults")),
@@ -225,6 +226,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
             "ending": self._no_ending.copy(),
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
+            "filter_lost": results[:, COLUMN["filter_lost"]] > 0.0,
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
         }
         infos |= self._drawn() | flight_info(self.flights.batch, results[:, COLUMN["faults"]])
@@ -239,6 +241,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             return
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.read(name, began)
+        infos["filter_lost"][began] = self.flights.batch.read("lost", began) > 0.0
         infos["ending"][began] = ENDINGS[0]
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)

@@ -17,10 +17,24 @@ from quad_gym.records import (
     WORK_BLOCK,
     Autoreset,
     Command,
+    Result,
 )
 
 _IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
 _JUDGE, _OBSERVE = int(Stage.JUDGE), int(Stage.OBSERVE)
+_REWARD = int(Result.REWARD)
+_TERMINATED = int(Result.TERMINATED)
+_TRUNCATED = int(Result.TRUNCATED)
+_ENDING = int(Result.ENDING)
+_POSITION_ERROR = int(Result.POSITION_ERROR)
+_ESTIMATION_ERROR = int(Result.ESTIMATION_ERROR)
+_FILTER_STATUS = int(Result.FILTER_STATUS)
+_EPISODE_STEPS = int(Result.EPISODE_STEPS)
+_EPISODE_RETURN = int(Result.EPISODE_RETURN)
+_EPISODE_ERROR_SUM = int(Result.EPISODE_ERROR_SUM)
+_GATES_PASSED = int(Result.GATES_PASSED)
+_FAULTS = int(Result.FAULTS)
+_FILTER_LOST = int(Result.FILTER_LOST)
 
 
 @kernel
@@ -53,18 +67,19 @@ def _write_results(block, results, index):
     first = index * WIDTH
     for lane in range(min(WIDTH, results.shape[1] - first)):
         flight = first + lane
-        results[0, flight] = block.reward[lane]
-        results[1, flight] = block.terminated[lane]
-        results[2, flight] = block.truncated[lane]
-        results[3, flight] = block.ending[lane]
-        results[4, flight] = block.position_error[lane]
-        results[5, flight] = block.estimation_error[lane]
-        results[6, flight] = block.filter_status[lane]
-        results[7, flight] = block.step[lane]
-        results[8, flight] = block.episode_return[lane]
-        results[9, flight] = block.episode_error[lane]
-        results[10, flight] = block.gate_next[lane]
-        results[11, flight] = block.faults[lane]
+        results[_REWARD, flight] = block.reward[lane]
+        results[_TERMINATED, flight] = block.terminated[lane]
+        results[_TRUNCATED, flight] = block.truncated[lane]
+        results[_ENDING, flight] = block.ending[lane]
+        results[_POSITION_ERROR, flight] = block.position_error[lane]
+        results[_ESTIMATION_ERROR, flight] = block.estimation_error[lane]
+        results[_FILTER_STATUS, flight] = block.filter_status[lane]
+        results[_EPISODE_STEPS, flight] = block.step[lane]
+        results[_EPISODE_RETURN, flight] = block.episode_return[lane]
+        results[_EPISODE_ERROR_SUM, flight] = block.episode_error[lane]
+        results[_GATES_PASSED, flight] = block.gate_next[lane]
+        results[_FAULTS, flight] = block.faults[lane]
+        results[_FILTER_LOST, flight] = block.lost[lane]
 
 
 @kernel
@@ -151,7 +166,7 @@ def fly(
         observations: (n, n_observation), written; with no columns nothing is observed.
         final_observations: Likewise, written where one episode ends and the next begins in this
             step.
-        results: (12, n), written in a STEP: a row for each of `quad_gym.records.RESULTS`.
+        results: (len(RESULTS), n), written in a STEP: a row for each of `quad_gym.records.RESULTS`.
     """
     scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
     stages = stage_table[0]

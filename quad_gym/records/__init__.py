@@ -49,6 +49,7 @@ from quad_gym.records.params import (
 )
 from quad_gym.records.results import (
     RESULTS,
+    Result,
 )
 from quad_gym.records.settings import (
     SETTINGS_FIELDS,
@@ -67,6 +68,7 @@ from quad_gym.records.sizes import (
     MAX_OBSERVATION,
     MAX_UNDER_WAY,
     POSITION_BLOCK,
+    SENSOR_GROUPS,
     VELOCITY_BLOCK,
     WARM_DRAWS,
     WIDTH,
@@ -160,7 +162,9 @@ __all__ = [
     "PARAMS_BLOCK",
     "PARAMS_FIELDS",
     "POSITION_BLOCK",
+    "SENSOR_GROUPS",
     "RESULTS",
+    "Result",
     "SETTINGS",
     "SETTINGS_FIELDS",
     "Source",

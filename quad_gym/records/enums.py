@@ -114,6 +114,7 @@ class Ending(IntEnum):
     ON_THE_GROUND = 4
     LAST_GATE = 5
     FILTER_FAILED = 6
+    FILTER_LOST = 7
 
 
 class Command(IntEnum):

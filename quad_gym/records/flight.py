@@ -8,6 +8,7 @@ from quad_gym.records.sizes import (
     MAX_FEATURES,
     MAX_GATES,
     MAX_HARMONICS,
+    SENSOR_GROUPS,
     Field,
 )
 
@@ -67,6 +68,12 @@ FLIGHT_FIELDS = (
     Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
     Field("rejected_in_row", (4,), "-", "positions, baselines, velocities, images wholly rejected since the last accepted one"),
     Field("reopened", (4,), "-", "times that the gate of each of these was reopened in this episode"),
+    Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
+    Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
+    Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
+    Field("doubt_tick", (), "ticks", "when the filter last doubted itself"),
+    Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
+    Field("lost", (), "0 or 1", "whether the covariance does not explain the last innovations"),
     # what the controller sees
     Field("r_seen", (3,), "m", "position in I from the controller's source"),
     Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),

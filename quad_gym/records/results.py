@@ -1,17 +1,25 @@
 """What a step returns for every flight."""
 
-RESULTS = (
-    "reward",
-    "terminated",
-    "truncated",
-    "ending",
-    "position_error",
-    "estimation_error",
-    "filter_status",
-    "episode_steps",
-    "episode_return",
-    "episode_error_sum",
-    "gates_passed",
-    "faults",
-)
-"""Columns of what a step returns for every flight."""
+from enum import IntEnum
+
+
+class Result(IntEnum):
+    """The rows of what a step returns, by their place."""
+
+    REWARD = 0
+    TERMINATED = 1
+    TRUNCATED = 2
+    ENDING = 3
+    POSITION_ERROR = 4
+    ESTIMATION_ERROR = 5
+    FILTER_STATUS = 6
+    EPISODE_STEPS = 7
+    EPISODE_RETURN = 8
+    EPISODE_ERROR_SUM = 9
+    GATES_PASSED = 10
+    FAULTS = 11
+    FILTER_LOST = 12
+
+
+RESULTS = tuple(result.name.lower() for result in Result)
+"""Their names."""

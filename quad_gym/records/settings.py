@@ -32,6 +32,7 @@ SETTINGS_FIELDS = (
     Field("max_steps", (), "steps", "time limit of an episode; 0: none", "f8"),
     Field("out_of_bounds", (), "m", "largest distance from the reference"),
     Field("ground", (), "m", "height below which the vehicle has crashed"),
+    Field("end_when_lost", (), "0 or 1", "whether a lost filter ends the episode"),
     Field("least_up", (), "-", "least cosine of the tilt"),
     Field("radius", (), "m", "size of the reference"),
     Field("period", (), "s", "period of the reference"),

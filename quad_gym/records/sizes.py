@@ -19,6 +19,8 @@ MAX_BLOCKS = 3 + MAX_FEATURES
 """Blocks of the stacked measurement: antenna position, baseline, velocity, features."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS
 """Length of the stacked measurement; a direction has three numbers."""
+SENSOR_GROUPS = 4
+"""Kinds of measurements: positions, baselines, velocities, images."""
 POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = 0, 1, 2, 3
 """Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
 FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES)

@@ -10,6 +10,7 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.innovations import forget_innovations
+from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import (
@@ -124,6 +125,7 @@ def initialize(flight, p, mask, x_I):
     flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
     flight.prediction_failures = select(mask, 0.0, flight.prediction_failures)
     flight.update_failures = select(mask, 0.0, flight.update_failures)
+    begin_recovery(flight, mask)
 
     L = flight.L
     for i in range(15):

@@ -9,9 +9,7 @@ A block whose normalised innovation squared, chi-square in a filter that is righ
 gate is masked as if the flight lacked it. So is a feature whose predicted direction is too
 uncertain for a linear model: as a direction's error is bounded it would pass any gate, and its
 update would be wrong and sure of itself. Where one kind of measurement has been rejected
-`gate_patience` times in a row, the filter is likelier wrong than the sensor: `reopen_gates` adds
-the square of the innovation to the covariance of what the sensor measures, so that the next
-measurement passes and moves the estimate there, while all else keeps its covariance.
+`gate_patience` times in a row, the filter is likelier wrong than the sensor, see `recovery.py`.
 
 Source: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, sections 5.4 and 11.
@@ -22,21 +20,21 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.elementary import maximum
+from quad_gym.kernels.filter.recovery import (
+    FITTING_FEATURES,
+    camera_fits,
+    follow_drift,
+    follow_ratio,
+)
+from quad_gym.kernels.maths.elementary import clip, maximum
 from quad_gym.kernels.maths.linalg import (
     add33,
     add_outer,
-    add_to_diagonal,
     apply,
-    cholesky,
     cross,
     dot,
-    load3,
-    load33,
     load_block,
     scale,
-    store_block,
-    sum_of_outers,
     sum_of_outers_of_rows,
     unit_or,
 )
@@ -55,6 +53,7 @@ _REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
 _FAILED, _UNSURE = float(Gate.FAILED), float(Gate.UNSURE)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _GATE = int(FilterForm.GATE)
+_LARGEST = 3.0
 
 
 @kernel
@@ -133,6 +132,8 @@ def _count_in_row(flight, group, measured, rejected, again):
     row = select(rejected, flight.rejected_in_row[group] + 1.0, 0.0)
     measured = measured & logical_not(again)
     flight.rejected_in_row[group] = select(measured, row, flight.rejected_in_row[group])
+    accepted, before = measured & logical_not(rejected), flight.accepted_tick[group]
+    flight.accepted_tick[group] = select(accepted, flight.tick, before)
 
 
 @kernel
@@ -143,22 +144,24 @@ def _decide(flight, s, has, wanting, again, decision):
 
 @kernel
 def _judge_triple(flight, p, work, k, s, has, again, gating):
-    """Keep the innovation of a position or velocity; return where it is rejected."""
+    """Keep the innovation of a position or velocity; return where it is rejected, and its NIS."""
     S = _covariance(p, work, k)
     nu = (work.z[k], work.z[k + 1], work.z[k + 2])
     nis = _nis_of_triple(S, nu)
     rejected = _decide(flight, s, has, (nis > p.gate_position) & gating, again, _REJECTED)
     sigma = (math.sqrt(S[0][0]), math.sqrt(S[1][1]), math.sqrt(S[2][2]))
     nowhere = rejected & logical_not(rejected)
-    _keep_block(flight, s, has & logical_not(again), nu, sigma, nis, rejected, nowhere)
-    return rejected
+    has = has & logical_not(again)
+    _keep_block(flight, s, has, nu, sigma, nis, rejected, nowhere)
+    follow_drift(flight, s, has, nu[0] / sigma[0], nu[1] / sigma[1], nu[2] / sigma[2])
+    return rejected, select(has, nis, 0.0)
 
 
 @kernel
 def _judge_direction(flight, p, work, k, s, has, again, gating, most):
     """Keep the innovation of a direction; return where it is rejected, and where too uncertain.
 
-    Too uncertain is one whose predicted variances add up to more than `most`.
+    Besides, its innovation in deviations, and its NIS. Too uncertain is one whose predicted variances add up to more than `most`.
     """
     S = _covariance(p, work, k)
     u = (work.h[k], work.h[k + 1], work.h[k + 2])
@@ -171,7 +174,8 @@ def _judge_direction(flight, p, work, k, s, has, again, gating, most):
     sigma = (math.sqrt(S2[0]), math.sqrt(S2[2]), none)
     has = has & logical_not(again)
     _keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
-    return rejected, unsure
+    scaled = (nu[0] / sigma[0], nu[1] / sigma[1])
+    return rejected, unsure, scaled, select(has & logical_not(unsure), nis, 0.0)
 
 
 @kernel
@@ -197,11 +201,16 @@ def judge_innovations(
     """
     gating = (form & _GATE) != 0
     zero = 0.0 * p.sigma_beta
-    left_out = zero
+    left_out, total, freedoms = zero, zero, zero
+    count, side, up = zero, zero, zero
+    trusted = camera_fits(flight, p)
     k = 0
     if use_position:
         has = mask & (flight.position_valid > 0.0)
-        rejected = _judge_triple(flight, p, work, k, POSITION_BLOCK, has, again, gating)
+        rejected, nis = _judge_triple(flight, p, work, k, POSITION_BLOCK, has, again, gating)
+        # a fix that is rejected while the camera fits tells of GNSS, not of the filter
+        counts = select(has & logical_not(rejected & trusted), 1.0, 0.0)
+        total, freedoms = total + counts * nis, freedoms + 3.0 * counts
         if gating:
             _mask_block(work, k, rejected)
             _count_in_row(flight, POSITION_BLOCK, has, rejected, again)
@@ -209,9 +218,13 @@ def judge_innovations(
         k += 3
     if use_baseline:
         has = mask & (flight.baseline_valid > 0.0)
-        rejected, _ = _judge_direction(
+        rejected, _, scaled, nis = _judge_direction(
             flight, p, work, k, BASELINE_BLOCK, has, again, gating, np.inf
         )
+        first = has & logical_not(again)
+        follow_drift(flight, BASELINE_BLOCK, first, scaled[0], scaled[1], zero)
+        counts = select(has & logical_not(rejected & trusted), 1.0, 0.0)
+        total, freedoms = total + counts * nis, freedoms + 2.0 * counts
         if gating:
             _mask_block(work, k, rejected)
             _count_in_row(flight, BASELINE_BLOCK, has, rejected, again)
@@ -219,7 +232,8 @@ def judge_innovations(
         k += 3
     if use_velocity:
         has = mask & (flight.velocity_valid > 0.0)
-        rejected = _judge_triple(flight, p, work, k, VELOCITY_BLOCK, has, again, gating)
+        rejected, nis = _judge_triple(flight, p, work, k, VELOCITY_BLOCK, has, again, gating)
+        total, freedoms = total + nis, freedoms + select(has, 3.0, 0.0)
         if gating:
             _mask_block(work, k, rejected)
             _count_in_row(flight, VELOCITY_BLOCK, has, rejected, again)
@@ -230,17 +244,30 @@ def judge_innovations(
         if any_of(flight.feature_valid[i] > 0.0):
             has = mask & (flight.feature_valid[i] > 0.0)
             s = FEATURE_BLOCKS + i
-            rejected, unsure = _judge_direction(
+            rejected, unsure, scaled, nis = _judge_direction(
                 flight, p, work, k, s, has, again, gating, p.gate_uncertainty
             )
+            total = total + nis
+            freedoms = freedoms + select(has & logical_not(unsure), 2.0, 0.0)
+            counts = select(has & logical_not(unsure | again), 1.0, 0.0)
+            count = count + counts
+            side = side + counts * clip(scaled[0], -_LARGEST, _LARGEST)
+            up = up + counts * clip(scaled[1], -_LARGEST, _LARGEST)
             if gating:
                 _mask_block(work, k, rejected | unsure)
                 left_out = left_out + select(rejected | unsure, 3.0, 0.0)
                 seen = seen + select(has & logical_not(unsure), 1.0, 0.0)
                 refused = refused + select(rejected, 1.0, 0.0)
             k += 3
+    if feature_count > 0:
+        root = math.sqrt(maximum(count, 1.0))
+        follow_drift(flight, FEATURE_BLOCKS, count > 0.0, side / root, up / root, zero)
     if gating and feature_count > 0:
         _count_in_row(flight, FEATURE_BLOCKS, seen > 0.0, refused >= seen, again)
+        fits = (seen - refused >= FITTING_FEATURES) & (2.0 * refused < seen) & logical_not(again)
+        flight.fit_tick = select(fits, flight.tick, flight.fit_tick)
+    first = mask & logical_not(again)
+    follow_ratio(flight, p, total, freedoms, first)
     return left_out
 
 
@@ -257,90 +284,6 @@ def mark_failed(flight, feature_count, failed):
     _mark_block(flight, VELOCITY_BLOCK, failed & (flight.velocity_valid > 0.0))
     for i in range(feature_count):
         _mark_block(flight, FEATURE_BLOCKS + i, failed & (flight.feature_valid[i] > 0.0))
-
-
-@kernel
-def _squares(nu, mask):
-    """The squares of an innovation on a diagonal, where `mask`, else zeros."""
-    x, y, z = select(mask, nu[0], 0.0), select(mask, nu[1], 0.0), select(mask, nu[2], 0.0)
-    zero = 0.0 * x
-    return ((x * x, zero, zero), (zero, y * y, zero), (zero, zero, z * z))
-
-
-@kernel
-def _add_to_covariance(flight, work, D_r, D_v, D_e, mask):
-    """P + D, with D of position, velocity and attitude error, where `mask`; return where it failed.
-
-    There the covariance stays as it was.
-    """
-    L, P = flight.L, work.P
-    for i in range(0, 15, 3):
-        for j in range(0, i + 3, 3):
-            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
-    store_block(P, 0, 0, add33(load_block(P, 0, 0), D_r))
-    store_block(P, 3, 3, add33(load_block(P, 3, 3), D_v))
-    store_block(P, 6, 6, add33(load_block(P, 6, 6), D_e))
-    ok = mask & (cholesky(P, 15, work.inverse_diagonal) > 0.0)
-    for i in range(15):
-        for j in range(i + 1):
-            L[i, j] = select(ok, P[i, j], L[i, j])
-    return mask & logical_not(ok)
-
-
-@kernel
-def reopen_gates(flight, p, work, feature_count, mask):
-    """Add the innovation's square to what a sensor measures, where it was rejected too long.
-
-    A position is doubted along its innovation's components; a baseline about the vertical and about
-    the horizontal apart; features put both the attitude and the position, at their distance, in
-    doubt.
-    """
-    patience = p.gate_patience
-    row = flight.rejected_in_row
-    position = mask & (row[POSITION_BLOCK] >= patience)
-    baseline = mask & (row[BASELINE_BLOCK] >= patience)
-    velocity = mask & (row[VELOCITY_BLOCK] >= patience)
-    camera = mask & (row[FEATURE_BLOCKS] >= patience)
-    doubtful = position | baseline | velocity | camera
-    if any_of(doubtful):
-        zero = 0.0 * p.sigma_beta
-        nu = flight.innovation
-        nothing = (zero, zero, zero)
-        D_e = (nothing, nothing, nothing)
-        D_r = _squares(nu[POSITION_BLOCK], position)
-        D_v = _squares(nu[VELOCITY_BLOCK], velocity)
-
-        R_BI = load33(flight.R_hat)
-        vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-        side = select(baseline, nu[BASELINE_BLOCK, 0], 0.0)
-        up = select(baseline, nu[BASELINE_BLOCK, 1], 0.0)
-        D_e = add_to_diagonal(D_e, up * up)
-        D_e = add_outer(D_e, scale(side * side - up * up, vertical), vertical)
-
-        angle, offset = zero, zero
-        for i in range(feature_count):
-            s = FEATURE_BLOCKS + i
-            seen = camera & (flight.feature_valid[i] > 0.0)
-            square = nu[s, 0] * nu[s, 0] + nu[s, 1] * nu[s, 1]
-            square = select(seen, square, 0.0)
-            to_feature = load3(p.features[i])
-            dx = to_feature[0] - flight.r_hat[0]
-            dy = to_feature[1] - flight.r_hat[1]
-            dz = to_feature[2] - flight.r_hat[2]
-            angle = maximum(angle, square)
-            offset = maximum(offset, square * (dx * dx + dy * dy + dz * dz))
-        D_e, D_r = add_to_diagonal(D_e, angle), add_to_diagonal(D_r, offset)
-        failed = _add_to_covariance(flight, work, D_r, D_v, D_e, doubtful)
-        flight.filter_status = select(
-            failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
-        )
-        flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
-        for group in range(4):
-            done = mask & (flight.rejected_in_row[group] >= patience)
-            flight.reopened[group] = select(
-                done, flight.reopened[group] + 1.0, flight.reopened[group]
-            )
-            flight.rejected_in_row[group] = select(done, 0.0, flight.rejected_in_row[group])
 
 
 @kernel

@@ -15,7 +15,8 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.ekf import measure_columns
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed, reopen_gates
+from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
+from quad_gym.kernels.filter.recovery import raise_doubts
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.linalg import (
     add,
@@ -297,7 +298,7 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again):
         )
     _innovate(work, n, c)
     if (form & _WATCH) != 0:
-        measured = measured - judge_innovations(
+        left_out = judge_innovations(
             flight,
             p,
             work,
@@ -309,6 +310,7 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again):
             mask,
             again,
         )
+        measured = measured - left_out
     _sum_noise(p, work, n, doubt)
 
     # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
@@ -375,7 +377,7 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again):
     if (form & _WATCH) != 0 and any_of(failed):
         mark_failed(flight, feature_count, failed)
     if (form & _GATE) != 0:
-        reopen_gates(flight, p, work, feature_count, mask & logical_not(failed))
+        raise_doubts(flight, p, work, feature_count, mask & logical_not(failed))
 
 
 @stage

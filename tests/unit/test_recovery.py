@@ -1,0 +1,85 @@
+"""A filter that notices that it is wrong: recovery after faults of the IMU, and what counts as lost."""
+
+import math
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.faults import AccelBiasStep, GnssRamp, GyroBiasStep
+from tests.field_flights import fly, state_errors, steps
+
+FLIGHTS = 256
+STEP = GyroBiasStep(start=3.0, size=math.radians(1.0))
+
+
+def flown(name, fault, seconds, **choices):
+    suite = quad_gym.sensor_suite(name)
+    suite = suite.replace(estimator=suite.estimator.replace(**choices))
+    batch = fly(suite, FLIGHTS, task="circle", start="hover", filter_start="warm", faults=fault)
+    steps(batch, seconds)
+    return batch
+
+
+def beyond(batch, deviations):
+    """(n,) whether any of the fifteen errors exceeds so many of its deviations."""
+    sigma = np.sqrt(np.einsum("nii->ni", batch.covariance()))
+    return (np.abs(state_errors(batch)) > deviations * sigma).any(axis=1)
+
+
+@pytest.mark.parametrize("fault", [STEP, AccelBiasStep(start=3.0, size=0.5)], ids=["gyro", "accel"])
+def test_ten_seconds_after_a_bias_step_the_filter_is_back_or_says_that_it_is_lost(fault):
+    batch = flown("rtk", fault, 13.0)
+    wrong, lost = beyond(batch, 6.0), batch.read("lost") > 0.0
+    assert wrong.mean() <= 0.01, wrong.mean()
+    assert not (wrong & ~lost).any()
+
+
+def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
+    batch = flown("rtk", STEP, 5.0)
+    wrong, lost = beyond(batch, 6.0), batch.read("lost") > 0.0
+    assert wrong.mean() > 0.5
+    assert (wrong & ~lost).mean() <= 0.01
+
+
+def test_without_inflated_biases_the_step_would_outlast_the_test():
+    """The same fault with a gate that never reopens and never doubts: it takes everything."""
+    batch = flown("rtk", STEP, 13.0, gate_false_alarm=0.0)
+    assert beyond(batch, 6.0).mean() > 0.99
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.5])
+def test_a_ramp_of_gnss_loses_no_flight_that_sees_markers(speed):
+    batch = flown("rtk", GnssRamp(start=3.0, speed=speed), 23.0)
+    assert batch.read("rejections")[:, 0].min() > 50
+    assert np.linalg.norm(state_errors(batch)[:, :3], axis=1).max() < 0.05
+    assert not (batch.read("lost") > 0.0).any()
+
+
+@pytest.mark.parametrize("name", ["rtk", "indoor", "consumer"])
+def test_a_sound_filter_hardly_ever_takes_itself_for_lost(name):
+    """Over 256 flights of 10 s: the alarm levels stand for far less than one in a thousand."""
+    batch = fly(quad_gym.sensor_suite(name), FLIGHTS, start="hover", filter_start="warm")
+    alarms = np.zeros(FLIGHTS, bool)
+    for _ in range(40):
+        steps(batch, 0.25)
+        alarms |= batch.read("lost") > 0.0
+    assert alarms.sum() <= 1, alarms.sum()
+
+
+def test_info_tells_of_it_and_episodes_can_end_with_it():
+    keywords = {"sensors": "rtk", "faults": GyroBiasStep(start=0.5, size=math.radians(3.0))}
+    keywords |= {"start": "hover", "filter_start": "warm", "duration": 4.0}
+    told, endings = QuadVectorEnv(32, "hover", **keywords), []
+    told.reset(seed=0)
+    ended = QuadVectorEnv(32, "hover", end_when_lost=True, **keywords)
+    ended.reset(seed=0)
+    lost = np.zeros(32, bool)
+    for _ in range(150):
+        _, _, _, truncated, info = told.step(np.zeros((32, 4)))
+        lost |= info["filter_lost"]
+        *_, truncated, info = ended.step(np.zeros((32, 4)))
+        endings += info["ending"][truncated].tolist()
+    assert lost.mean() > 0.9
+    assert endings.count("filter_lost") > 16
