@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from quad_gym import validation as check
 from quad_gym.distributions import Distribution, Uniform
 from quad_gym.params import Clocks, VehicleParams, check_lag, check_moments
-from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, Drawable
+from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL, UNIFORM, Drawable
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.world_params import BatteryParams, WorldParams
 
@@ -134,6 +135,19 @@ class DrawingTable:
         _check_hovering(self, vehicle, world)
         if "inertia" in self.names:
             _check_inertia(self)
+
+    def mean_square(self, name: str) -> NDArray[np.float64]:
+        """(size,) mean square of each component of a parameter, over its distribution."""
+        u = (np.arange(4096) + 0.5) / 4096
+        found = []
+        for k in range(COLUMNS[name].start, COLUMNS[name].stop):
+            values = {
+                UNIFORM: self.a[k] + self.b[k] * u,
+                LOG_UNIFORM: self.a[k] * np.exp(self.b[k] * u),
+                NORMAL: self.a[k] + self.b[k] * ndtri(self.c[k] + self.d[k] * u),
+            }.get(int(self.kind[k]), np.zeros(1))
+            found.append(math.fsum(values * values) / values.size)
+        return np.array(found)
 
     def _fill(
         self, drawable: Drawable, column: int, part: Distribution | None, nominal: float

@@ -57,6 +57,11 @@ def pack_options(
     if world.battery is not None:
         s["supply"] = Supply.BATTERY
     s["observe_world"] = s["privileged"] and (world != WorldParams() or bool(draws.names))
+    if "start_velocity_I" in draws.names:
+        s["start_velocity_variance"] = draws.mean_square("start_velocity_I")
+    for i, name in enumerate(("start_roll", "start_pitch")):
+        if name in draws.names:
+            s["start_tilt_variance"][i] = draws.mean_square(name)[0]
     s["randomized"], s["known"] = bool(draws.names), known
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))

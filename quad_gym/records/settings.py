@@ -42,6 +42,8 @@ SETTINGS_FIELDS = (
     Field("gate_count", (), "-", "gates of a course"),
     Field("gate_radius", (), "m", "distance at which a gate counts as passed"),
     Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
+    Field("start_velocity_variance", (3,), "m^2/s^2", "mean square of what is drawn on top of the start's velocity"),
+    Field("start_tilt_variance", (3,), "rad^2", "likewise of roll and pitch, then 0"),
     Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
     Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
     # late measurements

@@ -43,6 +43,7 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm
 
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
+NOTHING = (0.0, 0.0, 0.0)
 _NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
 _STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that tells no heading
 
@@ -82,7 +83,7 @@ def _tie_position_to_attitude(L, R_BI, lever_B, mask):
 
 
 @kernel
-def initialize(flight, p, mask, x_I):
+def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_variance=NOTHING):
     """Start the filter from the first fix, where `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
@@ -97,6 +98,9 @@ def initialize(flight, p, mask, x_I):
         mask: Which lanes.
         x_I: Level direction in I of the body x axis, as the place of the start tells it; zero where
             it tells none.
+        v_I: Velocity in I with which the vehicle is known to start [m/s].
+        v_variance: Per axis, added to that of a start at rest [m^2/s^2].
+        tilt_variance: Of roll and pitch, likewise [rad^2]; the third counts nothing.
     """
     inflation = math.sqrt(p.initial_scale)
     attitude = inflation * p.baseline_sigma
@@ -119,7 +123,7 @@ def initialize(flight, p, mask, x_I):
     antenna_I = apply(R_IG, load3(flight.gnss_position))
     keep33(flight.R_hat, mask, R_BI)
     keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
-    keep3(flight.v_hat, mask, (0.0, 0.0, 0.0))
+    keep3(flight.v_hat, mask, v_I)
     keep3(flight.b_a_hat, mask, (0.0, 0.0, 0.0))
     keep3(flight.b_g_hat, mask, (0.0, 0.0, 0.0))
     flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
@@ -133,12 +137,37 @@ def initialize(flight, p, mask, x_I):
             L[i, j] = select(mask, 0.0, L[i, j])
     for i in range(3):
         L[R + i, R + i] = select(mask, inflation * p.gnss_sigma[i], L[R + i, R + i])
-        L[V + i, V + i] = select(mask, math.sqrt(p.initial_velocity_variance), L[V + i, V + i])
-        angle = heading if i == 2 else select(level, p.initial_tilt_sigma, attitude)
+        speed = math.sqrt(p.initial_velocity_variance + v_variance[i])
+        L[V + i, V + i] = select(mask, speed, L[V + i, V + i])
+        tilt = select(level, p.initial_tilt_sigma, attitude)
+        angle = heading if i == 2 else math.sqrt(tilt * tilt + tilt_variance[i])
         L[E + i, E + i] = select(mask, angle, L[E + i, E + i])
         L[BA + i, BA + i] = select(mask, p.accel_bias_sigma, L[BA + i, BA + i])
         L[BG + i, BG + i] = select(mask, p.gyro_bias_sigma, L[BG + i, BG + i])
     _tie_position_to_attitude(L, R_BI, load3(p.antenna), mask & level)
+
+
+@kernel
+def known_velocity(flight, settings):
+    """The velocity in I that the filter is told of its start, and what is drawn on top of it.
+
+    A velocity that the caller of a reset gives is known; nothing is drawn then.
+    """
+    given = (flight.start_given[3], flight.start_given[4], flight.start_given[5])
+    drawn = load3(settings.start_velocity_variance)
+    zero = 0.0 * flight.tick
+    known = (given[0] == given[0], given[1] == given[1], given[2] == given[2])
+    v_I = (
+        select(known[0], given[0], zero),
+        select(known[1], given[1], zero),
+        select(known[2], given[2], zero),
+    )
+    variance = (
+        select(known[0], zero, drawn[0]),
+        select(known[1], zero, drawn[1]),
+        select(known[2], zero, drawn[2]),
+    )
+    return v_I, variance
 
 
 @stage
@@ -147,4 +176,7 @@ def align_stage(flight, world, model, settings, work, stages, flag):
     flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
     if (settings.form & _WATCH) != 0:
         forget_innovations(flying, settings.feature_count, mask)
-    initialize(flying, lanes_of(model), mask, look_along_mark(flying, lanes_of(world)))
+    x_I = look_along_mark(flying, lanes_of(world))
+    v_I, v_variance = known_velocity(flying, settings)
+    tilt_variance = load3(settings.start_tilt_variance)
+    initialize(flying, lanes_of(model), mask, x_I, v_I, v_variance, tilt_variance)
