@@ -14,8 +14,8 @@ SUITES = ("standard", "rtk", "consumer", "indoor")
 DRAWS = {
     "velocity": {"start_velocity_I": Uniform(-1.0, 1.0)},
     "tilt and yaw": {
-        "start_roll": Uniform(-0.2, 0.2),
-        "start_pitch": Normal(0.05, 0.1),
+        "start_roll": Uniform(-0.1, 0.1),
+        "start_pitch": Normal(0.03, 0.05),
         "start_yaw": Uniform(-3.0, 3.0),
     },
     "rates": {"start_body_rates": Uniform(-1.0, 1.0)},
