@@ -10,7 +10,7 @@ WORK_FIELDS = (
     # prediction
     Field("P", (15, 15), "mixed", "lower triangle of the predicted covariance; then its factor"),
     Field("F", (9, 15), "mixed", "half-differences of the propagated sigma points / c; rows r, v, e"),
-    Field("S", (9, 9), "mixed", "half-sums of the propagated sigma points less the centre / c; rows r, v, e"),
+    Field("S", (6, 9), "mixed", "half-sums of the propagated sigma points less the centre / c: of the acceleration, then e"),
     # update; the nine columns of L that matter come last first
     Field("X_B", (MAX_FEATURES, 3), "m", "features relative to the centre of mass, in B"),
     Field("inverse_distance", (MAX_FEATURES,), "1/m", "of the features from the camera"),

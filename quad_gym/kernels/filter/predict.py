@@ -99,7 +99,14 @@ def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
 
 @kernel
 def _propagate_columns(flight, p, work, f_B, w_B, half, form):
-    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's."""
+    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's.
+
+    Position and velocity share the half-sums of the acceleration, so that S has these, and those of
+    the error angles.
+
+    Returns:
+        The mean's share of acceleration and of error angles.
+    """
     L, F, S = flight.L, work.F, work.S
     R_BI = load33(flight.R_hat)
     dt = p.dt
@@ -128,11 +135,13 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form):
             even_B = sub(apply_transposed(even, f_start), apply_transposed(odd, df))
             a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
             a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
-            rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
-            e_odd = scale(inverse_c, add(d, scale(dt, rate_odd)))
-            e_even = scale(dt * inverse_c, rate_even)
+            e_odd, e_even = nothing, nothing
+            if not midpoint:
+                rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
+                e_odd = scale(inverse_c, add(d, scale(dt, rate_odd)))
+                e_even = scale(dt * inverse_c, rate_even)
         if midpoint:
-            e_odd, e_even = _turned_angles(L, j, full, half, dt), nothing
+            e_odd = _turned_angles(L, j, full, half, dt)
 
         v_j = load_column3(L, V, j)
         r_j = add(load_column3(L, R, j), scale(dt, v_j))
@@ -140,9 +149,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form):
             F[R + i, j] = r_j[i] + half_dt2 * a_odd[i]
             F[V + i, j] = v_j[i] + dt * a_odd[i]
             F[E + i, j] = e_odd[i]
-            S[R + i, j] = half_dt2 * a_even[i]
-            S[V + i, j] = dt * a_even[i]
-            S[E + i, j] = e_even[i]
+            S[i, j], S[3 + i, j] = a_even[i], e_even[i]
         mean_a, mean_e = add(mean_a, a_even), add(mean_e, e_even)
 
     for j in range(9, 15):  # offsets of the biases alone: linear
@@ -155,8 +162,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form):
             F[V + i, j] = dt * a_odd[i]
             F[E + i, j] = e_odd[i]
 
-    mean_a = scale(inverse_c, mean_a)
-    return scale(half_dt2, mean_a), scale(dt, mean_a), scale(inverse_c, mean_e)
+    return scale(inverse_c, mean_a), scale(inverse_c, mean_e)
 
 
 @kernel
@@ -185,34 +191,47 @@ def _add_gyro_noise(P, p, R_BI, f_B, half):
 
 
 @kernel
-def _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form):
+def _add_second_order(work, p, mean_a, mean_e, midpoint):
+    """Add the half-sums' share to work.P: of a common acceleration, and of the error angles.
+
+    With MIDPOINT the error angles have none.
+    """
+    S, P = work.S, work.P
+    dt = p.dt
+    half_dt2 = 0.5 * dt * dt
+    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
+    aa = add_outer(sum_of_squares(S, 0, 9), scale(excess, mean_a), mean_a)
+    store_block(P, R, R, add33(load_block(P, R, R), scale33(half_dt2 * half_dt2, aa)))
+    store_block(P, V, R, add33(load_block(P, V, R), scale33(dt * half_dt2, aa)))
+    store_block(P, V, V, add33(load_block(P, V, V), scale33(dt * dt, aa)))
+    if not midpoint:
+        ea = add_outer(sum_of_outers(S, 3, S, 0, 9), scale(excess, mean_e), mean_a)
+        ee = add_outer(sum_of_squares(S, 3, 9), scale(excess, mean_e), mean_e)
+        store_block(P, E, R, add33(load_block(P, E, R), scale33(half_dt2, ea)))
+        store_block(P, E, V, add33(load_block(P, E, V), scale33(dt, ea)))
+        store_block(P, E, E, add33(load_block(P, E, E), ee))
+
+
+@kernel
+def _sum_moments(flight, p, work, mean_a, mean_e, form):
     """Fill the lower triangle of work.P from the propagated pairs and the process noise.
 
     The gyro's noise is added here only where it enters through the tick's start.
     """
-    L, F, S, P = flight.L, work.F, work.S, work.P
+    L, F, P = flight.L, work.F, work.P
     dt = p.dt
     half_dt2 = 0.5 * dt * dt
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
     accel_variance = p.accel_sigma * p.accel_sigma
-    excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
     gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
 
     for i in range(0, 9, 3):
-        mean_i = mean_r if i == R else (mean_v if i == V else mean_e)
-        block = sum_of_squares(F, i, 15)
-        if not extended:
-            block = add33(block, sum_of_squares(S, i, 9))
-            block = add_outer(block, scale(excess, mean_i), mean_i)
-        store_block(P, i, i, block)
+        store_block(P, i, i, sum_of_squares(F, i, 15))
         for j in range(0, i, 3):
-            mean_j = mean_r if j == R else mean_v
-            block = sum_of_outers(F, i, F, j, 15)
-            if not extended:
-                block = add33(block, sum_of_outers(S, i, S, j, 9))
-                block = add_outer(block, scale(excess, mean_i), mean_j)
-            store_block(P, i, j, block)
+            store_block(P, i, j, sum_of_outers(F, i, F, j, 15))
+    if not extended:
+        _add_second_order(work, p, mean_a, mean_e, midpoint)
     for i in range(3):
         P[R + i, R + i] += half_dt2 * half_dt2 * accel_variance
         P[V + i, R + i] += half_dt2 * dt * accel_variance
@@ -269,8 +288,8 @@ def predict(flight, p, work, form=0):
         half = vector_to_dcm(scale(0.5 * dt, w_B))
     if (form & LEVER_ARM) != 0:
         f_B = sub(f_B, lever_force(flight, p, form, half))
-    mean_r, mean_v, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form)
-    _sum_moments(flight, p, work, mean_r, mean_v, mean_e, form)
+    mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form)
+    _sum_moments(flight, p, work, mean_a, mean_e, form)
     turn = add(scale(dt, w_B), mean_e)
     if midpoint:
         _add_gyro_noise(work.P, p, R_BI, f_B, half)
@@ -282,10 +301,10 @@ def predict(flight, p, work, form=0):
     ok = cholesky(work.P, 15, work.inverse_diagonal) > 0.0
 
     a_I = apply_transposed(R_BI, f_B)
-    a_I = (a_I[0], a_I[1], a_I[2] - p.gravity)
+    a_I = add((a_I[0], a_I[1], a_I[2] - p.gravity), mean_a)
     r, v = load3(flight.r_hat), load3(flight.v_hat)
-    r_pred = add(add(add(r, scale(dt, v)), scale(0.5 * dt * dt, a_I)), mean_r)
-    v_pred = add(add(v, scale(dt, a_I)), mean_v)
+    r_pred = add(add(r, scale(dt, v)), scale(0.5 * dt * dt, a_I))
+    v_pred = add(v, scale(dt, a_I))
     ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
 
     keep3(flight.r_hat, ok, r_pred)
