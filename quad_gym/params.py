@@ -103,8 +103,8 @@ class VehicleParams(Checked):
         smallest = np.linalg.eigvalsh(inertia)[0]
         if 0.0 < smallest < LEAST_MOMENT:
             raise ValueError(
-                f"VehicleParams.inertia must be at least {LEAST_MOMENT:g} kg m^2 about every axis, got "
-                f"{smallest:g} kg m^2"
+                f"VehicleParams.inertia must be at least {LEAST_MOMENT:g} kg m^2 about every "
+                f"axis, got {smallest:g} kg m^2"
             )
         if smallest <= 1e-9 * abs(inertia).max():
             raise ValueError(

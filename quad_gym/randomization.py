@@ -159,14 +159,15 @@ class DrawingTable:
                 f"{part!r}, which reaches from {low:g} to {high:g}"
             )
         reached = max((abs(bound) for bound in (low, high) if math.isfinite(bound)), default=0.0)
-        if reached > _FARTHEST.get(name, check.LARGEST):
+        farthest = _FARTHEST.get(name, check.LARGEST)
+        if reached > farthest:
             raise ValueError(
-                f"randomization of {name!r} must stay within {_FARTHEST.get(name, check.LARGEST):g} "
-                f"{drawable.unit} either way, got {part!r}"
+                f"randomization of {name!r} must stay within {farthest:g} {drawable.unit} either "
+                f"way, got {part!r}"
             )
         if name == "inertia" and low < LEAST_MOMENT:
             raise ValueError(
-                f"randomization of {name!r} must stay at least {LEAST_MOMENT:g} kg m^2, got {part!r}"
+                f"randomization of {name!r} must stay above {LEAST_MOMENT:g} kg m^2, got {part!r}"
             )
         self.kind[column], self.a[column], self.b[column], self.c[column], self.d[column] = (
             part.placed(factor, shift)

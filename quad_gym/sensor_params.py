@@ -109,10 +109,9 @@ class GnssParams(Checked):
             "position_sigma_I",
             length=3,
         )
-        if min(self.position_sigma_I) < 1e-9:  # the filter divides by its square
+        if min(self.position_sigma_I) <= 0.0:
             raise ValueError(
-                "GnssParams.position_sigma_I must be greater than 0, at least 1e-9 m, got "
-                f"{self.position_sigma_I}"
+                f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
             )
         for name in ("primary_antenna_B", "secondary_antenna_B"):
             if np.abs(getattr(self, name)).max() > 100.0:
@@ -282,11 +281,17 @@ class SensorSuite(Checked):
             )
 
     def require_filter(self) -> None:
-        """Refuse a suite whose filter takes the IMU's samples for something else.
+        """Refuse a suite whose filter takes the IMU's samples for something else, or would overflow.
 
         Raises:
-            ValueError: If it takes means over a tick for the motion at its start.
+            ValueError: If it takes means over a tick for the motion at its start, or divides by
+                the square of hardly any noise.
         """
+        if self.gnss is not None and min(self.gnss.position_sigma_I) < 1e-9:
+            raise ValueError(
+                "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
+                f"{self.gnss.position_sigma_I}"
+            )
         if self.imu.samples == "average" and self.estimator.integration == "euler":
             raise ValueError(
                 "sensors must have FilterParams.integration='midpoint' with ImuParams.samples="
