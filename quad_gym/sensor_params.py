@@ -281,7 +281,7 @@ class SensorSuite(Checked):
             )
 
     def require_filter(self) -> None:
-        """Refuse a suite whose filter takes the IMU's samples for something else, or would overflow.
+        """Refuse a suite whose filter mistakes the samples of the IMU, or would overflow.
 
         Raises:
             ValueError: If it takes means over a tick for the motion at its start, or divides by
