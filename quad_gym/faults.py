@@ -90,7 +90,7 @@ class Fault(Checked):
         if type(self) is Fault:
             raise ValueError("faults must be of a kind, such as GnssOutage, got a bare Fault")
         self._check(_span, "start")
-        if self.duration != math.inf:
+        if not (isinstance(self.duration, float) and self.duration == math.inf):
             self._check(_span, "duration", open_end=True)
         self._check(check.number, "rate", least=0.0)
         self._check(_share, "probability")

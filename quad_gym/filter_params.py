@@ -1,5 +1,6 @@
 """Parameters of the Kalman filter."""
 
+import math
 from dataclasses import dataclass
 
 from quad_gym import validation as check
@@ -92,7 +93,7 @@ class FilterParams(Checked):
         )
         self._check(check.flag, "reuse_first_fix")
         if self.initial_tilt_sigma is not None:
-            self._check(check.positive, "initial_tilt_sigma")
+            self._check(check.positive, "initial_tilt_sigma", most=math.pi)
         if self.gradual_above is not None:
             self._check(check.positive, "gradual_above")
         self._check(check.whole, "gate_patience")

@@ -32,6 +32,15 @@ FARTHEST = 1000.0
 MIN_PERIOD = 0.01
 """No vehicle follows a faster reference [s]."""
 
+LEAST_MOMENT = 1e-9
+"""Of inertia, beyond which numbers are mistaken; a quadrotor of 10 g has 1e-6 [kg m^2]."""
+
+MAX_LIFT = 1000.0
+"""Thrust over weight beyond which numbers are mistaken; racing drones reach 15."""
+
+MAX_TORQUE_ARM = 10.0
+"""Torque over thrust of a rotor beyond which numbers are mistaken; of propellers it is 0.02 [m]."""
+
 RK4_LIMIT = 2.78
 """Largest step of the classic Runge-Kutta method over the time constant of a decay, beyond which
 its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785."""
@@ -76,7 +85,6 @@ class VehicleParams(Checked):
     def __post_init__(self) -> None:
         self._check(
             check.positive,
-            "mass",
             "thrust_coefficient",
             "torque_coefficient",
             "motor_time_constant",
@@ -84,6 +92,7 @@ class VehicleParams(Checked):
             "max_voltage",
             "gravity",
         )
+        self._check(check.positive, "mass", least=1e-3)
         self._check(check.number, "disc_area", "drag_coefficient", "air_density", least=0.0)
         self._check(check.matrix, "inertia", rows=3, columns=3)
         self._check(check.matrix, "rotor_positions_B", rows=4, columns=3)
@@ -92,6 +101,11 @@ class VehicleParams(Checked):
         if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
             raise ValueError("VehicleParams.inertia must be symmetric")
         smallest = np.linalg.eigvalsh(inertia)[0]
+        if 0.0 < smallest < LEAST_MOMENT:
+            raise ValueError(
+                f"VehicleParams.inertia must be at least {LEAST_MOMENT:g} kg m^2 about every "
+                f"axis, got {smallest:g} kg m^2"
+            )
         if smallest <= 1e-9 * abs(inertia).max():
             raise ValueError(
                 "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
@@ -101,13 +115,27 @@ class VehicleParams(Checked):
         if self.hover_voltage >= self.max_voltage:
             raise ValueError(
                 f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: it takes "
-                f"{self.hover_voltage:.1f} V of {self.max_voltage:g} V"
+                f"{self.hover_voltage:.3g} V of {self.max_voltage:g} V (by mass, gravity, "
+                "thrust_coefficient, motor_speed_per_volt and max_voltage)"
+            )
+        if 4.0 * self.max_rotor_force > MAX_LIFT * self.mass * self.gravity:
+            raise ValueError(
+                f"VehicleParams.thrust_coefficient must lift at most {MAX_LIFT:g} times the weight "
+                f"at full voltage, got {4.0 * self.max_rotor_force:g} N and "
+                f"{self.mass * self.gravity:g} N (by mass, gravity, thrust_coefficient, "
+                "motor_speed_per_volt and max_voltage)"
+            )
+        if self.torque_coefficient > MAX_TORQUE_ARM * self.thrust_coefficient:
+            raise ValueError(
+                f"VehicleParams.torque_coefficient must be at most {MAX_TORQUE_ARM:g} m times "
+                f"thrust_coefficient, got {self.torque_coefficient:g}"
             )
         if any(abs(spin) != 1.0 for spin in self.rotor_spins):
             raise ValueError(f"VehicleParams.rotor_spins must be +1 or -1, got {self.rotor_spins}")
         if abs(np.linalg.det(self.effectiveness)) < 1e-12:
             raise ValueError(
-                "VehicleParams.rotor_positions_B must let the rotors turn the body about every axis"
+                "VehicleParams.rotor_positions_B must let the rotors turn the body about all axes "
+                "(and rotor_spins, with torque_coefficient over thrust_coefficient as their arm)"
             )
 
     @property
@@ -209,10 +237,10 @@ class Clocks(Checked):
     """Runge-Kutta steps in a tick"""
 
     def __post_init__(self) -> None:
-        self._check(check.positive, "imu_rate")
+        self._check(check.positive, "imu_rate", most=1e6)
         for name in ("control_rate", "gnss_rate", "camera_rate"):
             check.ticks(name, getattr(self, name), self.imu_rate)
-        self._check(check.whole, "substeps")
+        self._check(check.whole, "substeps", most=1000)
 
     @classmethod
     def of(cls, sensors: SensorSuite, control_rate: float, substeps: int = 1) -> "Clocks":
@@ -335,20 +363,21 @@ def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
         )
 
 
-def check_limit(task: TaskParams, rate: float) -> None:
+def check_limit(task: TaskParams, rate: float, name: str) -> None:
     """Refuse a time limit of less than a step, which would round to none.
 
     Args:
         task: Has the limit.
         rate: Of steps [Hz].
+        name: Of that rate.
 
     Raises:
         ValueError: If it is.
     """
     if task.duration > 0.0 and round(task.duration * rate) == 0:
         raise ValueError(
-            f"duration must be 0 (no limit) or at least one step of {1.0 / rate:g} s, got "
-            f"{task.duration:g} s"
+            f"duration must be 0 (no limit) or at least one step, {1.0 / rate:g} s at {name}="
+            f"{rate:g} Hz, got {task.duration:g} s"
         )
 
 

@@ -16,10 +16,13 @@ from scipy.special import ndtri
 
 from quad_gym import validation as check
 from quad_gym.distributions import Distribution, Uniform
-from quad_gym.params import Clocks, VehicleParams, check_lag, check_moments
+from quad_gym.params import LEAST_MOMENT, RK4_LIMIT, Clocks, VehicleParams, check_lag, check_moments
 from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL, UNIFORM, Drawable
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.world_params import BatteryParams, WorldParams
+
+FAST = 100.0
+"""Vehicles fly slower than this [m/s]."""
 
 Given = Distribution | Sequence[Distribution | None]
 
@@ -169,6 +172,17 @@ class DrawingTable:
                 f"randomization of {name!r} must stay {_range_in_words(drawable)}, got "
                 f"{part!r}, which reaches from {low:g} to {high:g}"
             )
+        reached = max((abs(bound) for bound in (low, high) if math.isfinite(bound)), default=0.0)
+        farthest = _FARTHEST.get(name, check.LARGEST)
+        if reached > farthest:
+            raise ValueError(
+                f"randomization of {name!r} must stay within {farthest:g} {drawable.unit} either "
+                f"way, got {part!r}"
+            )
+        if name == "inertia" and low < LEAST_MOMENT:
+            raise ValueError(
+                f"randomization of {name!r} must stay above {LEAST_MOMENT:g} kg m^2, got {part!r}"
+            )
         self.kind[column], self.a[column], self.b[column], self.c[column], self.d[column] = (
             part.placed(factor, shift)
         )
@@ -176,6 +190,15 @@ class DrawingTable:
         center, spread = part.center_and_spread
         self.center[column] = factor * center + shift
         self.spread[column] = abs(factor * spread) or 1.0
+
+
+_FARTHEST = {
+    "center_of_mass_B": 10.0,
+    "start_position_I": 1e6,
+    "start_velocity_I": 1e4,
+    "start_body_rates": 1e3,
+}
+"""What can be drawn at most, either way, where larger numbers are mistakes."""
 
 
 def _range_in_words(drawable: Drawable) -> str:
@@ -253,23 +276,59 @@ def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldPar
         )
 
 
-def check_draws(table: DrawingTable, vehicle: VehicleParams, clocks: Clocks) -> None:
-    """Refuse rotors that are, or may be drawn, too fast for the integration.
+def check_draws(
+    table: DrawingTable, vehicle: VehicleParams, world: WorldParams, clocks: Clocks
+) -> None:
+    """Refuse rotors that are too fast, or drag that is too large, for the integration.
 
     Args:
         table: What is drawn.
         vehicle: As it is without draws.
+        world: Likewise.
         clocks: Say how long a Runge-Kutta step is.
 
     Raises:
-        ValueError: If they are.
+        ValueError: If they are, or may be drawn so.
     """
+    _check_drag(table, vehicle, world, clocks)
     name = "motor_time_constant"
     if name in table.names:
         least = float(table.low[COLUMNS[name]].min())
         check_lag(f"randomization of {name!r} at its smallest draw", least, clocks)
     else:
         check_lag(name, vehicle.motor_time_constant, clocks)
+
+
+def _check_drag(
+    table: DrawingTable, vehicle: VehicleParams, world: WorldParams, clocks: Clocks
+) -> None:
+    """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
+
+    def most(name: str) -> float:
+        """The largest draw; of a normal without bounds that of six standard deviations."""
+        columns = COLUMNS[name]
+        high, low = table.high[columns], table.low[columns]
+        far = np.abs(table.center[columns]) + 6.0 * table.spread[columns]
+        reached = np.maximum(np.abs(high), np.abs(low))
+        return float(np.where(np.isinf(reached), far, reached).max())
+
+    wind = sum(most(f"wind_{part}") for part in ("east", "north", "up", "speed"))
+    speed = FAST + wind + float(np.linalg.norm(world.wind_I)) + most("gust_wind_speed")
+    disc = most("drag_coefficient") * vehicle.disc_area * vehicle.air_density * speed
+    rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
+    drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
+    columns = COLUMNS["mass"]
+    mass = float(table.low[columns][0])
+    if "mass" in table.names:  # of a normal with far bounds that of six standard deviations
+        mass = max(mass, float((table.center[columns] - 6.0 * table.spread[columns])[0]))
+    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    if step * drag > RK4_LIMIT * mass:
+        raise ValueError(
+            f"drag must slow the vehicle down by less than {RK4_LIMIT * mass / step:.3g} N s/m, "
+            f"where the integration is stable, got {drag:.3g} N s/m at {speed:.3g} m/s (by mass, "
+            "drag_coefficient, disc_area, air_density, linear_drag_B, rotor_drag_B, wind_I and "
+            "gust_wind_speed)"
+        )
 
 
 def _check_inertia(table: DrawingTable) -> None:

@@ -44,7 +44,8 @@ class ImuParams(Checked):
     """correlation time [s]; laboratory"""
 
     def __post_init__(self) -> None:
-        self._check(check.positive, "rate", "accel_bias_tau", "gyro_bias_tau")
+        self._check(check.positive, "rate", least=1.0, most=1e6)
+        self._check(check.positive, "accel_bias_tau", "gyro_bias_tau")
         self._check(check.positive, "accel_noise_density", "gyro_noise_density")
         self._check(check.positive, "accel_bias_sigma", "gyro_bias_sigma")
         self._check(check.vector, "lever_arm_B", length=3)
@@ -112,6 +113,12 @@ class GnssParams(Checked):
             raise ValueError(
                 f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
             )
+        for name in ("primary_antenna_B", "secondary_antenna_B"):
+            if np.abs(getattr(self, name)).max() > 100.0:
+                raise ValueError(
+                    f"GnssParams.{name} must be on the vehicle, within 100 m, got "
+                    f"{getattr(self, name)}"
+                )
         if np.linalg.norm(self.baseline_B) < 1e-3:
             raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
@@ -274,11 +281,17 @@ class SensorSuite(Checked):
             )
 
     def require_filter(self) -> None:
-        """Refuse a suite whose filter takes the IMU's samples for something else.
+        """Refuse a suite whose filter mistakes the samples of the IMU, or would overflow.
 
         Raises:
-            ValueError: If it takes means over a tick for the motion at its start.
+            ValueError: If it takes means over a tick for the motion at its start, or divides by
+                the square of hardly any noise.
         """
+        if self.gnss is not None and min(self.gnss.position_sigma_I) < 1e-9:
+            raise ValueError(
+                "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
+                f"{self.gnss.position_sigma_I}"
+            )
         if self.imu.samples == "average" and self.estimator.integration == "euler":
             raise ValueError(
                 "sensors must have FilterParams.integration='midpoint' with ImuParams.samples="
@@ -341,7 +354,9 @@ class SensorSuite(Checked):
             ValueError: If a rate is not positive or not a whole division of the IMU's, or there is
                 no GNSS, or no camera, that could have the rate given for it.
         """
-        imu_rate = self.imu.rate if imu is None else check.positive("imu_rate", imu)
+        imu_rate = self.imu.rate
+        if imu is not None:
+            imu_rate = check.positive("imu_rate", imu, least=1.0, most=1e6)
 
         def rate_of(name: str, wanted: float | None, current: float) -> float:
             follows = current == self.imu.rate or imu_rate < current

@@ -119,7 +119,7 @@ class FlightBatch:
         randomization: Randomization | Mapping[str, Given] | None = None,
         faults: FaultsGiven = None,
     ) -> None:
-        self.count = check.whole("count", count)
+        self.count = check.whole("count", count, most=10**7)
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
         self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
@@ -133,31 +133,33 @@ class FlightBatch:
             ("gains", self.gains, PDGains),
             ("actions", self.actions, ActionParams),
             ("task", self.task, TaskParams),
-            ("true_vehicle", true_vehicle or self.vehicle, VehicleParams),
-            ("true_sensors", true_sensors or self.sensors, SensorSuite),
+            ("true_vehicle", self.vehicle if true_vehicle is None else true_vehicle, VehicleParams),
+            ("true_sensors", self.sensors if true_sensors is None else true_sensors, SensorSuite),
             ("world", self.world, WorldParams),
         ):
             check.instance(name, value, kind)
         self.source, self.control = Source(source), Control(control)
         rate = self.sensors.imu.rate if control_rate is None else control_rate
         self.clocks = Clocks.of(self.sensors, rate, substeps)
-        check_limit(self.task, self.clocks.imu_rate)
+        check_limit(self.task, self.clocks.imu_rate, "IMU rate")
         self.threads = resolve_threads(threads)
         true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
         true_sensors = self.sensors if true_sensors is None else true_sensors
         self.sensors.require_like(true_sensors)
         self.faults = faults_of(faults, true_sensors)
         self.innovations = check.flag("innovations", innovations)
+        check.flag("include_covariance", include_covariance)
+        check.flag("privileged", privileged)
         check.choice("filter_start", filter_start, FILTER_STARTS)
         if run_filter is None:
             needed = include_covariance or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
-        self.run_filter = run_filter
+        self.run_filter = check.flag("run_filter", run_filter)
         if run_filter:
             self.sensors.require_filter()
 
         draws = DrawingTable(self.randomization, true_vehicle, true_sensors, self.world)
-        check_draws(draws, true_vehicle, self.clocks)
+        check_draws(draws, true_vehicle, self.world, self.clocks)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
         self._model, self._world = params_block(model), params_block(true)

@@ -9,6 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+MOST_TICKS = 10**5
+"""Between two events of a clock; 500 s at 200 Hz."""
+
+LARGEST = 1e15
+"""No quantity of a vehicle is larger, in SI units; its square is still far from overflow."""
+
+SMALLEST = 1e-15
+"""No quantity that has to be positive is smaller; its square is still far from underflow."""
+
 
 class UnknownKeywordError(TypeError, ValueError):
     """A keyword that nothing has; as Python's own a TypeError, and a ValueError as all checks."""
@@ -37,7 +46,7 @@ def number(
     *,
     least: float = -math.inf,
     open_end: bool = False,
-    most: float = math.inf,
+    most: float = LARGEST,
 ) -> float:
     """`value` as a finite float in [least, most] (above `least`, with `open_end`)."""
     try:
@@ -55,12 +64,17 @@ def number(
         raise ValueError(f"{name} must be {relation} {least:g}, got {value!r}")
     if result > most:
         raise ValueError(f"{name} must be at most {most:g}, got {value!r}")
+    if result < -LARGEST:
+        raise ValueError(f"{name} must be at least {-LARGEST:g}, got {value!r}")
     return result
 
 
-def positive(name: str, value: Any, *, most: float = math.inf) -> float:
-    """`value` as a finite float above zero, at most `most`."""
-    return number(name, value, least=0.0, open_end=True, most=most)
+def positive(name: str, value: Any, *, least: float = SMALLEST, most: float = LARGEST) -> float:
+    """`value` as a finite float above zero, in [least, most]."""
+    result = number(name, value, least=0.0, open_end=True, most=most)
+    if result < least:
+        raise ValueError(f"{name} must be at least {least:g}, got {value!r}")
+    return result
 
 
 def whole(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
@@ -146,17 +160,30 @@ def _holds_no_numbers(value: Any) -> bool:
 
 def vector(name: str, value: Any, length: int) -> tuple[float, ...]:
     """`value` as a tuple of `length` finite floats."""
-    return tuple(array(name, value, (length,)).tolist())
+    return tuple(_sized(name, array(name, value, (length,))).tolist())
+
+
+def _sized(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Numbers none of which is larger than LARGEST."""
+    if values.size and np.abs(values).max() > LARGEST:
+        raise ValueError(f"{name} must be at most {LARGEST:g} either way, got {values}")
+    return values
 
 
 def matrix(name: str, value: Any, rows: int | None, columns: int) -> tuple[tuple[float, ...], ...]:
     """`value` as a tuple of rows of finite floats."""
-    return tuple(tuple(row) for row in array(name, value, (rows, columns)).tolist())
+    numbers = _sized(name, array(name, value, (rows, columns)))
+    return tuple(tuple(row) for row in numbers.tolist())
 
 
 def ticks(name: str, rate: float, tick_rate: float) -> int:
     """How many ticks lie between two events at `rate` [Hz]; they must be a whole number."""
     ratio = tick_rate / positive(name, rate)
+    if ratio > MOST_TICKS:
+        raise ValueError(
+            f"{name} must be at least {tick_rate / MOST_TICKS:g} Hz at an IMU rate of "
+            f"{tick_rate:g} Hz, got {rate:g} Hz"
+        )
     if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-9 * ratio:
         raise ValueError(
             f"{name} must divide the IMU rate of {tick_rate:g} Hz into whole ticks, got {rate:g} Hz"

@@ -6,8 +6,13 @@ still, the ground far away and the battery never empty, as in the laboratory's m
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from quad_gym import validation as check
 from quad_gym.validation import Checked, Vector
+
+MAX_WIND = 200.0
+"""The strongest tornadoes blow at some 135 m/s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +81,11 @@ class WorldParams(Checked):
 
     def __post_init__(self) -> None:
         self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)
-        self._check(check.number, "gust_wind_speed", least=0.0)
+        self._check(check.number, "gust_wind_speed", least=0.0, most=MAX_WIND)
+        if np.linalg.norm(self.wind_I) > MAX_WIND:
+            raise ValueError(
+                f"WorldParams.wind_I must be at most {MAX_WIND:g} m/s, got {self.wind_I}"
+            )
         self._check(check.flag, "ground_effect")
         self._check(check.positive, "rotor_radius")
         self._check(check.number, "ground_height")

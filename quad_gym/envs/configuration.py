@@ -165,6 +165,7 @@ class Flights:
             )
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world
+        check.instance("world", place, WorldParams)
         features = 0 if suite.camera is None else len(suite.camera.features_I)
         self.table: tuple[ObservationField, ...] = observation_layout(
             observation,
@@ -179,7 +180,7 @@ class Flights:
         self._split = policy_size(self.table) if privileged else None
         self.observation, self.action, self.layout = observation, action, layout
         self.control_rate = check.positive("control_rate", control_rate)
-        check_limit(self.task, self.control_rate)
+        check_limit(self.task, self.control_rate, "control_rate")
         self.batch = FlightBatch(
             count,
             vehicle=vehicle,
@@ -272,13 +273,24 @@ def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
     )
 
 
+def named_options(options: Any) -> dict[str, Any]:
+    """A copy of the options of a reset; none for None.
+
+    Raises:
+        ValueError: If they are not options by name.
+    """
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"options must be values by name, or None, got {options!r}")
+    return dict(options or {})
+
+
 def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
     """The start values in the options of a reset.
 
     Raises:
-        ValueError: If an option is unknown.
+        ValueError: If an option is unknown, or there are none by name.
     """
-    chosen = dict(options or {})
+    chosen = named_options(options)
     known = ("position", "velocity", "yaw")
     unknown = sorted(set(chosen) - set(known))
     if unknown:

@@ -330,7 +330,7 @@ def limit_asked_of_make() -> int | None:
             if getattr(spec, "entry_point", None) != ENTRY_POINT:
                 return None  # it makes an environment that uses this one
             asked = spec.max_episode_steps if spec is not None and asked is None else asked
-            return None if asked == -1 else asked  # -1: no wrapper
+            return None if isinstance(asked, int) and asked == -1 else asked  # -1: no wrapper
         frame = frame.f_back if frame.f_code.co_name in _MAKERS else None
     return None
 

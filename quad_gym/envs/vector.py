@@ -9,7 +9,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from quad_gym.envs.configuration import COLUMN, ENDINGS, Flights, checked_actions
+from quad_gym.envs.configuration import (
+    COLUMN,
+    ENDINGS,
+    Flights,
+    checked_actions,
+    named_options,
+)
 from quad_gym.envs.flight_info import final_faults, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import seeds_of, with_limit
@@ -106,7 +112,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             ValueError: If an option is unknown or invalid, or the seeds do not fit.
             TypeError: If `reset_mask` is no array of booleans.
         """
-        options = dict(options or {})
+        options = named_options(options)
         mask = self._checked_mask(options.pop("reset_mask", None))
         start = self.flights.start(options)
         seeds = seeds_of(seed, self.num_envs)

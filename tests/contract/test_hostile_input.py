@@ -1,0 +1,329 @@
+"""Hostile values for every keyword: refused by name, or flown without a number that is not finite.
+
+A table: every keyword of every face, of flights, filters, parameters, draws and faults, with values
+that are not numbers, not finite, too large, too small, of another kind, or of another shape.
+"""
+
+import dataclasses
+import inspect
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import FlightBatch, TaskParams
+from quad_gym import faults as fault_kinds
+from quad_gym.records import Autoreset, Control
+
+RTK, INDOOR = quad_gym.sensor_suite("rtk"), quad_gym.sensor_suite("indoor")
+NUMBERS = [np.nan, np.inf, -np.inf, -1.0, 0.0, 10**400]
+NUMBERS += [1e308, -1e308, 1e15, 1e12, 1e9, 1e6, -1e6, 1e4, 1e-308, 1e-14, 1e-9, 1e-6, 1e-4]
+OTHERS = ["three", b"3", True, (), [], {}, [[1.0]], [np.nan] * 3, np.zeros((2, 2)), object(), 3j]
+
+
+def vectors(size):
+    return [(value,) * size for value in NUMBERS if isinstance(value, float)]
+
+
+def assert_refused_or_flown(call, name, value):
+    """An error that names the argument, or what `call` returns: arrays without NaN and infinity."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # overflow and such, too
+        try:
+            seen = call(value)
+        except (ValueError, TypeError) as error:
+            if name.lower() not in str(error).lower():
+                pytest.fail(f"{name}={value!r} is refused without its name: {error!r}")
+            return
+    for array in seen:
+        assert np.isfinite(array).all(), f"{name}={value!r}"
+
+
+# ---- environments --------------------------------------------------------------------------------
+
+ONE_TASK = {
+    "gate_count": "Waypoints",
+    "gate_radius": "Waypoints",
+    "max_speed": "RandomTrajectory",
+    "max_acceleration": "RandomTrajectory",
+}
+
+
+def names_of(kind):
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+def environment_keywords():
+    """What the documentation of the environment lists as its arguments."""
+    text = inspect.getdoc(quad_gym.QuadEnv).partition("Args:")[2].partition("Raises:")[0]
+    heads = [line for line in text.splitlines() if line.startswith("    ") and line[4] != " "]
+    names = [n for head in heads for n in head.strip().split(":")[0].split(", ")]
+    names += [name for name in names_of(TaskParams) if name != "kind"]
+    return sorted(
+        {name.strip(", ") for name in names if name.strip(", ").isidentifier()} - {"task"}
+    )
+
+
+def flat(observation):
+    parts = observation.values() if isinstance(observation, dict) else [observation]
+    return [np.asarray(part) for part in parts]
+
+
+def fly_make(task, **keywords):
+    env = gymnasium.make(f"QuadGym/{task}-v0", disable_env_checker=True, **keywords)
+    seen = flat(env.reset(seed=1)[0])
+    for _ in range(4):
+        observation, reward, terminated, truncated, _ = env.step(np.full(4, 0.3))
+        seen += [*flat(observation), np.array(reward)]
+        if terminated or truncated:
+            break
+    env.close()
+    return seen
+
+
+def fly_make_vec(task, **keywords):
+    env = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=2, **keywords)
+    seen = flat(env.reset(seed=1)[0])
+    for _ in range(4):
+        observation, reward, *_ = env.step(np.full((2, 4), 0.3))
+        seen += [*flat(observation), reward]
+    env.close()
+    return seen
+
+
+def fly_sb3(task, **keywords):
+    env = quad_gym.make_sb3_vec_env(f"QuadGym/{task}-v0", 2, seed=1, **keywords)
+    seen = flat(env.reset())
+    for _ in range(4):
+        observation, reward, *_ = env.step(np.full((2, 4), 0.3))
+        seen += [*flat(observation), reward]
+    env.close()
+    return seen
+
+
+FACES = {"make": fly_make, "make_vec": fly_make_vec, "make_sb3_vec_env": fly_sb3}
+
+
+@pytest.mark.parametrize("name", [*environment_keywords(), "threads"])
+@pytest.mark.parametrize("face", FACES)
+def test_keywords_of_environments(face, name):
+    if name == "render_mode":
+        pytest.skip("Gymnasium itself has a say in that keyword")
+    if (name == "threads" and face == "make") or name.startswith("render"):
+        pytest.skip("another keyword's business")
+    task = ONE_TASK.get(name, "Circle")
+    for value in [*NUMBERS[:: 1 + (face != "make")], *OTHERS]:
+        assert_refused_or_flown(lambda v: FACES[face](task, **{name: v}), name, value)
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_a_keyword_that_there_is_not(face):
+    for value in OTHERS:
+        with pytest.raises(TypeError, match="colour is not a keyword"):
+            FACES[face]("Hover", colour=value)
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "yaw", "seed", "options", "colour"])
+def test_arguments_of_reset(name):
+    env = quad_gym.QuadEnv("hover")
+    env.reset(seed=1)
+
+    def reset(value):
+        given = {name: value} if name in ("seed", "options") else {"options": {name: value}}
+        return [*flat(env.reset(**given)[0]), env.step(np.zeros(4))[0]]
+
+    for value in [*NUMBERS, *OTHERS, *vectors(3), None]:
+        if isinstance(value, dict) and name == "options":
+            continue  # no options
+        assert_refused_or_flown(reset, name, value)
+
+
+# ---- flights -------------------------------------------------------------------------------------
+
+FIELDS = ("r", "v", "q", "w", "rotor_speeds", "r_hat", "v_hat", "R_hat", "b_a_hat", "L", "reward")
+
+
+def fly_batch(**keywords):
+    seen = []
+    for control in (Control.PD, Control.VELOCITY):
+        batch = FlightBatch(4, **{"control": control, **keywords})
+        batch.reset(seeds=range(4))
+        for _ in range(20):
+            batch.step(np.full((4, 4), 0.2))
+        seen += [batch.read(name) for name in FIELDS]
+    return seen
+
+
+@pytest.mark.parametrize(
+    "name", sorted(set(inspect.signature(FlightBatch).parameters) - {"bounds"})
+)
+def test_arguments_of_flights(name):
+    enumerations = ("source", "control", "layout", "autoreset")
+    names = name if name not in enumerations else name.capitalize()
+    for value in [*NUMBERS, *OTHERS]:
+        if name == "count":
+            if type(value) is float and value in (1e4, 1e6):
+                continue  # flights that one may have
+            assert_refused_or_flown(lambda v: [FlightBatch(v).results], name, value)
+        elif name in enumerations and isinstance(value, np.ndarray):
+            continue  # Python's own message
+        elif name in ("run_filter", "include_covariance", "privileged") and not isinstance(
+            value, str
+        ):
+            continue  # anything is true or false to them
+        else:
+            assert_refused_or_flown(lambda v: fly_batch(**{name: v}), names, value)
+
+
+@pytest.mark.parametrize("name", ["seeds", "keys", "mask", "position", "velocity", "yaw"])
+def test_arguments_of_a_batch_that_is_reset(name):
+    def reset(value):
+        batch = FlightBatch(3)
+        batch.reset(**{"seeds": range(3), **({name: value} if name != "keys" else {})})
+        if name == "keys":
+            batch.reset(keys=value)
+        batch.step()
+        return [batch.read("r"), batch.read("v")]
+
+    for value in [*NUMBERS, *OTHERS, *vectors(3)]:
+        assert_refused_or_flown(reset, name, value)
+
+
+# ---- parameters ----------------------------------------------------------------------------------
+
+
+def suite_of(**parts):
+    return {"sensors": RTK.replace(**parts)}
+
+
+def imu_suite(imu):
+    kept = imu.samples == "average"
+    integration = RTK.estimator.replace(integration="midpoint" if kept else "euler")
+    return suite_of(imu=imu, estimator=integration)
+
+
+PARAMETERS = {
+    "VehicleParams": (quad_gym.VehicleParams(), lambda p: {"vehicle": p}),
+    "PDGains": (quad_gym.PDGains(), lambda p: {"gains": p}),
+    "ActionParams": (quad_gym.ActionParams(), lambda p: {"actions": p}),
+    "TaskParams": (TaskParams(), lambda p: {"task": p}),
+    "WorldParams": (quad_gym.WorldParams(), lambda p: {"world": p}),
+    "BatteryParams": (
+        quad_gym.BatteryParams(),
+        lambda p: {"world": quad_gym.WorldParams(battery=p)},
+    ),
+    "ImuParams": (RTK.imu, imu_suite),
+    "GnssParams": (RTK.gnss, lambda p: suite_of(gnss=p)),
+    "CameraParams": (RTK.camera, lambda p: suite_of(camera=p)),
+    "FilterParams": (RTK.estimator, lambda p: suite_of(estimator=p)),
+    "NoisyObservationParams": (RTK.noisy, lambda p: suite_of(noisy=p)),
+    "PlacementParams": (INDOOR.placement, lambda p: {"sensors": INDOOR.replace(placement=p)}),
+    "SensorSuite": (RTK, lambda p: {"sensors": p}),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, name) for kind, (p, _) in PARAMETERS.items() for name in names_of(p)]
+)
+def test_fields_of_parameters(kind, name):
+    nominal, use = PARAMETERS[kind]
+    present = getattr(nominal, name)
+    values = [*NUMBERS, *OTHERS]
+    if isinstance(present, tuple):
+        values += vectors(len(present))
+    for value in values:
+        assert_refused_or_flown(
+            lambda v: fly_batch(**use(nominal.replace(**{name: v}))), name, value
+        )
+
+
+@pytest.mark.parametrize("drawable", quad_gym.randomization.DRAWABLES, ids=lambda d: d.name)
+def test_ranges_of_draws(drawable):
+    keywords = {"sensors": RTK, "world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())}
+
+    def drawn(span):
+        part = {drawable.name: quad_gym.Uniform(*span)}
+        return fly_batch(**keywords, randomization=part)
+
+    limits = [(-1.0, 1.0), (0.0, 1.0), (1.0, 0.0), (np.nan, 1.0), (-1e15, 1e15), (0.0, np.inf)]
+    for span in [*limits, ("a", "b"), (1e-14, 1e-12)]:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                seen = drawn(span)
+        except (ValueError, TypeError) as error:
+            if not any(word in str(error) for word in (drawable.name, "Uniform", "by mass")):
+                pytest.fail(f"{drawable.name} in {span} is refused without its name: {error!r}")
+        else:
+            assert all(np.isfinite(part).all() for part in seen), span
+
+
+FAULTS = [
+    (kind, name)
+    for kind in fault_kinds.Fault.__subclasses__() + fault_kinds._Directed.__subclasses__()
+    if not kind.__name__.startswith("_")
+    for name in names_of(kind)
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), FAULTS, ids=lambda part: getattr(part, "__name__", part))
+def test_fields_of_faults(kind, name):
+    for value in [*NUMBERS, *OTHERS, *vectors(2), *vectors(3), (0.2, 0.1)]:
+        assert_refused_or_flown(
+            lambda v: fly_batch(sensors=RTK, faults=kind(**{name: v})), name, value
+        )
+
+
+# ---- filters -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        ("initialize", "gnss_position_G"),
+        ("initialize", "gnss_baseline_G"),
+        ("initialize", "heading"),
+        ("set_state", "position"),
+        ("set_state", "R_BI"),
+        ("set_state", "covariance"),
+        ("update", "gnss_position_G"),
+        ("update", "gnss_baseline_G"),
+        ("update", "pixels"),
+        ("update", "gnss_velocity_G"),
+        ("predict", "gyro"),
+        ("predict", "accel"),
+    ],
+)
+def test_arguments_of_filters(kind, method, name):
+    good = {
+        "initialize": {"gnss_position_G": np.ones(3), "gnss_baseline_G": [0.1, 0.1, 0.0]},
+        "set_state": {
+            "position": np.zeros(3),
+            "velocity": np.zeros(3),
+            "R_BI": np.eye(3),
+            "accel_bias": np.zeros(3),
+            "gyro_bias": np.zeros(3),
+            "covariance": np.eye(15) * 1e-2,
+        },
+        "update": {},
+        "predict": {"gyro": np.zeros(3), "accel": np.array([0.0, 0.0, 9.8])},
+    }
+
+    def use(value):
+        ukf = kind(RTK)
+        ukf.initialize(**good["initialize"])
+        with warnings.catch_warnings():  # a filter that keeps its last good state says so
+            warnings.simplefilter("ignore", RuntimeWarning)
+            getattr(ukf, method)(**{**good[method], name: value})
+        return [ukf.position, ukf.velocity, ukf.R_BI, ukf.covariance]
+
+    for value in [*NUMBERS, *OTHERS, *vectors(3), np.full((12, 2), np.inf), np.full((3, 3), 1e300)]:
+        assert_refused_or_flown(use, name, value)
+
+
+def test_kinds_of_autoreset_are_listed_by_their_enumeration():
+    with pytest.raises(ValueError, match="Autoreset"):
+        Autoreset("sometimes")
