@@ -221,7 +221,7 @@ def test_arrays_become_tuples_so_that_nobody_can_change_them():
 def test_presets_are_known_by_name(preset, argument):
     assert preset("lab") == preset("lab")
     for unknown in ("garage", None, ["lab"]):
-        with pytest.raises(ValueError, match=rf"^{argument} must be one of lab"):
+        with pytest.raises(ValueError, match=rf"^{argument} must be one of (standard, )?lab"):
             preset(unknown)
 
 

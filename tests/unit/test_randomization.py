@@ -205,7 +205,7 @@ def some_distribution(name):
 
 def flown(ticks=60, seeds=(3,), **keywords):
     task = quad_gym.TaskParams(kind="circle", start="hover", duration=0.0)
-    batch = FlightBatch(len(seeds), task=task, threads=1, **keywords)
+    batch = FlightBatch(len(seeds), task=task, threads=1, **({"sensors": SUITE} | keywords))
     batch.reset(seeds=seeds)
     for _ in range(ticks):
         batch.step()
