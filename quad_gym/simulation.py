@@ -386,7 +386,7 @@ class FlightBatch:
 
     @property
     def results(self) -> NDArray[np.float64]:
-        """(count, 12) of the last step, in the columns of `RESULTS`; the next step overwrites it."""
+        """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
         return self._results.T
 
     def result(self, name: str) -> NDArray[np.float64]:

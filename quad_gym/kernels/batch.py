@@ -128,6 +128,7 @@ _ARGUMENTS = (
 )
 
 
+@entry(signature=types.none(*_ARGUMENTS))
 def fly(
     blocks,
     first_block,
@@ -203,6 +204,3 @@ def fly(
                 call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
             scratch.begins = select(flight.tick >= 0.0, 1.0, 0.0)
             _write_rows(work[0].observation, low, high, observations, index, work[0].begins)
-
-
-fly = entry(fly, types.none(*_ARGUMENTS))

@@ -18,7 +18,7 @@ class DrawRange(NamedTuple):
 
     quantity: str
     first: int
-    count: int
+    draws: int
 
 
 DRAW_RANGES: list[DrawRange] = []
@@ -32,7 +32,7 @@ def _claim(quantity: str, first: int, count: int) -> int:
         ValueError: If another quantity has one of them.
     """
     for other in DRAW_RANGES:
-        if first < other.first + other.count and other.first < first + count:
+        if first < other.first + other.draws and other.first < first + count:
             raise ValueError(f"draws of {quantity!r} overlap those of {other.quantity!r}")
     DRAW_RANGES.append(DrawRange(quantity, first, count))
     return first

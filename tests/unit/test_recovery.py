@@ -1,4 +1,4 @@
-"""A filter that notices that it is wrong: recovery after faults of the IMU, and what counts as lost."""
+"""A filter that notices that it is wrong: recovery after faults, and what counts as lost."""
 
 import math
 

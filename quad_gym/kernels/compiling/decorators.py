@@ -4,6 +4,7 @@ No fast-math flag is set: what is fused into a multiply-add is fused where numbe
 `kernels/simd/lanes.py`, so that a result does not depend on what surrounds its computation.
 """
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -67,13 +68,17 @@ class EntryDispatcher(CPUDispatcher):  # type: ignore[misc]
         return bool(self.overloads) or self._cache.holds(self.signature, self.targetctx)
 
 
-def entry(function: Callable[..., Any], signature: Any = None) -> Any:
+def entry(function: Callable[..., Any] | None = None, signature: Any = None) -> Any:
     """Compile `function` for calls from Python: cached on disk, running without the GIL.
+
+    As a decorator: `@entry`, or `@entry(signature=...)`.
 
     Args:
         function: What to compile.
         signature: The Numba types of its arguments, so that it can be compiled ahead of a call.
     """
+    if function is None:
+        return functools.partial(entry, signature=signature)
     lean = {"pipeline_class": EntryCompiler} if LEAN else {}
     dispatcher = EntryDispatcher(py_func=function, targetoptions=_OPTIONS | {"nogil": True}, **lean)
     dispatcher._cache = cache_of(function)

@@ -161,7 +161,8 @@ def _judge_triple(flight, p, work, k, s, has, again, gating):
 def _judge_direction(flight, p, work, k, s, has, again, gating, most):
     """Keep the innovation of a direction; return where it is rejected, and where too uncertain.
 
-    Besides, its innovation in deviations, and its NIS. Too uncertain is one whose predicted variances add up to more than `most`.
+    Besides, its innovation in deviations, and its NIS. Too uncertain is one whose predicted
+    variances add up to more than `most`.
     """
     S = _covariance(p, work, k)
     u = (work.h[k], work.h[k + 1], work.h[k + 2])

@@ -54,9 +54,9 @@ DRIFT_ALARM = 0.55
 _MEMORY = 0.02
 """Weight of the latest innovation in the mean: it deviates by sqrt(0.02 / 1.98) = 0.1."""
 _LARGEST = 3.0
-"""Innovations count as no more deviations than that in the mean, so that outliers do not rule it."""
+"""Innovations count as no more deviations than that in the mean, for the sake of outliers."""
 LOST_RATIO, FOUND_RATIO = 2.0, 1.5
-"""Mean NIS over its degrees of freedom from which on a filter counts as lost, and as found again."""
+"""Mean NIS over its degrees of freedom at which a filter counts as lost, and as found again."""
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
 DOUBT_TIME = 1.0
 """How long a filter counts as lost after a doubt, at least [s]."""
@@ -159,7 +159,7 @@ def _doubt_attitude(flight, baseline):
 
 @kernel
 def _doubt_features(flight, p, feature_count, camera):
-    """The largest square of a feature's innovation, as an angle and as an offset of the position."""
+    """The largest square of a feature's innovation, as an angle and as an offset of position."""
     angle, offset = 0.0 * flight.tick, 0.0 * flight.tick
     for i in range(feature_count):
         s = FEATURE_BLOCKS + i

@@ -9,7 +9,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from quad_gym.kernels.simd.lanes import WIDTH, call_llvm, lanes, splat, words
+from quad_gym.kernels.simd.lanes import call_llvm, lanes, splat, words
+from quad_gym.records import WIDTH
 
 _FLOAT = ir.DoubleType()
 _INT = ir.IntType(64)

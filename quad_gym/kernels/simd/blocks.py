@@ -23,7 +23,8 @@ from numba.extending import (
 )
 from numba.np.arrayobj import make_array, populate_array
 
-from quad_gym.kernels.simd.lanes import WIDTH, lanes, vector_of, words
+from quad_gym.kernels.simd.lanes import lanes, vector_of, words
+from quad_gym.records import WIDTH
 
 
 class LaneRecord(types.Type):

@@ -8,7 +8,7 @@ on the SIMD unit. This file teaches Numba three value types and the operations o
 |-----------|----------|-------------------|------------------------------------------------------|
 | `Lanes`   | float64  | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt`          |
 | `Mask`    | bool     | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`            |
-| `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `kernels.simd.bits`        |
+| `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `bits.py`            |
 
 There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never
 sees its neighbors, so what a flight does is independent of who flies beside it, NaN included.
