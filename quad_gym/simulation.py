@@ -1,5 +1,6 @@
 """`FlightBatch`: many flights of one configuration, flown together."""
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -41,7 +42,7 @@ from quad_gym.records import (
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
 from quad_gym.starts import checked_keys, checked_mask, checked_start
-from quad_gym.threads import resolve_threads, run_ranges
+from quad_gym.threads import Crew, Fly, resolve_threads
 from quad_gym.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.world_packing import pack_options
 from quad_gym.world_params import WorldParams, world_params
@@ -213,6 +214,8 @@ class FlightBatch:
         self._begun = False
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
         self._results = np.zeros((len(RESULTS), self.count))
+        self._observations = np.zeros((self.count, self._low.size), np.float32)
+        self._crew: Crew | None = None
 
     # ---- flying -------------------------------------------------------------------------------
 
@@ -291,33 +294,43 @@ class FlightBatch:
         self._begun = True
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        observations = np.empty((self.count, self._low.size), np.float32)  # the kernel fills it
-
         table = linked_table(self._stages)
+        if self._crew is None or self._crew.process != os.getpid():
+            self._crew = Crew(self._ranges(table), len(self._blocks), self.threads)
+        self._crew.run(int(command))
+        return self._observations.copy()
 
-        def part(number: int, first: int, last: int) -> None:
+    def _ranges(self, table: NDArray[Any]) -> Fly:
+        """What flies a range of blocks; it knows the arrays, not the batch, which may go."""
+        own, work = self._own, self._work
+        blocks, resets, world = self._blocks, self._resets, self._world
+        model = (self._model, self._settings)
+        after = (table, self._actions, self._low, self._high)
+        written = (self._observations, self.final_observations, self._results)
+
+        def fly_range(
+            number: int, first: int, last: int, words: NDArray[np.int64], serving: int
+        ) -> None:
             fly(
-                self._blocks,
+                blocks,
                 first,
                 last,
-                int(command),
-                self._resets,
-                self._world,
-                self._own[number],
-                self._model,
-                self._settings,
-                self._work[number],
-                table,
-                self._actions,
-                self._low,
-                self._high,
-                observations,
-                self.final_observations,
-                self._results,
+                resets,
+                world,
+                own[number],
+                *model,
+                work[number],
+                *after,
+                *written,
+                words,
+                serving,
             )
 
-        run_ranges(part, len(self._blocks), self.threads)
-        return observations
+        return fly_range
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the threads, which a copy makes anew."""
+        return self.__dict__ | {"_crew": None}
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: never."""

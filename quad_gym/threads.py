@@ -1,24 +1,28 @@
 """The one place that knows of threads: shares a range of blocks among the cores.
 
-Kernels release the GIL, so plain threads run them side by side. A pool belongs to the process that
-made it: after a fork the child makes its own, and a batch that is pickled or copied takes none
-along.
+Kernels release the GIL, so plain threads run them side by side. A crew of threads belongs to the
+process that made it: after a fork the child makes its own, and a batch that is pickled or copied
+takes none along.
 """
 
 import os
+import threading
+import time
+import weakref
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
 
 from quad_gym import validation as check
+from quad_gym.kernels import mailbox
 from quad_gym.kernels.compiling.cores import available_cores
 
 MIN_BLOCKS_PER_THREAD = 4
-"""Fewer blocks than this are not worth a hand-over to another thread (some 20 us)."""
+"""Fewer blocks than this are not worth a hand-over to another thread."""
 
 MAX_THREADS = 1024
 """More than this is a mistake: each thread has memory of its own."""
-
-_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
 def resolve_threads(threads: int | None) -> int:
@@ -32,35 +36,99 @@ def resolve_threads(threads: int | None) -> int:
     return check.whole("threads", threads, most=MAX_THREADS)
 
 
-def _pool(workers: int) -> ThreadPoolExecutor:
-    key = (os.getpid(), workers)
-    if key not in _pools:
-        _pools[key] = ThreadPoolExecutor(workers, thread_name_prefix="quad_gym")
-    return _pools[key]
+Fly = Callable[[int, int, int, NDArray[np.int64], int], None]
+"""Flies a range: its number, first block, last block, mailbox, and whether to serve that."""
 
 
-def run_ranges(work: Callable[[int, int, int], None], blocks: int, threads: int) -> None:
-    """Call `work(part, first, last)` on ranges that together cover `blocks` blocks.
+class Crew:
+    """Helper threads of one batch, each of which flies a range of its blocks.
 
-    The first part runs in the calling thread. What the parts compute does not depend on how they
-    are cut.
+    A helper lives in compiled code while steps follow each other fast, and sleeps otherwise; see
+    `kernels/mailbox.py`. It ends with the crew.
 
     Args:
-        work: Called once per part, with the part's number and its range of blocks without the end.
+        fly: Flies a range: once with serving 0, and with 1 until its mailbox stays empty.
         blocks: How many blocks there are.
-        threads: The most parts to cut.
+        threads: The most ranges to cut; the first is the calling thread's.
     """
-    parts = max(1, min(threads, blocks // MIN_BLOCKS_PER_THREAD))
-    if parts == 1:
-        work(0, 0, blocks)
-        return
-    cuts = [blocks * part // parts for part in range(parts + 1)]
-    pool = _pool(threads - 1)
-    others: list[Future[None]] = [
-        pool.submit(work, part, cuts[part], cuts[part + 1]) for part in range(1, parts)
-    ]
-    try:
-        work(0, cuts[0], cuts[1])
-    finally:
-        for other in others:
-            other.result()
+
+    def __init__(self, fly: Fly, blocks: int, threads: int) -> None:
+        parts = max(1, min(threads, blocks // MIN_BLOCKS_PER_THREAD))
+        cuts = [blocks * part // parts for part in range(parts + 1)]
+        self.process = os.getpid()
+        self._fly, self._own = fly, (0, cuts[0], cuts[1])
+        self._mailboxes = np.zeros((parts - 1, mailbox.WORDS), np.int64)
+        self._words = np.zeros(mailbox.WORDS, np.int64)
+        self._alarms = [threading.Semaphore(0) for _ in range(parts - 1)]
+        self._errors: list[BaseException] = []
+        self._flying = False
+        for i in range(parts - 1):
+            part = (i + 1, cuts[i + 1], cuts[i + 2])
+            shared = (self._mailboxes[i], self._alarms[i], self._errors)
+            threading.Thread(
+                target=_help, args=(fly, *part, *shared), name="quad_gym", daemon=True
+            ).start()
+        weakref.finalize(self, _dismiss, self._mailboxes, self._alarms)
+
+    def run(self, command: int) -> None:
+        """Fly all ranges, the first of them in the calling thread.
+
+        Raises:
+            RuntimeError: If another thread is flying this batch at the same time.
+        """
+        if self._flying:
+            raise RuntimeError("a batch can be flown by one thread at a time")
+        self._flying = True
+        try:
+            self._words[mailbox.COMMAND] = command
+            if len(self._mailboxes):
+                self._wait()  # for what an interrupted step may have left
+                if mailbox.post(self._mailboxes, command):
+                    self._wake()
+            self._fly(*self._own, self._words, 0)
+            if len(self._mailboxes):
+                self._wait()
+        finally:
+            self._flying = False
+
+    def _wait(self) -> None:
+        """Wait until all helpers are done."""
+        while not mailbox.wait(self._mailboxes):
+            if self._errors:
+                raise self._errors.pop()
+            time.sleep(0.0)
+
+    def _wake(self) -> None:
+        """Wake the helpers that sleep."""
+        for words, alarm in zip(self._mailboxes, self._alarms, strict=True):
+            if words[mailbox.PRESENT] == 0:
+                alarm.release()
+
+
+def _help(
+    fly: Fly,
+    number: int,
+    first: int,
+    last: int,
+    words: NDArray[np.int64],
+    alarm: threading.Semaphore,
+    errors: list[BaseException],
+) -> None:
+    """What a helper thread does: sleep until it is woken, then serve its mailbox."""
+    while True:
+        alarm.acquire()
+        if words[mailbox.STOP]:
+            return
+        words[mailbox.PRESENT] = 1
+        try:
+            fly(number, first, last, words, 1)
+        except BaseException as error:
+            errors.append(error)
+            return
+
+
+def _dismiss(mailboxes: NDArray[np.int64], alarms: list[threading.Semaphore]) -> None:
+    """End the helpers of a crew that nobody needs any more."""
+    mailboxes[:, mailbox.STOP] = 1
+    for alarm in alarms:
+        alarm.release()

@@ -7,6 +7,8 @@ from numba.np.numpy_support import from_dtype
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.flight import begin_episode, tick
+from quad_gym.kernels.mailbox import COMMAND, DONE, next_ticket
+from quad_gym.kernels.simd.atomics import read_shared, write_shared
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import (
@@ -111,7 +113,6 @@ _ARGUMENTS = (
     _array(FLIGHT_BLOCK),
     types.int64,
     types.int64,
-    types.int64,
     _array(np.uint8),
     _array(PARAMS_BLOCK),
     _array(PARAMS_BLOCK),
@@ -125,6 +126,8 @@ _ARGUMENTS = (
     _array(np.float32, 2),
     _array(np.float32, 2),
     _array(np.float64, 2),
+    _array(np.int64),
+    types.int64,
 )
 
 
@@ -133,7 +136,6 @@ def fly(
     blocks,
     first_block,
     last_block,
-    command,
     resets,
     world,
     own,
@@ -147,13 +149,14 @@ def fly(
     observations,
     final_observations,
     results,
+    mailbox,
+    serving,
 ):
-    """Step or reset the flights of a range of blocks.
+    """Step or reset the flights of a range of blocks: once, or whenever a mailbox says so.
 
     Args:
         blocks: (n_blocks,) FLIGHT_BLOCK.
         first_block, last_block: The range, without its end.
-        command: A `Command`.
         resets: (n,) uint8; for RESET, which flights begin an episode.
         world: (1,) PARAMS_BLOCK: parameters as they are.
         own: (1,) PARAMS_BLOCK, used by no other thread: a copy of `world`, where the parameters of
@@ -168,6 +171,8 @@ def fly(
         final_observations: Likewise, written where one episode ends and the next begins in this
             step.
         results: (len(RESULTS), n), written in a STEP: a row for each of `quad_gym.records.RESULTS`.
+        mailbox: (WORDS,) of the thread that calls, see `mailbox.py`; has the `Command`.
+        serving: 0: fly once; 1: fly the commands of the mailbox until it stays empty.
     """
     scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
     stages = stage_table[0]
@@ -175,32 +180,42 @@ def fly(
     true = lanes_of(own[0]) if differ else nominal
     believed = true if todo.known else lanes_of(model[0])
     observing = observations.shape[1] > 0
-    for index in range(first_block, last_block):
-        block, flight = blocks[index], lanes_of(blocks[index])
-        if todo.randomized:
-            call_stage(stages, _IMPOSE, flight, true, nominal, todo, scratch, 0)
-        if todo.faults:
-            call_stage(stages, _MEET_ROTORS, flight, true, believed, todo, scratch, 0)
-        if command == Command.RESET:
-            for lane in range(WIDTH):
-                known = index * WIDTH + lane < resets.shape[0]
-                work[0].begins[lane] = resets[index * WIDTH + lane] if known else 1.0
-            begins = scratch.begins > 0.0
-        else:
-            _load_actions(block, actions, index)
-            begins, done = _fly_step(flight, true, believed, todo, scratch, stages)
-            _write_results(block, results, index)
+    while True:  # once, where nobody serves
+        ticket = 0
+        if serving:
+            ticket = next_ticket(mailbox)
+            if ticket == 0:
+                return
+        command = read_shared(mailbox, COMMAND)
+        for index in range(first_block, last_block):
+            block, flight = blocks[index], lanes_of(blocks[index])
+            if todo.randomized:
+                call_stage(stages, _IMPOSE, flight, true, nominal, todo, scratch, 0)
+            if todo.faults:
+                call_stage(stages, _MEET_ROTORS, flight, true, believed, todo, scratch, 0)
+            if command == Command.RESET:
+                for lane in range(WIDTH):
+                    known = index * WIDTH + lane < resets.shape[0]
+                    work[0].begins[lane] = resets[index * WIDTH + lane] if known else 1.0
+                begins = scratch.begins > 0.0
+            else:
+                _load_actions(block, actions, index)
+                begins, done = _fly_step(flight, true, believed, todo, scratch, stages)
+                _write_results(block, results, index)
+                if observing:
+                    call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
+                    scratch.begins = select(begins & done, 1.0, 0.0)
+                    _write_rows(
+                        work[0].observation, low, high, final_observations, index, work[0].begins
+                    )
+            beginning = any_of(begins)
+            if beginning:
+                begin_episode(flight, nominal, true, believed, todo, scratch, stages, begins)
             if observing:
-                call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
-                scratch.begins = select(begins & done, 1.0, 0.0)
-                _write_rows(
-                    work[0].observation, low, high, final_observations, index, work[0].begins
-                )
-        beginning = any_of(begins)
-        if beginning:
-            begin_episode(flight, nominal, true, believed, todo, scratch, stages, begins)
-        if observing:
-            if beginning or command == Command.RESET:
-                call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
-            scratch.begins = select(flight.tick >= 0.0, 1.0, 0.0)
-            _write_rows(work[0].observation, low, high, observations, index, work[0].begins)
+                if beginning or command == Command.RESET:
+                    call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
+                scratch.begins = select(flight.tick >= 0.0, 1.0, 0.0)
+                _write_rows(work[0].observation, low, high, observations, index, work[0].begins)
+        if not serving:
+            return
+        write_shared(mailbox, DONE, ticket)

@@ -1,0 +1,149 @@
+"""Helper threads of a batch: the same flights, awake or asleep, copied, forked and dismissed."""
+
+import copy
+import gc
+import multiprocessing
+import pickle
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from quad_gym.kernels import mailbox
+from quad_gym.records import WIDTH, Control, Source
+from quad_gym.simulation import FlightBatch
+from quad_gym.threads import MIN_BLOCKS_PER_THREAD, Crew
+
+COUNT = 3 * MIN_BLOCKS_PER_THREAD * WIDTH + 3
+
+
+def batch_of(threads, count=COUNT):
+    batch = FlightBatch(
+        count, source=Source.TRUTH, control=Control.CTBR, control_rate=50.0, threads=threads
+    )
+    batch.reset(seeds=range(count))
+    return batch
+
+
+def flown(batch, steps=20, pause=0.0):
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        batch.step(rng.uniform(-0.3, 0.3, (batch.count, 4)))
+        if pause:
+            time.sleep(pause)
+    return batch.snapshot().tobytes()
+
+
+def helpers():
+    return [thread for thread in threading.enumerate() if thread.name == "quad_gym"]
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.003])
+@pytest.mark.parametrize("threads", [2, 3])
+def test_flights_are_the_same_whether_helpers_watch_or_sleep(threads, pause):
+    assert flown(batch_of(threads), pause=pause) == flown(batch_of(1))
+
+
+def test_two_batches_take_turns():
+    one, other = batch_of(2), batch_of(3)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        actions = rng.uniform(-0.3, 0.3, (COUNT, 4))
+        one.step(actions)
+        other.step(actions)
+    assert one.snapshot().tobytes() == other.snapshot().tobytes() == flown(batch_of(1))
+
+
+@pytest.mark.parametrize("twin", [copy.deepcopy, lambda batch: pickle.loads(pickle.dumps(batch))])
+def test_a_copy_has_threads_of_its_own(twin):
+    batch = batch_of(2)
+    flown(batch, 3)
+    other = twin(batch)
+    assert flown(batch) == flown(other)
+
+
+def child(batch, pipe):
+    pipe.send(flown(batch))
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_after_a_fork_the_child_flies_with_threads_of_its_own():
+    batch = batch_of(2)
+    flown(batch, 3)
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe()
+    process = context.Process(target=child, args=(batch, there))
+    process.start()
+    assert here.poll(60.0)
+    assert here.recv() == flown(batch)
+    process.join(10.0)
+    assert process.exitcode == 0
+
+
+def test_helpers_end_with_their_batch():
+    gc.collect()
+    before = len(helpers())
+    batch = batch_of(3)
+    flown(batch, 3)
+    assert len(helpers()) == before + 2
+    del batch
+    gc.collect()
+    deadline = time.monotonic() + 10.0
+    while len(helpers()) > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert len(helpers()) == before
+
+
+def test_few_flights_need_no_helpers():
+    before = len(helpers())
+    flown(batch_of(8, count=WIDTH), 3)
+    assert len(helpers()) == before
+
+
+def crew_of(fly):
+    return Crew(fly, 2 * MIN_BLOCKS_PER_THREAD, 2)
+
+
+def test_what_goes_wrong_in_a_helper_is_raised():
+    def fly(number, first, last, words, serving):
+        if serving:
+            raise MemoryError("no more")
+
+    with pytest.raises(MemoryError, match="no more"):
+        crew_of(fly).run(0)
+
+
+def test_after_an_interrupted_step_the_next_one_is_flown_by_all():
+    flown_by, interrupts = [], [True]
+
+    def fly(number, first, last, words, serving):
+        if serving:
+            time.sleep(0.05)
+            while words[mailbox.TICKET] != words[mailbox.DONE]:
+                flown_by.append(number)
+                words[mailbox.DONE] = words[mailbox.TICKET]
+            words[mailbox.PRESENT] = 0
+        elif interrupts and interrupts.pop():
+            raise KeyboardInterrupt
+        else:
+            flown_by.append(number)
+
+    crew = crew_of(fly)
+    with pytest.raises(KeyboardInterrupt):
+        crew.run(0)
+    crew.run(0)
+    assert sorted(flown_by) == [0, 1, 1]
+
+
+def test_a_batch_is_flown_by_one_thread_at_a_time():
+    crew = None
+
+    def fly(number, first, last, words, serving):
+        if not serving:
+            crew.run(0)
+
+    crew = Crew(fly, 1, 1)
+    with pytest.raises(RuntimeError, match="one thread at a time"):
+        crew.run(0)
