@@ -8,11 +8,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from quad_gym import validation as check
 from quad_gym.distributions import Distribution, Uniform
@@ -141,14 +141,18 @@ class DrawingTable:
 
     def mean_square(self, name: str) -> NDArray[np.float64]:
         """(size,) mean square of each component of a parameter, over its distribution."""
-        u = (np.arange(4096) + 0.5) / 4096
+        u, quantile = (np.arange(4096) + 0.5) / 4096, NormalDist().inv_cdf
         found = []
         for k in range(COLUMNS[name].start, COLUMNS[name].stop):
-            values = {
-                UNIFORM: self.a[k] + self.b[k] * u,
-                LOG_UNIFORM: self.a[k] * np.exp(self.b[k] * u),
-                NORMAL: self.a[k] + self.b[k] * ndtri(self.c[k] + self.d[k] * u),
-            }.get(int(self.kind[k]), np.zeros(1))
+            kind, a, b = int(self.kind[k]), self.a[k], self.b[k]
+            if kind == UNIFORM:
+                values = a + b * u
+            elif kind == LOG_UNIFORM:
+                values = a * np.exp(b * u)
+            elif kind == NORMAL:
+                values = a + b * np.array([quantile(p) for p in self.c[k] + self.d[k] * u])
+            else:
+                values = np.zeros(1)
             found.append(math.fsum(values * values) / values.size)
         return np.array(found)
 

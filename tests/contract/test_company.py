@@ -163,9 +163,9 @@ def test_an_environment_travels_to_a_worker_in_mid_episode():
 # ---- the cache of compiled kernels ---------------------------------------------------------------
 
 SMALL = (
-    "import numpy as np; from quad_gym.rotations import euler_to_dcm;"
-    "R = euler_to_dcm([0.1, 0.2, 0.3]);"
-    "print(np.abs(R @ R.T - np.eye(3)).max() < 1e-12)"
+    "import numpy as np; from quad_gym.estimation import solve_wahba;"
+    "R = solve_wahba(np.ones(3), np.eye(3), np.eye(3)[[1, 2, 0]]);"
+    "print(np.abs(R @ np.eye(3).T - np.eye(3)[[1, 2, 0]].T).max() < 1e-12)"
 )
 """A program that compiles one small kernel."""
 
