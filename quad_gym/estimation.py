@@ -1,5 +1,6 @@
 """State estimation for one vehicle: Wahba's problem, an unscented and an extended Kalman filter."""
 
+import functools
 import warnings
 from typing import Any
 
@@ -8,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym import validation as check
 from quad_gym.kernels import single
+from quad_gym.kernels.compiling.workers import prepare
 from quad_gym.packing import form_of, params_record
 from quad_gym.params import VehicleParams
 from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterForm, FilterStatus
@@ -50,6 +52,12 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
             "v_I and v_B must determine a rotation: two directions at least must differ"
         )
     return R_BI
+
+
+@functools.cache
+def _prepare() -> None:
+    """Compile what a filter calls, side by side, unless this process has it."""
+    prepare(single.FILTER)
 
 
 def _require_relative(position_G: NDArray[np.float64]) -> None:
@@ -119,6 +127,7 @@ class _KalmanFilter:
             x_I[:2] = np.cos(angle), np.sin(angle)
         self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
         self._flight["w_before"] = np.nan
+        _prepare()
         single.ukf_initialize(self._flight, self._params, x_I)
         self._running = True
 
@@ -165,6 +174,7 @@ class _KalmanFilter:
         )
         for name, value in zip(_STATE, values, strict=True):
             self._flight[name] = value
+        _prepare()
         self._flight["L"], self._flight["filter_status"] = L, 0
         self._flight["w_before"] = np.nan
         self._running = True

@@ -83,11 +83,11 @@ def face_row(
     named = dict(options)
     named.pop("threads", None)
     observation, rate = named.pop("observation", "estimate"), named.pop("control_rate", 50)
-    extra = ", ".join(f"{key}={value:g}" for key, value in named.items())
-    label = f"{face}, {observation}, {rate} Hz" + (f", {extra}" if extra else "")
-    return report(
-        label, timing, face=face, envs=count, threads=threads, reset_share=resets, options=options
-    )
+    suite = named.pop("sensors", "standard")
+    extra = "".join(f", {key}={value:g}" for key, value in named.items())
+    label = f"{face}, {observation}, {rate} Hz, {suite}{extra}"
+    what = {"face": face, "envs": count, "threads": threads, "reset_share": resets}
+    return report(label, timing, **what, suite=suite, options=options)
 
 
 def time_others(envs: int, effort: Effort) -> list[Row]:
@@ -95,7 +95,14 @@ def time_others(envs: int, effort: Effort) -> list[Row]:
     env = gymnasium.make("Pendulum-v1")
     env.reset(seed=0)
     timing, resets = time_plain_env(env, [np.zeros(1, np.float32)], effort)
-    what = {"face": "single", "envs": 1, "threads": 1, "reset_share": resets, "options": {}}
+    what = {
+        "face": "single",
+        "envs": 1,
+        "threads": 1,
+        "reset_share": resets,
+        "suite": None,
+        "options": {},
+    }
     rows = [report("Pendulum-v1", timing, **what)]
     for env_id, mode, actions in (
         ("Pendulum-v1", "sync", np.zeros((envs, 1), np.float32)),
@@ -108,7 +115,8 @@ def time_others(envs: int, effort: Effort) -> list[Row]:
             many.step(actions)
 
         timing = measure(step, effort).per(envs)
-        what = {"face": mode, "envs": envs, "threads": 1, "reset_share": None, "options": {}}
+        what = {"face": mode, "envs": envs, "threads": 1, "reset_share": None, "suite": None}
+        what["options"] = {}
         rows.append(report(f"{env_id}, {mode}", timing, **what))
         many.close()
     return rows
@@ -124,6 +132,7 @@ def time_faces(envs: int, cores: int, effort: Effort) -> list[Row]:
     """
     rows: list[Row] = []
     slow = {"gnss_rate": 10.0, "camera_rate": 25.0}  # 30 Hz does not divide 200 Hz
+    more: tuple[dict[str, Any], ...] = (slow, {"sensors": "lab"}, {"sensors": "rtk"})
     for rate in (200, 50):
         for observation in ("estimate", "truth", "noisy", "sensors"):
             what = {"observation": observation, "control_rate": rate}
@@ -134,8 +143,9 @@ def time_faces(envs: int, cores: int, effort: Effort) -> list[Row]:
             except ImportError as error:
                 print(f"  sb3: {error}", file=sys.stderr)
             rows.append(time_single(effort, **what))
-        rows.append(time_batch("vector", envs, effort, cores, control_rate=rate, **slow))
-        rows.append(time_single(effort, control_rate=rate, **slow))
+        for options in more:
+            rows.append(time_batch("vector", envs, effort, cores, control_rate=rate, **options))
+            rows.append(time_single(effort, control_rate=rate, **options))
     for count in (1, 8, 64, 256, 1024, 4096):
         rows.append(time_batch("vector", count, effort, cores, control_rate=50))
     return rows + time_others(envs, effort)
@@ -155,5 +165,12 @@ def faces_table(rows: list[Row]) -> str:
         for r in rows
     ]
     heading = "Random actions around hover"
-    columns = ["face, observation, control", "envs", "threads", "steps/s", "spread", "resets"]
+    columns = [
+        "face, observation, control, suite",
+        "envs",
+        "threads",
+        "steps/s",
+        "spread",
+        "resets",
+    ]
     return text_table({heading: columns}, cells)

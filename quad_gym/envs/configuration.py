@@ -269,7 +269,8 @@ def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
         isinstance(actions, np.ndarray)
         and actions.dtype.kind == "f"
         and actions.shape == shape
-        and bool(np.abs(actions).max() <= 1.0)
+        and bool(actions.max() <= 1.0)
+        and bool(actions.min() >= -1.0)
     )
 
 

@@ -29,6 +29,7 @@ _MODES = {
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
 _ENDING_NAMES = np.array(ENDINGS, dtype=object)
+_NOBODY = np.zeros(0, np.intp)
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
@@ -172,8 +173,10 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
                 "reset it before step()"
             )
         batch = self.flights.batch
-        began = np.flatnonzero(self._over)
-        flown_with = batch.drawn()
+        next_step = self.autoreset_mode == AutoresetMode.NEXT_STEP
+        same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
+        began = np.flatnonzero(self._over) if next_step else _NOBODY
+        flown_with = batch.drawn() if same_step else {}
         observations = batch.step(numbers)
         results = batch.results
         terminated, truncated = (
@@ -184,10 +187,9 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         if self.rendering is not None:
             self.rendering.observe()
         infos = self._step_infos(results)
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            self._replace_by_start(infos, began)
+        self._replace_by_start(infos, began)
         infos = _masked(infos, self._everyone)
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
+        if same_step and self._over.any():
             infos = self._with_finals(infos, flown_with)
         return (
             self.flights.split(observations),

@@ -1,4 +1,4 @@
-"""Entries that run one stage on every block, or the filter alone: for timing, not for flying."""
+"""Entries that run one stage on every block, or the scalar filter: for timing, not for flying."""
 
 import numpy as np
 from numba import types
@@ -9,7 +9,15 @@ from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.predict import predict
 from quad_gym.kernels.filter.update import update
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK
+from quad_gym.records import (
+    FLIGHT,
+    FLIGHT_BLOCK,
+    PARAMS,
+    PARAMS_BLOCK,
+    SETTINGS,
+    WORK,
+    WORK_BLOCK,
+)
 
 
 def _run_stage(blocks, number, world, model, settings, work, table, flag):
@@ -44,9 +52,14 @@ run_stage = entry(
 )
 
 
-@entry
-def filter_cycle_of_flights(flights, model, work, feature_count, form):
+def _filter_cycle_of_flights(flights, model, work, feature_count, form):
     """Update and predict the filter of every flight: the scalar instance of the same kernels."""
     for index in range(len(flights)):
         update(flights[index], model[0], work[0], feature_count, True, form)
         predict(flights[index], model[0], work[0], form)
+
+
+filter_cycle_of_flights = entry(
+    _filter_cycle_of_flights,
+    types.none(*map(_array, (FLIGHT, PARAMS, WORK)), types.int64, types.int64),
+)

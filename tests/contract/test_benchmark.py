@@ -5,11 +5,16 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import quad_gym
 from quad_gym.cli import parse
+from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.records import WIDTH
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmark.py"
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "scripts" / "benchmark.py"
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +41,9 @@ def test_the_filter_section_compares_all_filters(script, tmp_path, capsys):
     kinds = {(row["kind"], row["measurements"]) for row in rows}
     assert {(kind, n) for kind in ("lanes", "scalar", "plain NumPy") for n in (6, 12)} <= kinds
     for row in rows:
-        assert set(row) == {"name", "seconds", "spread", "kind", "measurements", "times_lanes"}
+        more = {"kind", "measurements", "suite", "times_lanes"}
+        assert set(row) == {"name", "seconds", "spread"} | more
+        assert row["suite"] == "lab"
         assert row["seconds"] > 0.0
         assert row["spread"] >= 0.0
         assert row["times_lanes"] > 0.0
@@ -48,12 +55,40 @@ def test_the_filter_section_compares_all_filters(script, tmp_path, capsys):
     assert "plain NumPy, 12 measurements" in printed.err
 
 
-def test_the_tick_section_names_every_part(script, tmp_path):
+def test_the_tick_section_names_every_stage_that_the_suites_fly_through(script, tmp_path):
     rows = run(script, tmp_path, "--only", "tick", "--batch", "16")["sections"]["tick"]
-    names = [row["name"] for row in rows]
-    parts = ["control", "dynamics", "sensors", "task", "filter"]
-    assert names == ["whole tick", *parts, "sum of parts"]
-    assert rows[-1]["seconds"] == pytest.approx(sum(row["seconds"] for row in rows[1:-1]))
+    for suite in ("standard", "lab"):
+        mine = {row["part"]: row for row in rows if row["suite"] == suite}
+        batch = quad_gym.FlightBatch(1, sensors=suite)
+        stages = {stage.name.lower() for stage in needed_stages(batch._settings[0])}
+        assert stages < set(mine)
+        assert set(mine) - stages == {"whole tick", "filter", "sum of the tick's stages"}
+        assert {n for n, row in mine.items() if row["kind"] == "start"} == {"begin", "align"}
+        ticks = [row["seconds"] for row in mine.values() if row["kind"] == "tick"]
+        assert mine["sum of the tick's stages"]["seconds"] == pytest.approx(sum(ticks))
+        both = mine["predict"]["seconds"] + mine["update"]["seconds"]
+        assert mine["filter"]["seconds"] == pytest.approx(both)
+        for row in mine.values():
+            assert row["seconds"] > 0.0
+            assert row["share"] == pytest.approx(row["seconds"] / mine["whole tick"]["seconds"])
+    parts = {row["part"] for row in rows if row["suite"] == "standard"}
+    assert parts - {row["part"] for row in rows if row["suite"] == "lab"} == {"average_imu"}
+
+
+def test_blocks_over_a_period_measure_as_often_as_the_sensors_do(script):
+    """GNSS at 10 Hz and a camera at 25 Hz measure in 1 of 20 and 1 of 8 ticks of 5 ms."""
+    stages = sys.modules["benchmark_stages"]
+    batch = stages.hovering(40 * WIDTH, sensors="rtk")
+    blocks = stages.over_a_period(batch)
+    ticks = blocks["tick"][:, 0]
+    assert set(ticks - ticks.min()) == set(range(40))
+    later = blocks.copy()
+    batch.restore(blocks)
+    batch.step()
+    position = batch.read("position_valid").reshape(-1, WIDTH)
+    assert position.any(axis=1).sum() <= position.size  # phases may differ between flights
+    assert position.mean() == pytest.approx(1 / 20, abs=0.02)
+    np.testing.assert_array_equal(later["tick"], blocks["tick"])
 
 
 def test_the_rendering_section_has_every_task_and_view(script, tmp_path, capsys):
@@ -69,9 +104,79 @@ def test_the_options_section_compares_each_with_everything_off(script, tmp_path)
     assert next(iter(rows)) == "everything off"
     assert {"gate", "gusts", "suite rtk", "extended Kalman filter"} < set(rows)
     off = rows["everything off"]
+    assert off["suite"] == rows["gate"]["suite"] == "lab"
+    assert rows["suite rtk"]["suite"] == "rtk"
     for row in rows.values():
         assert row["times_off"] == pytest.approx(row["seconds"] / off["seconds"])
         assert row["seconds"] > 0.0
+
+
+def test_the_faces_name_the_suite_they_time(script, monkeypatch):
+    faces = sys.modules["benchmark_faces"]
+    effort = script.Effort(1, 0.001)
+    for options, suite in (({}, "standard"), ({"sensors": "lab"}, "lab")):
+        row = faces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
+        assert row["suite"] == suite
+        assert row["name"] == f"vector, estimate, 50 Hz, {suite}"
+
+
+def test_another_checkout_is_timed_by_turns_and_compared(script, tmp_path, capsys):
+    found = run(script, tmp_path, "--against", str(ROOT), "--envs", "8", "--threads", "1")
+    assert list(found["sections"]) == ["against"]
+    rows = found["sections"]["against"]
+    assert {"vector", "single"} <= {row["face"] for row in rows}
+    for row in rows:
+        assert row["suite"] == "standard"
+        assert row["ratio"] == pytest.approx(row["seconds"] / row["other"])
+        assert row["seconds"] > 0.0
+    assert "here / there" in capsys.readouterr().out
+
+
+def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(script):
+    against = sys.modules["benchmark_against"]
+
+    class Other:
+        folder = ROOT
+
+        def __init__(self, *suites):
+            self.suites = suites
+
+        def ask(self, suite):
+            if suite not in self.suites:
+                raise against.RefusedError(f"no suite {suite}")
+            return str(ROOT / "quad_gym" / "__init__.py")
+
+    new, old = Other("lab", "standard"), Other("lab")
+    assert against.common_suite((new, new)) == "standard"
+    assert against.common_suite((new, old)) == against.common_suite((old, new)) == "lab"
+    new.folder = ROOT / "elsewhere"
+    with pytest.raises(RuntimeError, match="elsewhere is not used"):
+        against.common_suite((new, old))
+
+
+def test_a_row_that_the_other_checkout_refuses_is_left_out(script, monkeypatch, capsys):
+    against = sys.modules["benchmark_against"]
+    rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["face"] == "single"][:2]
+    rows[0] = {**rows[0], "options": {"observation": "guess"}}
+    monkeypatch.setattr(against, "rows_to_compare", lambda envs, threads, suite: rows)
+    found = against.time_against(ROOT, 4, 1, script.Effort(1, 0.001))
+    assert [row["name"] for row in found] == [rows[1]["name"]]
+    said = capsys.readouterr().err
+    assert f"{rows[0]['name']}: left out: ValueError: observation must be" in said
+
+
+def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(script, tmp_path):
+    found = run(script, tmp_path, "--only", "compile")
+    assert list(found["sections"]) == ["compile"]
+    rows = {row["cache"]: row for row in found["sections"]["compile"]}
+    assert list(rows) == ["empty", "full", "edit"]
+    assert rows["edit"]["name"].endswith("kernels/task/reward.py")
+    assert rows["full"]["seconds"] < rows["empty"]["seconds"]
+
+
+def test_all_sections_are_those_that_do_not_compile(script):
+    chosen = script.chosen_sections(parse(script.Args, []))
+    assert chosen == ["filter", "tick", "options", "faces", "memory", "rendering"]
 
 
 @pytest.mark.parametrize(
@@ -85,10 +190,11 @@ def test_the_options_section_compares_each_with_everything_off(script, tmp_path)
         ["--seconds", "nan"],
         ["--threads", "0"],
         ["--only", "speed"],
+        ["--against", "/nowhere"],
     ],
     ids=" ".join,
 )
-def test_options_that_make_no_sense_are_one_line_and_exit_code_2(script, options, capsys):
+def test_invalid_options_are_one_line_and_exit_code_2(script, options, capsys):
     with pytest.raises(SystemExit) as caught:
         parse(script.Args, options)
     assert caught.value.code == 2

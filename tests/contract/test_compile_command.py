@@ -1,0 +1,129 @@
+"""The command that compiles ahead of the first use."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import quad_gym
+from quad_gym.__main__ import main, names_of_kinds
+from quad_gym.kernels.compiling import workers
+from quad_gym.kernels.compiling.decorators import EntryDispatcher
+from quad_gym.kernels.compiling.linked import name_of
+from quad_gym.kernels.compiling.stages import Stage
+from quad_gym.kernels.compiling.workers import dispatcher_of
+
+ROOT = Path(__file__).parents[2]
+FIRST_RESET = """
+import gymnasium, quad_gym
+gymnasium.make_vec("QuadGym/Circle-v0", 3, observation="truth").reset(seed=0)
+"""
+
+
+def run(folder, *words):
+    """The process, with a cache of its own, and how long it took [s]."""
+    began = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, *words],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    return done, time.monotonic() - began
+
+
+def test_what_is_compiled_ahead_is_listed_and_not_compiled_again(tmp_path):
+    words = ("-m", "quad_gym", "compile", "--stages", "truth")
+    first, lasted = run(tmp_path, *words)
+    assert first.returncode == 0, first.stderr
+    *listed, summary = first.stdout.splitlines()
+    names = names_of_kinds(["truth"])
+    assert listed == [f"compiled  {name}" for name in names]
+    assert summary.startswith(f"{len(names)} of {len(names)} functions compiled in ")
+    assert str(tmp_path) in summary
+    assert "quad_gym: compiling" in first.stderr
+
+    second, again = run(tmp_path, str(ROOT / "scripts" / "compile.py"), *words[3:])
+    assert second.returncode == 0, second.stderr
+    assert second.stdout.splitlines()[:-1] == [f"in cache  {name}" for name in names]
+    assert second.stderr == ""
+    assert again < lasted
+
+    environment, _ = run(tmp_path, "-c", FIRST_RESET)
+    assert environment.returncode == 0, environment.stderr
+    assert environment.stderr == ""  # it says what it compiles
+
+
+def test_all_is_every_stage_and_every_entry_of_one_vehicle():
+    names = names_of_kinds(["all"])
+    assert len(set(names)) == len(names)
+    assert set(map(name_of, Stage)) < set(names)
+    for kind in ("plain", "truth", "single"):
+        assert set(names_of_kinds([kind])) < set(names)
+    for name in names:
+        assert dispatcher_of(name).signature is not None
+
+
+def test_truth_takes_no_filter_and_kinds_add_up():
+    truth, plain, single = (set(names_of_kinds([k])) for k in ("truth", "plain", "single"))
+    update, predict = name_of(Stage.UPDATE), name_of(Stage.PREDICT)
+    assert {update, predict} <= plain
+    assert not {update, predict} & truth
+    assert set(names_of_kinds(["truth", "plain", "single"])) == truth | plain | single
+
+
+def test_code_that_cannot_be_kept_is_an_error(monkeypatch, capsys):
+    monkeypatch.setattr(EntryDispatcher, "is_cached", lambda self: False)
+    monkeypatch.setattr(workers, "prepare", lambda names, processes: None)
+    monkeypatch.setattr("quad_gym.__main__._is_kept", lambda dispatcher: False)
+    assert main(["compile", "--stages", "truth"]) == 1
+    count = len(names_of_kinds(["truth"]))
+    assert f"error: {count} of them could not be written" in capsys.readouterr().err
+
+
+def test_version(capsys):
+    assert main(["version"]) == 0
+    assert capsys.readouterr().out == f"{quad_gym.__version__}\n"
+
+
+@pytest.mark.parametrize("words", [["--help"], ["-h"]])
+def test_help_names_the_commands(words, capsys):
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "compile" in printed
+    assert "version" in printed
+
+
+def test_help_of_a_command_has_examples(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["compile", "--help"])
+    assert end.value.code == 0
+    assert "python -m quad_gym compile --stages truth" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["fly"],
+        ["compile", "--stages", "most"],
+        ["compile", "--stages"],
+        ["compile", "--processes", "0"],
+        ["version", "stray"],
+    ],
+    ids=" ".join,
+)
+def test_invalid_commands_are_one_line_and_exit_code_2(words, capsys):
+    try:
+        code = main(words)
+    except SystemExit as end:
+        code = end.code
+    printed = capsys.readouterr()
+    assert code == 2
+    assert printed.out == ""
+    assert len(printed.err.strip().splitlines()) == 1
