@@ -1,6 +1,6 @@
 """Is a filter's covariance honest? Statistics over many flights, with the bands of an honest one.
 
-If the covariance P is right, the normalised estimation error squared (NEES) e^T P^-1 e is
+If the covariance P is right, the normalized estimation error squared (NEES) e^T P^-1 e is
 chi-square with the number of its coordinates, so that its mean over n independent flights lies in a
 known band 95 times in 100, at each instant. So is the innovation squared (NIS) of a measurement,
 and innovations are white. The error e is truth minus estimate in the filter's
@@ -129,7 +129,7 @@ def mean_band(
 
 @dataclass(frozen=True)
 class MeanSquare:
-    """A normalised square over time: means over flights, and the band of an honest filter."""
+    """A normalized square over time: means over flights, and the band of an honest filter."""
 
     name: str
     dimension: int
@@ -259,7 +259,7 @@ class Whiteness:
 
 
 class InnovationRecorder:
-    """Normalised innovations squared (NIS) over time and their autocorrelation, sensor by sensor.
+    """Normalized innovations squared (NIS) over time and their autocorrelation, sensor by sensor.
 
     Args:
         batch: The flights, which keep their innovations.

@@ -1,7 +1,7 @@
 """Is the filter honest? Compare its errors with the covariance that it claims, over many flights.
 
-Flies random trajectories (or another task) by PD control and takes the normalised estimation error
-squared (NEES) of the 15 states and of each block of three, over time, and the normalised innovation
+Flies random trajectories (or another task) by PD control and takes the normalized estimation error
+squared (NEES) of the 15 states and of each block of three, over time, and the normalized innovation
 squared (NIS) of each sensor. If the covariance is right, means over 1,000 flights lie in known
 bands at 95 % of the instants, and innovations are white. The truth is the simulator's.
 

@@ -1,6 +1,6 @@
 """What do a wrong model, and the filter's own form, do to an honest filter?
 
-Flies the same seeds case by case, and tables the normalised estimation error squared (NEES) of the
+Flies the same seeds case by case, and tables the normalized estimation error squared (NEES) of the
 state and of each block, 15 and 3 where the covariance is right, beside the errors themselves.
 
   python scripts/honesty.py models    vehicle, world and sensors other than they are believed to be

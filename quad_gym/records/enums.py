@@ -83,7 +83,7 @@ class Start(IntEnum):
     GROUND = 0
     """At rest below the reference at height 0, rotors stopped: the report's."""
     HOVER = 1
-    """Hovering, at rest, within some decimetres of the reference."""
+    """Hovering, at rest, within some decimeters of the reference."""
     MIXED = 2
     """Either, by a coin: for training, as a policy that has learned to hover learns to take off."""
 

@@ -68,7 +68,7 @@ PARAMS_FIELDS = (
     Field("baseline_sigma", (), "rad", "direction noise of the baseline"),
     Field("heading_sigma", (), "rad", "of the heading that the place of the start tells"),
     Field("velocity_sigma", (), "m/s", "velocity noise per axis; 0: not measured"),
-    Field("camera", (3,), "m", "projection centre in B"),
+    Field("camera", (3,), "m", "projection center in B"),
     Field("R_CB", (3, 3), "-", "body to camera"),
     Field("pixel_size", (), "m", "pixel"),
     Field("focal_length", (), "pixels", "focal length"),

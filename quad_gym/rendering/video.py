@@ -217,7 +217,7 @@ def _write_animation(frames: Iterable[NDArray[np.uint8]], path: Path, fps: float
     if path.suffix.lower() == ".webp":
         options: dict[str, Any] = {"quality": 70, "method": 4, "minimize_size": False}
     else:
-        # one palette for all, so that colours do not flicker
+        # one palette for all, so that colors do not flicker
         palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)
         pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
         options = {"optimize": False}

@@ -1,6 +1,6 @@
 """Outages, outliers and jumps over 1,000 flights: the filter knows how lost it is, and comes back.
 
-"Inside 3 sigma" of an error of d numbers means that its normalised square is below the chi-square
+"Inside 3 sigma" of an error of d numbers means that its normalized square is below the chi-square
 quantile that holds 99.73 % of an honest filter's errors, as 3 sigma do of a single number. Of 1,000
 honest flights nearly three lie outside at any given instant, so that no filter can have all of them
 inside at one instant; it must have each of them inside at some instant of the time allowed, and all
@@ -123,7 +123,7 @@ def test_in_an_outage_of_a_minute_uncertainty_grows_as_theory_says(kind):
     np.testing.assert_allclose(ratio, 1.0, atol=0.005)
     gap = (found[some] - expected) / (sigma[:, :, np.newaxis] * sigma[:, np.newaxis])
     assert abs(gap).max() < 0.03
-    assert sigma[:, :2].min() > 5.0  # metres: nothing was clipped on the way
+    assert sigma[:, :2].min() > 5.0  # meters: nothing was clipped on the way
 
     for part in (slice(0, 15), R, V, E, BA, BG):  # chi-square, so mean d and variance 2 d
         d = part.stop - part.start

@@ -61,10 +61,10 @@ def test_a_feature_that_the_gate_refuses_is_left_out_of_every_portion():
     clean, pixels = started(0.01, 0.03, gate=1e-4)
     wrong, _ = started(0.01, 0.03, gate=1e-4)
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    spoilt, without = pixels.copy(), pixels.copy()
-    spoilt[seen[0]] += 900.0
+    corrupt, without = pixels.copy(), pixels.copy()
+    corrupt[seen[0]] += 900.0
     without[seen[0]] = np.nan
-    wrong.update(pixels=spoilt)
+    wrong.update(pixels=corrupt)
     clean.update(pixels=without)
     assert (wrong.gate_decisions == Gate.REJECTED).sum() == 1
     np.testing.assert_allclose(wrong.position, clean.position, atol=1e-6)

@@ -152,7 +152,7 @@ def test_a_false_alarm_that_is_no_probability_is_refused(value):
 
 
 def test_a_lane_gates_for_itself():
-    """The neighbours of a flight with a wild position update as they would without a gate."""
+    """The neighbors of a flight with a wild position update as they would without a gate."""
     filters, free = LaneFilter(GATED), LaneFilter(HONEST)
     for lanes in (filters, free):
         for lane in range(EIGHT):
@@ -285,7 +285,7 @@ def test_one_wrong_feature_stays_out_while_the_others_agree():
     flights = batch.snapshot()
     before = flights["rejections"].copy()
     batch.restore(flights)
-    batch._model["features"][0, 1] += 0.5  # the filter's map is wrong by half a metre
+    batch._model["features"][0, 1] += 0.5  # the filter's map is wrong by half a meter
     steps(batch, 2.0)
     more = batch.read("rejections") - before.transpose(0, 2, 1).reshape(-1, before.shape[1])[:50]
     seen = batch.read("gate")[:, FEATURE_BLOCKS + 1] > 0

@@ -5,7 +5,7 @@ and the block's measurement noise R its innovation has the covariance `S = A A^T
 alpha^2) mu mu^T + R` (3 x 3). A direction has two degrees of freedom: its innovation is taken
 across the predicted direction, for along it the length of a unit vector tells nothing.
 
-A block whose normalised innovation squared, chi-square in a filter that is right, lies beyond the
+A block whose normalized innovation squared, chi-square in a filter that is right, lies beyond the
 gate is masked as if the flight lacked it. So is a feature whose predicted direction is too
 uncertain for a linear model: as a direction's error is bounded it would pass any gate, and its
 update would be wrong and sure of itself. Where one kind of measurement has been rejected

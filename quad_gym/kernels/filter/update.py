@@ -80,7 +80,7 @@ def _has_feature(flight, k):
 
 @kernel
 def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, use_velocity):
-    """Fill work.h (centre), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
+    """Fill work.h (center), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
     h, z, Rz = work.h, work.z, work.Rz
     R_IG, R_BI, R_CB = load33(p.R_IG), load33(flight.R_hat), load33(p.R_CB)
     r = load3(flight.r_hat)
