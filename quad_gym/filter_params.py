@@ -48,7 +48,7 @@ class FilterParams(Checked):
     """whether the fix that starts the filter is also its first measurement, as in the laboratory;
     that counts it twice, so suites other than "lab" do not"""
     gradual_above: float | None = None
-    """deviation of the attitude above which images are taken in portions, each about the estimate
+    """deviation of the attitude above which images are processed in steps, each about the estimate
     that the one before has left [rad]; None: always whole (report). The derivatives of pixels are
     off by the square of the attitude's error, more than a precise camera's noise at a rough start
     """

@@ -1,4 +1,4 @@
-"""How well flights followed their reference, and how honest their filters were.
+"""How well flights followed their reference, and how consistent their filters were.
 
 Errors of flights are arrays whose last axis is time; numbers over seeds are arrays with one entry
 a flight. The filter's error has 15 coordinates in the order of its covariance: position, velocity,
@@ -162,7 +162,7 @@ def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
-    """Normalized estimation error squared, e^T P^-1 e; about n on average for an honest filter.
+    """Normalized estimation error squared, e^T P^-1 e; about n on average for a consistent filter.
 
     Args:
         errors: (..., n) errors of the estimate.

@@ -273,7 +273,8 @@ class TaskParams(Checked):
     """of the reference, at most 1000 [m]; report section 4.2"""
     start: str = "ground"
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
-    "hover": hovering at rest within some decimeters of the reference; "mixed": either, by a coin"""
+    "hover": hovering at rest within some decimeters of the reference; "mixed": either, with
+    probability 0.5"""
     randomize: bool = False
     """draw the reference anew each episode: phase, radius, period and sense of circle and
     lemniscate, the heading of a random trajectory and of a course of gates"""

@@ -113,7 +113,7 @@ class DrawingTable:
         world: The world without draws.
 
     Raises:
-        ValueError: If a range holds values that make no sense, such as a vehicle too heavy to
+        ValueError: If a range holds invalid values, such as a vehicle too heavy to
             hover.
     """
 

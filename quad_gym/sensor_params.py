@@ -198,10 +198,10 @@ class CameraParams(Checked):
 class PlacementParams(Checked):
     """How well the place of the start is known where there is no GNSS to measure it.
 
-    The vehicle is put down on a marked spot; the filter starts from where the spot is and whither
-    the vehicle looks, with these errors, and takes the vehicle for level. Where there is GNSS whose
-    baseline lies within 12 degrees of the vertical, so that it hardly tells the heading, whither
-    the vehicle looks is known from its mark, too.
+    The vehicle is put down on a marked spot. The filter starts from the position of the spot and
+    the heading of the vehicle, with these errors, and assumes that the vehicle is level. Where the
+    baseline of GNSS lies within 12 degrees of the vertical, so that it hardly tells the heading,
+    the heading is known from the mark, too.
     """
 
     position_sigma: float = 0.05

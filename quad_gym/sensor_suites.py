@@ -47,7 +47,7 @@ FIELD_FILTER = FilterParams(
     gradual_above=0.01,  # its square is below what a pixel subtends
     gate_false_alarm=1e-4,
 )
-"""The filter outside the laboratory: honest about its start, and gated."""
+"""The filter outside the laboratory: consistent from its start on, and gated."""
 
 RTK = SensorSuite(
     imu=ImuParams(
@@ -171,7 +171,7 @@ INDOOR = SensorSuite(
 
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
-    # the laboratory's pixels are coarse, so that images need not be taken in steps, and no
+    # the laboratory's pixels are coarse, so that images need not be processed in steps, and no
     # measurement of it is corrupted, so that none has to be rejected
     estimator=FIELD_FILTER.replace(gradual_above=None, gate_false_alarm=0.0),
     noisy=NoisyObservationParams(

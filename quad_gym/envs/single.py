@@ -93,7 +93,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     ## Start
     "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped,
     level, looking as wanted. "hover": hovering, with standard deviations of 0.3 m, 0.03 m/s, 0.2 rad
-    in yaw and 0.03 rad in tilt. "mixed": either, by a coin, for training: a policy that has learned
+    in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5, for training: a policy that has learned
     to hover then learns to take off. The filter starts from its first fix in each, or with
     `filter_start="warm"` as if it had been running for 10 s, as before any real take-off.
     `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these for one

@@ -58,7 +58,7 @@ FLIGHT_FIELDS = (
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
     Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
     Field("update_failures", (), "-", "updates that failed since the filter's start"),
-    Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was taken in portions"),
+    Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
     # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
     Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),

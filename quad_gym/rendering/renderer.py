@@ -38,7 +38,7 @@ class Renderer:
         size: Width and height [pixels].
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If pygame is not installed.
     """
 

@@ -39,7 +39,7 @@ def record_flight(
         The flight, from its start to the ending of the episode.
 
     Raises:
-        ValueError: If the episode would have no end, or a keyword makes no sense.
+        ValueError: If the episode would have no end, or a keyword is invalid.
     """
     env = gymnasium.make_vec(env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
     return flight_of(policy, env, seed=seed, about={"env_id": env_id, **(about or {})})
@@ -106,7 +106,7 @@ def save_video(
         The file.
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If a library that writes the file is not installed.
     """
     target = checked_video_path(path)
@@ -150,7 +150,7 @@ def record_video(
         The flight, to be saved or looked into.
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If a library that writes the file is not installed.
     """
     checked_video_path(path)  # before anything is flown

@@ -138,7 +138,7 @@ def _count_in_row(flight, group, measured, rejected, again):
 
 @kernel
 def _decide(flight, s, has, wanting, again, decision):
-    """Where a block is decided upon: as it is wanting or, in a later portion, as in the first."""
+    """Where a block is decided upon: as it is wanting or, in a later step, as in the first."""
     return has & ((wanting & logical_not(again)) | (again & (flight.gate[s] == decision)))
 
 
@@ -184,7 +184,7 @@ def judge_innovations(
 ):
     """Keep the innovations of the present measurements and mask those beyond the gate.
 
-    Where measurements are taken in portions, the first decides for all.
+    Where measurements are processed in steps, the first decides for all.
 
     Args:
         flight: Record; keeps innovations, NIS, decisions and counters.
@@ -194,7 +194,7 @@ def judge_innovations(
         use_position, use_baseline, use_velocity: Whether any lane has them.
         form: A `FilterForm`.
         mask: Which lanes.
-        again: Which lanes take a later portion of measurements that they have met before.
+        again: Which lanes take a later step of measurements that they have met before.
 
     Returns:
         How many measurements were masked in each lane.
