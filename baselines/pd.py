@@ -50,7 +50,7 @@ def _require_plain_observations(env: Any) -> None:
         normalizes = getattr(layer, "norm_obs", False)  # VecNormalize of Stable-Baselines3
         if changes or normalizes or layer.observation_space != inner.observation_space:
             raise ValueError(
-                "env must show observations as they are, in metres and radians: "
+                "env must show observations as they are, in meters and radians: "
                 f"{type(layer).__name__} changes them"
             )
         layer = inner

@@ -121,7 +121,7 @@ _SAC = Recipe(
     critic_layers=(128, 128),
     flights={"start": "mixed", "randomize": True},
     # a step's reward is about 0.3: an entropy worth 1 at the start would hide it for long, and
-    # noise as wide as the usual target's would blur what the last centimetres are worth
+    # noise as wide as the usual target's would blur what the last centimeters are worth
     parameters={**_OFF_POLICY, "ent_coef": "auto_0.02", "target_entropy": -8.0},
 )
 

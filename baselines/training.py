@@ -65,7 +65,7 @@ def train(
         What came of it.
 
     Raises:
-        ValueError: If the plan makes no sense, the folder holds a run and `resume` is not set, or
+        ValueError: If the plan is invalid, the folder holds a run and `resume` is not set, or
             holds the run of another plan.
         OSError: If nothing can be written to the folder.
     """

@@ -24,7 +24,7 @@ from contextlib import contextmanager
 from typing import Any, NoReturn, TypeVar
 
 USAGE_ERROR = 2
-"""Exit code of a program that was called in a way that makes no sense."""
+"""Exit code of a program that was called with invalid arguments."""
 
 _Args = TypeVar("_Args")
 
@@ -116,7 +116,7 @@ def usage_errors(
     """Turn what is raised while options are checked into one line on stderr and exit code 2.
 
     Args:
-        kinds: Errors that the user can mend.
+        kinds: Errors that the user can correct.
     """
     try:
         yield

@@ -1,6 +1,6 @@
 """Figures that set controllers side by side: errors over time, learning curves, matrices, paths.
 
-As in `plots`: no window opens, colours are those of Okabe and Ito, and every curve has a line style
+As in `plots`: no window opens, colors are those of Okabe and Ito, and every curve has a line style
 of its own too.
 """
 
@@ -33,7 +33,7 @@ _STYLES = (
     ("#CC79A7", (0, (5, 1))),
     ("#56B4E9", (0, (2, 1))),
 )
-"""Colour and dashes of the curves, in order."""
+"""Color and dashes of the curves, in order."""
 
 
 def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Any:

@@ -1,6 +1,6 @@
-"""Is a filter's covariance honest? Statistics over many flights, with the bands of an honest one.
+"""Filter consistency: statistics over many flights, with the bands of a consistent filter.
 
-If the covariance P is right, the normalised estimation error squared (NEES) e^T P^-1 e is
+If the covariance P is right, the normalized estimation error squared (NEES) e^T P^-1 e is
 chi-square with the number of its coordinates, so that its mean over n independent flights lies in a
 known band 95 times in 100, at each instant. So is the innovation squared (NIS) of a measurement,
 and innovations are white. The error e is truth minus estimate in the filter's
@@ -39,7 +39,7 @@ PARTS = {
 """The whole error state and its blocks of three, as of the covariance."""
 
 HONEST_SHARE = 0.9
-"""Share of instants in the 95 % band from which a filter is called honest."""
+"""Share of instants in the 95 % band from which a filter is called consistent."""
 
 BAND_FLIGHTS = 1000
 """Flights whose mean the band is for, where there are more. The means over more flights have less
@@ -129,11 +129,11 @@ def mean_band(
 
 @dataclass(frozen=True)
 class MeanSquare:
-    """A normalised square over time: means over flights, and the band of an honest filter."""
+    """A normalized square over time: means over flights, and the band of a consistent filter."""
 
     name: str
     dimension: int
-    """degrees of freedom: what the mean is about if the filter is honest"""
+    """degrees of freedom: what the mean is about if the filter is consistent"""
     time: Floats
     """(t,) since the start [s]"""
     mean: Floats
@@ -179,7 +179,7 @@ def verdict(part: MeanSquare) -> str:
     inside = f"inside its band at {100 * part.share_inside:.0f} % of the instants"
     what = f"{part.name}: mean {part.overall:.2f} where {part.dimension} is right, {inside}"
     if part.honest:
-        return f"{what}: honest."
+        return f"{what}: consistent."
     ratio = float(np.sqrt(part.overall / part.dimension))
     percent = f"{100.0 * abs(ratio - 1.0):.1f} %"
     if ratio < 1.0:
@@ -259,7 +259,7 @@ class Whiteness:
 
 
 class InnovationRecorder:
-    """Normalised innovations squared (NIS) over time and their autocorrelation, sensor by sensor.
+    """Normalized innovations squared (NIS) over time and their autocorrelation, sensor by sensor.
 
     Args:
         batch: The flights, which keep their innovations.

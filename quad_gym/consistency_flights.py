@@ -1,4 +1,4 @@
-"""Flights that put a filter to the test, and what came of them, in numbers and in words."""
+"""Flights that test a filter's consistency, and their findings, in numbers and in words."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -58,7 +58,7 @@ class Findings:
 
     @property
     def honest(self) -> bool:
-        """Whether everything is as an honest filter's."""
+        """Whether everything is as a consistent filter's."""
         squares = (*self.nees.values(), *self.nis.values())
         white = all(part.white for part in self.whiteness.values())
         return self.failed == 0 and white and all(part.honest for part in squares)

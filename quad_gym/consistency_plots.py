@@ -66,7 +66,7 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
 
 def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
     """NEES of the state and its blocks over time, each in its band."""
-    text = f"{title}\nMean NEES over flights (blue), in the 95 % band of an honest filter (grey)"
+    text = f"{title}\nMean NEES over flights (blue), in the 95 % band of a consistent filter (gray)"
     figure, axes = _grid(len(parts), text)
     for axis, part in zip(axes, parts.values(), strict=True):
         draw_mean_square(axis, part, settle)
@@ -101,7 +101,7 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
 
 def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
     """NIS of the sensors over time, each in its band."""
-    text = f"{title}\nMean NIS over flights (blue), in the 95 % band of an honest filter (grey)"
+    text = f"{title}\nMean NIS over flights (blue), in the 95 % band of a consistent filter (gray)"
     figure, axes = _grid(len(parts), text)
     for axis, part in zip(axes, parts.values(), strict=True):
         draw_mean_square(axis, part, settle)
@@ -110,7 +110,7 @@ def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) ->
 
 def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
     """Autocorrelation of the innovations of each sensor, with the band of white ones."""
-    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white ones (grey)"
+    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white ones (gray)"
     figure, axes = _grid(len(found), text)
     for axis, part in zip(axes, found.values(), strict=True):
         lags = np.arange(1, part.correlation.size + 1)

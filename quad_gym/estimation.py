@@ -110,7 +110,7 @@ class _KalmanFilter:
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
             heading: Of the body x axis, from east toward north, for a steep baseline [rad]; None:
                 not known. The filter of a steep baseline then takes it for anything, and as it
-                linearises, it may be lost.
+                linearizes, it may be lost.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the position is farther
@@ -264,7 +264,7 @@ class _KalmanFilter:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(3,) estimated position of the centre of mass in I [m]."""
+        """(3,) estimated position of the center of mass in I [m]."""
         return self._read("r_hat")
 
     @property
@@ -300,12 +300,12 @@ class _KalmanFilter:
 
     @property
     def nis(self) -> tuple[float, int]:
-        """Normalised innovation squared of the last update, and how many measurements it had."""
+        """Normalized innovation squared of the last update, and how many measurements it had."""
         return float(self._flight["nis"][0]), int(self._flight["nis_dimension"][0])
 
     @property
     def block_nis(self) -> NDArray[np.float64]:
-        """(n,) normalised innovation squared of the last position, baseline, velocity and features.
+        """(n,) normalized innovation squared of the last position, baseline, velocity and features.
 
         In a filter that is right they are chi-square with 3, 2, 3 and 2 degrees of freedom; NaN:
         not measured yet.

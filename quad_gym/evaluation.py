@@ -172,7 +172,7 @@ def evaluate(
         One number per episode.
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
     """
     if env_id not in quad_gym.IDS:
         raise ValueError(f"env_id must be one of {', '.join(quad_gym.IDS)}, got {env_id!r}")

@@ -30,7 +30,7 @@ FaultsGiven = str | Fault | Iterable[str | Fault] | None
 _SOON = (2.0, 5.0)
 """An instant [s] at which vehicles have left the ground and most of an episode lies ahead."""
 _A_WHILE = (2.0, 5.0)
-"""Some seconds [s]: a bridge, a tree, a shadow; our judgement, for episodes of 10 s."""
+"""Some seconds [s]: a bridge, a tree, a shadow; our judgment, for episodes of 10 s."""
 
 PRESETS: dict[str, tuple[Fault, ...]] = {
     "none": (),

@@ -160,7 +160,7 @@ class GnssOutliers(Fault):
 
     A position is an outlier with probability `share`, and then lies `size` standard deviations of a
     fix off, in any direction; the slow error (`GnssParams.drift_sigma_I`) counts. Velocities and
-    baselines stay sound. Reflected signals err by tens of metres and more, ten times and a hundred
+    baselines stay sound. Reflected signals err by tens of meters and more, ten times and a hundred
     times a fix's usual error: L.-T. Hsu, GPS Solutions 22(1), 2018.
     """
 
@@ -282,7 +282,7 @@ class AccelBiasStep(_Directed):
     """A step of the accelerometer's true bias, in addition to its slow wandering; B axes.
 
     Consumer parts are off by up to 50 milli-g (TDK ICM-20948 data sheet); a knock or a change of
-    temperature moves them by some of that, our judgement.
+    temperature moves them by some of that, our judgment.
     """
 
     size: Span = (0.05, 0.2)
@@ -300,7 +300,7 @@ class GyroBiasStep(_Directed):
     """A step of the gyro's true bias, likewise.
 
     Consumer parts are off by up to 5 deg/s (TDK ICM-20948 data sheet); some tenths of that, our
-    judgement.
+    judgment.
     """
 
     size: Span = (math.radians(0.2), math.radians(1.0))
@@ -364,7 +364,7 @@ class RotorLoss(Fault):
     """
 
     share: Span = (0.1, 0.3)
-    """lost, at most 1; our judgement of what chipped blades cost"""
+    """lost, at most 1; our judgment of what chipped blades cost"""
     rotor: int | None = None
     """0 to 3; None: drawn each time it comes"""
 

@@ -34,7 +34,7 @@ class FilterParams(Checked):
     """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
     across the "predicted" one, as the baseline's does. The first takes the angle between the two,
     tens of milliradians in the first second, for information that it trusts to 0.1 mrad.
-    "projected": across the predicted one, and less toward the image's centre, as pixels far out
+    "projected": across the predicted one, and less toward the image's center, as pixels far out
     subtend smaller angles there; the report takes the noise for equal about both axes"""
     initial_velocity_variance: float = 1e-3
     """[m^2/s^2]; laboratory"""
@@ -48,13 +48,13 @@ class FilterParams(Checked):
     """whether the fix that starts the filter is also its first measurement, as in the laboratory;
     that counts it twice, so suites other than "lab" do not"""
     gradual_above: float | None = None
-    """deviation of the attitude above which images are taken in portions, each about the estimate
+    """deviation of the attitude above which images are processed in steps, each about the estimate
     that the one before has left [rad]; None: always whole (report). The derivatives of pixels are
     off by the square of the attitude's error, more than a precise camera's noise at a rough start
     """
     gate_false_alarm: float = 0.0
     """probability that a sound measurement is rejected: a position, baseline, velocity or feature
-    whose normalised innovation squared exceeds the chi-square quantile of this alarm level is left
+    whose normalized innovation squared exceeds the chi-square quantile of this alarm level is left
     out of the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to
     Tracking and Navigation, section 5.4); 0: everything is taken"""
     gate_patience: int = 10

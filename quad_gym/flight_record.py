@@ -44,7 +44,7 @@ FEATURES = -1
 COLUMNS = (
     Column("time", (), "s", "-", "since the start of the episode"),
     # the truth
-    Column("position", (3,), "m", "I", "true position of the centre of mass"),
+    Column("position", (3,), "m", "I", "true position of the center of mass"),
     Column("velocity", (3,), "m/s", "I", "true velocity"),
     Column("attitude", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
     Column("body_rates", (3,), "rad/s", "B", "true body rates"),
@@ -62,8 +62,8 @@ COLUMNS = (
     Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's"),
     Column("covariance", (15, 15), "mixed", "mixed", "of position, velocity, attitude error, accelerometer and gyro bias"),
     Column("filter_status", (), "bits", "-", "failures of the filter so far, see `FilterStatus`"),
-    Column("nees", (), "-", "-", "normalised estimation error squared; 15 on average if the filter is consistent"),
-    Column("nis", (), "-", "-", "normalised innovation squared of the last update"),
+    Column("nees", (), "-", "-", "normalized estimation error squared; 15 on average if the filter is consistent"),
+    Column("nis", (), "-", "-", "normalized innovation squared of the last update"),
     Column("nis_dimension", (), "-", "-", "measurements in the last update"),
     # what the controller saw
     Column("seen_position", (3,), "m", "I", "position that the controller believed in"),
@@ -75,7 +75,7 @@ COLUMNS = (
     Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
     Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
     Column("gnss_gate", (3,), "-", "-", "what the filter made of position, baseline and velocity, see `Gate`; 0: it has no gate"),
-    Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's centre"),
+    Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's center"),
     Column("feature_gate", (FEATURES,), "-", "-", "what the filter made of them, likewise"),
     # the task
     Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),

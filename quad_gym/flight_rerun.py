@@ -10,7 +10,7 @@
 | `world/trail` | where truth and estimate were |
 | `plots` | errors, position errors with the filter's 3 sigma, NEES with its band, rotors, actions |
 
-Times are seconds since the start of the episode, lengths metres, in east, north, up; Rerun keeps
+Times are seconds since the start of the episode, lengths meters, in east, north, up; Rerun keeps
 what it draws in single precision, and what it plots in double.
 """
 
@@ -33,7 +33,7 @@ TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
 ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
 """[m]"""
 
-# those of Okabe and Ito, which people with a colour vision deficiency can tell apart; the viewer's
+# those of Okabe and Ito, which people with a color vision deficiency can tell apart; the viewer's
 # ground is dark
 TRUTH, ESTIMATE, REFERENCE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
@@ -200,7 +200,7 @@ class _Log:
     # ---- sensors ------------------------------------------------------------------------------
 
     def fixes(self) -> None:
-        """GNSS fixes when they arrive; grey where the filter's gate has rejected them."""
+        """GNSS fixes when they arrive; gray where the filter's gate has rejected them."""
         rr, fixes = self._rr, self._flight["gnss_position"]
         measured = np.isfinite(fixes).all(axis=1)
         if measured.any():

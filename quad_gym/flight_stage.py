@@ -27,7 +27,7 @@ class Stage:
     antennas_B: Floats
     """(2, 3) primary and secondary antenna [m]; NaN: there is no GNSS"""
     camera_B: Floats
-    """(3,) projection centre [m]; NaN: there is no camera"""
+    """(3,) projection center [m]; NaN: there is no camera"""
     R_CB: Floats
     """(3, 3) body to camera"""
     camera_rate: float
@@ -39,7 +39,7 @@ class Stage:
     features_I: Floats
     """(n, 3) [m]"""
     gates_I: Floats
-    """(n, 3) centres of the course's gates; (0, 3) on other tasks [m]"""
+    """(n, 3) centers of the course's gates; (0, 3) on other tasks [m]"""
     gate_radius: float
     """[m]"""
     reference_omega: float
@@ -78,11 +78,11 @@ class Stage:
         """Where the features are in the image of a camera at a pose.
 
         Args:
-            position: (..., 3) of the centre of mass in I [m].
+            position: (..., 3) of the center of mass in I [m].
             R_BI: (..., 3, 3) inertial to body.
 
         Returns:
-            (..., n, 2) pixels from the image's centre; NaN for a feature that is behind the camera.
+            (..., n, 2) pixels from the image's center; NaN for a feature that is behind the camera.
             Those outside the image are not left out.
         """
         X_B = (self.features_I - position[..., np.newaxis, :]) @ np.swapaxes(R_BI, -1, -2)
@@ -92,7 +92,7 @@ class Stage:
         return np.asarray(self.focal_length * X_C[..., :2] / depth)
 
     def frustum_corners(self, position: Floats, R_BI: Floats, depth: float) -> Floats:
-        """Projection centre and the image's four corners at a depth along the optical axis, in I.
+        """Projection center and the image's four corners at a depth along the optical axis, in I.
 
         Returns:
             (5, 3) [m].

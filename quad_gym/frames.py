@@ -29,7 +29,7 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
 
     Raises:
         ValueError: If `r_G` is not three finite numbers, or lies within 1,000 km of the Earth's
-            centre.
+            center.
     """
     return _geodetic(_checked_place("r_G", r_G))
 
@@ -38,7 +38,7 @@ def _checked_place(name: str, value: ArrayLike) -> NDArray[np.float64]:
     place = check.array(name, value, (3,))
     if norm(place) < 1e6:
         raise ValueError(
-            f"{name} must be a place near the Earth's surface in metres, got {value!r}"
+            f"{name} must be a place near the Earth's surface in meters, got {value!r}"
         )
     return place
 

@@ -1,4 +1,4 @@
-"""How well flights followed their reference, and how honest their filters were.
+"""How well flights followed their reference, and how consistent their filters were.
 
 Errors of flights are arrays whose last axis is time; numbers over seeds are arrays with one entry
 a flight. The filter's error has 15 coordinates in the order of its covariance: position, velocity,
@@ -55,7 +55,7 @@ def tracking_summary(errors: ArrayLike) -> TrackingSummary:
     """Mean error of each flight, over all of it and over its last half.
 
     Args:
-        errors: (..., n) error at n instants that are equally far apart, such as metres.
+        errors: (..., n) error at n instants that are equally far apart, such as meters.
 
     Returns:
         Means, (...,) each. The last half of an odd number of instants has the middle one.
@@ -162,7 +162,7 @@ def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
-    """Normalised estimation error squared, e^T P^-1 e; about n on average for an honest filter.
+    """Normalized estimation error squared, e^T P^-1 e; about n on average for a consistent filter.
 
     Args:
         errors: (..., n) errors of the estimate.

@@ -89,7 +89,7 @@ def params_record(
         period = 1.0 / (gnss.rate * gnss.drift_tau)
         p["drift_decay"] = math.exp(-period)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
-    else:  # the place of the start, as if its centre and its x axis had been measured
+    else:  # the place of the start, as if its center and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
         p["gnss_sigma"] = sensors.placement.position_sigma
         p["position_sigma"] = sensors.placement.position_sigma

@@ -53,14 +53,14 @@ class VehicleParams(Checked):
     mass: float = 0.78
     """[kg]; laboratory vehicle"""
     inertia: Matrix = ((1.7565e-3, 0.0, 0.0), (0.0, 3.5723e-3, 0.0), (0.0, 0.0, 4.7134e-3))
-    """(3, 3) about the centre of mass, in B [kg m^2]; laboratory vehicle"""
+    """(3, 3) about the center of mass, in B [kg m^2]; laboratory vehicle"""
     rotor_positions_B: Matrix = (
         (0.21, -0.21, 0.0),
         (0.21, 0.21, 0.0),
         (-0.21, 0.21, 0.0),
         (-0.21, -0.21, 0.0),
     )
-    """(4, 3) rotor hubs relative to the centre of mass, in B [m]; laboratory vehicle"""
+    """(4, 3) rotor hubs relative to the center of mass, in B [m]; laboratory vehicle"""
     rotor_spins: Vector = (1.0, -1.0, 1.0, -1.0)
     """(4,) sense of rotation about body z, opposite to the reaction torque; laboratory vehicle"""
     thrust_coefficient: float = 6.11e-8 / 0.104719755**2
@@ -273,7 +273,8 @@ class TaskParams(Checked):
     """of the reference, at most 1000 [m]; report section 4.2"""
     start: str = "ground"
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
-    "hover": hovering at rest within some decimetres of the reference; "mixed": either, by a coin"""
+    "hover": hovering at rest within some decimeters of the reference; "mixed": either, with
+    probability 0.5"""
     randomize: bool = False
     """draw the reference anew each episode: phase, radius, period and sense of circle and
     lemniscate, the heading of a random trajectory and of a course of gates"""

@@ -2,8 +2,8 @@
 
 Every `draw_*` puts one picture on a matplotlib Axes, so pictures can be combined; every `*_figure`
 makes a figure of one. Figures are made without pyplot: no window opens, nothing needs to be closed,
-and a server without a display will do. Colours are those of Okabe and Ito, which people with a
-colour vision deficiency can tell apart.
+and a server without a display will do. Colors are those of Okabe and Ito, which people with a
+color vision deficiency can tell apart.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -75,7 +75,7 @@ class Trace:
     time: Floats
     """(n,) since the start [s]"""
     position: Floats
-    """(n, 3) true position of the centre of mass in I [m]"""
+    """(n, 3) true position of the center of mass in I [m]"""
     heading: Floats
     """(n, 2) horizontal components of the body x axis in I [-]"""
     reference: Floats

@@ -1,4 +1,4 @@
-"""Domain randomisation: which parameters can be drawn anew for every episode, and from what.
+"""Domain randomization: which parameters can be drawn anew for every episode, and from what.
 
 Draws happen inside the kernel from each flight's own random stream, so the parameters of an episode
 depend on its flight's seed alone.
@@ -78,7 +78,7 @@ class Randomization:
 
     @classmethod
     def of(cls, given: "Randomization | Mapping[str, Given] | None") -> "Randomization":
-        """What a keyword may hold: a randomisation, distributions by name, or None for nothing."""
+        """What a keyword may hold: a randomization, distributions by name, or None for nothing."""
         return given if isinstance(given, Randomization) else cls({} if given is None else given)
 
     @cached_property
@@ -104,7 +104,7 @@ class Randomization:
 
 
 class DrawingTable:
-    """A randomisation in numbers: how each column of a flight's field `drawn` is drawn.
+    """A randomization in numbers: how each column of a flight's field `drawn` is drawn.
 
     Args:
         randomization: What is drawn.
@@ -113,7 +113,7 @@ class DrawingTable:
         world: The world without draws.
 
     Raises:
-        ValueError: If a range holds values that make no sense, such as a vehicle too heavy to
+        ValueError: If a range holds invalid values, such as a vehicle too heavy to
             hover.
     """
 
@@ -261,7 +261,7 @@ def nominal_values(
 
 
 def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldParams) -> None:
-    """Refuse a randomisation whose worst case cannot carry its weight."""
+    """Refuse a randomization whose worst case cannot carry its weight."""
 
     def least(name: str) -> float:
         return float(table.low[COLUMNS[name]].min())

@@ -210,7 +210,7 @@ class Tracer:
 
 
 def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
-    """Normalised estimation error squared of the chosen flights at the present instant, (m,)."""
+    """Normalized estimation error squared of the chosen flights at the present instant, (m,)."""
     names = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
     truth: dict[str, Any] = {word: batch.read(name)[chosen] for word, name in names.items()}
     estimate = {word: batch.read(f"{name}_hat")[chosen] for word, name in names.items()}

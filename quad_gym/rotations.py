@@ -73,7 +73,7 @@ def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
 
 
 def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
-    """The rotation matrix of a quaternion, which is normalised first.
+    """The rotation matrix of a quaternion, which is normalized first.
 
     Args:
         q: (..., 4) quaternions (w, x, y, z), not zero.

@@ -123,7 +123,7 @@ class GnssParams(Checked):
             raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
             raise ValueError(
-                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF metres, "
+                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF meters, "
                 f"got {self.reference_antenna_G}"
             )
 
@@ -140,7 +140,7 @@ class GnssParams(Checked):
         `sigma^2 (1 + a) / (1 - a)` with `a = exp(-1 / (rate tau))`. That is its sum over time as a
         filter that averages for longer than tau meets it; for any shorter memory it is more than
         there is, so that the filter errs on the side of doubt (R. G. Brown and P. Y. C. Hwang,
-        Introduction to Random Signals and Applied Kalman Filtering, on coloured measurement noise).
+        Introduction to Random Signals and Applied Kalman Filtering, on colored measurement noise).
         """
         a = math.exp(-1.0 / (self.rate * self.drift_tau))
         slow = np.square(self.drift_sigma_I) * (1.0 + a) / (1.0 - a)
@@ -154,7 +154,7 @@ class CameraParams(Checked):
     rate: float = 200.0
     """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
     position_B: Vector = (0.1159, -0.0004, -0.0435)
-    """(3,) projection centre in B [m]; laboratory vehicle"""
+    """(3,) projection center in B [m]; laboratory vehicle"""
     attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
     """(3,) Euler angles of R_CB, camera z along the optical axis [rad]; laboratory"""
     pixel_size: float = 2e-6
@@ -162,7 +162,7 @@ class CameraParams(Checked):
     focal_length: float = 1657.72
     """[pixels]; laboratory"""
     image_size: Vector = (3840.0, 2160.0)
-    """(2,) width and height, with the origin of coordinates at the centre [pixels]; laboratory"""
+    """(2,) width and height, with the origin of coordinates at the center [pixels]; laboratory"""
     pixel_sigma: float = 20.0
     """standard deviation per axis [pixels]; laboratory"""
     features_I: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
@@ -198,10 +198,10 @@ class CameraParams(Checked):
 class PlacementParams(Checked):
     """How well the place of the start is known where there is no GNSS to measure it.
 
-    The vehicle is put down on a marked spot; the filter starts from where the spot is and whither
-    the vehicle looks, with these errors, and takes the vehicle for level. Where there is GNSS whose
-    baseline lies within 12 degrees of the vertical, so that it hardly tells the heading, whither
-    the vehicle looks is known from its mark, too.
+    The vehicle is put down on a marked spot. The filter starts from the position of the spot and
+    the heading of the vehicle, with these errors, and assumes that the vehicle is level. Where the
+    baseline of GNSS lies within 12 degrees of the vertical, so that it hardly tells the heading,
+    the heading is known from the mark, too.
     """
 
     position_sigma: float = 0.05

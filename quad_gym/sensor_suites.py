@@ -47,7 +47,7 @@ FIELD_FILTER = FilterParams(
     gradual_above=0.01,  # its square is below what a pixel subtends
     gate_false_alarm=1e-4,
 )
-"""The filter outside the laboratory: honest about its start, and gated."""
+"""The filter outside the laboratory: consistent from its start on, and gated."""
 
 RTK = SensorSuite(
     imu=ImuParams(
@@ -56,7 +56,7 @@ RTK = SensorSuite(
         # density 100 ug/sqrt(Hz), in-run bias stability 8 deg/h and 13 ug
         gyro_noise_density=math.radians(0.008),
         accel_noise_density=0.1 * _MILLI_G,
-        # what turning on and temperature leave of its factory calibration; our judgement, some ten
+        # what turning on and temperature leave of its factory calibration; our judgment, some ten
         # times the in-run stability of the gyro, and what a level on the ground leaves of the
         # accelerometer
         gyro_bias_sigma=80.0 * _DEG_PER_HOUR,
@@ -99,14 +99,14 @@ CONSUMER = SensorSuite(
         gyro_noise_density=math.radians(0.015),
         accel_noise_density=0.23 * _MILLI_G,
         accel_bias_sigma=25.0 * _MILLI_G,
-        # what zeroing the gyro at rest before each flight leaves, 0.1 deg/s; our judgement
+        # what zeroing the gyro at rest before each flight leaves, 0.1 deg/s; our judgment
         gyro_bias_sigma=math.radians(0.1),
         gyro_bias_tau=300.0,
         accel_bias_tau=300.0,
     ),
     gnss=GnssParams(
         rate=10.0,  # u-blox MAX-M10S data sheet: 10 Hz with four constellations
-        # fixes scatter by decimetres from one to the next; our judgement
+        # fixes scatter by decimeters from one to the next; our judgment
         position_sigma_I=(0.2, 0.2, 0.4),
         # the same data sheet: 1.5 m CEP, so sigma = 1.27 m an axis over a day; half of it within a
         # correlation time of a minute (D. L. Wilson's records of a hand-held receiver), the rest
@@ -115,7 +115,7 @@ CONSUMER = SensorSuite(
         drift_tau=60.0,
         velocity_sigma=0.05,  # the same data sheet: velocity accuracy 0.05 m/s
         # one antenna has no baseline. Yaw comes from a compass: 5 deg among motors and iron. It is
-        # modelled as the direction of the body x axis, here the line between the two "antennas"
+        # modeled as the direction of the body x axis, here the line between the two "antennas"
         primary_antenna_B=(0.0, 0.0, 0.0472),
         secondary_antenna_B=(0.1, 0.0, 0.0472),
         baseline_sigma=math.radians(5.0),
@@ -148,7 +148,7 @@ INDOOR = SensorSuite(
         gyro_noise_density=math.radians(0.014),
         accel_noise_density=0.175 * _MILLI_G,
         accel_bias_sigma=20.0 * _MILLI_G,
-        # what zeroing at rest leaves; our judgement
+        # what zeroing at rest leaves; our judgment
         gyro_bias_sigma=math.radians(0.05),
         gyro_bias_tau=300.0,
         accel_bias_tau=300.0,
@@ -171,7 +171,7 @@ INDOOR = SensorSuite(
 
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
-    # the laboratory's pixels are coarse, so that images need not be taken in steps, and no
+    # the laboratory's pixels are coarse, so that images need not be processed in steps, and no
     # measurement of it is corrupted, so that none has to be rejected
     estimator=FIELD_FILTER.replace(gradual_above=None, gate_false_alarm=0.0),
     noisy=NoisyObservationParams(

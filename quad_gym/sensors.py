@@ -55,7 +55,7 @@ class GnssReceiver(_Sensor):
         """One measurement.
 
         Args:
-            position: (3,) true position of the centre of mass in I [m].
+            position: (3,) true position of the center of mass in I [m].
             R_BI: (3, 3) true attitude.
 
         Returns:
@@ -90,11 +90,11 @@ class Camera(_Sensor):
         """One image.
 
         Args:
-            position: (3,) true position of the centre of mass in I [m].
+            position: (3,) true position of the center of mass in I [m].
             R_BI: (3, 3) true attitude.
 
         Returns:
-            (n_features, 2) pixels from the image's centre; NaN for a feature that is behind the
+            (n_features, 2) pixels from the image's center; NaN for a feature that is behind the
             camera or whose noiseless projection lies outside the image.
 
         Raises:

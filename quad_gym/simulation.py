@@ -89,7 +89,7 @@ class FlightBatch:
         faults: What goes wrong: faults, or names of presets, see `quad_gym.faults`.
 
     Raises:
-        ValueError: If an argument makes no sense; nothing is allocated then.
+        ValueError: If an argument is invalid; nothing is allocated then.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The world and its randomisation as numbers in the records that kernels read."""
+"""The world and its randomization as numbers in the records that kernels read."""
 
 import math
 from typing import Any

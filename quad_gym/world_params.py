@@ -74,7 +74,7 @@ class WorldParams(Checked):
     rotor_radius: float = 0.127
     """[m]; ten-inch propellers"""
     ground_height: float = -0.1
-    """height of the ground in I, for ground effect and gusts [m]; the centre of mass of a vehicle
+    """height of the ground in I, for ground effect and gusts [m]; the center of mass of a vehicle
     that stands on its legs is at height 0"""
     battery: BatteryParams | None = None
     """None: full voltage for ever"""

@@ -102,7 +102,7 @@ def configure(args: Args) -> Setup:
     """Check all options before anything is flown.
 
     Raises:
-        ValueError: If an option makes no sense.
+        ValueError: If an option is invalid.
         OSError: If nothing can be written to the output folder.
         ImportError: If matplotlib or tqdm is missing.
     """

@@ -82,7 +82,7 @@ def configure(args: Args) -> Setting:
     """Check all options before anything is trained.
 
     Raises:
-        ValueError: If an option makes no sense, or the folder holds another comparison.
+        ValueError: If an option is invalid, or the folder holds another comparison.
         OSError: If nothing can be written to the folder.
         ImportError: If a package is missing.
     """

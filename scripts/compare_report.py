@@ -83,7 +83,7 @@ class Cell:
     """of the mean error: over training seeds, or for PD over episodes; None for a single seed"""
 
     def text(self) -> str:
-        """For people: millimetres, and the crashes."""
+        """For people: millimeters, and the crashes."""
         mean = 1e3 * float(np.mean(self.errors))
         text = f"{mean:.1f}"
         if self.interval is not None:

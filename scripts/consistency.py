@@ -1,7 +1,7 @@
-"""Is the filter honest? Compare its errors with the covariance that it claims, over many flights.
+"""Filter consistency: compare errors with the covariance that the filter claims, over many flights.
 
-Flies random trajectories (or another task) by PD control and takes the normalised estimation error
-squared (NEES) of the 15 states and of each block of three, over time, and the normalised innovation
+Flies random trajectories (or another task) by PD control and takes the normalized estimation error
+squared (NEES) of the 15 states and of each block of three, over time, and the normalized innovation
 squared (NIS) of each sensor. If the covariance is right, means over 1,000 flights lie in known
 bands at 95 % of the instants, and innovations are white. The truth is the simulator's.
 
@@ -11,7 +11,7 @@ configuration and the seeds (consistency.json). For example:
   python scripts/consistency.py                             the suite "rtk"
   python scripts/consistency.py --suite indoor --start warm
   python scripts/consistency.py --suite lab                 the report's filter
-  python scripts/consistency.py --suite lab --form mended   the same sensors, all mends
+  python scripts/consistency.py --suite lab --form corrected   the same sensors, all corrections
   python scripts/consistency.py --estimator ekf             an extended Kalman filter
   python scripts/consistency.py --mass-factor 1.2           a vehicle heavier than it is taken for
   python scripts/consistency.py --noise-factor 1.5          sensors worse than the filter believes
@@ -63,8 +63,10 @@ class Args:
     )
 
     suite: str = option("rtk", f"sensor suite, of {', '.join(SUITES)}", group="sensors and filter")
-    form: Literal["suite", "report", "mended"] = option(
-        "suite", "form of filter and IMU: as the suite has it, the report's, or with all mends"
+    form: Literal["suite", "report", "corrected", "mended"] = option(
+        "suite",
+        "form of filter and IMU: as the suite has it, the report's, or with all corrections "
+        "(formerly mended)",
     )
     samples: Literal["instant", "average"] | None = option(None, "in place of the form's")
     integration: Literal["euler", "midpoint"] | None = option(None, "in place of the form's")
@@ -205,7 +207,9 @@ def report_of(findings: Findings) -> str:
     if findings.nis:
         tables.append(table_of("NIS", findings.nis))
     lines = [
-        "The filter is honest." if findings.honest else "The filter is not honest in everything:",
+        "The filter is consistent."
+        if findings.honest
+        else "The filter is not consistent in everything:",
         *(f"  {text}" for text in findings.sentences().values()),
         f"  Filters that failed in a cycle: {findings.failed}. Flights astray: "
         f"{findings.astray.sum()}.",

@@ -68,7 +68,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     """Check all options, and make every policy with its environment.
 
     Raises:
-        ValueError: If an option makes no sense or a policy does not fit.
+        ValueError: If an option is invalid or a policy does not fit.
         OSError: If nothing can be written to the folder.
         ImportError: If a package is missing.
     """

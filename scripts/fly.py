@@ -117,7 +117,7 @@ class Switches:
 
 
 def check_options(args: Args) -> None:
-    """Refuse options that make no sense before anything is flown.
+    """Refuse invalid options before anything is flown.
 
     Raises:
         ValueError: If one does.
@@ -163,7 +163,7 @@ def make_env(args: Args) -> Any:
     """An environment of one flight.
 
     Raises:
-        ValueError: If an option makes no sense.
+        ValueError: If an option is invalid.
     """
     options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}

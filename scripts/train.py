@@ -64,7 +64,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     """Check all options before anything is trained.
 
     Raises:
-        ValueError: If an option makes no sense.
+        ValueError: If an option is invalid.
         OSError: If nothing can be written to the folder.
         ImportError: If Stable-Baselines3 is missing.
     """

@@ -154,7 +154,7 @@ def configure(args: Args) -> Search:
     """Check all options before anything flies.
 
     Raises:
-        ValueError: If an option makes no sense.
+        ValueError: If an option is invalid.
         OSError: If nothing can be written to the folder.
     """
     for env_id in args.tasks:

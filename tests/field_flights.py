@@ -65,7 +65,7 @@ def state_errors(batch):
 
 
 def nees(batch, block=slice(0, 15)):
-    """(n,) normalised estimation error squared of all 15 states, or of some."""
+    """(n,) normalized estimation error squared of all 15 states, or of some."""
     x, P = state_errors(batch)[:, block], batch.covariance()[:, block, block]
     return np.einsum("ni,ni->n", x, np.linalg.solve(P, x[..., np.newaxis])[..., 0])
 

@@ -33,7 +33,7 @@ def rendering_of(
     """What an environment renders with; None where it does not render.
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If it is to render and pygame is not installed.
     """
     if render_mode is None:

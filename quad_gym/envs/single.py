@@ -35,7 +35,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | id | reference | start | time limit |
     |---|---|---|---|
     | `QuadGym/Hover-v0` | a point 4 m from the origin, 1 m high, looking at the origin | hovering near it | 10 s |
-    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the centre | at rest on the ground below it, rotors stopped | 10 s |
+    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | at rest on the ground below it, rotors stopped | 10 s |
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
@@ -82,7 +82,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
 
     times the control period. At most 1.6 a second, so a circle flown perfectly returns 16; an
-    action that jumps from corner to corner costs 0.32 a second. `Waypoints` gives 1 a metre of
+    action that jumps from corner to corner costs 0.32 a second. `Waypoints` gives 1 a meter of
     progress toward the next gate and 1 a gate instead of the two exponentials.
 
     ## Episode end
@@ -93,7 +93,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     ## Start
     "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped,
     level, looking as wanted. "hover": hovering, with standard deviations of 0.3 m, 0.03 m/s, 0.2 rad
-    in yaw and 0.03 rad in tilt. "mixed": either, by a coin, for training: a policy that has learned
+    in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5, for training: a policy that has learned
     to hover then learns to take off. The filter starts from its first fix in each, or with
     `filter_start="warm"` as if it had been running for 10 s, as before any real take-off.
     `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these for one

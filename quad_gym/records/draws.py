@@ -27,7 +27,7 @@ DRAWABLES = (
     # the vehicle
     Drawable("mass", 1, "kg", "mass", above=0.0),
     Drawable("inertia", 3, "kg m^2", "its diagonal; the rest follows", above=0.0),
-    Drawable("center_of_mass_B", 3, "m", "true centre of mass, from where it is believed to be"),
+    Drawable("center_of_mass_B", 3, "m", "true center of mass, from where it is believed to be"),
     Drawable("thrust_coefficient", 1, "N/(rad/s)^2", "kF", above=0.0),
     Drawable("torque_coefficient", 1, "N m/(rad/s)^2", "kN", above=0.0),
     Drawable("rotor_efficiency", 4, "-", "of each rotor: of its thrust and torque", above=0.0),
@@ -60,7 +60,7 @@ DRAWABLES = (
     Drawable("lever_arm_B", 3, "m", "accelerometer"),
     Drawable("primary_antenna_B", 3, "m", "primary GNSS antenna"),
     Drawable("secondary_antenna_B", 3, "m", "secondary GNSS antenna"),
-    Drawable("camera_position_B", 3, "m", "projection centre"),
+    Drawable("camera_position_B", 3, "m", "projection center"),
     Drawable("camera_rotation", 3, "rad", "error e of the camera's attitude, R(e) R_CB"),
     Drawable("focal_length", 1, "pixels", "of the camera", above=0.0),
     # the start, on top of the task's own; what a caller gives to a reset stays as it was given

@@ -30,7 +30,7 @@ class FilterForm(IntFlag):
     LEVER_SAMPLES = 128
     """likewise, and samples are of the tick's start"""
     GRADUAL = 32
-    """updates take images in portions while the attitude is uncertain"""
+    """updates process images in steps while the attitude is uncertain"""
 
 
 class Gate(IntEnum):
@@ -83,9 +83,9 @@ class Start(IntEnum):
     GROUND = 0
     """At rest below the reference at height 0, rotors stopped: the report's."""
     HOVER = 1
-    """Hovering, at rest, within some decimetres of the reference."""
+    """Hovering, at rest, within some decimeters of the reference."""
     MIXED = 2
-    """Either, by a coin: for training, as a policy that has learned to hover learns to take off."""
+    """Either, with probability 0.5: for training, as a policy that has learned to hover learns to take off."""
 
 
 class Layout(IntEnum):

@@ -15,7 +15,7 @@ from quad_gym.records.sizes import (
 # fmt: off
 FLIGHT_FIELDS = (
     # the truth
-    Field("r", (3,), "m", "position r_I of the centre of mass"),
+    Field("r", (3,), "m", "position r_I of the center of mass"),
     Field("v", (3,), "m/s", "velocity v_I"),
     Field("q", (4,), "-", "attitude, unit quaternion (w, x, y, z), body to inertial"),
     Field("w", (3,), "rad/s", "body rates w_B"),
@@ -58,12 +58,12 @@ FLIGHT_FIELDS = (
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
     Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
     Field("update_failures", (), "-", "updates that failed since the filter's start"),
-    Field("nis", (), "-", "normalised innovation squared of the last update; NaN: it was taken in portions"),
+    Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
     # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
     Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
     Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
-    Field("block_nis", (MAX_BLOCKS,), "-", "normalised innovation squared of each block, with FREEDOMS; NaN: none yet"),
+    Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
     Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
     Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
     Field("rejected_in_row", (4,), "-", "positions, baselines, velocities, images wholly rejected since the last accepted one"),
@@ -94,7 +94,7 @@ FLIGHT_FIELDS = (
     Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
     Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
     # the course of gates
-    Field("gates", (MAX_GATES, 3), "m", "gate centres in I"),
+    Field("gates", (MAX_GATES, 3), "m", "gate centers in I"),
     Field("gate_next", (), "-", "gates passed so far"),
     # the task
     Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),

@@ -31,7 +31,7 @@ VERMILLION: Color = (198, 81, 0)
 GREEN: Color = (0, 145, 80)
 PURPLE: Color = (190, 90, 150)
 PALE_PURPLE: Color = (218, 176, 204)
-"""After those of Okabe and Ito, which people with a colour vision deficiency can tell apart; darker
+"""After those of Okabe and Ito, which people with a color vision deficiency can tell apart; darker
 than theirs, to stand out from a pale ground, and shifted so that they stay apart for everyone."""
 
 OVERSAMPLING = 2

@@ -67,7 +67,7 @@ class View:
         return float(self.center[1] + self.focal * down / max(level, 1e-9))
 
     def scale_at(self, point: Floats) -> float:
-        """Pixels per metre across the line of sight at a point in I."""
+        """Pixels per meter across the line of sight at a point in I."""
         return self.focal / max(float(self.in_view(point)[2]), NEAR)
 
 

@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 def place_in_inset(pixels: Floats, stage: Stage, box: Box) -> Floats:
-    """Where pixels of the camera, from its image's centre, are in the inset.
+    """Where pixels of the camera, from its image's center, are in the inset.
 
     The image is turned upright: half a turn, where the camera's y axis points up in the body.
 
@@ -89,7 +89,7 @@ class Inset:
         seen = np.isfinite(image["pixels"]).all(axis=1)
         wordings = ["camera"] if seen.any() else ["camera: no feature in view", "no feature"]
         if (count := rejected_features(image).sum()) > 0:
-            wordings = [f"camera: {count} rejected (grey)", f"{count} rejected"]
+            wordings = [f"camera: {count} rejected (gray)", f"{count} rejected"]
         top, size = box.top + box.height + 2.0, self._size
         words = canvas.fitting(wordings, size, box.width - 4.0)
         width = canvas.width_of(words, size)

@@ -96,7 +96,7 @@ class Rendering:
         size: Width and height of each picture [pixels].
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If pygame is not installed.
     """
 

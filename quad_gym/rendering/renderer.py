@@ -38,7 +38,7 @@ class Renderer:
         size: Width and height [pixels].
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If pygame is not installed.
     """
 
@@ -115,7 +115,7 @@ class Renderer:
             self._stage = stage
 
     def _write_legend(self, flight: Flight) -> None:
-        """What, when, what the colours mean, and what is wrong, in the upper left corner."""
+        """What, when, what the colors mean, and what is wrong, in the upper left corner."""
         canvas, stage, now = self._canvas, flight.stage, flight.rows[-1]
         large, small = self._text + 2, self._text - 1
         name = stage.task.replace("_", " ")
@@ -130,7 +130,7 @@ class Renderer:
             entries += [("estimate", VERMILLION), (size, VERMILLION)]
             if stage.has_gnss:
                 refused = (flight.rows["gnss_gate"][:, 0] == Gate.REJECTED).any()
-                words = "GNSS fix (grey: rejected)" if refused else "GNSS fix"
+                words = "GNSS fix (gray: rejected)" if refused else "GNSS fix"
                 entries.append((words, PURPLE))
         elif stage.observation == "noisy":
             entries.append(("what the controller sees", VERMILLION))

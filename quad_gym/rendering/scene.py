@@ -51,12 +51,12 @@ _NORTHWARD = [
     for s in (-1, 1)
 ]
 _GRID = np.stack([np.concatenate([ends, ends[:, [1, 0, 2]]]) for ends in _NORTHWARD])
-"""Starts and ends of the lines on the ground, one metre apart, (2, n, 3)."""
+"""Starts and ends of the lines on the ground, one meter apart, (2, n, 3)."""
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
 
 Label = tuple[str, Floats, tuple[int, int, int]]
-"""Words, where (2,), colour."""
+"""Words, where (2,), color."""
 
 
 def ellipsoid_scale(flight: Flight) -> float:

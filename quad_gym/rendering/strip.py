@@ -41,7 +41,7 @@ class Plot:
     """A plot of columns over time, on a logarithmic scale."""
 
     curves: tuple[tuple[str, str, Color], ...]
-    """column, name and colour of each curve"""
+    """column, name and color of each curve"""
     low: float
     high: float
     ticks: dict[float, str]
@@ -73,7 +73,7 @@ def nees_band() -> Interval:
 
 
 def format_length(meters: float) -> str:
-    """A length for people, in millimetres to metres."""
+    """A length for people, in millimeters to meters."""
     if not np.isfinite(meters):
         return "-"
     if meters < 0.01:

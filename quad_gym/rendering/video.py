@@ -39,7 +39,7 @@ def record_flight(
         The flight, from its start to the ending of the episode.
 
     Raises:
-        ValueError: If the episode would have no end, or a keyword makes no sense.
+        ValueError: If the episode would have no end, or a keyword is invalid.
     """
     env = gymnasium.make_vec(env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
     return flight_of(policy, env, seed=seed, about={"env_id": env_id, **(about or {})})
@@ -106,7 +106,7 @@ def save_video(
         The file.
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If a library that writes the file is not installed.
     """
     target = checked_video_path(path)
@@ -150,7 +150,7 @@ def record_video(
         The flight, to be saved or looked into.
 
     Raises:
-        ValueError: If an argument makes no sense.
+        ValueError: If an argument is invalid.
         ImportError: If a library that writes the file is not installed.
     """
     checked_video_path(path)  # before anything is flown
@@ -217,7 +217,7 @@ def _write_animation(frames: Iterable[NDArray[np.uint8]], path: Path, fps: float
     if path.suffix.lower() == ".webp":
         options: dict[str, Any] = {"quality": 70, "method": 4, "minimize_size": False}
     else:
-        # one palette for all, so that colours do not flicker
+        # one palette for all, so that colors do not flicker
         palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)
         pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
         options = {"optimize": False}

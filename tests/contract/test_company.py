@@ -214,8 +214,8 @@ def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, damage):
     assert files
     for file in files:
         content = file.read_bytes()
-        spoiled = {"emptied": b"", "cut": content[: len(content) // 2], "overwritten": b"\x00" * 99}
-        file.write_bytes(spoiled[damage])
+        corrupt = {"emptied": b"", "cut": content[: len(content) // 2], "overwritten": b"\x00" * 99}
+        file.write_bytes(corrupt[damage])
     assert outcome(start(cache))
     assert not outcome(start(cache))
 

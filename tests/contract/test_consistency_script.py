@@ -1,9 +1,13 @@
 """The consistency script: what it writes, and that it finds fault where there is fault."""
 
+import importlib.util
 import json
 import subprocess
 import sys
 from pathlib import Path
+
+import quad_gym
+from quad_gym.cli import parse
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "consistency.py"
 
@@ -13,7 +17,7 @@ def run(output, *options):
         "--suite",
         "lab",
         "--form",
-        "mended",
+        "corrected",
         "--no-camera",
         "--flights",
         "64",
@@ -62,3 +66,15 @@ def test_wrong_options_are_refused_in_a_line(tmp_path):
         done = run(tmp_path, *options)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1, done.stderr
+
+
+def test_the_former_name_of_the_corrected_form_is_accepted(monkeypatch):
+    spec = importlib.util.spec_from_file_location("consistency_script", SCRIPT)
+    script = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, script)
+    spec.loader.exec_module(script)
+    forms = [
+        script.suite_of(parse(script.Args, ["--suite", "lab", "--form", form]))
+        for form in ("corrected", "mended")
+    ]
+    assert forms[0] == forms[1] != quad_gym.sensor_suite("lab")

@@ -110,7 +110,7 @@ def test_the_order_of_the_flights_changes_nothing(seed, thousand):
     assert_same(flown, tuple(column[:, order].copy() for column in thousand))
 
 
-def test_what_a_neighbour_does_changes_nothing():
+def test_what_a_neighbor_does_changes_nothing():
     env, twin = (QuadVectorEnv(8, "circle", out_of_bounds=50.0) for _ in range(2))
     env.reset(seed=2)
     twin.reset(seed=2)

@@ -158,7 +158,7 @@ STILL = np.zeros(4)
 
 
 @pytest.mark.parametrize("task", ["hover", "circle", "lemniscate", "random_trajectory"])
-def test_farther_than_three_metres_from_the_reference_is_out_of_bounds(task):
+def test_farther_than_three_meters_from_the_reference_is_out_of_bounds(task):
     start = QuadEnv(task)
     start.reset(seed=1)
     r_ref, _ = reference_of(task, 0.0, start.flights.batch)
@@ -188,7 +188,7 @@ def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
 
 
 @pytest.mark.parametrize("task", ["hover", "circle", "waypoints"])
-def test_half_a_metre_below_the_origin_is_on_the_ground(task):
+def test_half_a_meter_below_the_origin_is_on_the_ground(task):
     env = QuadEnv(task)
     *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
     assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")

@@ -131,10 +131,10 @@ def test_what_the_caller_does_to_the_arrays_does_not_reach_the_flights():
     actions = np.stack([actions_of(i, 20) for i in range(9)], axis=1)
     for k in range(20):
         given = actions[k].copy()
-        spoiled = env.step(given)
-        assert_same(spoiled, twin.step(actions[k]))
+        corrupt = env.step(given)
+        assert_same(corrupt, twin.step(actions[k]))
         assert_same(given, actions[k])
-        for array in arrays_in(spoiled):
+        for array in arrays_in(corrupt):
             array[...] = None if array.dtype == object else 1
 
 

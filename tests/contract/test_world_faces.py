@@ -1,4 +1,4 @@
-"""With a world and a randomisation at their fullest: the same flights in every face."""
+"""With a world and a randomization at their fullest: the same flights in every face."""
 
 import numpy as np
 import pytest

@@ -70,7 +70,7 @@ def assert_told(batch, failures, nis):
     measured, gate = measured_now(batch), batch.read("gate")
     made, accepted = measured.any(axis=1), (measured & (gate == Gate.ACCEPTED)).any(axis=1)
     failed = counted[0] > failures[0]
-    known = np.isfinite(now) & np.isfinite(nis)  # of an image taken in portions there is no NIS
+    known = np.isfinite(now) & np.isfinite(nis)  # of an image processed in steps there is no NIS
     np.testing.assert_array_equal((now != nis)[known], (accepted & ~failed)[known])
     np.testing.assert_array_equal((measured & (gate == Gate.FAILED)).any(axis=1), failed)
     return made, int((made & ~accepted & ~failed).sum()), counted, now

@@ -1,10 +1,10 @@
 """Outages, outliers and jumps over 1,000 flights: the filter knows how lost it is, and comes back.
 
-"Inside 3 sigma" of an error of d numbers means that its normalised square is below the chi-square
-quantile that holds 99.73 % of an honest filter's errors, as 3 sigma do of a single number. Of 1,000
-honest flights nearly three lie outside at any given instant, so that no filter can have all of them
-inside at one instant; it must have each of them inside at some instant of the time allowed, and all
-of them within the quantile of 1e-6 in 1,000 at its end.
+"Inside 3 sigma" of an error of d numbers means that its normalized square is below the chi-square
+quantile that holds 99.73 % of a consistent filter's errors, as 3 sigma do of a single number. Of
+1,000 flights of such a filter nearly three lie outside at any given instant, so that no filter can
+have all of them inside at one instant; it must have each of them inside at some instant of the time
+allowed, and all of them within the quantile of 1e-6 in 1,000 at its end.
 """
 
 import numpy as np
@@ -123,7 +123,7 @@ def test_in_an_outage_of_a_minute_uncertainty_grows_as_theory_says(kind):
     np.testing.assert_allclose(ratio, 1.0, atol=0.005)
     gap = (found[some] - expected) / (sigma[:, :, np.newaxis] * sigma[:, np.newaxis])
     assert abs(gap).max() < 0.03
-    assert sigma[:, :2].min() > 5.0  # metres: nothing was clipped on the way
+    assert sigma[:, :2].min() > 5.0  # meters: nothing was clipped on the way
 
     for part in (slice(0, 15), R, V, E, BA, BG):  # chi-square, so mean d and variance 2 d
         d = part.stop - part.start
@@ -202,9 +202,9 @@ SUITES = {
 def test_with_five_percent_outliers_the_error_is_hardly_larger(kind, name):
     suite = of_kind(SUITES[name], kind)
     clean = rms_error(suite, None)
-    spoiled = rms_error(suite, GnssOutliers(share=0.05, size=(10.0, 100.0)))
-    print(f"{name}, {kind}: {clean:.4f} m, with outliers {spoiled:.4f} m, {spoiled / clean:.3f}")
-    assert spoiled < 1.2 * clean
+    corrupt = rms_error(suite, GnssOutliers(share=0.05, size=(10.0, 100.0)))
+    print(f"{name}, {kind}: {clean:.4f} m, with outliers {corrupt:.4f} m, {corrupt / clean:.3f}")
+    assert corrupt < 1.2 * clean
 
 
 @pytest.mark.slow
@@ -212,8 +212,8 @@ def test_without_the_gate_outliers_do_harm():
     suite = SUITES["rtk, no camera"]
     open_ = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=0.0))
     clean = rms_error(open_, None)
-    spoiled = rms_error(open_, GnssOutliers(share=0.05, size=(10.0, 100.0)))
-    assert spoiled > 3.0 * clean
+    corrupt = rms_error(open_, GnssOutliers(share=0.05, size=(10.0, 100.0)))
+    assert corrupt > 3.0 * clean
 
 
 # ---- jumps -------------------------------------------------------------------------------------

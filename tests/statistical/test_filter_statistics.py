@@ -79,8 +79,8 @@ def whitened_errors_on_imu_alone(rates, runs, seed):
         ukf.predict(gyro, accel)
 
     truth = (r, v, small_euler_angles(R_BI @ ukf.R_BI.T), b_a, b_g)
-    centres = (ukf.position, ukf.velocity, 0.0, ukf.accel_bias, ukf.gyro_bias)
-    errors = np.concatenate([x - c for x, c in zip(truth, centres, strict=True)], axis=1)
+    centers = (ukf.position, ukf.velocity, 0.0, ukf.accel_bias, ukf.gyro_bias)
+    errors = np.concatenate([x - c for x, c in zip(truth, centers, strict=True)], axis=1)
     return np.linalg.solve(np.linalg.cholesky(ukf.covariance), errors.T)
 
 
@@ -110,7 +110,7 @@ def test_a_rolling_vehicle_turns_its_covariance_less_than_it_should():
 
 
 def nees(batch):
-    """Normalised estimation error squared of every flight, the attitude's in error Euler angles."""
+    """Normalized estimation error squared of every flight, the attitude's in error Euler angles."""
     R_BI, R_hat = attitudes_of_quaternions(batch.read("q")), batch.read("R_hat")
     errors = np.concatenate(
         [

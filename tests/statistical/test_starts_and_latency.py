@@ -33,7 +33,7 @@ def yaw_errors(batch):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
-def test_a_warm_filter_is_honest_from_the_first_instant_on(kind, late):
+def test_a_warm_filter_is_consistent_from_the_first_instant_on(kind, late):
     """NEES of state and blocks and NIS of all sensors in their bands, innovations white."""
     suite = delayed(RTK, kind) if late else RTK.replace(estimator=RTK.estimator.replace(kind=kind))
     batch = fly(suite, 1000, filter_start="warm")
@@ -76,7 +76,7 @@ def test_any_yaw_is_known_to_a_degree_within_ten_seconds(name, camera):
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("camera", [True, False], ids=["camera", "no camera"])
 def test_a_vertical_baseline_does_no_harm(camera, start):
-    """From any yaw, which the mark of the start tells: the filter stays honest and close.
+    """From any yaw, which the mark of the start tells: the filter stays consistent and close.
 
     A filter that has hovered knows the balance of tilt and accelerometer bias to 0.4 mrad. Half the
     square of a heading wrong by 50 mrad is more than that: without a camera the error angles bend

@@ -48,10 +48,10 @@ def drawn(factor, instants=400, flights=500):
     return MeanSquare("state", 15, np.arange(instants) * 0.05, mean, low, high)
 
 
-def test_an_honest_filter_is_called_honest_and_others_by_how_much_they_err():
-    honest = drawn(1.0)
-    assert honest.honest
-    assert verdict(honest).endswith(": honest.")
+def test_a_consistent_filter_is_called_consistent_and_others_by_how_much_they_err():
+    consistent = drawn(1.0)
+    assert consistent.honest
+    assert verdict(consistent).endswith(": consistent.")
     for factor, words in (
         (1.1, "overconfident, as errors are 10"),
         (0.9, "too cautious, as errors are 10"),
@@ -147,7 +147,7 @@ def recorded(memory, factor=1.0, instants=200):
     return recorder
 
 
-def test_white_innovations_are_called_white_and_their_nis_honest():
+def test_white_innovations_are_called_white_and_their_nis_consistent():
     recorder = recorded(0.0)
     assert set(recorder.nis()) == set(recorder.whiteness()) == {"position"}
     white = recorder.whiteness()["position"]

@@ -1,4 +1,4 @@
-"""Dryden gusts against MIL-F-8785C: scales, discretisation, variance, correlation, spectrum."""
+"""Dryden gusts against MIL-F-8785C: scales, discretization, variance, correlation, spectrum."""
 
 import itertools
 
@@ -57,7 +57,7 @@ def test_scales_are_those_of_the_specification(height, wind_speed):
 
 
 @pytest.mark.parametrize("h", [1e-9, 1e-6, 1e-3, 0.03, 0.9, 1.1, 4.0])
-def test_the_discretisation_is_exact(h):
+def test_the_discretization_is_exact(h):
     """Transition and noise covariance are those of Van Loan's matrix exponential (1978)."""
     A, B = np.array([[-1.0, 0.0], [1.0, -1.0]]), np.array([[1.0], [0.0]])
     van_loan = expm(h * np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]))
@@ -187,7 +187,7 @@ def test_the_spectra_are_drydens():
         ratio = density[:, k] / aliased
         for low, high in itertools.pairwise(edges):
             chosen = (frequency >= low) & (frequency < high)
-            # half-overlapping Hann segments: 7 in a record, worth some 5.8; bins share neighbours
+            # half-overlapping Hann segments: 7 in a record, worth some 5.8; bins share neighbors
             freedom = 2 * 256 * 5.8 * max(1.0, chosen.sum() / 1.94)
             bound = stats.norm.isf(ALARM / 2 / 39) * np.sqrt(2.0 / freedom)
             assert abs(ratio[chosen].mean() - 1.0) < bound + 0.005, (k, low)
@@ -204,5 +204,5 @@ def test_across_and_along_follow_the_wind():
 def test_different_flights_and_axes_meet_different_gusts(history):
     scores = np.corrcoef(history[4000].T)[np.triu_indices(3, 1)] * np.sqrt(4000)
     assert np.abs(scores).max() < alarm_score(3)
-    neighbours = (history[0][1:] * history[0][:-1]).mean(axis=0) * np.sqrt(3999)
-    assert np.abs(neighbours).max() < alarm_score(3)
+    neighbors = (history[0][1:] * history[0][:-1]).mean(axis=0) * np.sqrt(3999)
+    assert np.abs(neighbors).max() < alarm_score(3)

@@ -94,7 +94,7 @@ def difference(moved, reference):
 
 @pytest.mark.parametrize("kind", [ExtendedKalmanFilter, UnscentedKalmanFilter])
 @pytest.mark.parametrize("seed", range(5))
-def test_midpoint_prediction_is_the_linearised_exact_motion(seed, kind):
+def test_midpoint_prediction_is_the_linearized_exact_motion(seed, kind):
     """F P F^T + G Q G^T with F and G by finite differences of the exact motion on the manifold."""
     sensors = LAB.replace(estimator=LAB.estimator.replace(**MIDPOINT))
     ukf, imu = started(sensors, kind, seed), sensors.imu

@@ -199,11 +199,11 @@ def test_no_turn_at_all_is_exact(evaluate):
 )
 def test_a_strange_angle_in_one_lane_changes_no_other(bad, where, values):
     x = np.array(values)
-    spoilt = x.copy()
-    spoilt[where] = bad
+    corrupt = x.copy()
+    corrupt[where] = bad
     clean, dirty = (
         compiled.on_lanes(x=x),
-        compiled.on_lanes(x=spoilt, y=np.where(x == spoilt, 0, bad)),
+        compiled.on_lanes(x=corrupt, y=np.where(x == corrupt, 0, bad)),
     )
     others = np.arange(WIDTH) != where
     for name in NAMES:

@@ -71,7 +71,7 @@ def filters_with(blocks, sensors, form):
 )
 @pytest.mark.parametrize("how", ["nan", "infinity", "singular", "covariance"])
 def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
-    """One block alone or all at once; its neighbours' updates are theirs."""
+    """One block alone or all at once; its neighbors' updates are theirs."""
     if how == "infinity" and sensors is FIELD:
         pytest.skip("a gate rejects what is infinitely far")
     filters, free = (filters_with(blocks, sensors, form) for _ in range(2))

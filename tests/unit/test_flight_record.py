@@ -119,7 +119,7 @@ def test_what_the_gate_made_of_measurements_is_kept():
     np.testing.assert_array_equal(np.isfinite(flight["gnss_gate"][:, 0]), measured)
     antenna_B = env.flights.batch.sensors.gnss.primary_antenna_B
     antenna = flight["position"] + antenna_B @ quaternion_to_dcm(flight["attitude"])
-    # the vehicle moves some centimetres from a fix to the end of its row
+    # the vehicle moves some centimeters from a fix to the end of its row
     far = np.linalg.norm(flight["gnss_position"] - antenna, axis=1) > 0.3
     assert far.sum() > 5
     np.testing.assert_array_equal(flight["gnss_gate"][far, 0], Gate.REJECTED)

@@ -1,4 +1,4 @@
-"""Images in portions: the same filter where the model is linear, an honest one where it is not."""
+"""Images in steps: the same filter where the model is linear, a consistent one where it is not."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def started(above, sigma, gate=0.0):
     return ukf, camera.measure((0.53, -0.35, 1.22), np.eye(3))
 
 
-def test_portions_of_a_linear_measurement_add_up_to_it():
+def test_steps_of_a_linear_measurement_add_up_to_it():
     whole, pixels = started(None, 1e-5)
     parts, _ = started(1e-6, 1e-5)
     before = whole.covariance
@@ -57,14 +57,14 @@ def test_portions_of_a_linear_measurement_add_up_to_it():
     np.testing.assert_array_equal(parts.block_nis, whole.block_nis)
 
 
-def test_a_feature_that_the_gate_refuses_is_left_out_of_every_portion():
+def test_a_feature_that_the_gate_refuses_is_left_out_of_every_step():
     clean, pixels = started(0.01, 0.03, gate=1e-4)
     wrong, _ = started(0.01, 0.03, gate=1e-4)
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    spoilt, without = pixels.copy(), pixels.copy()
-    spoilt[seen[0]] += 900.0
+    corrupt, without = pixels.copy(), pixels.copy()
+    corrupt[seen[0]] += 900.0
     without[seen[0]] = np.nan
-    wrong.update(pixels=spoilt)
+    wrong.update(pixels=corrupt)
     clean.update(pixels=without)
     assert (wrong.gate_decisions == Gate.REJECTED).sum() == 1
     np.testing.assert_allclose(wrong.position, clean.position, atol=1e-6)
@@ -72,7 +72,7 @@ def test_a_feature_that_the_gate_refuses_is_left_out_of_every_portion():
 
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-def test_a_rough_start_is_honest_after_the_first_image_in_portions_only(kind):
+def test_a_rough_start_is_consistent_after_the_first_image_in_steps_only(kind):
     sums = {}
     for above in (0.01, None):
         batch = fly(with_gradual(above, kind), 2000, task="hover")

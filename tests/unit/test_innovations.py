@@ -21,13 +21,13 @@ from tests.lane_filter import EIGHT, STATE, LaneFilter
 from tests.reference_ukf import PlainUKF
 
 LAB = quad_gym.sensor_suite("lab")
-HONEST = LAB.replace(estimator=LAB.estimator.replace(feature_noise_across="predicted"))
+CONSISTENT = LAB.replace(estimator=LAB.estimator.replace(feature_noise_across="predicted"))
 GATED = LAB.replace(
     estimator=LAB.estimator.replace(
         feature_noise_across="predicted", gate_false_alarm=1e-4, gate_patience=5
     )
 )
-RECORDING = record_circle(HONEST, 400, 11)
+RECORDING = record_circle(CONSISTENT, 400, 11)
 FIX = slice(0, 3)
 FIELD = GATED.replace(
     estimator=GATED.estimator.replace(integration="midpoint", covariance_reset="turn")
@@ -88,7 +88,7 @@ def test_the_nis_of_each_block_is_that_of_a_plain_filter(across):
 
 
 def test_without_a_measurement_there_is_no_nis():
-    ukf = UnscentedKalmanFilter(HONEST)
+    ukf = UnscentedKalmanFilter(CONSISTENT)
     ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
     assert np.isnan(ukf.block_nis).all()
     ukf.update(RECORDING.gnss_position[0])
@@ -101,7 +101,7 @@ def test_without_a_measurement_there_is_no_nis():
 def test_a_rejected_block_is_as_good_as_not_measured(wrong):
     k = int(np.flatnonzero(np.isfinite(RECORDING.pixels).all(axis=(1, 2)))[-1])
     assert k > 100
-    without = warm(HONEST, k)
+    without = warm(CONSISTENT, k)
     gated = UnscentedKalmanFilter(GATED)
     gated.set_state(
         position=without.position,
@@ -152,8 +152,8 @@ def test_a_false_alarm_that_is_no_probability_is_refused(value):
 
 
 def test_a_lane_gates_for_itself():
-    """The neighbours of a flight with a wild position update as they would without a gate."""
-    filters, free = LaneFilter(GATED), LaneFilter(HONEST)
+    """The neighbors of a flight with a wild position update as they would without a gate."""
+    filters, free = LaneFilter(GATED), LaneFilter(CONSISTENT)
     for lanes in (filters, free):
         for lane in range(EIGHT):
             lanes.measure(lane, RECORDING, 0)
@@ -172,7 +172,12 @@ def test_a_lane_gates_for_itself():
 
 @pytest.mark.parametrize(
     ("sensors", "form"),
-    [(LAB, 0), (HONEST, FilterForm.INNOVATIONS), (GATED, FilterForm.GATE), (FIELD, FilterForm.EKF)],
+    [
+        (LAB, 0),
+        (CONSISTENT, FilterForm.INNOVATIONS),
+        (GATED, FilterForm.GATE),
+        (FIELD, FilterForm.EKF),
+    ],
     ids=["lab", "watched", "gated", "ekf"],
 )
 @pytest.mark.parametrize(
@@ -285,7 +290,7 @@ def test_one_wrong_feature_stays_out_while_the_others_agree():
     flights = batch.snapshot()
     before = flights["rejections"].copy()
     batch.restore(flights)
-    batch._model["features"][0, 1] += 0.5  # the filter's map is wrong by half a metre
+    batch._model["features"][0, 1] += 0.5  # the filter's map is wrong by half a meter
     steps(batch, 2.0)
     more = batch.read("rejections") - before.transpose(0, 2, 1).reshape(-1, before.shape[1])[:50]
     seen = batch.read("gate")[:, FEATURE_BLOCKS + 1] > 0

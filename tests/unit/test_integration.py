@@ -214,12 +214,12 @@ def test_eight_flights_in_lanes_are_eight_flights_in_floats():
         np.testing.assert_allclose(plain[name], lanes[name], rtol=1e-12, atol=1e-12, err_msg=name)
 
 
-def test_a_flight_that_is_not_a_number_does_not_touch_its_neighbours():
+def test_a_flight_that_is_not_a_number_does_not_touch_its_neighbors():
     flights = eight_flights()
     clean = lanes_and_floats.on_lanes(5, **flights)
-    spoilt = {name: value.copy() for name, value in flights.items()}
-    spoilt["w"][2], spoilt["r"][5], spoilt["mass"][5] = np.nan, np.inf, 0.0
-    dirty = lanes_and_floats.on_lanes(5, **spoilt)
+    corrupt = {name: value.copy() for name, value in flights.items()}
+    corrupt["w"][2], corrupt["r"][5], corrupt["mass"][5] = np.nan, np.inf, 0.0
+    dirty = lanes_and_floats.on_lanes(5, **corrupt)
     for name in STATE:
         others = [0, 1, 3, 4, 6, 7]
         assert clean[name][others].tobytes() == dirty[name][others].tobytes(), name

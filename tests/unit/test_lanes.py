@@ -227,12 +227,12 @@ def test_floats_and_lanes_agree_to_the_last_bits(pairs):
     st.integers(0, WIDTH - 1),
     st.lists(st.floats(-1e3, 1e3), min_size=WIDTH, max_size=WIDTH),
 )
-def test_a_lane_never_sees_its_neighbour(bad, where, values):
+def test_a_lane_never_sees_its_neighbor(bad, where, values):
     x, y = np.array(values), np.linspace(-1.0, 2.0, WIDTH)
-    spoilt_x, spoilt_y = x.copy(), y.copy()
-    spoilt_x[where] = spoilt_y[where] = bad
+    corrupt_x, corrupt_y = x.copy(), y.copy()
+    corrupt_x[where] = corrupt_y[where] = bad
     others = np.arange(WIDTH) != where
     for compiled in (arithmetic_on, asking_on):
         clean = compiled.on_lanes(x=x, y=y)["out"]
-        spoilt = compiled.on_lanes(x=spoilt_x, y=spoilt_y)["out"]
-        assert clean[others].tobytes() == spoilt[others].tobytes()
+        corrupt = compiled.on_lanes(x=corrupt_x, y=corrupt_y)["out"]
+        assert clean[others].tobytes() == corrupt[others].tobytes()

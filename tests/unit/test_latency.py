@@ -25,8 +25,8 @@ def late(suite, gnss=None, camera=None, **choices):
     return suite.replace(**changes)
 
 
-def mended_lab(kind="ukf", quiet=False, **latencies):
-    """The laboratory's sensors at rates of the field, with the mended filter, without a gate."""
+def corrected_lab(kind="ukf", quiet=False, **latencies):
+    """The laboratory's sensors at rates of the field, with the corrected filter, without a gate."""
     lab = quad_gym.sensor_suite("lab").with_rates(gnss=10.0, camera=25.0)
     imu = lab.imu.replace(samples="average")
     if quiet:
@@ -164,14 +164,16 @@ def distance(batch, i, plain, P):
 @pytest.mark.parametrize(("kind", "plain"), [("ukf", PlainUKF), ("ekf", PlainEKF)])
 def test_it_is_what_filtering_all_over_again_would_do(kind, plain):
     """Up to what measurements in between tell about the IMU's noise, and the second order."""
-    mean, covariance = deviations_from_the_reference(mended_lab(kind, gnss=0.1, camera=0.06), plain)
+    mean, covariance = deviations_from_the_reference(
+        corrected_lab(kind, gnss=0.1, camera=0.06), plain
+    )
     assert mean < 0.15, mean
     assert covariance < 0.02, covariance
 
 
 @pytest.mark.parametrize(("kind", "plain"), [("ukf", PlainUKF), ("ekf", PlainEKF)])
 def test_with_a_quiet_imu_the_covariance_is_the_same(kind, plain):
-    suite = mended_lab(kind, quiet=True, gnss=0.1, camera=0.06)
+    suite = corrected_lab(kind, quiet=True, gnss=0.1, camera=0.06)
     mean, covariance = deviations_from_the_reference(suite, plain)
     assert mean < 0.1, mean
     assert covariance < 1e-3, covariance
@@ -182,7 +184,7 @@ def test_with_a_quiet_imu_the_covariance_is_the_same(kind, plain):
 )
 def test_at_the_longest_latency_it_is_what_filtering_all_over_again_would_do(gnss, camera):
     """Exactly two periods: one measurement is taken at the instant at which another arrives."""
-    suite = mended_lab("ukf", quiet=True, gnss=gnss, camera=camera)
+    suite = corrected_lab("ukf", quiet=True, gnss=gnss, camera=camera)
     mean, covariance = deviations_from_the_reference(suite, PlainUKF, seconds=1.5)
     assert mean < 0.15, mean
     assert covariance < 2e-3, covariance
@@ -209,7 +211,7 @@ def test_nees_is_right_at_the_longest_latency_of_any_rate(rates):
 
 
 def test_taken_as_fresh_it_is_another():
-    suite = mended_lab("ukf", gnss=0.1, camera=0.06)
+    suite = corrected_lab("ukf", gnss=0.1, camera=0.06)
     ignorant = late(suite, late_measurements="as_fresh")
     mean, _ = deviations_from_the_reference(ignorant, PlainUKF)
     assert mean > 1.0
@@ -222,20 +224,20 @@ def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
     suite = quad_gym.sensor_suite(name)
     latencies = {"camera": 0.06} if suite.gnss is None else {"gnss": 0.11, "camera": 0.06}
     suite = late(suite, **latencies, kind=kind)
-    honest = fly(suite, 400, filter_start="warm")
+    informed = fly(suite, 400, filter_start="warm")
     ignorant = fly(
         late(suite, late_measurements="as_fresh", gate_false_alarm=0.0), 400, filter_start="warm"
     )
-    means = {"honest": [], "ignorant": []}
+    means = {"informed": [], "ignorant": []}
     for _ in range(8):
-        for label, batch in (("honest", honest), ("ignorant", ignorant)):
+        for label, batch in (("informed", informed), ("ignorant", ignorant)):
             steps(batch, 0.25)
             means[label].append(nees(batch).mean())
     bound = 5 * np.sqrt(2 * 15 / 400)
-    assert np.abs(np.array(means["honest"]) - 15.0).max() < bound, means
+    assert np.abs(np.array(means["informed"]) - 15.0).max() < bound, means
     assert min(means["ignorant"][-4:]) > 15.0 + 2 * bound, means
-    assert not honest.read("filter_status").any()
-    assert (honest.read("rejections").sum(axis=1) > 0).mean() < 0.05
+    assert not informed.read("filter_status").any()
+    assert (informed.read("rejections").sum(axis=1) > 0).mean() < 0.05
 
 
 # ---- what must not change --------------------------------------------------------------------

@@ -115,9 +115,9 @@ def test_a_matrix_that_is_not_positive_definite_shows_in_the_pivot(instance, n):
         diagonal = np.eye(n)
         diagonal[k, k] = 0.0 if k % 2 else -1.0
         bad.append(diagonal)
-        spoilt = positive_definite(rng, n, 10.0)
-        spoilt[k, k] = np.nan
-        bad.append(spoilt)
+        corrupt = positive_definite(rng, n, 10.0)
+        corrupt[k, k] = np.nan
+        bad.append(corrupt)
     got = getattr(blocks, instance)(n, a=[embedded(one) for one in bad])
     assert not (got["least"] > 0.0).any()
 
@@ -127,10 +127,10 @@ def test_a_failure_in_one_lane_leaves_the_others_alone():
     a = np.array([positive_definite(rng, LARGEST, 100.0) for _ in range(8)])
     b = rng.normal(size=(8, LARGEST))
     clean = blocks.on_lanes(LARGEST, a=a, b=b)
-    spoilt = a.copy()
-    spoilt[3] = -spoilt[3]
-    spoilt[6] = np.nan
-    got = blocks.on_lanes(LARGEST, a=spoilt, b=b)
+    corrupt = a.copy()
+    corrupt[3] = -corrupt[3]
+    corrupt[6] = np.nan
+    got = blocks.on_lanes(LARGEST, a=corrupt, b=b)
     others = [0, 1, 2, 4, 5, 7]
     for name in ("a", "b", "least", "inverse"):
         assert clean[name][others].tobytes() == got[name][others].tobytes()

@@ -122,7 +122,7 @@ class TestNees:
         P = B @ B.T
         assert metrics.nees(A @ e, A @ P @ A.T) == pytest.approx(metrics.nees(e, P), rel=1e-9)
 
-    def test_of_honest_errors_is_chi_square(self):
+    def test_of_consistent_errors_is_chi_square(self):
         from scipy.stats import kstest
 
         rng = np.random.default_rng(2)

@@ -11,7 +11,7 @@ pytest.importorskip("matplotlib")
 
 
 def circle(n=201, duration=10.0, gap=0.1):
-    """A flight on a circle at some distance from its reference, looking at the centre."""
+    """A flight on a circle at some distance from its reference, looking at the center."""
     time = np.linspace(0.0, duration, n)
     c, s = np.cos(2 * np.pi * time / duration), np.sin(2 * np.pi * time / duration)
     reference = np.stack([4.0 * c, 4.0 * s, np.ones(n)], axis=1)

@@ -131,7 +131,7 @@ def test_successive_instants_are_independent():
 
 
 @pytest.mark.parametrize("other", [(1, 0), (0, 1), (2**63, 0), (1, 1)])
-def test_streams_of_neighbouring_keys_are_independent(other):
+def test_streams_of_neighboring_keys_are_independent(other):
     assert_uncorrelated(sample("normals", key=(0, 0)), sample("normals", key=other))
 
 

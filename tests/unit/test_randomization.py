@@ -98,9 +98,9 @@ def test_draws_of_parameters_components_flights_and_episodes_are_independent(dra
     ranks = stats.rankdata(np.concatenate(columns), axis=1)
     scores = np.corrcoef(ranks)[np.triu_indices(len(ranks), 1)] * math.sqrt(20_000)
     assert np.abs(scores).max() < alarm_score(scores.size)
-    centred = ranks - ranks.mean(axis=1, keepdims=True)
+    centered = ranks - ranks.mean(axis=1, keepdims=True)
     along = (
-        (centred[:, 1:] * centred[:, :-1]).mean(axis=1) / centred.var(axis=1) * math.sqrt(19_999)
+        (centered[:, 1:] * centered[:, :-1]).mean(axis=1) / centered.var(axis=1) * math.sqrt(19_999)
     )
     assert np.abs(along).max() < alarm_score(along.size)
 
@@ -384,7 +384,7 @@ def test_a_snapshot_keeps_what_was_drawn():
     ],
     ids=str,
 )  # fmt: skip
-def test_a_randomisation_that_makes_no_sense_is_refused(given, message):
+def test_a_randomization_that_makes_no_sense_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         FlightBatch(1, randomization=given)
 

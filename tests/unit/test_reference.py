@@ -176,7 +176,7 @@ def test_random_trajectories_differ_from_one_another():
     assert gaps.min() > 1e-4
 
 
-def test_a_randomized_circle_keeps_its_centre_and_varies_the_rest():
+def test_a_randomized_circle_keeps_its_center_and_varies_the_rest():
     flights = drawn(2_000, randomize=True, height=1.2)
     position, velocity, _, heading = (x[:, 0] for x in evaluated(flights, 0.0))
     radius = np.linalg.norm(position[:, :2], axis=1)

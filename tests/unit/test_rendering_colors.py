@@ -1,4 +1,4 @@
-"""Pictures can be read with any kind of colour vision: contrast, and colours told apart."""
+"""Pictures can be read with any kind of color vision: contrast, and colors told apart."""
 
 from itertools import combinations
 
@@ -40,7 +40,7 @@ VISIONS = {
 
 
 def linear(color):
-    """Linear light of an sRGB colour (IEC 61966-2-1)."""
+    """Linear light of an sRGB color (IEC 61966-2-1)."""
     c = np.array(color) / 255.0
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 

@@ -28,8 +28,8 @@ def flight():
     return record_flight(Still(), "QuadGym/Hover-v0", seed=1, max_episode_steps=30)
 
 
-def colour_near(frame, at, radius, color):
-    """Whether a colour is found within a distance of a pixel."""
+def color_near(frame, at, radius, color):
+    """Whether a color is found within a distance of a pixel."""
     x, y = np.round(at).astype(int)
     part = frame[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
     return bool((abs(part.astype(int) - color) < 40).all(axis=-1).any())
@@ -39,12 +39,12 @@ def test_features_and_reference_are_drawn_where_the_view_projects_them(flight):
     frame = Renderer("fixed", (640, 480)).draw(flight)
     view = fixed_view(flight, 640, round(0.765 * 480))
     for feature in flight.stage.features_I:
-        assert colour_near(frame, view.project(feature)[0], 3, colors.INK)
-    assert colour_near(frame, view.project(flight["position"][-1])[0], 25, colors.BLUE)
+        assert color_near(frame, view.project(feature)[0], 3, colors.INK)
+    assert color_near(frame, view.project(flight["position"][-1])[0], 25, colors.BLUE)
     start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m below it
     frame = Renderer("fixed", (640, 480)).draw(start)
     at = fixed_view(start, 640, round(0.765 * 480)).project(start["reference_position"][-1])[0]
-    assert colour_near(frame, at, 8, colors.GREEN)
+    assert color_near(frame, at, 8, colors.GREEN)
 
 
 def test_the_inset_is_drawn_where_the_camera_measured(flight):
@@ -53,7 +53,7 @@ def test_the_inset_is_drawn_where_the_camera_measured(flight):
     seen = flight["pixels"][-1][np.isfinite(flight["pixels"][-1]).all(axis=1)]
     assert len(seen)
     for pixel in seen:
-        assert colour_near(frame, place_in_inset(pixel, flight.stage, box), 2, colors.INK)
+        assert color_near(frame, place_in_inset(pixel, flight.stage, box), 2, colors.INK)
 
 
 def test_an_image_is_shown_until_the_next_one_is_due():
@@ -66,7 +66,7 @@ def test_an_image_is_shown_until_the_next_one_is_due():
         assert shown["time"] == flight["time"][k - k % 5]
 
 
-def test_what_the_gate_rejects_is_grey():
+def test_what_the_gate_rejects_is_gray():
     faults = GnssOutliers(share=1.0, size=100.0, start=0.3)
     options = {"sensors": "rtk", "faults": faults, "max_episode_steps": 30}
     flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
@@ -76,8 +76,8 @@ def test_what_the_gate_rejects_is_grey():
     for k, is_purple in ((measured[2], True), (measured[-1], False)):
         frame = Renderer("fixed", (640, 480)).draw(flight.until(flight["time"][k]))
         at = view.project(flight["gnss_position"][k])[0]
-        assert colour_near(frame, at, 8, colors.PURPLE) == is_purple
-        assert colour_near(frame, at, 3, colors.GREY) or is_purple
+        assert color_near(frame, at, 8, colors.PURPLE) == is_purple
+        assert color_near(frame, at, 3, colors.GREY) or is_purple
 
 
 def test_a_replay_shows_what_was_seen_live(flight):

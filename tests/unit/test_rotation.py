@@ -140,7 +140,7 @@ def test_half_turns_have_well_conditioned_quaternions(axis):
     np.testing.assert_allclose(rotations.quaternion_to_dcm(q), R, rtol=0.0, atol=1e-15)
 
 
-def test_a_quaternion_is_normalised_first():
+def test_a_quaternion_is_normalized_first():
     q = np.array([0.1, -0.2, 0.3, 0.4])
     R = rotations.quaternion_to_dcm(q / np.linalg.norm(q))
     np.testing.assert_allclose(rotations.quaternion_to_dcm(1e-3 * q), R, rtol=0.0, atol=1e-15)

@@ -24,7 +24,7 @@ def test_the_suites_have_names():
 
 
 @pytest.mark.parametrize("name", FIELD)
-def test_a_suite_of_the_field_is_honest_by_its_settings(name):
+def test_a_suite_of_the_field_is_consistent_by_its_settings(name):
     suite = quad_gym.sensor_suite(name)
     assert suite.imu.samples == "average"
     assert suite.estimator.feature_noise_across == "projected"

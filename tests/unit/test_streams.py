@@ -196,7 +196,7 @@ def quantities_of(batch, task):
 
 
 def features_of(quantities):
-    """Functions of the ranks of each quantity, centred, of unit length: (COUNT, n, 4).
+    """Functions of the ranks of each quantity, centered, of unit length: (COUNT, n, 4).
 
     They see whether one quantity is a function of another, be it an angle or its double.
     """

@@ -1,4 +1,4 @@
-"""Eight filters in lanes: each does what the scalar instance does, whatever its neighbours do."""
+"""Eight filters in lanes: each does what the scalar instance does, whatever its neighbors do."""
 
 import numpy as np
 import pytest
@@ -109,17 +109,17 @@ def test_a_lane_that_misses_a_measurement_has_exactly_the_update_without_it():
                 np.testing.assert_array_equal(before["L"], flight["L"])
 
 
-def test_missing_measurements_of_neighbours_do_not_move_a_lane(calm):
-    def without_neighbours(filters, k):
+def test_missing_measurements_of_neighbors_do_not_move_a_lane(calm):
+    def without_neighbors(filters, k):
         for lane in range(1, EIGHT):
             filters.measure(lane, RECORDINGS[lane], k, position=False, camera=lane > 4)
 
-    assert_lane_is_unmoved(calm, fly(LaneFilter(LAB), upset=without_neighbours), 0)
+    assert_lane_is_unmoved(calm, fly(LaneFilter(LAB), upset=without_neighbors), 0)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, -1e300])
 @pytest.mark.parametrize("name", ["gnss_position", "gnss_baseline", "pixels", "gyro", "accel"])
-def test_wild_measurements_of_a_neighbour_do_not_move_a_lane(calm, name, value):
+def test_wild_measurements_of_a_neighbor_do_not_move_a_lane(calm, name, value):
     def wild(filters, k):
         if k == 7:
             filters.put(5, **{name: value}, position_valid=1, baseline_valid=1, feature_valid=1)
@@ -132,7 +132,7 @@ def test_wild_measurements_of_a_neighbour_do_not_move_a_lane(calm, name, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0, 1e200])
 @pytest.mark.parametrize("name", ["L", "r_hat", "R_hat", "b_a_hat"])
-def test_a_ruined_state_of_a_neighbour_does_not_move_a_lane(calm, name, value):
+def test_a_ruined_state_of_a_neighbor_does_not_move_a_lane(calm, name, value):
     def ruin(filters, k):
         if k == 7:
             filters.put(2, **{name: value})

@@ -3,7 +3,7 @@
 It shares everything else with the UKF of `ukf.py` and `ukf_update.py`: state, error angles, models,
 noise, and the factor L of the covariance. Where the UKF puts the half-differences of a pair of
 sigma points into a column, the EKF puts the derivative of the model times the column of L; the
-half-sums less the centre, which carry the second order, are zero. With `R(e) = I - [e x] + ...`:
+half-sums less the center, which carry the second order, are zero. With `R(e) = I - [e x] + ...`:
 
 * `a = R_hat^T R(e)^T (f - b_a) - g e3`:  da = R_hat^T (de x f - db_a)
 * `e+ = e + dt S(e) (w - b_g)`:  de+ = de + dt ((de_th w_z, -de_phi w_z, -de_th w_x) - db_g)
@@ -57,7 +57,7 @@ def measure_columns(flight, p, work, n, feature_count, use_position, use_baselin
     """Fill work.A with the derivatives of the measurement along the nine columns of L that matter.
 
     Column j of L is row 8 - j; work.E becomes zero. Reads work.X_B, work.inverse_distance and
-    work.h, the measurement predicted at the centre.
+    work.h, the measurement predicted at the center.
     """
     L = flight.L
     R_BI = load33(flight.R_hat)

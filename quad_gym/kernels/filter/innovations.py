@@ -5,7 +5,7 @@ and the block's measurement noise R its innovation has the covariance `S = A A^T
 alpha^2) mu mu^T + R` (3 x 3). A direction has two degrees of freedom: its innovation is taken
 across the predicted direction, for along it the length of a unit vector tells nothing.
 
-A block whose normalised innovation squared, chi-square in a filter that is right, lies beyond the
+A block whose normalized innovation squared, chi-square in a filter that is right, lies beyond the
 gate is masked as if the flight lacked it. So is a feature whose predicted direction is too
 uncertain for a linear model: as a direction's error is bounded it would pass any gate, and its
 update would be wrong and sure of itself. Where one kind of measurement has been rejected
@@ -138,7 +138,7 @@ def _count_in_row(flight, group, measured, rejected, again):
 
 @kernel
 def _decide(flight, s, has, wanting, again, decision):
-    """Where a block is decided upon: as it is wanting or, in a later portion, as in the first."""
+    """Where a block is decided upon: as it is wanting or, in a later step, as in the first."""
     return has & ((wanting & logical_not(again)) | (again & (flight.gate[s] == decision)))
 
 
@@ -185,7 +185,7 @@ def judge_innovations(
 ):
     """Keep the innovations of the present measurements and mask those beyond the gate.
 
-    Where measurements are taken in portions, the first decides for all.
+    Where measurements are processed in steps, the first decides for all.
 
     Args:
         flight: Record; keeps innovations, NIS, decisions and counters.
@@ -195,7 +195,7 @@ def judge_innovations(
         use_position, use_baseline, use_velocity: Whether any lane has them.
         form: A `FilterForm`.
         mask: Which lanes.
-        again: Which lanes take a later portion of measurements that they have met before.
+        again: Which lanes take a later step of measurements that they have met before.
 
     Returns:
         How many measurements were masked in each lane.

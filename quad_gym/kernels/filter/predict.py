@@ -7,7 +7,7 @@ the augmented filter (27 columns in the prediction, 15 + n_z in the update), but
 * the augmented factor is block diagonal, so that noise which enters linearly contributes in closed
   form, and so do the columns for states on which a model does not depend: 9 pairs of points remain;
 * a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and its half-sum less the
-  centre s, for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the
+  center s, for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the
   moments are
       mean = f(x0) + mu,  mu = sum s / c^2
       cov  = sum (a a^T + s s^T) / c^2 + (beta - alpha^2) mu mu^T + noise
@@ -99,7 +99,7 @@ def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
 
 @kernel
 def _propagate_columns(flight, p, work, f_B, w_B, half, form):
-    """Fill work.F and work.S with the propagated pairs; return their mean less the centre's.
+    """Fill work.F and work.S with the propagated pairs; return their mean less the center's.
 
     Position and velocity share the half-sums of the acceleration, so that S has these, and those of
     the error angles.
@@ -130,7 +130,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form):
             d, dg = scale(c, load_column3(L, E, j)), scale(c, load_column3(L, BG, j))
             df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
             even, odd, parts = split_rotation(d)
-            # a_I = R^T R(e)^T (f - b_a) - g: its odd part in the offset, its even less the centre
+            # a_I = R^T R(e)^T (f - b_a) - g: its odd part in the offset, its even less the center
             odd_B = sub(sub(apply_transposed(odd, f_start), df), apply_transposed(even, df))
             even_B = sub(apply_transposed(even, f_start), apply_transposed(odd, df))
             a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))

@@ -80,7 +80,7 @@ def _has_feature(flight, k):
 
 @kernel
 def _compare_centre(flight, p, work, feature_count, use_position, use_baseline, use_velocity):
-    """Fill work.h (centre), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
+    """Fill work.h (center), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
     h, z, Rz = work.h, work.z, work.Rz
     R_IG, R_BI, R_CB = load33(p.R_IG), load33(flight.R_hat), load33(p.R_CB)
     r = load3(flight.r_hat)
@@ -223,7 +223,7 @@ def _sum_noise(p, work, n, doubt):
 
 
 _DOUBTS = (100.0, 100.0 / 9.0, 100.0 / 90.0)
-"""Factors on the noise of the portions of a measurement; the sum of their inverses is one."""
+"""Factors on the noise of the steps of a measurement; the sum of their inverses is one."""
 
 
 @kernel
@@ -234,7 +234,7 @@ def update(flight, p, work, feature_count, mask, form=0):
     The gate masks after the spread c of the sigma points was chosen for all measurements; c enters
     the moments in their fourth order only.
 
-    With GRADUAL, lanes whose attitude is uncertain take images in portions: three updates by the
+    With GRADUAL, lanes whose attitude is uncertain process images in steps: three updates by the
     same measurements with more noise, each about the estimate that the one before has left. Their
     information adds up to that of the measurements, so that a linear model would see no difference;
     the derivatives of this one are taken where they matter. (R. Zanetti, "Recursive Update
@@ -256,7 +256,7 @@ def update(flight, p, work, feature_count, mask, form=0):
     failures = flight.update_failures
     for part in range(first, 3):
         doubt = select(loose, _DOUBTS[part], 1.0)
-        well = flight.update_failures == failures  # a portion that fails is the last
+        well = flight.update_failures == failures  # a step that fails is the last
         taking, again = mask & well & (loose | (part == 2)), loose & (part > 0)
         _update_by(flight, p, work, feature_count, taking, form, doubt, again)
     if (form & _GRADUAL) != 0:

@@ -49,7 +49,7 @@ def _perpendicular_unit(candidate, a):
 
 @kernel
 def wahba(B):
-    """The rotation R_BI that maximises tr(R_BI^T B), by one-sided Jacobi rotations.
+    """The rotation R_BI that maximizes tr(R_BI^T B), by one-sided Jacobi rotations.
 
     Args:
         B: Attitude profile matrix, sum of a_i v_B,i v_I,i^T.

@@ -1,4 +1,4 @@
-"""Domain randomisation: a flight's own parameters, drawn when an episode begins.
+"""Domain randomization: a flight's own parameters, drawn when an episode begins.
 
 `flight.drawn` holds the drawn numbers, in the columns of `quad_gym.randomization`; the parameters
 that follow from them are put together anew whenever flights are stepped, so that a flight's record
@@ -139,7 +139,7 @@ def _impose_body(flight, nominal, own, settings):
     y = _value(flight, settings, _CENTER + 1, zero)
     z = _value(flight, settings, _CENTER + 2, zero)
     for i in range(4):
-        # E' = M E D and so A' = D^-1 A M^-1: D scales the rotors, M moves the centre of mass
+        # E' = M E D and so A' = D^-1 A M^-1: D scales the rotors, M moves the center of mass
         e = _value(flight, settings, _EFFICIENCY + i, zero + 1.0)
         E, A = nominal.effectiveness, nominal.allocation
         own.effectiveness[0, i] = e * E[0, i]
@@ -217,7 +217,7 @@ def _impose_noise(flight, nominal, own, settings):
 
 @kernel
 def _impose_mounting(flight, nominal, own, settings):
-    """Where the sensors are, seen from the true centre of mass."""
+    """Where the sensors are, seen from the true center of mass."""
     for i in range(3):
         center = _value(flight, settings, _CENTER + i, 0.0 * nominal.mass)
         antenna, baseline = nominal.antenna[i], nominal.baseline[i]

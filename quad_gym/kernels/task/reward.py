@@ -12,7 +12,7 @@ from quad_gym.records import MAX_GATES, Ending, Task
 NEAR_WEIGHT, FINE_WEIGHT, HEADING_WEIGHT, ACTION_COST, RATE_COST = 1.0, 0.5, 0.1, 0.02, 0.002
 """Reward a second: exp(-2e), exp(-20e), alignment, |change of action|^2, |body rates|^2."""
 PROGRESS_WEIGHT, GATE_BONUS = 1.0, 1.0
-"""Reward of a course: per metre toward the next gate, and per gate passed."""
+"""Reward of a course: per meter toward the next gate, and per gate passed."""
 
 _FILTER_LOST = float(Ending.FILTER_LOST)
 _TIME_LIMIT, _FILTER_FAILED = float(Ending.TIME_LIMIT), float(Ending.FILTER_FAILED)

@@ -47,7 +47,7 @@ def combine(matrix, column):
 
 @kernel
 def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
-    """Acceleration of the centre of mass in I and angular acceleration in B.
+    """Acceleration of the center of mass in I and angular acceleration in B.
 
     `m dv/dt = -m g e3 + z_I sum(F_i) + d - 0.5 Cd Ad rho |z_I . v| v` with `F_i = kF W_i^2`, and
     `J dw/dt = N - w x J w` with `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`; where the air moves, v
@@ -144,7 +144,7 @@ def store_state(flight, state):
 def integrate(flight, p, substeps):
     """Carry the true state over one tick by `substeps` classical Runge-Kutta steps of order four.
 
-    The voltages and the disturbance are held; the quaternion is normalised after each step.
+    The voltages and the disturbance are held; the quaternion is normalized after each step.
     """
     h = p.dt / substeps
     voltages, d_I = load4(flight.voltages), load3(flight.disturbance)

@@ -1,4 +1,4 @@
-"""Dryden gusts in the low-altitude form of MIL-F-8785C (3.7.3.4), discretised exactly.
+"""Dryden gusts in the low-altitude form of MIL-F-8785C (3.7.3.4), discretized exactly.
 
 Along the mean wind the gust u has the spectrum of a first-order filter of white noise, across (v)
 and upward (w) that of `(1 + sqrt(3) T s) / (1 + T s)^2` with T = L / V. In the time h = V t / L all

@@ -1,4 +1,4 @@
-"""The suites' filters are honest, for UKF and EKF alike; the report's form is not, by how much.
+"""The suites' filters are consistent, for UKF and EKF alike; the report's is not, by how much.
 
 Means over thousands of flights of random trajectories, on the estimate, judged by the band of 1,000
 flights. Errors of biases last for seconds, so that the means of fewer flights are all high or all
@@ -30,7 +30,7 @@ def flown(sensors, *, flights=3000, seconds=10.0, matched=False, **keywords):
     return findings
 
 
-def assert_honest(findings, parts):
+def assert_consistent(findings, parts):
     for name, part in parts.items():
         assert part.honest, (name, part.share_inside, part.overall)
     for name, white in findings.whiteness.items():
@@ -41,12 +41,12 @@ def assert_honest(findings, parts):
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("suite", ["rtk", "indoor"])
-def test_a_suite_is_honest_from_its_first_instant_on(suite, kind, start):
+def test_a_suite_is_consistent_from_its_first_instant_on(suite, kind, start):
     """NEES of state and blocks and NIS of all sensors in their bands, innovations white."""
     sensors = quad_gym.sensor_suite(suite)
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
     findings = flown(sensors, filter_start=start)
-    assert_honest(findings, findings.nees | findings.nis)
+    assert_consistent(findings, findings.nees | findings.nis)
 
 
 @pytest.mark.slow
@@ -61,7 +61,7 @@ def test_errors_with_a_consumer_receiver_are_as_claimed():
 @pytest.mark.slow
 @pytest.mark.parametrize("gnss_rate", [200.0, 10.0])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-def test_the_laboratorys_sensors_can_have_an_honest_filter(kind, gnss_rate):
+def test_the_laboratorys_sensors_can_have_a_consistent_filter(kind, gnss_rate):
     sensors = LAB.replace(
         imu=LAB.imu.replace(samples="average"), estimator=FIELD_FILTER.replace(kind=kind)
     )
@@ -70,7 +70,7 @@ def test_the_laboratorys_sensors_can_have_an_honest_filter(kind, gnss_rate):
 
 
 @pytest.mark.slow
-def test_each_mend_has_its_share():
+def test_each_correction_has_its_share():
     """The reset is what matters at 200 Hz; the report's form is overconfident throughout."""
     without_camera = LAB.replace(camera=None)
     report, turned = (

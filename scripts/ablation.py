@@ -1,10 +1,10 @@
-"""What do a wrong model, and the filter's own form, do to an honest filter?
+"""Ablation: what a wrong model, and each correction of the filter, do to its consistency.
 
-Flies the same seeds case by case, and tables the normalised estimation error squared (NEES) of the
+Flies the same seeds case by case, and tables the normalized estimation error squared (NEES) of the
 state and of each block, 15 and 3 where the covariance is right, beside the errors themselves.
 
-  python scripts/honesty.py models    vehicle, world and sensors other than they are believed to be
-  python scripts/honesty.py filters   UKF and EKF, and the filter without each of its mends
+  python scripts/ablation.py models    vehicle, world and sensors other than they are believed to be
+  python scripts/ablation.py filters   UKF and EKF, and the filter without each correction
 
 Prints the table and writes it with the whole configuration to TABLE.json.
 """
@@ -41,7 +41,7 @@ class Args:
     first_seed: int = option(0, "seed of the first flight; the others follow it")
     duration: float = option(10.0, "length of a flight [s]")
     start: Literal["cold", "warm"] = option("cold", "the filter's start")
-    output: Path = option(Path("results/honesty"), "folder for the numbers; made if missing")
+    output: Path = option(Path("results/ablation"), "folder for the numbers; made if missing")
     threads: int | None = option(None, "threads; if not given, as many as there are cores")
 
     def __post_init__(self) -> None:
@@ -151,7 +151,7 @@ def model_cases(suite: SensorSuite) -> list[Case]:
 
 
 def filter_cases(suite: SensorSuite) -> list[Case]:
-    """The suite's filter, the other kind, and the filter without each mend."""
+    """The suite's filter, the other kind, and the filter without each correction."""
     report = sensor_suite("lab")
 
     def form(name: str, **changes: Any) -> Case:
@@ -255,7 +255,7 @@ def main(args: Args) -> None:
         cases = model_cases(suite) if args.table == "models" else filter_cases(suite)
         batches = [batch_of(case, args, 8, 1) for case in cases]
         args.output.mkdir(parents=True, exist_ok=True)
-    del batches  # they were made to refuse a case that makes no sense before flying any
+    del batches  # they were made to refuse an invalid case before flying any
     rows: dict[str, dict[str, float]] = {}
     for number, case in enumerate(cases, 1):
         print(f"  {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "honesty.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "ablation.py"
 
 
 def run(output, *options):
