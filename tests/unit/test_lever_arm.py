@@ -50,9 +50,14 @@ def test_a_center_of_mass_that_each_episode_draws_and_the_filter_knows():
     assert np.abs(found - 15.0).max() < BAND, found
 
 
-@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
-def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind):
-    """The closed form: f = dw x l + w x (w x l) + g e3, with w = (0, 0, a t) about the vertical."""
+@pytest.mark.parametrize(
+    ("kind", "tolerance"), [(ExtendedKalmanFilter, 1e-9), (UnscentedKalmanFilter, 1e-5)]
+)
+def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind, tolerance):
+    """The closed form: f = dw x l + w x (w x l) + g e3, with w = (0, 0, a t) about the vertical.
+
+    The UKF's mean has a second order: the gyro's noise makes the force point up a little less.
+    """
     arm, rate = np.array([0.3, -0.2, 0.1]), 4.0
     suite = mounted("lab", tuple(arm))
     kalman = kind(sensors=suite)
@@ -72,5 +77,5 @@ def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind):
         kalman.predict(w, force)
         w_before = w
     assert w_before[2] > 3.9
-    np.testing.assert_allclose(kalman.velocity, 0.0, atol=1e-9)
-    np.testing.assert_allclose(kalman.position, 0.0, atol=1e-9)
+    np.testing.assert_allclose(kalman.velocity, 0.0, atol=tolerance)
+    np.testing.assert_allclose(kalman.position, 0.0, atol=tolerance)
