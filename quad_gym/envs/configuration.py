@@ -160,8 +160,8 @@ class Flights:
         if idle and felt:
             raise ValueError(
                 f"faults must concern what is simulated: {type(felt[0]).__name__} concerns "
-                f'sensors, and none runs with observation="{observation}" (unless include_covariance or '
-                "innovations ask for the filter)"
+                f'sensors, and none runs with observation="{observation}" (unless '
+                "include_covariance or innovations ask for the filter)"
             )
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world
