@@ -33,7 +33,7 @@ animation: setup  ## the animation of README
 		--fault gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
 	rm .github/images/outage.npz
 
-compare: $(VENV)/.trainer  ## the comparison of the README: two sensor suites, 5 training seeds
+compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
 	$(BIN)/python scripts/compare.py --sensors lab rtk --output results/compare/circle
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes

@@ -57,7 +57,7 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
 
     Args:
         given: See `FaultsGiven`; "all" stands for every preset that the suite can have.
-        sensors: The suite that they befall.
+        sensors: The suite that they affect.
 
     Returns:
         One fault of each kind at most.
@@ -92,9 +92,9 @@ def needs_sensors(fault: Fault) -> bool:
 
 
 def felt_without_sensors(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
-    """Those of the faults that befall the vehicle itself, so that they are felt on the truth.
+    """Those of the faults that affect the vehicle itself, so that they are felt on the truth.
 
-    For comparisons of control on the estimate, which all of the faults befall, with control on the
+    For comparisons of control on the estimate, which all of the faults affect, with control on the
     truth, which sensor faults do not concern.
     """
     return tuple(fault for fault in faults_of(given, sensors) if not needs_sensors(fault))

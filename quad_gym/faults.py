@@ -147,7 +147,7 @@ class GnssOutage(Fault):
     """No fixes: neither position nor velocity nor baseline, as under a bridge or indoors.
 
     Outages of 30 s and a minute are the usual trial of inertial navigation: S. Godha and M. E.
-    Cannon, GPS Solutions 11(3), 2007. The fix that starts the filter is always there, and sound.
+    Cannon, GPS Solutions 11(3), 2007. The fix that starts the filter is always there, and valid.
     """
 
     kind = FaultKind.GNSS_OUTAGE
@@ -160,7 +160,7 @@ class GnssOutliers(Fault):
 
     A position is an outlier with probability `share`, and then lies `size` standard deviations of a
     fix off, in any direction; the slow error (`GnssParams.drift_sigma_I`) counts. Velocities and
-    baselines stay sound. Reflected signals err by tens of meters and more, ten times and a hundred
+    baselines stay valid. Reflected signals err by tens of meters and more, ten times and a hundred
     times a fix's usual error: L.-T. Hsu, GPS Solutions 22(1), 2018.
     """
 
@@ -180,7 +180,7 @@ class GnssOutliers(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class GnssRamp(_Directed):
-    """Positions that drift away steadily, and jump back when the fault goes; velocities stay sound.
+    """Positions that drift away steadily, and jump back when the fault goes; velocities stay valid.
 
     As a spoofer drags a vehicle along, slowly enough not to be noticed: A. J. Kerns, D. P. Shepard,
     J. A. Bhatti and T. E. Humphreys, J. Field Robotics 31(4), 2014. No gate on single innovations
@@ -253,7 +253,7 @@ class WrongAssociations(Fault):
     share: float = 0.05
     """of images, while the fault is active"""
     how: str = "swap"
-    """"swap": two features, drawn among those seen, are taken for each other; "copy": one of them
+    """"swap": two features, drawn among those seen, are swapped; "copy": one of them
     is reported in the direction of the other, which keeps its own"""
 
     kind = FaultKind.WRONG_ASSOCIATIONS

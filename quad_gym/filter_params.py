@@ -53,13 +53,13 @@ class FilterParams(Checked):
     off by the square of the attitude's error, more than a precise camera's noise at a rough start
     """
     gate_false_alarm: float = 0.0
-    """probability that a sound measurement is rejected: a position, baseline, velocity or feature
+    """probability that a valid measurement is rejected: a position, baseline, velocity or feature
     whose normalized innovation squared exceeds the chi-square quantile of this alarm level is left
     out of the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to
     Tracking and Navigation, section 5.4); 0: everything is taken"""
     gate_patience: int = 10
-    """positions, baselines, velocities or images rejected in a row after which the filter rather
-    doubts itself: it adds the square of the innovation to the covariance of what the sensor
+    """positions, baselines, velocities or images rejected in a row after which the filter doubts
+    itself instead: it adds the square of the innovation to the covariance of what the sensor
     measures, and takes the next one"""
     gate_direction_sigma: float = 0.2
     """[rad] a gating filter leaves out features whose direction it predicts more vaguely than that,

@@ -237,7 +237,7 @@ def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
     """How many ticks a latency [s] is.
 
     Raises:
-        ValueError: If more than MAX_UNDER_WAY measurements would be under way at a time.
+        ValueError: If more than MAX_UNDER_WAY measurements would be in transit at a time.
     """
     ticks, longest = round(latency * imu_rate), MAX_UNDER_WAY * check.ticks(name, rate, imu_rate)
     if ticks > longest:

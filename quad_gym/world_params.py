@@ -77,7 +77,7 @@ class WorldParams(Checked):
     """height of the ground in I, for ground effect and gusts [m]; the center of mass of a vehicle
     that stands on its legs is at height 0"""
     battery: BatteryParams | None = None
-    """None: full voltage for ever"""
+    """None: always full voltage"""
 
     def __post_init__(self) -> None:
         self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)

@@ -1,4 +1,4 @@
-"""From the keywords of an environment to its flights: the same for all three faces."""
+"""From the keywords of an environment to its flights: the same for all three interfaces."""
 
 import inspect
 from collections.abc import Mapping
@@ -54,7 +54,7 @@ ONE_TASK_KEYWORDS = {
 """Those that mean something to a single task."""
 
 FACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
-"""Keywords that the faces take themselves."""
+"""Keywords that the interfaces take themselves."""
 
 
 CONTROL_RATE = 50.0
@@ -159,9 +159,9 @@ class Flights:
         felt = [fault for fault in befall if needs_sensors(fault)]
         if idle and felt:
             raise ValueError(
-                f"faults must befall what is there: {type(felt[0]).__name__} concerns sensors, and "
-                f'none runs with observation="{observation}" (unless include_covariance or '
-                "innovations ask for the filter)"
+                f"faults must concern what is simulated: {type(felt[0]).__name__} concerns "
+                f'sensors, and none runs with observation="{observation}" (unless '
+                "include_covariance or innovations ask for the filter)"
             )
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world

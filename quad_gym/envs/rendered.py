@@ -1,4 +1,4 @@
-"""What the faces of an environment share about rendering; nothing is imported until it is used."""
+"""Rendering, as all interfaces of an environment do it; imports nothing until it is used."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any

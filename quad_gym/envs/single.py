@@ -87,8 +87,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Episode end
     Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by more than 100
-    degrees, below -0.5 m, or through the last gate. Truncated: at the time limit, or when the
-    filter has failed (`info["filter_status"]`). `info["ending"]` says which.
+    degrees, below -0.5 m, or through the last gate. Truncated: at the time limit, when the
+    filter has failed (`info["filter_status"]`), or with `end_when_lost=True` when it finds that it is
+    lost. `info["ending"]` says which.
 
     ## Start
     "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped,
@@ -151,8 +152,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
         faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as "gnss_outage" or
             "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
-        radius, period, height, start, randomize, duration, out_of_bounds, ground, max_tilt,
-            max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
+        radius, period, height, start, randomize, duration, out_of_bounds, ground, end_when_lost,
+            max_tilt, max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
             `quad_gym.TaskParams`.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.

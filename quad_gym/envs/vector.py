@@ -239,7 +239,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         }
         infos |= self._drawn() | flight_info(self.flights.batch, results[:, COLUMN["faults"]])
         ended = np.flatnonzero(self._over)
-        if ended.size:  # seldom: looking up a name for every flight would cost more than the rest
+        if ended.size:  # rare: looking up a name for every flight would cost more than the rest
             infos["ending"][ended] = _ENDING_NAMES[results[ended, COLUMN["ending"]].astype(np.intp)]
         return infos
 

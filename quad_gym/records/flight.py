@@ -125,20 +125,20 @@ FLIGHT_FIELDS = (
     Field("outlier", (), "0 or 1", "whether the last GNSS position is an outlier"),
     Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "whether an occlusion hides a feature"),
     Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
-    Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a sound one; only where rotors can fail"),
+    Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
     # what the IMU has summed up since the start of the episode, biases and gravity included
     Field("imu_turn", (3, 3), "-", "C, from the body frame of the start to the present one"),
     Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
     Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
     Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
-    # the same when the measurements under way were taken, the latest first; of GNSS and camera
+    # the same when the measurements in transit were taken, the latest first; of GNSS and camera
     Field("stamp_tick", (2, DELAY_SLOTS), "ticks", "time stamp; NaN: none"),
     Field("stamp_turn", (2, DELAY_SLOTS, 3, 3), "-", "C"),
     Field("stamp_velocity", (2, DELAY_SLOTS, 3), "m/s", "V"),
     Field("stamp_position", (2, DELAY_SLOTS, 3), "m", "X"),
     Field("stamp_bias_gain", (2, DELAY_SLOTS, 3, 3), "s", "B"),
     Field("stamp_rates", (2, DELAY_SLOTS, 3), "rad/s", "w_meas"),
-    # the measurements under way
+    # the measurements in transit
     Field("late_position", (DELAY_SLOTS, 3), "m", "gnss_position"),
     Field("late_baseline", (DELAY_SLOTS, 3), "m", "gnss_baseline"),
     Field("late_velocity", (DELAY_SLOTS, 3), "m/s", "gnss_velocity"),

@@ -35,7 +35,7 @@ PARAMS_FIELDS = (
     Field("battery_resistance", (), "ohm", "resistance of the battery"),
     Field("motor_efficiency", (), "-", "mechanical over electrical power"),
     # faults
-    Field("sound_effectiveness", (4, 4), "mixed", "effectiveness with four sound rotors"),
+    Field("sound_effectiveness", (4, 4), "mixed", "effectiveness with four working rotors"),
     Field("gain_k", (), "N/m", "PD gain of position"),
     Field("gain_kd", (), "N s/m", "PD gain of velocity"),
     Field("gain_K", (3,), "N m", "PD gain of attitude"),

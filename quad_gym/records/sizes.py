@@ -12,7 +12,7 @@ MAX_GATES = 8
 MAX_FEATURES = 16
 """Features of a camera."""
 MAX_UNDER_WAY = 2
-"""Longest latency of a sensor, in its periods: so many measurements can be on their way."""
+"""Longest latency of a sensor, in its periods: as many measurements can be in transit."""
 DELAY_SLOTS = MAX_UNDER_WAY + 1
 """Measurements that wait: at a latency of MAX_UNDER_WAY periods one is taken as another arrives."""
 MAX_BLOCKS = 3 + MAX_FEATURES

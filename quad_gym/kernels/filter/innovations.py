@@ -138,7 +138,7 @@ def _count_in_row(flight, group, measured, rejected, again):
 
 @kernel
 def _decide(flight, s, has, wanting, again, decision):
-    """Where a block is decided upon: as it is wanting or, in a later step, as in the first."""
+    """Where a block gets `decision`: as `wanting` says or, in a later step, as in the first."""
     return has & ((wanting & logical_not(again)) | (again & (flight.gate[s] == decision)))
 
 

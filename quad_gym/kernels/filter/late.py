@@ -53,7 +53,7 @@ _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 @kernel
 def begin_without_waiting(flight, mask):
-    """Begin an episode with nothing under way, where `mask`."""
+    """Begin an episode with nothing in transit, where `mask`."""
     begin_increments(flight, mask)
     for sensor in range(2):
         for slot in range(DELAY_SLOTS):
@@ -355,7 +355,7 @@ def update_in_turn(flight, p, work, settings, stages, mask):
 
 @stage
 def begin_late_stage(flight, world, model, settings, work, stages, flag):
-    """Begin an episode with no measurement under way."""
+    """Begin an episode with no measurement in transit."""
     begin_without_waiting(lanes_of(flight), lanes_of(work).mask > 0.0)
 
 
