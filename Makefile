@@ -34,7 +34,7 @@ animation: setup  ## the animation of README
 	rm .github/images/outage.npz
 
 compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
-	$(BIN)/python scripts/compare.py --sensors lab rtk --output results/compare/circle
+	$(BIN)/python scripts/compare.py --sensors standard rtk --output results/compare/circle
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"

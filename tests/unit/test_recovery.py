@@ -83,3 +83,13 @@ def test_info_tells_of_it_and_episodes_can_end_with_it():
         endings += info["ending"][truncated].tolist()
     assert lost.mean() > 0.9
     assert endings.count("filter_lost") > 16
+
+
+@pytest.mark.parametrize("keywords", [{}, {"sensors": "rtk", "observation": "truth"}])
+def test_an_end_that_no_filter_could_tell_is_refused(keywords):
+    with pytest.raises(ValueError, match="end_when_lost needs a filter that watches"):
+        QuadVectorEnv(2, "hover", end_when_lost=True, **keywords)
+
+
+def test_a_filter_without_a_gate_watches_its_innovations_where_it_keeps_them():
+    assert QuadVectorEnv(2, "hover", end_when_lost=True, innovations=True)
