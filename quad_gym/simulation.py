@@ -156,6 +156,12 @@ class FlightBatch:
             needed = include_covariance or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = check.flag("run_filter", run_filter)
+        watches = self.innovations or self.sensors.estimator.gate_false_alarm > 0.0
+        if self.task.end_when_lost and not (run_filter and watches):
+            raise ValueError(
+                "end_when_lost needs a filter that watches its innovations: a suite whose filter "
+                "gates, such as 'rtk', or innovations=True"
+            )
         if run_filter:
             self.sensors.require_filter()
 

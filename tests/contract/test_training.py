@@ -199,7 +199,7 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
     train(small_plan(), tmp_path, quiet=True, tensorboard=False)
     with pytest.raises(ValueError, match="holds a run already"):
         train(small_plan(), tmp_path, quiet=True, tensorboard=False)
-    with pytest.raises(ValueError, match=r"another plan \(different: seed\)"):
+    with pytest.raises(ValueError, match=r"another plan \(different: seed, first_flights\)"):
         train(small_plan(seed=3), tmp_path, resume=True, quiet=True, tensorboard=False)
     record = json.loads((tmp_path / "training.json").read_text())
     assert record["finished"]

@@ -129,6 +129,14 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
     )
     assert default.snapshot().tobytes() == cold.snapshot().tobytes()
     estimates = {*FILTER, "nis", "nis_dimension", "innovation", "innovation_sigma", "block_nis"}
+    estimates |= {
+        "innovation_drift",
+        "nis_ratio",
+        "lost",
+        "accepted_tick",
+        "fit_tick",
+        "doubt_tick",
+    }
     seen = {"r_seen", "v_seen", "R_seen", "w_seen", "estimation_error", "gate"}
     fixes = {"position_valid", "baseline_valid", "velocity_valid"}
     for field in FLIGHT_FIELDS:
