@@ -89,8 +89,8 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
     page = (tmp_path / "out/report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert "http" not in page
-    kept = tmp_path / "out/runs/lab/truth/seed_0/best.zip"
-    (tmp_path / "out/runs/lab/truth/seed_0/flown_on_truth.npz").unlink()
+    kept = tmp_path / "out/runs/standard/truth/seed_0/best.zip"
+    (tmp_path / "out/runs/standard/truth/seed_0/flown_on_truth.npz").unlink()
     before = kept.stat().st_mtime_ns
     again = compare(tmp_path)
     assert again.returncode == 0, again.stderr
@@ -107,14 +107,14 @@ def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind
     process = subprocess.Popen(
         line, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-    wait_until(lambda: len(list(tmp_path.glob("out/runs/lab/*/seed_0/last.zip"))) >= 2)
+    wait_until(lambda: len(list(tmp_path.glob("out/runs/standard/*/seed_0/last.zip"))) >= 2)
     assert process.poll() is None
     process.terminate()
     _, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
     wait_until(lambda: nobody_is_in_group(process.pid), seconds=20.0)
     for source in ("truth", "noisy"):
-        record = json.loads((tmp_path / f"out/runs/lab/{source}/seed_0/training.json").read_text())
+        record = json.loads((tmp_path / f"out/runs/standard/{source}/seed_0/training.json").read_text())
         assert not record["finished"]
 
 
