@@ -114,7 +114,9 @@ def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind
     assert process.returncode == 130, err
     wait_until(lambda: nobody_is_in_group(process.pid), seconds=20.0)
     for source in ("truth", "noisy"):
-        record = json.loads((tmp_path / f"out/runs/standard/{source}/seed_0/training.json").read_text())
+        record = json.loads(
+            (tmp_path / f"out/runs/standard/{source}/seed_0/training.json").read_text()
+        )
         assert not record["finished"]
 
 
