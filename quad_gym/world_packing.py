@@ -61,7 +61,8 @@ def pack_options(
         s["start_velocity_variance"] = draws.mean_square("start_velocity_I")
     for i, name in enumerate(("start_roll", "start_pitch")):
         if name in draws.names:
-            s["start_tilt_variance"][i] = draws.mean_square(name)[0]
+            # no angle is less known than one that may be any
+            s["start_tilt_variance"][i] = min(draws.mean_square(name)[0], math.pi**2 / 3.0)
     s["randomized"], s["known"] = bool(draws.names), known
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))

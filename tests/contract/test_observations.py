@@ -47,7 +47,7 @@ def seen_state(env, source):
     batch = env.flights.batch
     if source == "truth":
         return batch.read("r"), batch.read("v"), body_axes(batch.read("q")), batch.read("w")
-    rates = batch.read("gyro") - batch.read("b_g_hat")
+    rates = batch.read("w_meas") - batch.read("b_g_hat")
     return batch.read("r_hat"), batch.read("v_hat"), batch.read("R_hat"), rates
 
 
@@ -174,7 +174,7 @@ def test_a_slow_controller_hears_of_every_fix_since_its_last_step():
 
 def test_measurements_scatter_about_what_the_true_state_implies():
     n = 1500
-    env, observation, _ = flown(n=n, start="hover", observation="sensors")
+    env, observation, _ = flown(n=n, start="hover", observation="sensors", sensors="lab")
     seen, batch = parts_of(observation, observation="sensors"), env.flights.batch
     suite = quad_gym.sensor_suite("lab")
     r, R = batch.read("r"), body_axes(batch.read("q"))
@@ -223,7 +223,7 @@ def test_noisy_observations_have_the_stated_noise_and_no_memory():
     n = 3000
     env = QuadVectorEnv(n, "circle", observation="noisy", layout="absolute", **UNBOUNDED)
     env.reset(seed=4)
-    batch, sigma = env.flights.batch, quad_gym.sensor_suite("lab").noisy
+    batch, sigma = env.flights.batch, quad_gym.sensor_suite("standard").noisy
     seconds = []
     for _ in range(2):
         seen = parts_of(env.step(np.zeros((n, 4)))[0], layout="absolute")
