@@ -5,10 +5,13 @@ hand. Comments, docstrings and layout do not count: what is hashed is the syntax
 """
 
 import ast
+import atexit
+import contextlib
 import dis
 import functools
 import hashlib
 import inspect
+import json
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -17,6 +20,7 @@ from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from numba.core import config
 
 PACKAGE = __package__.partition(".")[0]
 _BASE = Path(__file__).resolve().parents[len(__package__.split("."))]
@@ -53,12 +57,61 @@ def digest_of(path: Path) -> str:
 @functools.lru_cache(maxsize=1024)
 def _read(file: Path, changed: int) -> tuple[str, tuple[Path, ...]]:
     """The digest of one file, and the files of the package that it imports."""
-    tree = ast.parse(file.read_bytes())
-    imported = {name for node in ast.walk(tree) for name in _imports(node, file)}
+    content = file.read_bytes()
+    place = "/".join(file.relative_to(_BASE).parts[:-1]) if _BASE in file.parents else ""
+    key = hashlib.sha256(place.encode() + b"\n" + content).hexdigest()
+    known = _known()
+    if key not in known:
+        known[key] = _parsed(content, file)
+        _save_at_exit()
+    digest, imported = known[key]
     paths = [_path_of(name) for name in imported if name not in _NO_CODE]
+    return digest, tuple(filter(None, paths))
+
+
+def _parsed(content: bytes, file: Path) -> tuple[str, list[str]]:
+    """The digest of a source, and the names that it imports."""
+    tree = ast.parse(content)
+    imported = {name for node in ast.walk(tree) for name in _imports(node, file)}
     for node in ast.walk(tree):
         _drop_docstring(node)
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), tuple(filter(None, paths))
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), sorted(imported)
+
+
+# what was parsed before, by the hash of the source: parsing takes longer than loading the code
+
+
+def _memory() -> Path:
+    """The file that remembers it; another one for each version of Python, whose trees differ."""
+    folder = config.CACHE_DIR or Path(__file__).with_name("__pycache__")
+    return Path(folder) / f"quad_gym_digests.{sys.implementation.cache_tag}.json"
+
+
+@functools.cache
+def _known() -> dict[str, tuple[str, list[str]]]:
+    try:
+        found = json.loads(_memory().read_text())
+        return {str(key): (str(digest), list(names)) for key, (digest, names) in found.items()}
+    except (OSError, ValueError, TypeError, AttributeError):  # none yet, or a damaged one
+        return {}
+
+
+@functools.cache
+def _save_at_exit() -> None:
+    """Write what is known when this process ends, once; where that fails, nothing is lost."""
+    atexit.register(_save)
+
+
+def _save() -> None:
+    file = _memory()
+    temporary = file.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(json.dumps(dict(list(_known().items())[-1000:])))
+        temporary.replace(file)
+    except OSError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _imports(node: ast.AST, file: Path) -> list[str]:
