@@ -126,9 +126,7 @@ class _KalmanFilter:
             angle = check.number("heading", heading)
             x_I[:2] = np.cos(angle), np.sin(angle)
         self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
-        self._flight["w_before"] = np.nan
-        _prepare()
-        single.ukf_initialize(self._flight, self._params, x_I)
+        self._start(x_I)
         self._running = True
 
     def set_state(
@@ -172,12 +170,18 @@ class _KalmanFilter:
             check.array("accel_bias", accel_bias, (3,)),
             check.array("gyro_bias", gyro_bias, (3,)),
         )
+        self._start(np.zeros(3))  # what the filter remembers begins anew; the estimate is given
         for name, value in zip(_STATE, values, strict=True):
             self._flight[name] = value
-        _prepare()
-        self._flight["L"], self._flight["filter_status"] = L, 0
-        self._flight["w_before"] = np.nan
+        self._flight["L"] = L
         self._running = True
+
+    def _start(self, x_I: NDArray[np.float64]) -> None:
+        """Start from the fix in the record, with clocks at zero and nothing remembered."""
+        _prepare()
+        self._flight["tick"], self._flight["w_before"] = 0.0, np.nan
+        self._flight["rejected_in_row"] = self._flight["reopened"] = 0.0
+        single.ukf_initialize(self._flight, self._params, x_I)
 
     def update(
         self,
@@ -253,6 +257,7 @@ class _KalmanFilter:
         force = check.array("accel", accel, (3,))
         self._flight["gyro"], self._flight["accel"] = rates, force
         # they turn the lever arms of a velocity and of the accelerometer
+        self._flight["tick"] += 1.0
         known = np.isfinite(self._flight["w_before"]).all()
         self._flight["w_before"] = self._flight["w_meas"] if known else rates
         self._flight["w_meas"] = rates

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import quad_gym
+import quad_gym.frames
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import AccelBiasStep, GnssRamp, GyroBiasStep
 from tests.field_flights import fly, state_errors, steps
 
@@ -93,3 +95,29 @@ def test_an_end_that_no_filter_could_tell_is_refused(keywords):
 
 def test_a_filter_without_a_gate_watches_its_innovations_where_it_keeps_them():
     assert QuadVectorEnv(2, "hover", end_when_lost=True, innovations=True)
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_a_filter_by_itself_doubts_itself_however_it_was_started(kind):
+    """Sound fixes 5 m away from where it was told to be, at 10 Hz: it moves there."""
+    suite = quad_gym.sensor_suite("rtk").replace(camera=None)
+    kalman = kind(sensors=suite)
+    R_IG = quad_gym.frames.ecef_to_enu(suite.gnss.reference_antenna_G)
+    antenna, baseline = np.array(suite.gnss.primary_antenna_B), suite.gnss.baseline_B
+    kalman.set_state(
+        position=np.zeros(3),
+        velocity=np.zeros(3),
+        R_BI=np.eye(3),
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=1e-4 * np.eye(15),
+    )
+    away = np.array([5.0, 0.0, 0.0])
+    for tick in range(1200):
+        kalman.predict(np.zeros(3), (0.0, 0.0, 9.8))
+        if tick % 20 == 19:
+            fix = {"gnss_position_G": R_IG.T @ (away + antenna)}
+            kalman.update(**fix, gnss_baseline_G=R_IG.T @ baseline, gnss_velocity_G=np.zeros(3))
+        if tick == 100:
+            assert np.linalg.norm(kalman.position) < 0.5  # the first fixes are rejected
+    np.testing.assert_allclose(kalman.position, away, atol=0.1)

@@ -22,6 +22,7 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.recovery import (
     FITTING_FEATURES,
+    LARGEST,
     camera_fits,
     follow_drift,
     follow_ratio,
@@ -53,7 +54,6 @@ _REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
 _FAILED, _UNSURE = float(Gate.FAILED), float(Gate.UNSURE)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _GATE = int(FilterForm.GATE)
-_LARGEST = 3.0
 
 
 @kernel
@@ -252,8 +252,8 @@ def judge_innovations(
             freedoms = freedoms + select(has & logical_not(unsure), 2.0, 0.0)
             counts = select(has & logical_not(unsure | again), 1.0, 0.0)
             count = count + counts
-            side = side + counts * clip(scaled[0], -_LARGEST, _LARGEST)
-            up = up + counts * clip(scaled[1], -_LARGEST, _LARGEST)
+            side = side + counts * clip(scaled[0], -LARGEST, LARGEST)
+            up = up + counts * clip(scaled[1], -LARGEST, LARGEST)
             if gating:
                 _mask_block(work, k, rejected | unsure)
                 left_out = left_out + select(rejected | unsure, 3.0, 0.0)

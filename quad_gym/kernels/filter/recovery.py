@@ -53,7 +53,7 @@ DRIFT_ALARM = 0.55
 """Mean of the last innovations, in deviations, from which on they drift."""
 _MEMORY = 0.02
 """Weight of the latest innovation in the mean: it deviates by sqrt(0.02 / 1.98) = 0.1."""
-_LARGEST = 3.0
+LARGEST = 3.0
 """Innovations count as no more deviations than that in the mean, for the sake of outliers."""
 LOST_RATIO, FOUND_RATIO = 2.0, 1.5
 """Mean NIS over its degrees of freedom at which a filter counts as lost, and as found again."""
@@ -73,7 +73,7 @@ def follow_drift(flight, group, has, first, second, third):
     """Follow the mean innovation of a group, in deviations, where a lane `has` one."""
     values = (first, second, third)
     for i in range(3):
-        value = clip(values[i], -_LARGEST, _LARGEST)
+        value = clip(values[i], -LARGEST, LARGEST)
         mean = flight.innovation_drift[group, i]
         mean = mean + _MEMORY * (value - mean)
         flight.innovation_drift[group, i] = select(has, mean, flight.innovation_drift[group, i])
