@@ -6,10 +6,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from benchmark_timing import Effort, Row, Timing, measure, percent, report
 
 import quad_gym
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 
 
 def random_actions(count: int) -> Any:

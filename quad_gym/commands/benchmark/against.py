@@ -13,12 +13,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from benchmark_timing import Effort, Row, percent
-
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Effort, Row, percent
 
-WORKER = Path(__file__).resolve().parent / "benchmark_worker.py"
-HERE = Path(__file__).resolve().parents[1]
+WORKER = Path(__file__).resolve().parent / "worker.py"
+HERE = Path(__file__).resolve().parents[3]
 FEWEST_TURNS = 5
 
 

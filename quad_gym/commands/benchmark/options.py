@@ -10,11 +10,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from benchmark_timing import Effort, Row, Timing, percent, report
-
 import quad_gym
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import SUITES
 
