@@ -117,6 +117,7 @@ def configure(args: Args) -> Setup:
     task = TaskParams(
         kind="circle",
         start="ground",
+        pad=False,  # the report has none
         radius=args.radius,
         period=args.period,
         height=args.height,
