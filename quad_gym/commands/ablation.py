@@ -22,7 +22,7 @@ from tyro.conf import Positional
 
 from quad_gym import SensorSuite, VehicleParams, WorldParams, sensor_suite, vehicle_params
 from quad_gym.analysis.consistency import PARTS
-from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, put_to_the_test
+from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, measure_consistency
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import SuiteName, usage_errors
@@ -266,7 +266,7 @@ def main(args: Args) -> None:
     rows: dict[str, dict[str, float]] = {}
     for number, case in enumerate(cases, 1):
         print(f"  {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
-        findings = put_to_the_test(
+        findings = measure_consistency(
             batch_of(case, args, args.flights, args.threads),
             seeds=range(args.first_seed, args.first_seed + args.flights),
             duration=args.duration,

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Literal
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
-from quad_gym.analysis.consistency import HONEST_SHARE, MeanSquare
-from quad_gym.analysis.consistency_flights import Findings, endless, put_to_the_test
+from quad_gym.analysis.consistency import CONSISTENT_SHARE, MeanSquare
+from quad_gym.analysis.consistency_flights import Findings, endless, measure_consistency
 from quad_gym.analysis.consistency_plots import (
     errors_figure,
     nees_figure,
@@ -170,7 +170,7 @@ def fly(args: Args, batch: FlightBatch) -> Findings:
             shown = time.monotonic()
             print(f"  {flown:.1f} of {args.duration:g} s flown", file=sys.stderr, flush=True)
 
-    return put_to_the_test(
+    return measure_consistency(
         batch,
         seeds=range(args.first_seed, args.first_seed + args.flights),
         duration=args.duration,
@@ -219,7 +219,7 @@ def report_of(findings: Findings) -> str:
         tables.append(table_of("NIS", findings.nis))
     lines = [
         "The filter is consistent."
-        if findings.honest
+        if findings.consistent
         else "The filter is not consistent in everything:",
         *(f"  {text}" for text in findings.sentences().values()),
         f"  Filters that failed in a cycle: {findings.failed}. Flights astray: "
@@ -254,8 +254,8 @@ def main(args: Args) -> None:
             files += save_figure(figure, args.output / name)
     squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
     found = {
-        "honest": findings.honest,
-        "honest_share": HONEST_SHARE,
+        "consistent": findings.consistent,
+        "consistent_share": CONSISTENT_SHARE,
         "verdicts": findings.sentences(),
         "share_inside": {name: part.share_inside for name, part in squares.items()},
         "overall": {name: part.overall for name, part in squares.items()},

@@ -55,7 +55,7 @@ ONE_TASK_KEYWORDS = {
 }
 """Those that mean something to a single task."""
 
-FACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
+INTERFACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
 """Keywords that the interfaces take themselves."""
 
 
@@ -82,7 +82,9 @@ class Flights:
 
     def __init__(self, task: str, count: int, autoreset: Autoreset, **keywords: Any) -> None:
         check.choice("task", task, tuple(TASK_DEFAULTS))
-        check.keywords(keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *FACE_KEYWORDS), "environments")
+        check.keywords(
+            keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *INTERFACE_KEYWORDS), "environments"
+        )
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
         for name in given:

@@ -93,11 +93,11 @@ def test_the_options_section_compares_each_with_everything_off(tmp_path):
         assert row["seconds"] > 0.0
 
 
-def test_the_faces_name_the_suite_they_time(monkeypatch):
-    faces = sys.modules["benchmark_faces"]
+def test_the_interfaces_name_the_suite_they_time(monkeypatch):
+    interfaces = sys.modules["benchmark_interfaces"]
     effort = script.Effort(1, 0.001)
     for options, suite in (({}, "standard"), ({"sensors": "lab"}, "lab")):
-        row = faces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
+        row = interfaces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
         assert row["suite"] == suite
         assert row["name"] == f"vector, estimate, 50 Hz, {suite}"
 
@@ -106,7 +106,7 @@ def test_another_checkout_is_timed_by_turns_and_compared(tmp_path, capsys):
     found = run(tmp_path, "--against", str(ROOT), "--envs", "8", "--threads", "1")
     assert list(found["sections"]) == ["against"]
     rows = found["sections"]["against"]
-    assert {"vector", "single"} <= {row["face"] for row in rows}
+    assert {"vector", "single"} <= {row["interface"] for row in rows}
     for row in rows:
         assert row["suite"] == "standard"
         assert row["ratio"] == pytest.approx(row["seconds"] / row["other"])
@@ -138,7 +138,7 @@ def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(s
 
 def test_a_row_that_the_other_checkout_refuses_is_left_out(monkeypatch, capsys):
     against = sys.modules["benchmark_against"]
-    rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["face"] == "single"][:2]
+    rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["interface"] == "single"][:2]
     rows[0] = {**rows[0], "options": {"observation": "guess"}}
     monkeypatch.setattr(against, "rows_to_compare", lambda envs, threads, suite: rows)
     found = against.time_against(ROOT, 4, 1, script.Effort(1, 0.001))
@@ -159,7 +159,7 @@ def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(tmp_path)
 
 def test_all_sections_are_those_that_do_not_compile(script):
     chosen = script.chosen_sections(parse(script.Args, []))
-    assert chosen == ["filter", "tick", "options", "faces", "memory", "rendering"]
+    assert chosen == ["filter", "tick", "options", "interfaces", "memory", "rendering"]
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
 def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path):
     assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
-    assert not found["honest"]
+    assert not found["consistent"]
     assert "overconfident" in found["verdicts"]["nees_state"]
     assert run(tmp_path, "--noise-factor", "0.7").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())

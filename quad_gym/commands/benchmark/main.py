@@ -25,8 +25,8 @@ from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.benchmark.against import against_table, time_against
 from quad_gym.commands.benchmark.compiling import compile_table, time_compile
-from quad_gym.commands.benchmark.faces import faces_table, time_faces
 from quad_gym.commands.benchmark.filter import filter_table, time_filter
+from quad_gym.commands.benchmark.interfaces import interfaces_table, time_interfaces
 from quad_gym.commands.benchmark.options import options_table, time_options
 from quad_gym.commands.benchmark.rendering import rendering_table, time_rendering
 from quad_gym.commands.benchmark.stages import tick_table, time_tick
@@ -36,7 +36,9 @@ from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.records import WIDTH
 
-Section = Literal["all", "filter", "tick", "options", "faces", "memory", "rendering", "compile"]
+Section = Literal[
+    "all", "filter", "tick", "options", "interfaces", "memory", "rendering", "compile"
+]
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Args:
     batch: int = 256
     """flights in the batches of filter, tick and options, in eights"""
     envs: int = 1024
-    """environments in the faces' batches"""
+    """environments in the interfaces' batches"""
     threads: int | None = None
     """most threads to use; if not given, one per core"""
     quick: bool = False
@@ -172,9 +174,9 @@ SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str
     ),
     "tick": (lambda args: time_tick(args.batch, args.effort), tick_table),
     "options": (lambda args: time_options(args.batch, args.effort), options_table),
-    "faces": (
-        lambda args: time_faces(args.envs, args.most_threads, args.effort),
-        faces_table,
+    "interfaces": (
+        lambda args: time_interfaces(args.envs, args.most_threads, args.effort),
+        interfaces_table,
     ),
     "memory": (measure_memory, memory_table),
     "rendering": (lambda args: time_rendering(args.effort), rendering_table),
