@@ -1,12 +1,12 @@
 """The benchmark's script runs and writes what it says; no test asserts on a clock."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 import quad_gym
+from quad_gym.commands.benchmark import against, interfaces, stages
 from quad_gym.commands.benchmark import main as script
 from quad_gym.commands.options import parse
 from quad_gym.kernels.compiling.stages import needed_stages
@@ -64,7 +64,6 @@ def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path
 
 def test_blocks_over_a_period_measure_as_often_as_the_sensors_do(script):
     """GNSS at 10 Hz and a camera at 25 Hz measure in 1 of 20 and 1 of 8 ticks of 5 ms."""
-    stages = sys.modules["benchmark_stages"]
     batch = stages.hovering(40 * WIDTH, sensors="rtk")
     blocks = stages.over_a_period(batch)
     ticks = blocks["tick"][:, 0]
@@ -94,7 +93,6 @@ def test_the_options_section_compares_each_with_everything_off(tmp_path):
 
 
 def test_the_interfaces_name_the_suite_they_time(monkeypatch):
-    interfaces = sys.modules["benchmark_interfaces"]
     effort = script.Effort(1, 0.001)
     for options, suite in (({}, "standard"), ({"sensors": "lab"}, "lab")):
         row = interfaces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
@@ -115,7 +113,6 @@ def test_another_checkout_is_timed_by_turns_and_compared(tmp_path, capsys):
 
 
 def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(script):
-    against = sys.modules["benchmark_against"]
 
     class Other:
         folder = ROOT
@@ -137,7 +134,6 @@ def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(s
 
 
 def test_a_row_that_the_other_checkout_refuses_is_left_out(monkeypatch, capsys):
-    against = sys.modules["benchmark_against"]
     rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["interface"] == "single"][:2]
     rows[0] = {**rows[0], "options": {"observation": "guess"}}
     monkeypatch.setattr(against, "rows_to_compare", lambda envs, threads, suite: rows)

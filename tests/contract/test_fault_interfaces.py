@@ -1,4 +1,4 @@
-"""With every fault there is: the same flights in every interface, and `info` tells what is wrong."""
+"""With every fault there is: the same flights in every interface; `info` tells what is wrong."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 """Hostile values for every keyword: refused by name, or flown without a number that is not finite.
 
-A table: every keyword of every interface, of flights, filters, parameters, draws and faults, with values
-that are not numbers, not finite, too large, too small, of another kind, or of another shape.
+A table: every keyword of every interface, of flights, filters, parameters, draws and faults, with
+values that are not numbers, not finite, too large, too small, of another kind, or of another shape.
 """
 
 import dataclasses

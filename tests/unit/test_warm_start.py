@@ -1,4 +1,4 @@
-"""Warm starts: errors as the covariance claims them from the first instant on, in every interface."""
+"""Warm starts: from the first instant on, errors are as the covariance says, everywhere."""
 
 import numpy as np
 import pytest
@@ -185,7 +185,7 @@ def test_a_filter_that_cannot_know_its_heading_has_nothing_to_start_warm_with(ca
     FlightBatch(1, sensors=suite)  # cold it may fly
 
 
-# ---- the interfaces -------------------------------------------------------------------------------
+# ---- the interfaces --------------------------------------------------------------------------
 
 
 def test_every_interface_starts_warm_alike():
