@@ -39,8 +39,8 @@ from quad_gym.commands.compare_report import (
     write_page,
 )
 from quad_gym.commands.options import EnvId, Keywords, SuiteNames, leave, usage_errors
+from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params import checks as check
-from quad_gym.params.fault_presets import felt_without_sensors
 from quad_gym.params.suites import sensor_suite
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200

@@ -25,7 +25,7 @@ from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, usage_errors
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.params.fault_presets import felt_without_sensors
+from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params.suites import sensor_suite
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 

@@ -32,8 +32,8 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import Keywords, SuiteName, leave, usage_errors
 from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
+from quad_gym.faults.presets import PRESETS, faults_of
 from quad_gym.flights.rerun import load_rerun
-from quad_gym.params.fault_presets import PRESETS, faults_of
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path

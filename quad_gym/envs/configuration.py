@@ -20,9 +20,9 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
+from quad_gym.faults.presets import FaultsGiven, faults_of, needs_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.control import ActionParams
-from quad_gym.params.fault_presets import FaultsGiven, faults_of, needs_sensors
 from quad_gym.params.randomization import Given, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
