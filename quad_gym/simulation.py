@@ -12,7 +12,7 @@ from quad_gym.fault_packing import pack_faults
 from quad_gym.fault_presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.batch import fly
 from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing import pack_latency, params_block, params_record, settings_record
 from quad_gym.params import (
     ActionParams,
@@ -32,12 +32,14 @@ from quad_gym.records import (
     WIDTH,
     WORK_BLOCK,
     Autoreset,
+    Call,
     Command,
     Control,
     Layout,
     Source,
     aligned_zeros,
     field_of_flights,
+    room_of,
 )
 from quad_gym.sensor_params import SensorSuite
 from quad_gym.sensor_suites import sensor_suite
@@ -48,6 +50,15 @@ from quad_gym.world_packing import pack_options
 from quad_gym.world_params import WorldParams, world_params
 
 _NO_BOUNDS = np.zeros(0)
+_UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
+"""Fields that are NaN at first, all others are zero."""
+_WORTH_NO_COPY = 1 << 16
+"""Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
+
+
+def _address(array: NDArray[Any]) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address
 
 
 class FlightBatch:
@@ -207,20 +218,25 @@ class FlightBatch:
             )
         self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
-        self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
+        self._room = room_of(used_parts(self._settings[0]))
+        self._blocks = aligned_zeros(-(-self.count // WIDTH), self._room.dtype)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
         self._blocks["idle"] = lanes >= self.count
         self._blocks["needs_reset"] = 1.0
-        for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
-            self._blocks[name] = np.nan
-        self._blocks["drawn"] = draws.low[:, np.newaxis]  # as it stays where nothing is drawn
+        for name in _UNKNOWN:
+            if name in self._room.dtype.fields:
+                self._blocks[name] = np.nan
+        self._undrawn = draws.low  # as it stays where nothing is drawn
+        if "drawn" in self._room.dtype.fields:
+            self._blocks["drawn"] = draws.low[:, np.newaxis]
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
-        self._actions = np.zeros((self.count, 4))
+        padded = len(self._blocks) * WIDTH
+        self._actions = np.zeros((padded, 4))
         self._resets = np.zeros(self.count, np.uint8)
         self._begun = False
-        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
-        self._results = np.zeros((len(RESULTS), self.count))
         self._observations = np.zeros((self.count, self._low.size), np.float32)
+        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
+        self._results = np.zeros((len(RESULTS), padded))
         self._crew: Crew | None = None
 
     # ---- flying -------------------------------------------------------------------------------
@@ -286,7 +302,7 @@ class FlightBatch:
         """
         if not self._begun:
             self._require_begun()
-        self._actions[:] = self.read("action") if actions is None else actions
+        self._actions[: self.count] = self.read("action") if actions is None else actions
         return self._run(Command.STEP)
 
     def _require_begun(self) -> None:
@@ -300,43 +316,63 @@ class FlightBatch:
         self._begun = True
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        table = linked_table(self._stages)
         if self._crew is None or self._crew.process != os.getpid():
-            self._crew = Crew(self._ranges(table), len(self._blocks), self.threads)
+            self._calls = self._calls_of_threads()
+            self._crew = Crew(self._fly_of(self._calls), len(self._blocks), self.threads)
+        self._crew.gather()
+        if self._observations.nbytes < _WORTH_NO_COPY:
+            self._crew.run(int(command))
+            return self._observations.copy()
+        self._observations = np.empty_like(self._observations)
+        self._calls[:, Call.OBSERVATIONS] = _address(self._observations)
         self._crew.run(int(command))
-        return self._observations.copy()
+        return self._observations
 
-    def _ranges(self, table: NDArray[Any]) -> Fly:
-        """What flies a range of blocks; it knows the arrays, not the batch, which may go."""
-        own, work = self._own, self._work
-        blocks, resets, world = self._blocks, self._resets, self._world
-        model = (self._model, self._settings)
-        after = (table, self._actions, self._low, self._high)
-        written = (self._observations, self.final_observations, self._results)
+    def _calls_of_threads(self) -> NDArray[np.int64]:
+        """What `fly` is called with, by each thread; the batch keeps the memory alive."""
+        self._table = linked_table(self._stages)
+        calls = np.zeros((self.threads, len(Call)), np.int64)
+        calls[:, Call.BLOCKS] = _address(self._blocks) - self._room.skipped
+        calls[:, Call.PITCH] = self._room.dtype.itemsize
+        calls[:, Call.COUNT], calls[:, Call.SIZE] = self.count, self._low.size
+        calls[:, Call.RESULT_PITCH] = self._results.strides[0]
+        for word, array in (
+            (Call.RESETS, self._resets),
+            (Call.WORLD, self._world),
+            (Call.MODEL, self._model),
+            (Call.SETTINGS, self._settings),
+            (Call.STAGES, self._table),
+            (Call.ACTIONS, self._actions),
+            (Call.LOW, self._low),
+            (Call.HIGH, self._high),
+            (Call.OBSERVATIONS, self._observations),
+            (Call.FINAL_OBSERVATIONS, self.final_observations),
+            (Call.RESULTS, self._results),
+        ):
+            calls[:, word] = _address(array)
+        for thread in range(self.threads):
+            calls[thread, Call.OWN] = _address(self._own[thread])
+            calls[thread, Call.WORK] = _address(self._work[thread])
+        return calls
 
-        def fly_range(
-            number: int, first: int, last: int, words: NDArray[np.int64], serving: int
-        ) -> None:
-            fly(
-                blocks,
-                first,
-                last,
-                resets,
-                world,
-                own[number],
-                *model,
-                work[number],
-                *after,
-                *written,
-                words,
-                serving,
-            )
+    def _fly_of(self, calls: NDArray[np.int64]) -> Fly:
+        """What flies blocks: it keeps all memory that it knows alive, but not the batch."""
+        rows = list(calls)
+        kept = (self._blocks, self._resets, self._world, self._own, self._model, self._settings)
+        kept += (self._work, self._table, self._actions, self._low, self._high, self._results)
+        kept += (self.final_observations,)
 
-        return fly_range
+        def fly_blocks(
+            board: NDArray[np.int64], number: int, command: int, serving: bool, _: Any = kept
+        ) -> bool:
+            return bool(fly(rows[number], board, number, command, serving))
+
+        return fly_blocks
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""
-        return self.__dict__ | {"_crew": None}
+        own = {"_crew": None, "_calls": None, "_table": None}
+        return self.__dict__ | own
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: never."""
@@ -399,18 +435,27 @@ class FlightBatch:
                 f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
                 f"got {name!r}"
             )
+        if name not in self._room.dtype.fields:
+            return self._unused(name, self.count if flights is None else len(flights))
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
 
+    def _unused(self, name: str, count: int) -> NDArray[Any]:
+        """A field that flights of this configuration do not use, and have no room for."""
+        if name == "drawn":
+            return np.tile(self._undrawn, (count, 1))
+        base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
+        return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
+
     @property
     def results(self) -> NDArray[np.float64]:
         """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
-        return self._results.T
+        return self._results[:, : self.count].T
 
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
-        return self._results[RESULTS.index(name)].copy()
+        return self._results[RESULTS.index(name), : self.count].copy()
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """What the present episodes have drawn, by name: (count,) or (count, components)."""
@@ -444,7 +489,7 @@ class FlightBatch:
         """
         fits = (
             isinstance(snapshot, np.ndarray)
-            and snapshot.dtype == FLIGHT_BLOCK
+            and snapshot.dtype == self._blocks.dtype
             and snapshot.shape == self._blocks.shape
             and np.array_equal(snapshot["idle"], self._blocks["idle"])
         )
