@@ -106,7 +106,10 @@ def _load_actions(call, flight, index):
 
 @kernel
 def _write_results(call, flight, index):
-    """What the caller wants to know of a step, before a new episode overwrites it."""
+    """What the caller wants to know of a step.
+
+    Where an episode begins in the same step as one ends it is that of the end, else of the start.
+    """
     here, pitch = call[_RESULTS] + index * (8 * WIDTH), call[_RESULT_PITCH]
     store_lanes(here + _REWARD * pitch, flight.reward)
     store_lanes(here + _TERMINATED * pitch, flight.terminated)
@@ -151,7 +154,7 @@ def _fly_step(flight, world, model, settings, work, stages):
 def _fly_block(call, index, command, nominal, true, believed, settings, work, stages):
     """Step or reset the flights of one block."""
     flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
-    observing = call[_SIZE] > 0
+    observing, written = call[_SIZE] > 0, False
     if settings.randomized:
         call_stage(stages, _IMPOSE, flight, true, nominal, settings, work, 0)
     if settings.faults:
@@ -165,12 +168,16 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
     else:
         _load_actions(call, flight, index)
         begins, done = _fly_step(flight, true, believed, settings, work, stages)
-        _write_results(call, flight, index)
+        if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
+            _write_results(call, flight, index)  # of the episodes that end
+            written = True
         if observing and any_of(begins & done):
             _observe(call, flight, true, believed, settings, work, stages)
             _write_rows(call, call[_FINALS], index, work, begins & done)
     if any_of(begins):
         begin_episode(flight, nominal, true, believed, settings, work, stages, begins)
+    if command != Command.RESET and not written:
+        _write_results(call, flight, index)
     if observing:
         _observe(call, flight, true, believed, settings, work, stages)
         _write_rows(call, call[_OBSERVATIONS], index, work, flight.tick >= 0.0)
