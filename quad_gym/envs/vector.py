@@ -303,14 +303,10 @@ def _blank(values: NDArray[Any]) -> Any:
 
 
 def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Every array beside the mask of the environments that it speaks of, the same for all."""
-    return _with_mask(infos, mask.copy())
-
-
-def _with_mask(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Every array beside the mask of the environments that it speaks of."""
     masked = dict(infos)
     for name, values in infos.items():
         if isinstance(values, dict):
-            masked[name] = _with_mask(values, mask)
-        masked[f"_{name}"] = mask
+            masked[name] = _masked(values, mask)
+        masked[f"_{name}"] = mask.copy()
     return masked

@@ -16,7 +16,7 @@ EVERYTHING = frozenset(name for name, _ in PARTS)
 
 def late(suite):
     suite = quad_gym.sensor_suite(suite)
-    return suite.replace(gnss=suite.gnss.replace(latency=0.1))
+    return suite.replace(gnss=suite.gnss.replace(latency=0.005))
 
 
 TRUTH = {"source": Source.TRUTH, "run_filter": False}
