@@ -10,6 +10,7 @@ from quad_gym.kernels.flight import begin_episode, tick
 from quad_gym.kernels.simd.addresses import (
     array_at,
     lanes_at,
+    prefetch,
     record_at,
     store_lanes,
     store_tile,
@@ -51,6 +52,10 @@ _SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
 _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
 _RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
+
+_CORE = int(FLIGHT_BLOCK.fields["r"][1])
+_TICKED = int(FLIGHT_BLOCK.fields["ref_cos"][1]) - _CORE
+"""Bytes of what every step needs, which come first in a record's core."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _params_at = lanes_at(PARAMS_BLOCK)
@@ -130,7 +135,17 @@ def _write_results(call, flight, index):
 
 
 @kernel
-def _fly_step(flight, world, model, settings, work, stages):
+def _fetch_ahead(call, index, settings, left):
+    """Ask for a tick's share of the next block's memory, which is far away in large batches."""
+    ticks, line = settings.ticks_per_step, 8 * WIDTH
+    share = (_TICKED // line + ticks) // ticks * line
+    begin = call[_BLOCKS] + (index + 1) * call[_PITCH] + _CORE + left * share
+    for k in range(0, share, line):
+        prefetch(begin + k)
+
+
+@kernel
+def _fly_step(call, index, flight, world, model, settings, work, stages):
     """Fly a control period and judge it; return which lanes begin and which ended an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
     flight.position_fresh = 0.0
@@ -139,6 +154,7 @@ def _fly_step(flight, world, model, settings, work, stages):
         flight.feature_fresh[i] = 0.0
     instant = flight.instant
     for left in range(settings.ticks_per_step - 1, -1, -1):
+        _fetch_ahead(call, index, settings, left)
         tick(flight, world, model, settings, work, stages, left == 0)
     # a step that begins an episode draws nothing before it
     flight.instant = select(resetting, instant, flight.instant)
@@ -167,7 +183,7 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
         begins = work.begins > 0.0
     else:
         _load_actions(call, flight, index)
-        begins, done = _fly_step(flight, true, believed, settings, work, stages)
+        begins, done = _fly_step(call, index, flight, true, believed, settings, work, stages)
         if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
             _write_results(call, flight, index)  # of the episodes that end
             written = True

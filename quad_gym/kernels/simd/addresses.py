@@ -90,6 +90,21 @@ def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
+    """Ask for the cache line at an address, which is needed soon; it may be no address at all."""
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        word = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [_BYTES, word, word, word])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [_BYTES], kind)
+        place = builder.inttoptr(args[0], _BYTES)
+        builder.call(function, [place, word(0), word(2), word(1)])  # to read, into the second level
+        return context.get_dummy_value()
+
+    return types.none(types.int64), lower
+
+
+@intrinsic
 def store_tile(typing_context, address, pitch, source, first):  # type: ignore[no-untyped-def]
     """Write WIDTH numbers of each lane as float32: those of a lane side by side.
 
