@@ -6,7 +6,7 @@ from the others': nobody waits for a thread that sleeps or that another process 
 mostly stay in the cache of one core. A step is over when all blocks are finished.
 
 Waking a thread takes longer than a step of some hundred flights. So a helper without work watches
-the board for a while, and sleeps only then; Python wakes it (`quad_gym.threads`).
+the board for a while, and sleeps only then; Python wakes it (`quad_gym.batch.threads`).
 
 COMMAND and what the step is about are written before NEXT, so that whoever takes a block finds them.
 """

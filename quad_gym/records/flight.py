@@ -30,7 +30,7 @@ _FAULT_FIELDS = (
 )
 _DRAW_FIELDS = (
     # parameters
-    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.randomization`"),
+    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
 )
 _CORE_FIELDS = (
     # what every tick reads and writes: the truth, clocks, the random stream
@@ -40,6 +40,7 @@ _CORE_FIELDS = (
     Field("w", (3,), "rad/s", "body rates w_B"),
     Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
     Field("voltages", (4,), "V", "motor voltages over the present tick"),
+    Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
     Field("disturbance", (3,), "N", "external force d_I on the body"),
     Field("tick", (), "ticks", "since the start of the episode"),
     Field("instant", (), "-", "instants drawn so far", "u8"),

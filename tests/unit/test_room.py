@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import quad_gym
-import quad_gym.simulation
+import quad_gym.batch.flight_batch as flight_batch
 from quad_gym import Uniform
 from quad_gym.records import FLIGHT_BLOCK, FLIGHT_FIELDS, PARTS, Source, room_of
-from quad_gym.simulation import FlightBatch
+from quad_gym.batch.flight_batch import FlightBatch
 
 EVERYTHING = frozenset(name for name, _ in PARTS)
 
@@ -51,7 +51,7 @@ def test_flights_touch_nothing_beyond_their_room(name, monkeypatch):
     """The same flights in full records, of which what there was no room for is filled before."""
     small = flown(CASES[name])
     kept = set(small.snapshot().dtype.names)
-    monkeypatch.setattr(quad_gym.simulation, "room_of", lambda used: room_of(EVERYTHING))
+    monkeypatch.setattr(flight_batch, "room_of", lambda used: room_of(EVERYTHING))
     begin = FlightBatch.reset
 
     def fill_and_reset(batch, **options):

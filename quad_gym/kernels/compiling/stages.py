@@ -28,6 +28,7 @@ from quad_gym.records import (
     SETTINGS,
     WORK_BLOCK,
     FilterForm,
+    Start,
     Supply,
 )
 
@@ -39,6 +40,7 @@ class Stage(IntEnum):
     SUPPLY = auto()
     MOVE = auto()
     MOVE_IN_AIR = auto()
+    REST_ON_PAD = auto()
     BEGIN_IN_AIR = auto()
     DRIFT_BIASES = auto()
     AVERAGE_IMU = auto()
@@ -98,6 +100,10 @@ def _late(s: Any) -> bool:
     return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
 
 
+def _pad(s: Any) -> bool:
+    return bool(s["pad"] and s["start"] != Start.HOVER)
+
+
 def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
@@ -131,6 +137,7 @@ SOURCES = {
     Stage.LOOK: Source("task.look", "look_stage", _always),
     Stage.JUDGE: Source("task.reward", "judge_stage", _always),
     Stage.DRIFT_BIASES: Source("sensors.measure", "drift_biases_stage", _filter),
+    Stage.REST_ON_PAD: Source("vehicle.pad", "rest_on_pad_stage", _pad),
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
     Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),

@@ -1,0 +1,152 @@
+"""The one place that knows of threads: shares a range of blocks among the cores.
+
+Kernels release the GIL, so plain threads run them side by side. A crew of threads belongs to the
+process that made it: after a fork the child makes its own, and a batch that is pickled or copied
+takes none along.
+"""
+
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.kernels import board
+from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.params import checks as check
+
+MIN_BLOCKS_PER_THREAD = 4
+"""Fewer blocks than this are not worth a hand-over to another thread."""
+
+CHUNKS_OF_RANGE = 16
+"""Times that a thread comes for blocks of its range: each time costs some tens of nanoseconds."""
+
+MAX_THREADS = 1024
+"""More than this is a mistake: each thread has memory of its own."""
+
+
+def resolve_threads(threads: int | None) -> int:
+    """`threads` checked, or the available cores where it is None.
+
+    Raises:
+        ValueError: If `threads` is not a whole number from 1 to MAX_THREADS.
+    """
+    if threads is None:
+        return available_cores()
+    return check.whole("threads", threads, most=MAX_THREADS)
+
+
+Fly = Callable[[NDArray[np.int64], int, int, bool], bool]
+"""Flies blocks that a board has: board, number of the thread, command, whether it serves."""
+
+POSTED_BEFORE = -1
+"""In place of a command: nothing new, wait for what was posted before."""
+
+
+class Crew:
+    """The threads that fly the blocks of one batch: the calling one, and helpers.
+
+    A helper lives in compiled code while steps follow each other fast, and sleeps otherwise; see
+    `kernels/board.py`. It ends with the crew. A single thread needs no crew, but has its board.
+
+    Args:
+        fly: Flies blocks, see `Fly`.
+        blocks: How many blocks there are.
+        threads: The most threads to fly them.
+    """
+
+    def __init__(self, fly: Fly, blocks: int, threads: int) -> None:
+        parts = max(1, min(threads, blocks // MIN_BLOCKS_PER_THREAD))
+        self.process = os.getpid()
+        self._fly = fly
+        self._board = board_of(blocks, parts)
+        places = board.RANGES + board.WORDS_OF_RANGE * np.arange(1, parts) + board.PRESENT
+        self._alarms = [(int(place), threading.Semaphore(0)) for place in places]
+        self._errors: list[BaseException] = []
+        self._flying = False
+        for number, alarm in enumerate(self._alarms, 1):
+            shared = (fly, self._board, number, *alarm, self._errors)
+            threading.Thread(target=_help, args=shared, name="quad_gym", daemon=True).start()
+        weakref.finalize(self, _dismiss, self._board, self._alarms)
+
+    def run(self, command: int) -> None:
+        """Fly all blocks.
+
+        Raises:
+            RuntimeError: If another thread is flying this batch at the same time.
+        """
+        if self._flying:
+            raise RuntimeError("a batch can be flown by one thread at a time")
+        self._flying = True
+        try:
+            if not self._fly(self._board, 0, command, False):
+                self._wait()
+        except Exception as error:
+            self._errors.append(error)  # its blocks will never be finished
+            raise
+        finally:
+            self._flying = False
+
+    def gather(self) -> None:
+        """Wait for what an interrupted step may have left, and wake the helpers that sleep."""
+        if not self._alarms:
+            return
+        words = self._board
+        if words[board.FINISHED] != words[board.LAST - board.WORDS_OF_RANGE]:
+            self._wait()
+        for place, alarm in self._alarms:
+            if words[place] == 0:
+                words[place] = 1
+                alarm.release()
+
+    def _wait(self) -> None:
+        """Wait until all blocks are finished."""
+        while True:
+            if self._errors:
+                raise self._errors[-1]
+            if self._fly(self._board, 0, POSTED_BEFORE, False):
+                return
+            time.sleep(0.0)
+
+
+def board_of(blocks: int, parts: int) -> NDArray[np.int64]:
+    """A board with the blocks cut into ranges, and nothing posted."""
+    words = np.zeros(board.RANGES + parts * board.WORDS_OF_RANGE, np.int64)
+    ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
+    cuts = [blocks * part // parts for part in range(parts + 1)]
+    ranges[:, board.FIRST], ranges[:, board.LAST] = cuts[:-1], cuts[1:]
+    ranges[:, board.NEXT] = cuts[1:]
+    words[board.FINISHED] = blocks
+    words[board.CHUNK] = 1 + blocks // (CHUNKS_OF_RANGE * parts) if parts > 1 else blocks
+    return words
+
+
+def _help(
+    fly: Fly,
+    words: NDArray[np.int64],
+    number: int,
+    place: int,
+    alarm: threading.Semaphore,
+    errors: list[BaseException],
+) -> None:
+    """What a helper thread does: sleep until it is woken, then serve the board."""
+    while True:
+        alarm.acquire()
+        if words[board.STOP]:
+            return
+        words[place] = 1
+        try:
+            fly(words, number, POSTED_BEFORE, True)
+        except BaseException as error:
+            errors.append(error)
+            return
+
+
+def _dismiss(words: NDArray[np.int64], alarms: list[tuple[int, threading.Semaphore]]) -> None:
+    """End the helpers of a crew that nobody needs any more."""
+    words[board.STOP] = 1
+    for _, alarm in alarms:
+        alarm.release()
