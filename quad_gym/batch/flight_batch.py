@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.calls import Calls
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
-from quad_gym.batch.threads import Crew, Fly, resolve_threads
+from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
-from quad_gym.kernels.batch import fly
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.faults import pack_faults
@@ -48,11 +48,6 @@ _UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
 """Fields that are NaN at first, all others are zero."""
 _WORTH_NO_COPY = 1 << 16
 """Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
-
-
-def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
-    return address
 
 
 class FlightBatch:
@@ -218,10 +213,10 @@ class FlightBatch:
         self._blocks["idle"] = lanes >= self.count
         self._blocks["needs_reset"] = 1.0
         for name in _UNKNOWN:
-            if name in self._room.dtype.fields:
+            if self._room.holds(name):
                 self._blocks[name] = np.nan
         self._undrawn = draws.low  # as it stays where nothing is drawn
-        if "drawn" in self._room.dtype.fields:
+        if self._room.holds("drawn"):
             self._blocks["drawn"] = draws.low[:, np.newaxis]
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         padded = len(self._blocks) * WIDTH
@@ -312,61 +307,41 @@ class FlightBatch:
     def _run(self, command: Command) -> NDArray[np.float32]:
         if self._crew is None or self._crew.process != os.getpid():
             self._calls = self._calls_of_threads()
-            self._crew = Crew(self._fly_of(self._calls), len(self._blocks), self.threads)
+            self._crew = Crew(self._calls, len(self._blocks), self.threads)
         self._crew.gather()
         if self._observations.nbytes < _WORTH_NO_COPY:
             self._crew.run(int(command))
             return self._observations.copy()
         self._observations = np.empty_like(self._observations)
-        self._calls[:, Call.OBSERVATIONS] = _address(self._observations)
+        self._calls.observe_into(self._observations)
         self._crew.run(int(command))
         return self._observations
 
-    def _calls_of_threads(self) -> NDArray[np.int64]:
-        """What `fly` is called with, by each thread; the batch keeps the memory alive."""
-        self._table = linked_table(self._stages)
-        calls = np.zeros((self.threads, len(Call)), np.int64)
-        calls[:, Call.BLOCKS] = _address(self._blocks) - self._room.skipped
-        calls[:, Call.PITCH] = self._room.dtype.itemsize
-        calls[:, Call.COUNT], calls[:, Call.SIZE] = self.count, self._low.size
-        calls[:, Call.RESULT_PITCH] = self._results.strides[0]
-        for word, array in (
-            (Call.RESETS, self._resets),
-            (Call.WORLD, self._world),
-            (Call.MODEL, self._model),
-            (Call.SETTINGS, self._settings),
-            (Call.STAGES, self._table),
-            (Call.ACTIONS, self._actions),
-            (Call.LOW, self._low),
-            (Call.HIGH, self._high),
-            (Call.OBSERVATIONS, self._observations),
-            (Call.FINAL_OBSERVATIONS, self.final_observations),
-            (Call.RESULTS, self._results),
-        ):
-            calls[:, word] = _address(array)
-        for thread in range(self.threads):
-            calls[thread, Call.OWN] = _address(self._own[thread])
-            calls[thread, Call.WORK] = _address(self._work[thread])
-        return calls
-
-    def _fly_of(self, calls: NDArray[np.int64]) -> Fly:
-        """What flies blocks: it keeps all memory that it knows alive, but not the batch."""
-        rows = list(calls)
-        kept = (self._blocks, self._resets, self._world, self._own, self._model, self._settings)
-        kept += (self._work, self._table, self._actions, self._low, self._high, self._results)
-        kept += (self.final_observations,)
-
-        def fly_blocks(
-            board: NDArray[np.int64], number: int, command: int, serving: bool, _: Any = kept
-        ) -> bool:
-            return bool(fly(rows[number], board, number, command, serving))
-
-        return fly_blocks
+    def _calls_of_threads(self) -> Calls:
+        """What the threads call the compiled code with."""
+        shared = {
+            Call.RESETS: self._resets,
+            Call.WORLD: self._world,
+            Call.MODEL: self._model,
+            Call.SETTINGS: self._settings,
+            Call.STAGES: linked_table(self._stages),
+            Call.ACTIONS: self._actions,
+            Call.LOW: self._low,
+            Call.HIGH: self._high,
+            Call.OBSERVATIONS: self._observations,
+            Call.FINAL_OBSERVATIONS: self.final_observations,
+            Call.RESULTS: self._results,
+        }
+        numbers = {
+            Call.COUNT: self.count,
+            Call.SIZE: self._low.size,
+            Call.RESULT_PITCH: self._results.strides[0],
+        }
+        return Calls(self._blocks, self._room, shared, numbers, self._own, self._work)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""
-        own = {"_crew": None, "_calls": None, "_table": None}
-        return self.__dict__ | own
+        return self.__dict__ | {"_crew": None, "_calls": None}
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: never."""
@@ -429,7 +404,7 @@ class FlightBatch:
                 f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
                 f"got {name!r}"
             )
-        if name not in self._room.dtype.fields:
+        if not self._room.holds(name):
             return self._unused(name, self.count if flights is None else len(flights))
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)

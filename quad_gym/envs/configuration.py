@@ -274,7 +274,7 @@ def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
     ):
         return False
     if actions.ndim == 1:  # a few numbers are sooner looked at than handed to NumPy
-        return all([-1.0 <= number <= 1.0 for number in actions.tolist()])
+        return all(-1.0 <= number <= 1.0 for number in actions.tolist())
     return bool(actions.max() <= 1.0 and actions.min() >= -1.0)
 
 

@@ -1,6 +1,5 @@
 """The one entry that flies: a step, or a reset, of the blocks of a batch."""
 
-import numpy as np
 from numba import types
 
 from quad_gym.kernels.board import COMMAND, FINISHED, TICKET, comes, finished, post, take
@@ -27,6 +26,7 @@ from quad_gym.records import (
     Call,
     Command,
     Result,
+    offset_of,
 )
 
 _IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
@@ -53,8 +53,8 @@ _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
 _RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
 
-_CORE = int(FLIGHT_BLOCK.fields["r"][1])
-_TICKED = int(FLIGHT_BLOCK.fields["ref_cos"][1]) - _CORE
+_CORE = offset_of(FLIGHT_BLOCK, "r")
+_TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
 """Bytes of what every step needs, which come first in a record's core."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)

@@ -1,14 +1,15 @@
 """How threads share the blocks of a batch among them, without Python and its lock.
 
 All look at one board of words. The caller cuts the blocks into ranges, one for each thread, and
-posts a step. A thread takes some blocks at a time, from its own range as long as there are any, then
-from the others': nobody waits for a thread that sleeps or that another process holds up, and blocks
-mostly stay in the cache of one core. A step is over when all blocks are finished.
+posts a step. A thread takes some blocks at a time, from its own range as long as there are any,
+then from the others': nobody waits for a thread that sleeps or that another process holds up, and
+blocks mostly stay in the cache of one core. A step is over when all blocks are finished.
 
 Waking a thread takes longer than a step of some hundred flights. So a helper without work watches
 the board for a while, and sleeps only then; Python wakes it (`quad_gym.batch.threads`).
 
-COMMAND and what the step is about are written before NEXT, so that whoever takes a block finds them.
+COMMAND and what the step is about are written before NEXT, so that whoever takes a block finds
+them.
 """
 
 from quad_gym.kernels.compiling import kernel

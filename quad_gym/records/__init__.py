@@ -47,6 +47,7 @@ from quad_gym.records.layout import (
     aligned_zeros,
     block_dtype,
     field_of_flights,
+    offset_of,
     room_of,
     scalar_dtype,
 )
@@ -189,6 +190,7 @@ __all__ = [
     "aligned_zeros",
     "block_dtype",
     "field_of_flights",
+    "offset_of",
     "room_of",
     "scalar_dtype",
 ]

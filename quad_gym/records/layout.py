@@ -40,6 +40,16 @@ class Room(NamedTuple):
     skipped: int
     """bytes of the full record before the first of them"""
 
+    def holds(self, name: str) -> bool:
+        """Whether there is room for a field."""
+        return name in (self.dtype.names or ())
+
+
+def offset_of(dtype: np.dtype, name: str) -> int:
+    """Bytes from the beginning of a record to a field."""
+    assert dtype.fields is not None
+    return int(dtype.fields[name][1])
+
 
 def room_of(used: frozenset[str]) -> Room:
     """The least room for the core, and for the parts that are used.
@@ -52,9 +62,7 @@ def room_of(used: frozenset[str]) -> Room:
     """
     chosen = [i for i, (name, _) in enumerate(PARTS) if name in used | {"core"}]
     fields = [field for _, part in PARTS[chosen[0] : chosen[-1] + 1] for field in part]
-    skipped = int(FLIGHT_BLOCK.fields[fields[0].name][1])  # type: ignore[index]
-    dtype = block_dtype(tuple(fields))
-    return Room(dtype, skipped)
+    return Room(block_dtype(tuple(fields)), offset_of(FLIGHT_BLOCK, fields[0].name))
 
 
 def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:

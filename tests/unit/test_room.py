@@ -8,8 +8,8 @@ import pytest
 import quad_gym
 import quad_gym.batch.flight_batch as flight_batch
 from quad_gym import Uniform
-from quad_gym.records import FLIGHT_BLOCK, FLIGHT_FIELDS, PARTS, Source, room_of
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.records import FLIGHT_BLOCK, FLIGHT_FIELDS, PARTS, Source, room_of
 
 EVERYTHING = frozenset(name for name, _ in PARTS)
 
