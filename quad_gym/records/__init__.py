@@ -71,6 +71,7 @@ from quad_gym.records.sizes import (
     SENSOR_GROUPS,
     VELOCITY_BLOCK,
     WARM_DRAWS,
+    WARM_DRIFT_DRAWS,
     WIDTH,
     Field,
 )
@@ -96,6 +97,7 @@ from quad_gym.records.streams import (
     DRAW_START,
     DRAW_VELOCITY,
     DRAW_WARM,
+    DRAW_WARM_DRIFT,
     DRAWS_OF_FAULT,
 )
 from quad_gym.records.work import (
@@ -130,6 +132,7 @@ __all__ = [
     "DRAW_START",
     "DRAW_VELOCITY",
     "DRAW_WARM",
+    "DRAW_WARM_DRIFT",
     "FAULT_KINDS",
     "FEATURE_BLOCKS",
     "FIXED",
@@ -157,6 +160,7 @@ __all__ = [
     "UNIFORM",
     "VELOCITY_BLOCK",
     "WARM_DRAWS",
+    "WARM_DRIFT_DRAWS",
     "WIDTH",
     "WORK",
     "WORK_BLOCK",

@@ -145,5 +145,8 @@ FLIGHT_FIELDS = (
     Field("late_valid", (DELAY_SLOTS, 3), "0 or 1", "whether these were measured"),
     Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
     Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
+    # the slow error of GNSS positions, where the filter estimates it
+    Field("gnss_drift_hat", (3,), "m", "estimated slow error d in I"),
+    Field("L_drift", (3, 18), "mixed", "rows of d below L in the factor of the joint covariance"),
 )
 # fmt: on
