@@ -12,8 +12,8 @@ from types import MappingProxyType
 from typing import Any
 
 from quad_gym import IDS
-from quad_gym import validation as check
-from quad_gym.validation import Checked
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
 
 ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Those of Stable-Baselines3 and its contributions that fit continuous actions in many flights."""

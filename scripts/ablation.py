@@ -20,15 +20,15 @@ from typing import Any, Literal
 import numpy as np
 
 from quad_gym import SensorSuite, VehicleParams, WorldParams, sensor_suite, vehicle_params
+from quad_gym.analysis.consistency import PARTS
+from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, put_to_the_test
+from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.cli import option, parse, usage_errors
-from quad_gym.consistency import PARTS
-from quad_gym.consistency_flights import ASTRAY, Findings, endless, put_to_the_test
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.reports import text_table, versions, write_json
-from quad_gym.sensor_suites import SUITES
-from quad_gym.simulation import FlightBatch
-from quad_gym.validation import Vector
-from quad_gym.world_params import world_params
+from quad_gym.params.checks import Vector
+from quad_gym.params.suites import SUITES
+from quad_gym.params.world import world_params
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.cli import option, parse, usage_errors
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.records import WIDTH
-from quad_gym.reports import text_table, versions, write_json
-from quad_gym.simulation import FlightBatch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from benchmark_against import against_table, time_against

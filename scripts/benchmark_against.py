@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmark_timing import Effort, Row, percent
 
-from quad_gym.reports import text_table
+from quad_gym.analysis.reports import text_table
 
 WORKER = Path(__file__).resolve().parent / "benchmark_worker.py"
 HERE = Path(__file__).resolve().parents[1]

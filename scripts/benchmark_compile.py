@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmark_timing import Row
 
 import quad_gym
-from quad_gym.reports import text_table
+from quad_gym.analysis.reports import text_table
 
 PACKAGE = Path(quad_gym.__file__).resolve().parent
 ENVS = 1024

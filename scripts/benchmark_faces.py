@@ -9,7 +9,7 @@ import numpy as np
 from benchmark_timing import Effort, Row, Timing, measure, percent, report
 
 import quad_gym
-from quad_gym.reports import text_table
+from quad_gym.analysis.reports import text_table
 
 
 def random_actions(count: int) -> Any:

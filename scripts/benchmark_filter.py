@@ -9,12 +9,12 @@ from benchmark_stages import Staged, hovering
 from benchmark_timing import Effort, Row, Timing, measure, percent, report
 
 import quad_gym
+from quad_gym.analysis.reports import text_table
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.parts import filter_cycle_of_flights
-from quad_gym.packing import params_record
+from quad_gym.packing.flight import params_record
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, WORK, aligned_zeros
-from quad_gym.reports import text_table
-from quad_gym.simulation import FlightBatch
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:

@@ -13,10 +13,10 @@ from typing import Any
 from benchmark_timing import Effort, Row, Timing, percent, report
 
 import quad_gym
+from quad_gym.analysis.reports import text_table
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.reports import text_table
-from quad_gym.sensor_suites import SUITES
-from quad_gym.simulation import FlightBatch
+from quad_gym.params.suites import SUITES
 
 LAB = quad_gym.sensor_suite("lab")
 OFF = "everything off"

@@ -9,8 +9,8 @@ from benchmark_timing import Effort, Row, measure, percent, report
 
 from baselines import PDPolicy
 from quad_gym import IDS, Flight
+from quad_gym.analysis.reports import text_table
 from quad_gym.rendering import VIEWS, Renderer, flight_of
-from quad_gym.reports import text_table
 
 SIZE = (640, 480)
 INSTANTS = 40

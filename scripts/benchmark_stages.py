@@ -7,14 +7,14 @@ import numpy as np
 from benchmark_timing import Effort, Row, Timing, measure, percent, report
 from numpy.typing import NDArray
 
+from quad_gym.analysis.reports import text_table
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.parts import run_stage
-from quad_gym.reports import text_table
-from quad_gym.simulation import FlightBatch
 
 SUITES = ("standard", "lab")
 FILTER = (Stage.PREDICT, Stage.UPDATE)

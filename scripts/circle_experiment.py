@@ -20,9 +20,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import PDGains, SensorSuite, TaskParams, pd_gains, plots, sensor_suite, vehicle_params
-from quad_gym.cli import option, parse, usage_errors
-from quad_gym.metrics import (
+from quad_gym import PDGains, SensorSuite, TaskParams, pd_gains, sensor_suite, vehicle_params
+from quad_gym.analysis import plots
+from quad_gym.analysis.metrics import (
     STATE_DIMENSION,
     PairedDifference,
     TrackingSummary,
@@ -30,10 +30,11 @@ from quad_gym.metrics import (
     paired_difference,
     spread,
 )
-from quad_gym.recording import Recording, record_flights
+from quad_gym.analysis.recording import Recording, record_flights
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.cli import option, parse, usage_errors
 from quad_gym.records import Source
-from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.simulation import FlightBatch
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
 LABELS = {TRUTH: "truth", ESTIMATE: "estimate", NO_CAMERA: "estimate, no camera"}

@@ -27,13 +27,14 @@ from compare_flights import Floats, Flown, fly
 from compare_report import Comparison, Setting, conclusions, matrix_text, write_figures, write_page
 
 from baselines.seeds import first_seed
-from quad_gym import IDS, plots
-from quad_gym import validation as check
+from quad_gym import IDS
+from quad_gym.analysis import plots
+from quad_gym.analysis.reports import as_json, require_writable, versions, write_csv, write_json
+from quad_gym.batch.threads import resolve_threads
 from quad_gym.cli import leave, option, parse, usage_errors
-from quad_gym.fault_presets import felt_without_sensors
-from quad_gym.reports import as_json, require_writable, versions, write_csv, write_json
-from quad_gym.sensor_suites import SUITES, sensor_suite
-from quad_gym.threads import resolve_threads
+from quad_gym.params import checks as check
+from quad_gym.params.fault_presets import felt_without_sensors
+from quad_gym.params.suites import SUITES, sensor_suite
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200
 FLOWN_ON = ("truth", "estimate")

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.analysis.plots import Trace
+from quad_gym.analysis.recording import Tracer
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.plots import Trace
-from quad_gym.recording import Tracer
 
 Floats = NDArray[np.float64]
 

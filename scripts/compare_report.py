@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from compare_flights import Floats, Flown
 
-from quad_gym import plots
-from quad_gym.comparison_plots import (
+from quad_gym.analysis import plots
+from quad_gym.analysis.comparison_plots import (
     error_over_time_figure,
     learning_figure,
     matrix_figure,
     paths_figure,
 )
-from quad_gym.metrics import Interval, bootstrap_interval, paired_difference
-from quad_gym.reports import text_table
+from quad_gym.analysis.metrics import Interval, bootstrap_interval, paired_difference
+from quad_gym.analysis.reports import text_table
 
 NAMES = {
     "PD": "PD, tuned",

@@ -25,16 +25,21 @@ from pathlib import Path
 from typing import Literal
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
+from quad_gym.analysis.consistency import HONEST_SHARE, MeanSquare
+from quad_gym.analysis.consistency_flights import Findings, endless, put_to_the_test
+from quad_gym.analysis.consistency_plots import (
+    errors_figure,
+    nees_figure,
+    nis_figure,
+    whiteness_figure,
+)
+from quad_gym.analysis.plots import house_style, require_matplotlib, save_figure
+from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.cli import option, parse, usage_errors
-from quad_gym.consistency import HONEST_SHARE, MeanSquare
-from quad_gym.consistency_flights import Findings, endless, put_to_the_test
-from quad_gym.consistency_plots import errors_figure, nees_figure, nis_figure, whiteness_figure
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.plots import house_style, require_matplotlib, save_figure
+from quad_gym.params.suites import FIELD_FILTER, SUITES
 from quad_gym.records import Source
-from quad_gym.reports import text_table, versions, write_json
-from quad_gym.sensor_suites import FIELD_FILTER, SUITES
-from quad_gym.simulation import FlightBatch
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,17 @@ import gymnasium
 
 from baselines.policies import load_policy, task_of
 from baselines.seeds import first_seed
-from quad_gym import IDS, plots
+from quad_gym import IDS
+from quad_gym.analysis import plots
+from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
+from quad_gym.analysis.metrics import bootstrap_interval
+from quad_gym.analysis.recording import Tracer
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.cli import leave, option, parse, usage_errors
-from quad_gym.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.fault_presets import felt_without_sensors
-from quad_gym.metrics import bootstrap_interval
-from quad_gym.recording import Tracer
+from quad_gym.params.fault_presets import felt_without_sensors
+from quad_gym.params.suites import SUITES, sensor_suite
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
-from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.sensor_suites import SUITES, sensor_suite
 
 
 @dataclass(frozen=True)

@@ -26,17 +26,17 @@ import numpy as np
 
 from baselines.policies import load_policy
 from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
+from quad_gym.analysis.reports import require_writable
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.cli import leave, option, parse, usage_errors
 from quad_gym.evaluation import Policy
-from quad_gym.fault_presets import PRESETS, faults_of
 from quad_gym.faults import Fault
-from quad_gym.flight_rerun import load_rerun
+from quad_gym.flights.rerun import load_rerun
+from quad_gym.params.fault_presets import PRESETS, faults_of
+from quad_gym.params.suites import SUITES
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
-from quad_gym.reports import require_writable
-from quad_gym.sensor_suites import SUITES
-from quad_gym.simulation import FlightBatch
 
 ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
 OTHER_ENDINGS = (".npz", ".csv", ".rrd")

@@ -69,7 +69,7 @@ def configure(args: Args) -> tuple[Any, Path]:
         ImportError: If Stable-Baselines3 is missing.
     """
     from baselines.recipes import recipe
-    from quad_gym.reports import require_writable
+    from quad_gym.analysis.reports import require_writable
 
     try:
         from baselines.plans import Plan, make_model

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from baselines.pd import PDPolicy
 from baselines.seeds import first_seed
 from quad_gym import IDS, PDGains, pd_gains
+from quad_gym.analysis.metrics import paired_difference
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.cli import flying_options, leave, option, parse, usage_errors
 from quad_gym.evaluation import roll_out
-from quad_gym.metrics import paired_difference
-from quad_gym.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.sensor_suites import SUITES
+from quad_gym.params.suites import SUITES
 
 Floats = NDArray[np.float64]
 

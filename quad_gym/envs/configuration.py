@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.starts import checked_start
 from quad_gym.envs.spaces import (
     ACTIONS,
     LAYOUTS,
@@ -19,15 +20,16 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
-from quad_gym.fault_presets import FaultsGiven, faults_of, needs_sensors
-from quad_gym.params import ActionParams, TaskParams, VehicleParams, check_limit
-from quad_gym.randomization import Given, Randomization
+from quad_gym.params import checks as check
+from quad_gym.params.control import ActionParams
+from quad_gym.params.fault_presets import FaultsGiven, faults_of, needs_sensors
+from quad_gym.params.randomization import Given, Randomization
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
-from quad_gym.sensor_params import SensorSuite
-from quad_gym.sensor_suites import sensor_suite
-from quad_gym.simulation import FlightBatch
-from quad_gym.starts import checked_start
-from quad_gym.world_params import WorldParams, world_params
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
     "hover": TaskParams(kind="hover", start="hover"),

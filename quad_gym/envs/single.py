@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, make
 
-from quad_gym import validation as check
+from quad_gym.batch.starts import stream_key
 from quad_gym.envs.configuration import (
     COLUMN,
     ENDINGS,
@@ -19,8 +19,8 @@ from quad_gym.envs.configuration import (
 from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
+from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
-from quad_gym.starts import stream_key
 
 
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
@@ -113,7 +113,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C), linear
     rotor drag, ground effect and a battery; `randomization={"mass": Uniform(0.8, 1.2,
     relative=True), "wind_speed": Uniform(0.0, 5.0)}` draws parameters anew for every episode. What
-    can be drawn is listed in `quad_gym.randomization.DRAWABLES`. The filter and the controller know
+    can be drawn is listed in `quad_gym.params.randomization.DRAWABLES`. The filter and the controller know
     of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
     know all but the wind and the ground). With `privileged=True` the truth ends with the wind in
     the body frame and the draws, each less the middle of its distribution over its spread.
@@ -126,7 +126,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or
+        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.params.suites`), or
             a `SensorSuite`. "standard" has the laboratory's sensors and a consistent filter; "lab"
             is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter

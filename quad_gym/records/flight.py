@@ -31,7 +31,7 @@ FLIGHT_FIELDS = (
     Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
     Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
     Field("charge", (), "-", "charge of the battery, 1: full"),
-    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.randomization`"),
+    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
     # the last measurements
     Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
     Field("w_before", (3,), "rad/s", "w_meas one sample before"),

@@ -61,7 +61,7 @@ SETTINGS_FIELDS = (
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
     Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),
     Field("known", (), "0 or 1", "whether filter and controller know the world as it is", "i8"),
-    Field("draw_kind", (DRAWN_SIZE,), "-", "how a column is drawn, see `quad_gym.distributions`", "i8"),
+    Field("draw_kind", (DRAWN_SIZE,), "-", "how a column is drawn, see `quad_gym.params.distributions`", "i8"),
     Field("draw_a", (DRAWN_SIZE,), "mixed", "of the distribution"),
     Field("draw_b", (DRAWN_SIZE,), "mixed", "of the distribution"),
     Field("draw_c", (DRAWN_SIZE,), "-", "of the distribution"),

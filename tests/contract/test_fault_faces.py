@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.fault_presets import faults_of
 from quad_gym.faults import GnssOutage, RotorLoss
+from quad_gym.params.fault_presets import faults_of
 from quad_gym.records import FEATURE_BLOCKS, FaultKind, Gate
-from quad_gym.simulation import FlightBatch
 from tests.contract.comparing import actions_of, assert_same
 from tests.contract.test_same_flights import SHORT, STEPS, fly_single, fly_vector, future_of
 

@@ -239,7 +239,7 @@ def test_fields_of_parameters(kind, name):
         )
 
 
-@pytest.mark.parametrize("drawable", quad_gym.randomization.DRAWABLES, ids=lambda d: d.name)
+@pytest.mark.parametrize("drawable", quad_gym.params.randomization.DRAWABLES, ids=lambda d: d.name)
 def test_ranges_of_draws(drawable):
     keywords = {"sensors": RTK, "world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())}
 

@@ -8,12 +8,12 @@ import pytest
 
 import quad_gym
 from baselines import PDPolicy
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import evaluate, roll_out
-from quad_gym.params import PDGains
+from quad_gym.params.control import PDGains
 from quad_gym.records import Control
-from quad_gym.simulation import FlightBatch
 from tests.contract.comparing import ACTIONS
 
 TRACKING = ("QuadGym/Hover-v0", "QuadGym/Circle-v0", "QuadGym/Lemniscate-v0")

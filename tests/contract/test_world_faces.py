@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.simulation import FlightBatch
 from tests.contract.comparing import actions_of, assert_same
 from tests.contract.test_same_flights import SHORT, STEPS, fly_single, fly_vector, future_of
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.consistency import flight_errors, start_matched
-from quad_gym.consistency_flights import endless, put_to_the_test
+from quad_gym.analysis.consistency import flight_errors, start_matched
+from quad_gym.analysis.consistency_flights import endless, put_to_the_test
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
-from quad_gym.sensor_suites import FIELD_FILTER
-from quad_gym.simulation import FlightBatch
 
 LAB = quad_gym.sensor_suite("lab")
 

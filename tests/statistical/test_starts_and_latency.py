@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.consistency import PARTS, InnovationRecorder, NeesRecorder
+from quad_gym.analysis.consistency import PARTS, InnovationRecorder, NeesRecorder
 from tests.field_flights import attitudes, fly, nees, small_euler_angles, state_errors, steps
 
 ANY_YAW = {"start_yaw": Uniform(-np.pi, np.pi)}

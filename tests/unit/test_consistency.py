@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from quad_gym import FilterParams, sensor_suite
-from quad_gym.consistency import (
+from quad_gym.analysis.consistency import (
     InnovationRecorder,
     MeanSquare,
     NeesRecorder,
@@ -14,8 +14,8 @@ from quad_gym.consistency import (
     start_matched,
     verdict,
 )
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK
-from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import assert_normal
 
 

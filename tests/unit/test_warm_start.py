@@ -5,12 +5,12 @@ import pytest
 
 import quad_gym
 from quad_gym import Uniform
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.warm_start import WARM_UP
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.params.suites import SUITES
 from quad_gym.records import FLIGHT_FIELDS
-from quad_gym.sensor_suites import SUITES
-from quad_gym.simulation import FlightBatch
-from quad_gym.warm_start import WARM_UP
 from tests.field_flights import attitudes, fly, nees, state_errors, steps
 from tests.unit.alarms import assert_normal
 

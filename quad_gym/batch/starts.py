@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym import validation as check
-from quad_gym.params import TaskParams
+from quad_gym.params import checks as check
+from quad_gym.params.task import TaskParams
 
 MAX_SPEED = 1e4
 """Fastest start [m/s]: some times faster than any bullet, and the drag still integrable."""

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_gym import validation as check
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
 from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
-from quad_gym.validation import Checked
 
 
 class Affine(NamedTuple):

@@ -7,10 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from quad_gym import portable
-from quad_gym.filter_params import FilterParams
 from quad_gym.frames import ecef_to_enu
-from quad_gym.params import ActionParams, Clocks, PDGains, TaskParams, VehicleParams
+from quad_gym.packing.world import pack_world
+from quad_gym.params import portable
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.control import ActionParams, PDGains
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.sensors import LEAST_DRIFT, ImuParams, SensorSuite, delay_ticks
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import (
     BASELINE_BLOCK,
     FREEDOMS,
@@ -28,9 +34,6 @@ from quad_gym.records import (
     Task,
     aligned_zeros,
 )
-from quad_gym.sensor_params import LEAST_DRIFT, ImuParams, SensorSuite, delay_ticks
-from quad_gym.world_packing import pack_world
-from quad_gym.world_params import WorldParams
 
 
 def params_record(

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.metrics import STATE_DIMENSION, nees, state_error
+from quad_gym.analysis.metrics import STATE_DIMENSION, nees, state_error
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
@@ -26,7 +27,6 @@ from quad_gym.records import (
     WIDTH,
 )
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
-from quad_gym.simulation import FlightBatch
 
 PARTS = {
     "state": slice(0, STATE_DIMENSION),

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.metrics import RunningSummary, TrackingSummary, nees, state_error
-from quad_gym.plots import Band, Trace
+from quad_gym.analysis.metrics import RunningSummary, TrackingSummary, nees, state_error
+from quad_gym.analysis.plots import Band, Trace
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Ending, Source
 from quad_gym.rotations import quaternion_to_dcm
-from quad_gym.simulation import FlightBatch
 
 Floats = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_stage import Stage
-from quad_gym.metrics import nees, state_error
-from quad_gym.packing import params_record
+from quad_gym.analysis.metrics import nees, state_error
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.flights.stage import Stage
+from quad_gym.packing.flight import params_record
 from quad_gym.records import FEATURE_BLOCKS, Source
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
-from quad_gym.simulation import FlightBatch
 
 if TYPE_CHECKING:
     import pandas
@@ -158,8 +158,8 @@ class Flight:
         return dataclasses.replace(self, rows=self.rows[: max(count, 1)])
 
     def save(self, path: Path | str) -> Path:
-        """Write a compressed NumPy archive (npz); see `quad_gym.flight_files`."""
-        from quad_gym.flight_files import save_flight
+        """Write a compressed NumPy archive (npz); see `quad_gym.flights.files`."""
+        from quad_gym.flights.files import save_flight
 
         return save_flight(self, Path(path))
 
@@ -170,13 +170,13 @@ class Flight:
         Raises:
             ValueError: If the file is damaged, of another kind, or of an unknown version.
         """
-        from quad_gym.flight_files import load_flight
+        from quad_gym.flights.files import load_flight
 
         return load_flight(Path(path))
 
     def to_csv(self, path: Path | str) -> Path:
         """Write a table for spreadsheets, with the covariance's standard deviations."""
-        from quad_gym.flight_files import write_flight_csv
+        from quad_gym.flights.files import write_flight_csv
 
         return write_flight_csv(self, Path(path))
 
@@ -186,7 +186,7 @@ class Flight:
         Raises:
             ImportError: If pandas is not installed.
         """
-        from quad_gym.flight_files import flight_frame
+        from quad_gym.flights.files import flight_frame
 
         return flight_frame(self)
 
@@ -194,12 +194,12 @@ class Flight:
         """A recording for the Rerun viewer: 3D, the camera's image and plots on one time line.
 
         `flight.to_rerun().spawn()` opens the viewer; `flight.to_rerun().save("flight.rrd")` writes
-        a file for it. See `quad_gym.flight_rerun` for what it holds.
+        a file for it. See `quad_gym.flights.rerun` for what it holds.
 
         Raises:
             ImportError: If rerun-sdk is not installed.
         """
-        from quad_gym.flight_rerun import rerun_recording
+        from quad_gym.flights.rerun import rerun_recording
 
         return rerun_recording(self)
 

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
-from quad_gym.distributions import Distribution, Uniform
-from quad_gym.params import LEAST_MOMENT, RK4_LIMIT, Clocks, VehicleParams, check_lag, check_moments
+from quad_gym.params import checks as check
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.distributions import Distribution, Uniform
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import LEAST_MOMENT, RK4_LIMIT, VehicleParams, check_lag, check_moments
+from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL, UNIFORM, Drawable
-from quad_gym.sensor_params import SensorSuite
-from quad_gym.world_params import BatteryParams, WorldParams
 
 FAST = 100.0
 """Vehicles fly slower than this [m/s]."""
@@ -31,7 +32,7 @@ Given = Distribution | Sequence[Distribution | None]
 class Randomization:
     """Which parameters are drawn anew for every episode, and from what distributions.
 
-    The names are those of `quad_gym.randomization.DRAWABLES`. Of a parameter with several
+    The names are those of `quad_gym.params.randomization.DRAWABLES`. Of a parameter with several
     components each is drawn by itself, from the same distribution or from those of a sequence,
     where None keeps a component.
 

@@ -4,8 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from quad_gym.consistency import NEGLIGIBLE_CORRELATION, PARTS, Floats, MeanSquare, Whiteness
-from quad_gym.plots import BLUE, GREY, INK, PALE, VERMILLION, require_matplotlib
+from quad_gym.analysis.consistency import (
+    NEGLIGIBLE_CORRELATION,
+    PARTS,
+    Floats,
+    MeanSquare,
+    Whiteness,
+)
+from quad_gym.analysis.plots import BLUE, GREY, INK, PALE, VERMILLION, require_matplotlib
 
 _TITLES = {
     "state": "whole state",

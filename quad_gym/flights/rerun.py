@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight
-from quad_gym.metrics import STATE_DIMENSION, chi_square_band
+from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
+from quad_gym.flights.record import Flight
 from quad_gym.records import Gate
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 

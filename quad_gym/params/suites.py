@@ -22,9 +22,9 @@ import math
 
 import numpy as np
 
-from quad_gym import validation as check
-from quad_gym.filter_params import FilterParams
-from quad_gym.sensor_params import (
+from quad_gym.params import checks as check
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.sensors import (
     CameraParams,
     GnssParams,
     ImuParams,

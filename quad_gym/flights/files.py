@@ -5,8 +5,8 @@ The archive (`.npz`, readable by `numpy.load` alone) holds
 | entry | what |
 |---|---|
 | `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and what the stage has in single numbers |
-| `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flight_record.COLUMNS` |
-| `stage/NAME` | one float64 array per array of `quad_gym.flight_stage.Stage` |
+| `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.record.COLUMNS` |
+| `stage/NAME` | one float64 array per array of `quad_gym.flights.stage.Stage` |
 
 A table has the same columns with one number each, vectors as `_x`, `_y`, `_z` (`_w`, `_x`, `_y`,
 `_z` for quaternions, `_1` ... where there are no axes), and in place of the covariance the square
@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import COLUMNS, Column, Flight, row_dtype
-from quad_gym.flight_stage import Stage
+from quad_gym.flights.record import COLUMNS, Column, Flight, row_dtype
+from quad_gym.flights.stage import Stage
 
 if TYPE_CHECKING:
     import pandas

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from quad_gym import validation as check
-from quad_gym.filter_params import FilterParams
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.filter import FilterParams
 from quad_gym.records import MAX_FEATURES, MAX_UNDER_WAY
-from quad_gym.validation import Checked, Matrix, Vector
 
 LEAST_DRIFT = 1e-6
 """Slow error that a filter assumes in an axis that has none beside one that has [m]: its covariance

@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-from quad_gym.faults import (
+from quad_gym.kernels.sensors.faults import NEVER
+from quad_gym.params.faults import (
     AccelBiasStep,
     CameraOcclusion,
     Fault,
@@ -19,7 +20,6 @@ from quad_gym.faults import (
     WrongAssociations,
     ends,
 )
-from quad_gym.kernels.sensors.faults import NEVER
 
 
 def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quad_gym import validation as check
-from quad_gym.validation import Checked, Vector
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Vector
 
 MAX_WIND = 200.0
 """The strongest tornadoes blow at some 135 m/s."""

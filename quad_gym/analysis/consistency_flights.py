@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.consistency import (
+from quad_gym.analysis.consistency import (
     Floats,
     InnovationRecorder,
     MeanSquare,
@@ -17,9 +17,9 @@ from quad_gym.consistency import (
     start_matched,
     verdict,
 )
-from quad_gym.metrics import RunningSummary, TrackingSummary
-from quad_gym.params import TaskParams
-from quad_gym.simulation import FlightBatch
+from quad_gym.analysis.metrics import RunningSummary, TrackingSummary
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params.task import TaskParams
 
 
 def endless(task: TaskParams) -> TaskParams:
@@ -34,7 +34,7 @@ class Findings:
     """What was found about a filter."""
 
     nees: dict[str, MeanSquare]
-    """by the names of `quad_gym.consistency.PARTS`"""
+    """by the names of `quad_gym.analysis.consistency.PARTS`"""
     nis: dict[str, MeanSquare]
     """by sensor"""
     whiteness: dict[str, Whiteness]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.plots import (
+from quad_gym.analysis.plots import (
     BLUE,
     GREEN,
     GREY,

@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 
-import quad_gym
-
 
 def versions(*packages: str) -> dict[str, str | None]:
     """Versions of Python, quad_gym and further packages; None for one that is not installed."""
     found: dict[str, str | None] = {
         "python": platform.python_version(),
-        "quad_gym": quad_gym.__version__,
+        "quad_gym": version("quad-gym"),
     }
     for package in packages:
         try:

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
 from quad_gym.kernels import mailbox
 from quad_gym.kernels.compiling.cores import available_cores
+from quad_gym.params import checks as check
 
 MIN_BLOCKS_PER_THREAD = 4
 """Fewer blocks than this are not worth a hand-over to another thread."""

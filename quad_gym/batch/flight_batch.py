@@ -7,24 +7,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym import validation as check
-from quad_gym.fault_packing import pack_faults
-from quad_gym.fault_presets import FaultsGiven, faults_of, named_faults
+from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
+from quad_gym.batch.threads import Crew, Fly, resolve_threads
+from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.kernels.batch import fly
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
-from quad_gym.packing import pack_latency, params_block, params_record, settings_record
-from quad_gym.params import (
-    ActionParams,
-    Clocks,
-    PDGains,
-    TaskParams,
-    VehicleParams,
-    check_limit,
-    pd_gains,
-    vehicle_params,
-)
-from quad_gym.randomization import DrawingTable, Given, Randomization, check_draws
+from quad_gym.packing.faults import pack_faults
+from quad_gym.packing.flight import pack_latency, params_block, params_record, settings_record
+from quad_gym.packing.world import pack_options
+from quad_gym.params import checks as check
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.control import ActionParams, PDGains, pd_gains
+from quad_gym.params.fault_presets import FaultsGiven, faults_of, named_faults
+from quad_gym.params.randomization import DrawingTable, Given, Randomization, check_draws
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.vehicle import VehicleParams, vehicle_params
+from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
     COLUMNS,
     FLIGHT_BLOCK,
@@ -39,13 +40,6 @@ from quad_gym.records import (
     aligned_zeros,
     field_of_flights,
 )
-from quad_gym.sensor_params import SensorSuite
-from quad_gym.sensor_suites import sensor_suite
-from quad_gym.starts import checked_keys, checked_mask, checked_start
-from quad_gym.threads import Crew, Fly, resolve_threads
-from quad_gym.warm_start import FILTER_STARTS, pack_warm_start
-from quad_gym.world_packing import pack_options
-from quad_gym.world_params import WorldParams, world_params
 
 _NO_BOUNDS = np.zeros(0)
 
@@ -75,8 +69,8 @@ class FlightBatch:
         autoreset: When a flight whose episode is over begins the next one.
         run_filter: Whether sensors and filter run; None: where something needs them.
         filter_start: "cold": the filter starts from its first fix; "warm": it has converged in
-            `quad_gym.warm_start.WARM_UP` of hovering where the task begins, with errors drawn from
-            the covariance that it has reached.
+            `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn
+            from the covariance that it has reached.
         innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
             "innovation_sigma", "block_nis"; a gate keeps them anyway.
         threads: Threads to use; None: as many as there are cores.

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.params import VehicleParams
-from quad_gym.randomization import DrawingTable, Randomization
+from quad_gym.params.randomization import DrawingTable, Randomization
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import COLUMNS, SETTINGS, Supply
-from quad_gym.sensor_params import SensorSuite
-from quad_gym.world_params import BatteryParams, WorldParams
 
 
 def pack_world(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:

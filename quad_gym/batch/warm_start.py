@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import portable
-from quad_gym.params import TaskParams, VehicleParams
+from quad_gym.params import portable
+from quad_gym.params.sensors import LEAST_DRIFT, GnssParams, SensorSuite
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import WARM_DRAWS, WARM_DRIFT_DRAWS, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
-from quad_gym.sensor_params import LEAST_DRIFT, GnssParams, SensorSuite
 
 FILTER_STARTS = ("cold", "warm")
 """Values of the keyword `filter_start`."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.faults import (
+from quad_gym.params.faults import (
     AccelBiasStep,
     BaselineLoss,
     CameraOcclusion,
@@ -21,8 +21,8 @@ from quad_gym.faults import (
     RotorLoss,
     WrongAssociations,
 )
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FAULT_KINDS
-from quad_gym.sensor_params import SensorSuite
 
 FaultsGiven = str | Fault | Iterable[str | Fault] | None
 """A fault, the name of a preset or several joined by "+", several of both, or None."""

@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass
 
-from quad_gym import validation as check
-from quad_gym.frames import GRAVITY
-from quad_gym.validation import Checked
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
+from quad_gym.params.gravity import GRAVITY
 
 
 @dataclass(frozen=True, kw_only=True)
