@@ -128,7 +128,7 @@ def sense_gnss(flights, params):
 @_entry(_FLIGHT, _PARAMS)
 def step_gnss_drift(flights, params):
     """Step the slow position error of flights[0] to the next measurement."""
-    drift_gnss(flights[0], params[0], True)
+    drift_gnss(flights[0], params[0], True, 1.0)
 
 
 @_entry(_FLIGHT, _PARAMS, types.int64)
