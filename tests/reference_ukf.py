@@ -170,6 +170,7 @@ class PlainUKF:
         self.l_b = array(gnss.secondary_antenna_B) - self.l_p
         self.R_position = eye * array(gnss.position_sigma_I) ** 2
         self.drifts, self.states = any(gnss.drift_sigma_I), 18 if any(gnss.drift_sigma_I) else 15
+        self.d = self.zeros[: self.states - 15]
         self.baseline_variance = number(gnss.baseline_sigma) ** 2
         self.features = array(np.zeros((0, 3)))
         if sensors.camera is not None:
