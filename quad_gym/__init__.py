@@ -6,8 +6,8 @@ compiled or loaded from their cache, when the first environment is made.
 
 from typing import Any
 
+from quad_gym import faults
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all
-from quad_gym.params import faults
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.distributions import LogUniform, Normal, Uniform

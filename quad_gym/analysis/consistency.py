@@ -38,7 +38,7 @@ PARTS = {
 }
 """The whole error state and its blocks of three, as of the covariance."""
 
-HONEST_SHARE = 0.9
+CONSISTENT_SHARE = 0.9
 """Share of instants in the 95 % band from which a filter is called consistent."""
 
 BAND_FLIGHTS = 1000
@@ -154,9 +154,9 @@ class MeanSquare:
         return float(self.mean.mean())
 
     @property
-    def honest(self) -> bool:
-        """Whether the mean lies in the band at `HONEST_SHARE` of the instants or more."""
-        return self.share_inside >= HONEST_SHARE
+    def consistent(self) -> bool:
+        """Whether the mean lies in the band at `CONSISTENT_SHARE` of the instants or more."""
+        return self.share_inside >= CONSISTENT_SHARE
 
     def since(self, start: float) -> "MeanSquare":
         """The same from an instant on [s].
@@ -178,7 +178,7 @@ def verdict(part: MeanSquare) -> str:
     """
     inside = f"inside its band at {100 * part.share_inside:.0f} % of the instants"
     what = f"{part.name}: mean {part.overall:.2f} where {part.dimension} is right, {inside}"
-    if part.honest:
+    if part.consistent:
         return f"{what}: consistent."
     ratio = float(np.sqrt(part.overall / part.dimension))
     percent = f"{100.0 * abs(ratio - 1.0):.1f} %"

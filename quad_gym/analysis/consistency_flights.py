@@ -57,11 +57,11 @@ class Findings:
         return replace(self, nees=nees, nis=nis)
 
     @property
-    def honest(self) -> bool:
+    def consistent(self) -> bool:
         """Whether everything is as a consistent filter's."""
         squares = (*self.nees.values(), *self.nis.values())
         white = all(part.white for part in self.whiteness.values())
-        return self.failed == 0 and white and all(part.honest for part in squares)
+        return self.failed == 0 and white and all(part.consistent for part in squares)
 
     def sentences(self) -> dict[str, str]:
         """Verdicts in plain English, by what they are on."""
@@ -78,7 +78,7 @@ ASTRAY = 5.0
 """Distance from the reference beyond which a flight counts as astray [m]."""
 
 
-def put_to_the_test(
+def measure_consistency(
     batch: FlightBatch,
     *,
     seeds: Sequence[int],

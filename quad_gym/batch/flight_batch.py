@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, Fly, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
+from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.batch import fly
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
@@ -19,7 +20,6 @@ from quad_gym.packing.world import pack_options
 from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
-from quad_gym.params.fault_presets import FaultsGiven, faults_of, named_faults
 from quad_gym.params.randomization import DrawingTable, Given, Randomization, check_draws
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite

@@ -20,9 +20,9 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
+from quad_gym.faults.presets import FaultsGiven, faults_of, needs_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.control import ActionParams
-from quad_gym.params.fault_presets import FaultsGiven, faults_of, needs_sensors
 from quad_gym.params.randomization import Given, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -55,7 +55,7 @@ ONE_TASK_KEYWORDS = {
 }
 """Those that mean something to a single task."""
 
-FACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
+INTERFACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
 """Keywords that the interfaces take themselves."""
 
 
@@ -82,7 +82,9 @@ class Flights:
 
     def __init__(self, task: str, count: int, autoreset: Autoreset, **keywords: Any) -> None:
         check.choice("task", task, tuple(TASK_DEFAULTS))
-        check.keywords(keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *FACE_KEYWORDS), "environments")
+        check.keywords(
+            keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *INTERFACE_KEYWORDS), "environments"
+        )
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
         for name in given:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.params.fault_presets import named_faults
+from quad_gym.faults.presets import named_faults
 from quad_gym.records import FEATURE_BLOCKS
 
 Parts = dict[str, dict[str, NDArray[Any]]]

@@ -4,22 +4,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from quad_gym.faults import Fault, Span, ends
 from quad_gym.kernels.sensors.faults import NEVER
-from quad_gym.params.faults import (
-    AccelBiasStep,
-    CameraOcclusion,
-    Fault,
-    GnssJump,
-    GnssOutliers,
-    GnssRamp,
-    GyroBiasStep,
-    ImuSaturation,
-    PositionJump,
-    RotorLoss,
-    Span,
-    WrongAssociations,
-    ends,
-)
 
 
 def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
@@ -37,23 +23,13 @@ def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
         s["fault_start"][k] = _ticks(fault.start, dt)
         s["fault_duration"][k] = _ticks(fault.duration, dt, least=1.0)
         s["fault_probability"][k] = fault.probability
-        if isinstance(fault, (GnssOutliers, CameraOcclusion, WrongAssociations)):
-            s["fault_share"][k] = fault.share
-        if isinstance(fault, (GnssOutliers, GnssJump, PositionJump, AccelBiasStep, GyroBiasStep)):
-            s["fault_size"][k] = _low_and_range(fault.size)
-        if isinstance(fault, (GnssRamp, GnssJump, PositionJump, AccelBiasStep, GyroBiasStep)):
-            s["fault_direction"][k] = fault.unit
-        if isinstance(fault, GnssRamp):
-            s["fault_size"][k] = _low_and_range(fault.speed)
-        if isinstance(fault, WrongAssociations):
-            s["fault_swaps"] = fault.how == "swap"
-        if isinstance(fault, ImuSaturation):
-            s["imu_range"] = fault.accel_range, fault.gyro_range
-        if isinstance(fault, RotorLoss):
-            s["fault_size"][k] = _low_and_range(fault.share)
-            s["fault_pick"] = 0.0, 1.0
-            if fault.rotor is not None:
-                s["fault_pick"] = (fault.rotor + 0.5) / 4.0, 0.0
+        for name, value in fault.numbers.items():
+            if name == "size":
+                s["fault_size"][k] = _low_and_range(value)
+            elif name in ("share", "direction"):
+                s[f"fault_{name}"][k] = value
+            else:
+                s[name] = value
 
 
 def _low_and_range(value: Span) -> tuple[float, float]:

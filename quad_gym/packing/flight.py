@@ -241,7 +241,8 @@ def settings_record(
     s["include_covariance"], s["privileged"] = include_covariance, privileged
     s["autoreset"], s["run_filter"] = autoreset, run_filter
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
-    s["randomize"] = task.randomize
+    s["pad"], s["randomize"] = task.pad, task.randomize
+    s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
     s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], 0)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground

@@ -36,6 +36,12 @@ class TaskParams(Checked):
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
     "hover": hovering at rest within some decimeters of the reference; "mixed": either, with
     probability 0.5"""
+    pad: bool = True
+    """whether a launch pad carries a vehicle that starts on the ground until its thrust lifts it;
+    without one it sinks while its rotors spin up, as in the report"""
+    reward_per: str = "step"
+    """"step": a reward of the order of one in each step, as learning algorithms expect; "second":
+    the same times the control period"""
     randomize: bool = False
     """draw the reference anew each episode: phase, radius, period and sense of circle and
     lemniscate, the heading of a random trajectory and of a course of gates"""
@@ -44,7 +50,8 @@ class TaskParams(Checked):
     out_of_bounds: float = 3.0
     """distance from the reference at which an episode ends [m]"""
     ground: float = -0.5
-    """height at which an episode ends [m]; below 0, for flights sag while the rotors spin up"""
+    """height at which an episode ends [m]; below 0, as a vehicle without a launch pad sinks while
+    its rotors spin up"""
     end_when_lost: bool = False
     """whether an episode is truncated where the filter finds that it is lost"""
     max_tilt: float = math.radians(100.0)
@@ -63,6 +70,8 @@ class TaskParams(Checked):
     def __post_init__(self) -> None:
         self._check(check.choice, "kind", choices=TASKS)
         self._check(check.choice, "start", choices=STARTS)
+        self._check(check.choice, "reward_per", choices=("step", "second"))
+        self._check(check.flag, "pad")
         self._check(
             check.positive,
             "out_of_bounds",

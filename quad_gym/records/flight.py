@@ -21,6 +21,7 @@ FLIGHT_FIELDS = (
     Field("w", (3,), "rad/s", "body rates w_B"),
     Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
     Field("voltages", (4,), "V", "motor voltages over the present tick"),
+    Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
     Field("disturbance", (3,), "N", "external force d_I on the body"),
     Field("b_a", (3,), "m/s^2", "accelerometer bias"),
     Field("b_g", (3,), "rad/s", "gyro bias"),

@@ -29,6 +29,8 @@ SETTINGS_FIELDS = (
     Field("privileged", (), "0 or 1", "whether the observation ends with the truth", "i8"),
     Field("autoreset", (), "-", "see Autoreset", "i8"),
     Field("start", (), "-", "how episodes begin, see Start", "i8"),
+    Field("pad", (), "0 or 1", "whether a launch pad carries vehicles that start on the ground", "i8"),
+    Field("reward_scale", (), "-", "what a reward per second is multiplied by"),
     Field("randomize", (), "0 or 1", "whether the reference is drawn anew each episode", "i8"),
     Field("max_steps", (), "steps", "time limit of an episode; 0: none", "f8"),
     Field("out_of_bounds", (), "m", "largest distance from the reference"),

@@ -132,7 +132,7 @@ def test_single_and_batched_predictions_agree(action, privileged):
         observation, *_ = env.step(together)
 
 
-def test_it_reads_its_environment_through_wrappers_and_all_faces():
+def test_it_reads_its_environment_through_wrappers_and_all_interfaces():
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=2)
     single = gymnasium.make("QuadGym/Hover-v0")
     observation, _ = single.reset(seed=2)

@@ -1,4 +1,4 @@
-"""Every face renders what Gymnasium asks for, and a flight does not notice."""
+"""Every interface renders what Gymnasium asks for, and a flight does not notice."""
 
 import copy
 import os

@@ -14,7 +14,7 @@ import numpy as np
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.params.fault_presets import PRESETS
+from quad_gym.faults.presets import PRESETS
 from quad_gym.params.suites import SUITES
 
 DIGESTS = Path(__file__).with_name("flights.json")

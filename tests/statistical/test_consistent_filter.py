@@ -10,7 +10,7 @@ import pytest
 
 import quad_gym
 from quad_gym.analysis.consistency import flight_errors, start_matched
-from quad_gym.analysis.consistency_flights import endless, put_to_the_test
+from quad_gym.analysis.consistency_flights import endless, measure_consistency
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import FIELD_FILTER
@@ -25,14 +25,14 @@ def flown(sensors, *, flights=3000, seconds=10.0, matched=False, **keywords):
     batch = FlightBatch(
         flights, sensors=sensors, task=task, gains="tuned", innovations=True, **keywords
     )
-    findings = put_to_the_test(batch, seeds=range(flights), duration=seconds, matched=matched)
+    findings = measure_consistency(batch, seeds=range(flights), duration=seconds, matched=matched)
     assert findings.failed == 0
     return findings
 
 
 def assert_consistent(findings, parts):
     for name, part in parts.items():
-        assert part.honest, (name, part.share_inside, part.overall)
+        assert part.consistent, (name, part.share_inside, part.overall)
     for name, white in findings.whiteness.items():
         assert white.white, (name, white.largest)
 
@@ -57,7 +57,7 @@ def test_the_laboratorys_sensors_can_have_a_consistent_filter(kind, gnss_rate):
         imu=LAB.imu.replace(samples="average"), estimator=FIELD_FILTER.replace(kind=kind)
     )
     findings = flown(sensors.with_rates(gnss=gnss_rate), matched=True)
-    assert all(part.honest for part in findings.nees.values())
+    assert all(part.consistent for part in findings.nees.values())
 
 
 @pytest.mark.slow

@@ -26,8 +26,8 @@ from quad_gym.faults import (
     RotorLoss,
     WrongAssociations,
 )
+from quad_gym.faults.presets import ALL, PRESETS, faults_of
 from quad_gym.frames import ecef_to_enu
-from quad_gym.params.fault_presets import ALL, PRESETS, faults_of
 from quad_gym.records import POSITION_BLOCK, FaultKind, Source
 from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import fly

@@ -1,4 +1,4 @@
-"""Warm starts: errors as the covariance claims them from the first instant on, in every face."""
+"""Warm starts: from the first instant on, errors are as the covariance says, everywhere."""
 
 import numpy as np
 import pytest
@@ -183,10 +183,10 @@ def test_a_filter_that_cannot_know_its_heading_has_nothing_to_start_warm_with(ca
     FlightBatch(1, sensors=suite)  # cold it may fly
 
 
-# ---- the faces -------------------------------------------------------------------------------
+# ---- the interfaces --------------------------------------------------------------------------
 
 
-def test_every_face_starts_warm_alike():
+def test_every_interface_starts_warm_alike():
     keywords = {
         "sensors": "rtk",
         "filter_start": "warm",

@@ -4,11 +4,11 @@ import math
 from typing import Any
 
 import numpy as np
-from benchmark_timing import Effort, Row, Timing, measure, percent, report
 from numpy.typing import NDArray
 
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.kernels.compiling import Stage

@@ -1,4 +1,4 @@
-"""The face for Stable-Baselines3: what its algorithms and wrappers rely on."""
+"""The interface for Stable-Baselines3: what its algorithms and wrappers rely on."""
 
 import gymnasium
 import numpy as np

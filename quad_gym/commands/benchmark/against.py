@@ -13,12 +13,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from benchmark_timing import Effort, Row, percent
-
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Effort, Row, percent
 
-WORKER = Path(__file__).resolve().parent / "benchmark_worker.py"
-HERE = Path(__file__).resolve().parents[1]
+WORKER = Path(__file__).resolve().parent / "worker.py"
+HERE = Path(__file__).resolve().parents[3]
 FEWEST_TURNS = 5
 
 
@@ -78,15 +77,15 @@ class Checkout:
 
 
 def rows_to_compare(envs: int, threads: int, suite: str) -> list[Row]:
-    """What is compared: the faces at 50 Hz, and the vector face at 200 Hz."""
+    """What is compared: the interfaces at 50 Hz, and the vector interface at 200 Hz."""
     rows: list[Row] = []
-    for rate, faces in ((50, ("vector", "sb3", "single")), (200, ("vector",))):
+    for rate, interfaces in ((50, ("vector", "sb3", "single")), (200, ("vector",))):
         for observation in ("estimate", "truth", "sensors"):
-            for face in faces:
-                count, most = (1, 1) if face == "single" else (envs, threads)
+            for interface in interfaces:
+                count, most = (1, 1) if interface == "single" else (envs, threads)
                 options = {"observation": observation, "control_rate": rate, "sensors": suite}
-                name = f"{face}, {observation}, {rate} Hz, {suite}"
-                rows.append({"name": name, "face": face, "envs": count, "threads": most})
+                name = f"{interface}, {observation}, {rate} Hz, {suite}"
+                rows.append({"name": name, "interface": interface, "envs": count, "threads": most})
                 rows[-1] |= {"suite": suite, "options": options}
     return rows
 
@@ -151,6 +150,6 @@ def against_table(rows: list[Row]) -> str:
         )
         for r in rows
     ]
-    columns = ["face, observation, control, suite", "envs", "threads", "here", "there"]
+    columns = ["interface, observation, control, suite", "envs", "threads", "here", "there"]
     heading = "A step of one flight [us], here and of the other checkout"
     return text_table({heading: [*columns, "here / there", "spread"]}, cells)

@@ -1,4 +1,4 @@
-"""With every fault there is: the same flights in every face, and `info` tells what is wrong."""
+"""With every fault there is: the same flights in every interface; `info` tells what is wrong."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, RotorLoss
-from quad_gym.params.fault_presets import faults_of
+from quad_gym.faults.presets import faults_of
 from quad_gym.records import FEATURE_BLOCKS, FaultKind, Gate
 from tests.contract.comparing import actions_of, assert_same
 from tests.contract.test_same_flights import SHORT, STEPS, fly_single, fly_vector, future_of
@@ -56,7 +56,7 @@ def test_a_restored_snapshot_has_the_same_future():
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_info_tells_every_face_which_faults_there_are(mode):
+def test_info_tells_every_interface_which_faults_there_are(mode):
     names = {kind.name.lower() for kind in FaultKind}
     env = QuadVectorEnv(3, "hover", autoreset_mode=mode, **SHORT, **EVERYTHING)
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=7, **SHORT, **EVERYTHING)
@@ -94,7 +94,7 @@ def test_without_faults_info_says_nothing_of_them():
     assert not {"faults", "innovations"} & set(QuadVectorEnv(2, "hover").reset(seed=1)[1])
 
 
-def test_info_tells_every_face_the_innovations():
+def test_info_tells_every_interface_the_innovations():
     keywords = {"sensors": "rtk", "innovations": True, "faults": "gnss_outliers"}
     keywords |= {"out_of_bounds": 1e3, "ground": -1e3, "max_tilt": np.pi}
     env = QuadVectorEnv(3, "hover", **keywords)
@@ -124,7 +124,7 @@ def test_info_tells_every_face_the_innovations():
     assert 0 < rejected < measured / 5
 
 
-def test_bad_faults_are_refused_by_every_face():
+def test_bad_faults_are_refused_by_every_interface():
     for make in (
         lambda **k: QuadEnv("hover", **k),
         lambda **k: QuadVectorEnv(2, "hover", **k),

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from compare_flights import Floats, Flown
 
 from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import (
@@ -19,6 +18,7 @@ from quad_gym.analysis.comparison_plots import (
 )
 from quad_gym.analysis.metrics import Interval, bootstrap_interval, paired_difference
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.compare_flights import Floats, Flown
 
 NAMES = {
     "PD": "PD, tuned",

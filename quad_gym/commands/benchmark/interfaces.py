@@ -1,4 +1,4 @@
-"""The environments' part of the benchmark: steps a second of all faces."""
+"""The environments' part of the benchmark: steps a second of all interfaces."""
 
 import itertools
 import sys
@@ -6,10 +6,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from benchmark_timing import Effort, Row, Timing, measure, percent, report
 
 import quad_gym
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 
 
 def random_actions(count: int) -> Any:
@@ -19,11 +19,11 @@ def random_actions(count: int) -> Any:
     return itertools.cycle(list(draws))
 
 
-def time_batch(face: str, count: int, effort: Effort, threads: int, **options: Any) -> Row:
-    """Steps of many flights, by Gymnasium's face or Stable-Baselines3's."""
+def time_batch(interface: str, count: int, effort: Effort, threads: int, **options: Any) -> Row:
+    """Steps of many flights, by Gymnasium's interface or Stable-Baselines3's."""
     options.update(threads=threads)
     env: Any
-    if face == "sb3":
+    if interface == "sb3":
         env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=count, seed=0, **options)
         batch = env.flights.batch
         env.reset()
@@ -42,7 +42,7 @@ def time_batch(face: str, count: int, effort: Effort, threads: int, **options: A
     timing = measure(step, effort).per(count)
     resets = float((batch.read("episode").sum() - began) / steps)
     env.close()
-    return face_row(face, count, threads, timing, resets, options)
+    return interface_row(interface, count, threads, timing, resets, options)
 
 
 def time_single(effort: Effort, **options: Any) -> Row:
@@ -52,7 +52,7 @@ def time_single(effort: Effort, **options: Any) -> Row:
     timing, resets = time_plain_env(
         env, [a[0] for a in itertools.islice(random_actions(1), 16)], effort
     )
-    return face_row("single", 1, 1, timing, resets, options)
+    return interface_row("single", 1, 1, timing, resets, options)
 
 
 def time_plain_env(env: Any, actions: list[Any], effort: Effort) -> tuple[Timing, float]:
@@ -76,17 +76,17 @@ def time_plain_env(env: Any, actions: list[Any], effort: Effort) -> tuple[Timing
     return timing, resets / steps
 
 
-def face_row(
-    face: str, count: int, threads: int, timing: Timing, resets: float, options: dict[str, Any]
+def interface_row(
+    interface: str, count: int, threads: int, timing: Timing, resets: float, options: dict[str, Any]
 ) -> Row:
-    """A row of the faces."""
+    """A row of the interfaces."""
     named = dict(options)
     named.pop("threads", None)
     observation, rate = named.pop("observation", "estimate"), named.pop("control_rate", 50)
     suite = named.pop("sensors", "standard")
     extra = "".join(f", {key}={value:g}" for key, value in named.items())
-    label = f"{face}, {observation}, {rate} Hz, {suite}{extra}"
-    what = {"face": face, "envs": count, "threads": threads, "reset_share": resets}
+    label = f"{interface}, {observation}, {rate} Hz, {suite}{extra}"
+    what = {"interface": interface, "envs": count, "threads": threads, "reset_share": resets}
     return report(label, timing, **what, suite=suite, options=options)
 
 
@@ -96,7 +96,7 @@ def time_others(envs: int, effort: Effort) -> list[Row]:
     env.reset(seed=0)
     timing, resets = time_plain_env(env, [np.zeros(1, np.float32)], effort)
     what = {
-        "face": "single",
+        "interface": "single",
         "envs": 1,
         "threads": 1,
         "reset_share": resets,
@@ -115,15 +115,15 @@ def time_others(envs: int, effort: Effort) -> list[Row]:
             many.step(actions)
 
         timing = measure(step, effort).per(envs)
-        what = {"face": mode, "envs": envs, "threads": 1, "reset_share": None, "suite": None}
+        what = {"interface": mode, "envs": envs, "threads": 1, "reset_share": None, "suite": None}
         what["options"] = {}
         rows.append(report(f"{env_id}, {mode}", timing, **what))
         many.close()
     return rows
 
 
-def time_faces(envs: int, cores: int, effort: Effort) -> list[Row]:
-    """Steps a second of all faces; random actions around hover, standard deviation 0.05.
+def time_interfaces(envs: int, cores: int, effort: Effort) -> list[Row]:
+    """Steps a second of all interfaces; random actions around hover, standard deviation 0.05.
 
     Args:
         envs: Environments in a batch.
@@ -151,8 +151,8 @@ def time_faces(envs: int, cores: int, effort: Effort) -> list[Row]:
     return rows + time_others(envs, effort)
 
 
-def faces_table(rows: list[Row]) -> str:
-    """The faces' figures."""
+def interfaces_table(rows: list[Row]) -> str:
+    """The interfaces' figures."""
     cells = [
         (
             r["name"],
@@ -166,7 +166,7 @@ def faces_table(rows: list[Row]) -> str:
     ]
     heading = "Random actions around hover"
     columns = [
-        "face, observation, control, suite",
+        "interface, observation, control, suite",
         "envs",
         "threads",
         "steps/s",

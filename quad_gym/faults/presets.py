@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.params.faults import (
+from quad_gym.faults import (
     AccelBiasStep,
     BaselineLoss,
     CameraOcclusion,

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
-from benchmark_timing import Effort, Row, measure, percent, report
 
 from baselines import PDPolicy
 from quad_gym import IDS, Flight
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Effort, Row, measure, percent, report
 from quad_gym.rendering import VIEWS, Renderer, flight_of
 
 SIZE = (640, 480)

@@ -12,10 +12,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmark_timing import Row
-
 import quad_gym
 from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Row
 
 PACKAGE = Path(quad_gym.__file__).resolve().parent
 ENVS = 1024

@@ -22,7 +22,7 @@ def steps_of(row: dict[str, Any]) -> Any:
     count, options = row["envs"], row["options"]
     rng = np.random.default_rng(0)
     draws = np.clip(rng.normal(0.0, 0.05, (16, count, 4)), -1.0, 1.0).astype(np.float32)
-    if row["face"] == "single":
+    if row["interface"] == "single":
         env: Any = gymnasium.make("QuadGym/Hover-v0", **options)
         actions = itertools.cycle(list(draws[:, 0]))
 
@@ -35,7 +35,7 @@ def steps_of(row: dict[str, Any]) -> Any:
         return step_single
     actions = itertools.cycle(list(draws))
     threads = row["threads"]
-    if row["face"] == "sb3":
+    if row["interface"] == "sb3":
         env = quad_gym.make_sb3_vec_env(
             "QuadGym/Hover-v0", n_envs=count, seed=0, threads=threads, **options
         )

@@ -1,4 +1,4 @@
-"""With a world and a randomization at their fullest: the same flights in every face."""
+"""With a world and a randomization at their fullest: the same flights in every interface."""
 
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ def test_order_changes_nothing(hundred, order):
     assert_same(flown, tuple(column[:, order[:17]].copy() for column in hundred))
 
 
-def test_info_tells_every_face_the_same_draws():
+def test_info_tells_every_interface_the_same_draws():
     names = set(EVERYTHING["randomization"])
     env = QuadVectorEnv(3, "hover", autoreset_mode="SameStep", **SHORT, **EVERYTHING)
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=7, **SHORT, **EVERYTHING)
@@ -156,7 +156,7 @@ def test_a_restored_snapshot_has_the_same_future():
     assert_same(future, future_of(fresh, 9, vector=True))
 
 
-def test_bad_worlds_and_draws_are_refused_by_every_face():
+def test_bad_worlds_and_draws_are_refused_by_every_interface():
     for make in (
         lambda **k: QuadEnv("hover", **k),
         lambda **k: QuadVectorEnv(2, "hover", **k),

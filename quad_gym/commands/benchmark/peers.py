@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from quad_gym import SensorSuite
 
-REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference_ukf.py"
+REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
 """The plain filter; where it is missing, nothing is compared with it."""
 
 

@@ -4,13 +4,13 @@ import sys
 from typing import Any
 
 import numpy as np
-from benchmark_peers import Measured, filterpy_cycles, plain_cycles
-from benchmark_stages import Staged, hovering
-from benchmark_timing import Effort, Row, Timing, measure, percent, report
 
 import quad_gym
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.benchmark.peers import Measured, filterpy_cycles, plain_cycles
+from quad_gym.commands.benchmark.stages import Staged, hovering
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.parts import filter_cycle_of_flights
 from quad_gym.packing.flight import params_record

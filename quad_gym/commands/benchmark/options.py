@@ -10,11 +10,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from benchmark_timing import Effort, Row, Timing, percent, report
-
 import quad_gym
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import SUITES
 
@@ -56,7 +55,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "midpoint integration": filter_form(integration="midpoint"),
     "covariance turns at its reset": filter_form(covariance_reset="turn"),
     "pixel noise as projected": filter_form(feature_noise_across="projected"),
-    "images in portions at the start": filter_form(gradual_above=0.01),
+    "images in steps at the start": filter_form(gradual_above=0.01),
     "innovations kept": {"innovations": True},
     "gate": filter_form(gate_false_alarm=1e-4),
     "measurements 10 ms late": arriving_late("lab", gnss=0.01, camera=0.01),
@@ -94,7 +93,7 @@ def time_options(count: int, effort: Effort) -> list[Row]:
         options = {"sensors": "lab", **options}
         batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
         batch.reset(seeds=range(count))
-        for _ in range(50):  # the start, where images come in portions, is not what counts
+        for _ in range(50):  # the start, where images are processed in steps, is not what counts
             batch.step()
         turns[name] = turn_of(batch, batch.step if name in OPTIONS else batch.reset)
     number = max(2, round(effort.repeats * effort.seconds / (TICKS * count * turns[OFF]())))
