@@ -185,7 +185,7 @@ class FlightBatch:
             innovations=innovations,
             lever_drawn=self.randomization.known
             and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
-            gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
+            gnss_drifts=true_sensors.drifts,
         )
         pack_options(
             self._settings[0],
@@ -200,6 +200,7 @@ class FlightBatch:
             pack_warm_start(
                 self._settings[0],
                 FlightBatch,
+                true_sensors,
                 vehicle=self.vehicle,
                 sensors=self.sensors,
                 task=self.task,

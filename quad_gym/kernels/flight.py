@@ -23,6 +23,10 @@ _PREDICT, _INCREMENT, _UPDATE = int(Stage.PREDICT), int(Stage.INCREMENT), int(St
 _DRIFT_BIASES, _ADVANCE_FAULTS = int(Stage.DRIFT_BIASES), int(Stage.ADVANCE_FAULTS)
 _SET_ASIDE, _SAMPLE, _LOOK = int(Stage.SET_ASIDE), int(Stage.SAMPLE), int(Stage.LOOK)
 _EXCHANGE, _LATE_UPDATE = int(Stage.EXCHANGE), int(Stage.LATE_UPDATE)
+_PREDICT_WITH_DRIFT = int(Stage.PREDICT_WITH_DRIFT)
+_UPDATE_WITH_DRIFT = int(Stage.UPDATE_WITH_DRIFT)
+_WARM_WITH_DRIFT = int(Stage.WARM_WITH_DRIFT)
+_LATE_UPDATE_WITH_DRIFT = int(Stage.LATE_UPDATE_WITH_DRIFT)
 _ALIGN, _WARM = int(Stage.ALIGN), int(Stage.WARM)
 _DRAW, _IMPOSE, _BEGIN = int(Stage.DRAW), int(Stage.IMPOSE), int(Stage.BEGIN)
 _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
@@ -55,15 +59,18 @@ def sense(flight, world, model, settings, work, stages, mask, starting, within):
         if starting:
             call_stage(stages, _ALIGN, flight, world, model, settings, work, 0)
             if settings.warm:
-                call_stage(stages, _WARM, flight, world, model, settings, work, 0)
+                warm = _WARM_WITH_DRIFT if settings.estimates_drift else _WARM
+                call_stage(stages, warm, flight, world, model, settings, work, 0)
         if late:
             call_stage(stages, _EXCHANGE, flight, world, model, settings, work, starting)
         if late and settings.rewinds and not starting:
-            call_stage(stages, _LATE_UPDATE, flight, world, model, settings, work, 0)
+            late_update = _LATE_UPDATE_WITH_DRIFT if settings.estimates_drift else _LATE_UPDATE
+            call_stage(stages, late_update, flight, world, model, settings, work, 0)
             work.mask = select(mask, 1.0, 0.0)
         else:
             features = settings.feature_count
-            call_stage(stages, _UPDATE, flight, world, model, settings, work, features)
+            update = _UPDATE_WITH_DRIFT if settings.estimates_drift else _UPDATE
+            call_stage(stages, update, flight, world, model, settings, work, features)
     call_stage(stages, _LOOK, flight, world, model, settings, work, within)
 
 
@@ -101,7 +108,8 @@ def tick(flight, world, model, settings, work, stages, last):
             call_stage(stages, _AVERAGE_IMU, flight, world, model, settings, work, 0)
             if settings.faults:
                 call_stage(stages, _SATURATE_IMU, flight, world, model, settings, work, 0)
-        call_stage(stages, _PREDICT, flight, world, model, settings, work, 0)
+        predict = _PREDICT_WITH_DRIFT if settings.estimates_drift else _PREDICT
+        call_stage(stages, predict, flight, world, model, settings, work, 0)
         if settings.gnss_delay + settings.camera_delay > 0:
             call_stage(stages, _INCREMENT, flight, world, model, settings, work, 0)
         call_stage(stages, _DRIFT_BIASES, flight, world, model, settings, work, 0)

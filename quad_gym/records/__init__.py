@@ -78,6 +78,7 @@ from quad_gym.records.sizes import (
     SENSOR_GROUPS,
     VELOCITY_BLOCK,
     WARM_DRAWS,
+    WARM_DRIFT_DRAWS,
     WIDTH,
     Field,
 )
@@ -103,6 +104,7 @@ from quad_gym.records.streams import (
     DRAW_START,
     DRAW_VELOCITY,
     DRAW_WARM,
+    DRAW_WARM_DRIFT,
     DRAWS_OF_FAULT,
 )
 from quad_gym.records.work import (
@@ -137,6 +139,7 @@ __all__ = [
     "DRAW_START",
     "DRAW_VELOCITY",
     "DRAW_WARM",
+    "DRAW_WARM_DRIFT",
     "FAULT_KINDS",
     "FEATURE_BLOCKS",
     "FIXED",
@@ -165,6 +168,7 @@ __all__ = [
     "UNIFORM",
     "VELOCITY_BLOCK",
     "WARM_DRAWS",
+    "WARM_DRIFT_DRAWS",
     "WIDTH",
     "WORK",
     "WORK_BLOCK",

@@ -158,6 +158,11 @@ _LATE_FIELDS = (
     Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
     Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
 )
+_DRIFT_FIELDS = (
+    # the slow error of GNSS positions, where the filter estimates it
+    Field("gnss_drift_hat", (3,), "m", "estimated slow error d in I"),
+    Field("L_drift", (3, 18), "mixed", "rows of d below L in the factor of the joint covariance"),
+)
 # fmt: on
 PARTS = (
     ("faults", _FAULT_FIELDS),
@@ -166,6 +171,7 @@ PARTS = (
     ("filter", _FILTER_FIELDS),
     ("watch", _WATCH_FIELDS),
     ("late", _LATE_FIELDS),
+    ("drift", _DRIFT_FIELDS),
 )
 """The parts of a record, in the order in which they lie in memory. All flights have the core; what
 a batch uses beside it is best close to it, as the memory of a flight has no gaps: see `Room`."""

@@ -66,6 +66,10 @@ class Stage(IntEnum):
     LOOK = auto()
     JUDGE = auto()
     OBSERVE = auto()
+    PREDICT_WITH_DRIFT = auto()
+    UPDATE_WITH_DRIFT = auto()
+    LATE_UPDATE_WITH_DRIFT = auto()
+    WARM_WITH_DRIFT = auto()
 
 
 class Source(NamedTuple):
@@ -100,6 +104,18 @@ def _late(s: Any) -> bool:
     return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
 
 
+def _rewinds(s: Any) -> bool:
+    return bool(_late(s) and s["rewinds"] > 0)
+
+
+def _with_drift(s: Any) -> bool:
+    return bool(s["run_filter"] and s["estimates_drift"])
+
+
+def _without_drift(s: Any) -> bool:
+    return bool(s["run_filter"] and not s["estimates_drift"])
+
+
 def _pad(s: Any) -> bool:
     return bool(s["pad"] and s["start"] != Start.HOVER)
 
@@ -109,10 +125,15 @@ def _drawn(s: Any) -> bool:
 
 
 SOURCES = {
-    Stage.UPDATE: Source("filter.update", "update_stage", _filter),
-    Stage.PREDICT: Source("filter.predict", "predict_stage", _filter),
+    Stage.UPDATE_WITH_DRIFT: Source("filter.update", "update_with_drift_stage", _with_drift),
+    Stage.UPDATE: Source("filter.update", "update_stage", _without_drift),
+    Stage.PREDICT_WITH_DRIFT: Source("filter.predict", "predict_with_drift_stage", _with_drift),
+    Stage.PREDICT: Source("filter.predict", "predict_stage", _without_drift),
+    Stage.LATE_UPDATE_WITH_DRIFT: Source(
+        "filter.late", "late_update_with_drift_stage", lambda s: _with_drift(s) and _rewinds(s)
+    ),
     Stage.LATE_UPDATE: Source(
-        "filter.late", "late_update_stage", lambda s: _late(s) and s["rewinds"] > 0
+        "filter.late", "late_update_stage", lambda s: _without_drift(s) and _rewinds(s)
     ),
     Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
     Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
@@ -126,7 +147,10 @@ SOURCES = {
     Stage.CONTROL: Source("vehicle.control", "control_stage", _always),
     Stage.MOVE: Source("vehicle.dynamics", "move_stage", lambda s: not _air(s)),
     Stage.BEGIN_IN_AIR: Source("vehicle.air", "begin_in_air_stage", _air),
-    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _filter(s) and s["warm"] > 0),
+    Stage.WARM_WITH_DRIFT: Source(
+        "filter.warm", "warm_with_drift_stage", lambda s: _with_drift(s) and s["warm"] > 0
+    ),
+    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_drift(s) and s["warm"] > 0),
     Stage.AVERAGE_IMU: Source(
         "sensors.measure", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
     ),
@@ -164,6 +188,7 @@ def used_parts(settings: Any) -> frozenset[str]:
         "filter": _filter(settings),
         "watch": _filter(settings) and bool(watches),
         "late": _late(settings),
+        "drift": bool(settings["run_filter"] and settings["estimates_drift"]),
     }
     return frozenset(name for name, used in uses.items() if used)
 
