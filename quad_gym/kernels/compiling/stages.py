@@ -188,7 +188,7 @@ def used_parts(settings: Any) -> frozenset[str]:
         "filter": _filter(settings),
         "watch": _filter(settings) and bool(watches),
         "late": _late(settings),
-        "drift": bool(settings["run_filter"] and settings["estimates_drift"]),
+        "drift": _with_drift(settings),
     }
     return frozenset(name for name, used in uses.items() if used)
 
