@@ -15,6 +15,7 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Supply
 
+_DELAY_ACTION = int(Stage.DELAY_ACTION)
 _CONTROL, _SUPPLY = int(Stage.CONTROL), int(Stage.SUPPLY)
 _MOVE, _MOVE_IN_AIR = int(Stage.MOVE), int(Stage.MOVE_IN_AIR)
 _AVERAGE_IMU, _SATURATE_IMU = int(Stage.AVERAGE_IMU), int(Stage.SATURATE_IMU)
@@ -81,6 +82,8 @@ def tick(flight, world, model, settings, work, stages):
     """Fly one tick."""
     everyone = flight.tick >= 0.0
     work.mask = 1.0
+    if settings.action_delays > 0:
+        call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 0)
     call_stage(stages, _CONTROL, flight, world, model, settings, work, 0)
     if settings.supply != Supply.NOMINAL:
         call_stage(stages, _SUPPLY, flight, world, model, settings, work, 0)
@@ -121,6 +124,8 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.randomized:
         call_stage(stages, _DRAW, flight, world, nominal, settings, work, 0)
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
+    if settings.action_delays > 0:
+        call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
     if settings.gnss_delay + settings.camera_delay > 0:
         call_stage(stages, _BEGIN_LATE, flight, world, model, settings, work, 0)
     call_stage(stages, _BEGIN, flight, world, model, settings, work, 0)

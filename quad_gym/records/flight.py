@@ -4,6 +4,7 @@ from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
     DELAY_SLOTS,
     FAULT_KINDS,
+    MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_GATES,
@@ -100,6 +101,8 @@ FLIGHT_FIELDS = (
     Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
     Field("action", (4,), "-", "the present action, in [-1, 1]"),
     Field("last_action", (4,), "-", "the action before it"),
+    Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first; only where actions are delayed"),
+    Field("delayed_action", (4,), "-", "the action that the vehicle carries out; likewise"),
     Field("idle", (), "0 or 1", "a lane that only pads the last block"),
     Field("step", (), "steps", "control steps since the start of the episode"),
     Field("episode", (), "-", "episodes begun since seeding"),

@@ -47,6 +47,7 @@ PARAMS_FIELDS = (
     Field("torque_scale", (3,), "N m", "torque at full action"),
     Field("tilt_scale", (), "rad", "roll and pitch at full action"),
     Field("velocity_scale", (), "m/s", "velocity at full action"),
+    Field("action_delay", (), "steps", "from when an action is commanded to when it is carried out"),
     Field("dt", (), "s", "the tick"),
     Field("imu_lever_arm", (3,), "m", "accelerometer in B"),
     Field("accel_sigma", (), "m/s^2", "white noise of a sample"),

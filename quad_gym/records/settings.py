@@ -21,6 +21,7 @@ SETTINGS_FIELDS = (
     Field("source", (), "-", "what the controller sees, see Source", "i8"),
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
     Field("control", (), "-", "what the action means, see Control", "i8"),
+    Field("action_delays", (), "steps", "the longest delay of an action, rounded up; 0: none", "i8"),
     Field("task", (), "-", "see Task", "i8"),
     Field("harmonics", (), "-", "terms of the reference's series in use", "i8"),
     Field("layout", (), "-", "of the observation, see Layout", "i8"),

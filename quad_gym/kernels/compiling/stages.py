@@ -29,6 +29,7 @@ class Stage(IntEnum):
     """The stages, by their places in the table of addresses."""
 
     CONTROL = 0
+    DELAY_ACTION = auto()
     SUPPLY = auto()
     MOVE = auto()
     MOVE_IN_AIR = auto()
@@ -127,6 +128,9 @@ SOURCES = {
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
     Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),
+    Stage.DELAY_ACTION: Source(
+        "vehicle.delay", "delay_action_stage", lambda s: s["action_delays"] > 0
+    ),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
 }

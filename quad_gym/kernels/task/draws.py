@@ -44,6 +44,7 @@ _PIXEL_SIGMA, _LEVER_ARM = COLUMNS["pixel_sigma"].start, COLUMNS["lever_arm_B"].
 _PRIMARY, _SECONDARY = COLUMNS["primary_antenna_B"].start, COLUMNS["secondary_antenna_B"].start
 _CAMERA, _CAMERA_ROTATION = COLUMNS["camera_position_B"].start, COLUMNS["camera_rotation"].start
 _FOCAL_LENGTH = COLUMNS["focal_length"].start
+_ACTION_DELAY = COLUMNS["action_delay"].start
 
 
 @kernel
@@ -155,6 +156,7 @@ def _impose_body(flight, nominal, own, settings):
         own.rotors[i, 2] = nominal.rotors[i, 2] - z
 
     own.kF, own.kN = kF, kN
+    own.action_delay = _value(flight, settings, _ACTION_DELAY, nominal.action_delay)
     own.motor_tau = _value(flight, settings, _TAU, nominal.motor_tau)
     gain = _value(flight, settings, _GAIN, nominal.motor_gain)
     full = _value(flight, settings, _VOLTAGE, nominal.max_voltage)
