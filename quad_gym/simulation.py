@@ -14,7 +14,13 @@ from quad_gym.fault_presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.batch import fly
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
-from quad_gym.packing import pack_latency, params_block, params_record, settings_record
+from quad_gym.packing import (
+    pack_imperfections,
+    pack_latency,
+    params_block,
+    params_record,
+    settings_record,
+)
 from quad_gym.params import (
     ActionParams,
     Clocks,
@@ -211,6 +217,7 @@ class FlightBatch:
         self._settings["action_delays"] = longest_delay
         pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
         pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors.estimator)
+        pack_imperfections(self._settings[0], true_sensors)
         if run_filter and filter_start == "warm":
             pack_warm_start(
                 self._settings[0],

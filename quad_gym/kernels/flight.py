@@ -15,6 +15,7 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Supply
 
+_DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
 _DELAY_ACTION = int(Stage.DELAY_ACTION)
 _CONTROL, _SUPPLY = int(Stage.CONTROL), int(Stage.SUPPLY)
 _MOVE, _MOVE_IN_AIR = int(Stage.MOVE), int(Stage.MOVE_IN_AIR)
@@ -97,6 +98,8 @@ def tick(flight, world, model, settings, work, stages):
     if settings.run_filter:
         if settings.imu_averages:
             call_stage(stages, _AVERAGE_IMU, flight, world, model, settings, work, 0)
+            if settings.imu_errs + settings.imu_vibrates > 0:
+                call_stage(stages, _DISTURB_IMU, flight, world, model, settings, work, 0)
             if settings.faults:
                 call_stage(stages, _SATURATE_IMU, flight, world, model, settings, work, 0)
         call_stage(stages, _PREDICT, flight, world, model, settings, work, 0)
@@ -129,6 +132,8 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.gnss_delay + settings.camera_delay > 0:
         call_stage(stages, _BEGIN_LATE, flight, world, model, settings, work, 0)
     call_stage(stages, _BEGIN, flight, world, model, settings, work, 0)
+    if settings.run_filter and settings.imu_errs + settings.heading_errs > 0:
+        call_stage(stages, _BEGIN_IMPERFECT, flight, world, model, settings, work, 0)
     if settings.air:
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:

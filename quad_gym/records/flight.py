@@ -26,6 +26,9 @@ FLIGHT_FIELDS = (
     Field("b_a", (3,), "m/s^2", "accelerometer bias"),
     Field("b_g", (3,), "rad/s", "gyro bias"),
     Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
+    Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
+    Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
+    Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
     # the world
     Field("wind", (3,), "m/s", "velocity of the air in I"),
     Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),

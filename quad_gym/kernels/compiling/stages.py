@@ -37,6 +37,10 @@ class Stage(IntEnum):
     DRIFT_BIASES = auto()
     AVERAGE_IMU = auto()
     SAMPLE = auto()
+    BEGIN_IMPERFECT = auto()
+    DISTURB_IMU = auto()
+    TURN_BASELINE = auto()
+    LIMIT_CAMERA = auto()
     BEGIN_FAULTS = auto()
     ADVANCE_FAULTS = auto()
     MEET_ROTORS = auto()
@@ -92,6 +96,14 @@ def _late(s: Any) -> bool:
     return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
 
 
+def _imu_disturbed(s: Any) -> bool:
+    return bool(s["run_filter"] and s["imu_errs"] + s["imu_vibrates"] > 0)
+
+
+def _lasting(s: Any) -> bool:
+    return bool(s["run_filter"] and s["imu_errs"] + s["heading_errs"] > 0)
+
+
 def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
@@ -128,6 +140,14 @@ SOURCES = {
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
     Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),
+    Stage.BEGIN_IMPERFECT: Source("sensors.imperfect", "begin_imperfect_stage", _lasting),
+    Stage.DISTURB_IMU: Source("sensors.imperfect", "disturb_imu_stage", _imu_disturbed),
+    Stage.TURN_BASELINE: Source(
+        "sensors.imperfect", "turn_baseline_stage", lambda s: _filter(s) and s["heading_errs"] > 0
+    ),
+    Stage.LIMIT_CAMERA: Source(
+        "sensors.imperfect", "limit_camera_stage", lambda s: _filter(s) and s["camera_limited"] > 0
+    ),
     Stage.DELAY_ACTION: Source(
         "vehicle.delay", "delay_action_stage", lambda s: s["action_delays"] > 0
     ),
