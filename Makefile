@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark clean
+.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark wheel clean
 
 setup: $(VENV)/.developer
 
@@ -23,18 +23,18 @@ $(VENV)/.developer: $(VENV)/.user
 	touch $@
 
 demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each, and compare: some minutes
-	$(BIN)/python scripts/compare.py --quick
+	$(BIN)/quad-gym compare --quick
 
 circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
-	$(BIN)/python scripts/circle_experiment.py --output results/circle
+	$(BIN)/quad-gym circle --output results/circle
 
 animation: setup  ## the animation of README
-	$(BIN)/python scripts/fly.py --task circle --no-camera --seed 1 \
+	$(BIN)/quad-gym fly --task circle --no-camera --seed 1 \
 		--fault gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
 	rm .github/images/outage.npz
 
 compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
-	$(BIN)/python scripts/compare.py --sensors standard rtk --output results/compare/circle
+	$(BIN)/quad-gym compare --sensors standard rtk --output results/compare/circle
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
@@ -55,7 +55,14 @@ lint: setup  ## style, types and import rules
 	$(BIN)/lint-imports
 
 benchmark: setup  ## steps per second of every face and the cost of each part
-	$(BIN)/python scripts/benchmark.py --output results/benchmark
+	$(BIN)/quad-gym benchmark --output results/benchmark
+
+wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they hold
+	rm -rf dist
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine check-wheel-contents
+	$(BIN)/python -m build --installer pip
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
 	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.envs.spaces import policy_size
-from quad_gym.params import PDGains, pd_gains
+from quad_gym.params.control import PDGains, pd_gains
 
 Array = NDArray[np.float64]
 

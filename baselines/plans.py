@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 import quad_gym
 from baselines.recipes import Recipe, recipe, unfreeze
 from baselines.seeds import MAX_SEED, first_seed
-from quad_gym import validation as check
-from quad_gym.reports import as_json
-from quad_gym.validation import Checked
+from quad_gym.analysis.reports import as_json
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,8 @@ from types import MappingProxyType
 from typing import Any
 
 from quad_gym import IDS
-from quad_gym import validation as check
-from quad_gym.validation import Checked
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
 
 ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
 """Those of Stable-Baselines3 and its contributions that fit continuous actions in many flights."""
@@ -40,8 +40,8 @@ class Recipe(Checked):
     """likewise of the value function, or of each critic"""
     activation: str = "relu"
     """one of ACTIVATIONS"""
-    reward_scale: float = 10.0
-    """the algorithm sees the reward times this; returns of about 100 are what its losses expect"""
+    reward_scale: float = 0.2
+    """the algorithm sees the reward times this; with it a perfect circle returns 160"""
     action_noise: float = 0.1
     """standard deviation of the noise on actions while learning; of TD3 alone, as the policies of
     the other algorithms have noise of their own"""

@@ -15,7 +15,7 @@ seeds of its own:
 "validation" says which checkpoint of a training is kept; "test" is what is reported.
 """
 
-from quad_gym import validation as check
+from quad_gym.params import checks as check
 
 PURPOSES = ("training", "validation", "test")
 """What flights are for."""

@@ -23,8 +23,8 @@ from baselines.checkpoints import Keeper, RunError, has_checkpoint, load_model
 from baselines.mlp import mlp_of
 from baselines.plans import Plan, algorithm_class, description, make_model
 from baselines.policies import interface_of
-from quad_gym.reports import versions, write_json
-from quad_gym.threads import resolve_threads
+from quad_gym.analysis.reports import versions, write_json
+from quad_gym.batch.threads import resolve_threads
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,13 @@ compiled or loaded from their cache, when the first environment is made.
 from typing import Any
 
 from quad_gym import faults
-from quad_gym.distributions import LogUniform, Normal, Uniform
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all
-from quad_gym.filter_params import FilterParams
-from quad_gym.params import (
-    ActionParams,
-    Clocks,
-    PDGains,
-    TaskParams,
-    VehicleParams,
-    pd_gains,
-    vehicle_params,
-)
-from quad_gym.randomization import Randomization
-from quad_gym.sensor_params import (
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.control import ActionParams, PDGains, pd_gains
+from quad_gym.params.distributions import LogUniform, Normal, Uniform
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.randomization import Randomization
+from quad_gym.params.sensors import (
     CameraParams,
     GnssParams,
     ImuParams,
@@ -28,8 +21,10 @@ from quad_gym.sensor_params import (
     PlacementParams,
     SensorSuite,
 )
-from quad_gym.sensor_suites import sensor_suite
-from quad_gym.world_params import BatteryParams, WorldParams, world_params
+from quad_gym.params.suites import sensor_suite
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams, vehicle_params
+from quad_gym.params.world import BatteryParams, WorldParams, world_params
 
 __version__ = "0.1.0"
 
@@ -46,9 +41,9 @@ def __getattr__(name: str) -> Any:
 
 
 _LAZY = {
-    "Flight": "quad_gym.flight_record",
-    "FlightBatch": "quad_gym.simulation",
-    "FlightRecorder": "quad_gym.flight_record",
+    "Flight": "quad_gym.flights.record",
+    "FlightBatch": "quad_gym.batch.flight_batch",
+    "FlightRecorder": "quad_gym.flights.record",
     "QuadEnv": "quad_gym.envs.single",
     "QuadVectorEnv": "quad_gym.envs.vector",
     "ExtendedKalmanFilter": "quad_gym.estimation",

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym import validation as check
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.workers import prepare
-from quad_gym.packing import form_of, params_record
-from quad_gym.params import VehicleParams
+from quad_gym.packing.flight import form_of, params_record
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterForm, FilterStatus
-from quad_gym.sensor_params import SensorSuite
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import quad_gym
-from quad_gym import validation as check
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.simulation import FlightBatch
+from quad_gym.params import checks as check
 
 
 class Policy(Protocol):

@@ -1,18 +1,16 @@
-"""The Earth: its frames ECEF (G, WGS-84) and the local east-north-up one (I), its gravity."""
+"""The Earth: its frames ECEF (G, WGS-84) and the local east-north-up one (I)."""
 
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym import validation as check
-from quad_gym.portable import norm
+from quad_gym.params import checks as check
+from quad_gym.params.portable import norm
 
 WGS84_SEMI_MAJOR_AXIS = 6378137.0
 """[m]"""
 WGS84_FLATTENING = 1.0 / 298.257223563
-GRAVITY = 9.8
-"""Standard gravity as the laboratory rounds it [m/s^2]."""
 
 
 def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym import validation as check
 from quad_gym.kernels import single
-from quad_gym.packing import params_record
-from quad_gym.params import VehicleParams
+from quad_gym.packing.flight import params_record
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import CameraParams, GnssParams, ImuParams, SensorSuite
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import FLIGHT
 from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.sensor_params import CameraParams, GnssParams, ImuParams, SensorSuite
 from quad_gym.vehicle import State, checked_state
 
 

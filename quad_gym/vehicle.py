@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym import validation as check
 from quad_gym.kernels import single
-from quad_gym.packing import params_record
-from quad_gym.params import VehicleParams
-from quad_gym.sensor_params import SensorSuite
-from quad_gym.world_packing import world_settings
-from quad_gym.world_params import WorldParams
+from quad_gym.packing.flight import params_record
+from quad_gym.packing.world import world_settings
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
 
 State = Mapping[str, ArrayLike]
 STATE_SHAPES: dict[str, tuple[int, ...]] = {

@@ -1,8 +1,8 @@
-"""Compile the kernels ahead of their first use: `python -m quad_gym compile`."""
+"""The same as `quad-gym compile`: see `quad_gym/commands`."""
 
 import sys
 
-from quad_gym.__main__ import main
+from quad_gym.commands.main import run
 
 if __name__ == "__main__":
-    sys.exit(main(["compile", *sys.argv[1:]]))
+    sys.exit(run("compile"))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.records import Control
-from quad_gym.simulation import FlightBatch
 
 
 def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **keywords):

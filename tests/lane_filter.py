@@ -7,8 +7,8 @@ from quad_gym.kernels.filter.align import initialize
 from quad_gym.kernels.filter.predict import predict
 from quad_gym.kernels.filter.update import update
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.packing import form_of, params_block, params_record
-from quad_gym.params import VehicleParams
+from quad_gym.packing.flight import form_of, params_block, params_record
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
     FLIGHT,
     FLIGHT_BLOCK,

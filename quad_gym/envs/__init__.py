@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
 
-from quad_gym import validation as check
+from quad_gym.params import checks as check
 
 if TYPE_CHECKING:
     from quad_gym.envs.sb3 import QuadVecEnv

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.starts import checked_start
 from quad_gym.envs.spaces import (
     ACTIONS,
     LAYOUTS,
@@ -19,15 +20,16 @@ from quad_gym.envs.spaces import (
     observation_space,
     policy_size,
 )
-from quad_gym.fault_presets import FaultsGiven, faults_of, needs_sensors
-from quad_gym.params import ActionParams, TaskParams, VehicleParams, check_limit
-from quad_gym.randomization import Given, Randomization
+from quad_gym.faults.presets import FaultsGiven, faults_of, needs_sensors
+from quad_gym.params import checks as check
+from quad_gym.params.control import ActionParams
+from quad_gym.params.randomization import Given, Randomization
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
-from quad_gym.sensor_params import SensorSuite
-from quad_gym.sensor_suites import sensor_suite
-from quad_gym.simulation import FlightBatch
-from quad_gym.starts import checked_start
-from quad_gym.world_params import WorldParams, world_params
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
     "hover": TaskParams(kind="hover", start="hover"),
@@ -53,7 +55,7 @@ ONE_TASK_KEYWORDS = {
 }
 """Those that mean something to a single task."""
 
-FACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
+INTERFACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
 """Keywords that the interfaces take themselves."""
 
 
@@ -80,7 +82,9 @@ class Flights:
 
     def __init__(self, task: str, count: int, autoreset: Autoreset, **keywords: Any) -> None:
         check.choice("task", task, tuple(TASK_DEFAULTS))
-        check.keywords(keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *FACE_KEYWORDS), "environments")
+        check.keywords(
+            keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *INTERFACE_KEYWORDS), "environments"
+        )
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
         for name in given:

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.fault_presets import named_faults
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.faults.presets import named_faults
 from quad_gym.records import FEATURE_BLOCKS
-from quad_gym.simulation import FlightBatch
 
 Parts = dict[str, dict[str, NDArray[Any]]]
 

@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from quad_gym import validation as check
+from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import (
     COLUMN,
     ENDINGS,
@@ -21,8 +21,8 @@ from quad_gym.envs.configuration import (
 from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
+from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
-from quad_gym.starts import stream_keys
 
 
 class QuadVecEnv(VecEnv):

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, make
 
-from quad_gym import validation as check
+from quad_gym.batch.starts import stream_key
 from quad_gym.envs.configuration import (
     COLUMN,
     ENDINGS,
@@ -19,8 +19,8 @@ from quad_gym.envs.configuration import (
 from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
+from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
-from quad_gym.starts import stream_key
 
 
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
@@ -35,7 +35,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | id | reference | start | time limit |
     |---|---|---|---|
     | `QuadGym/Hover-v0` | a point 4 m from the origin, 1 m high, looking at the origin | hovering near it | 10 s |
-    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | at rest on the ground below it, rotors stopped | 10 s |
+    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | on a launch pad below it, rotors stopped | 10 s |
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
@@ -76,14 +76,16 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `"velocity"` | velocity ahead 5 m/s | to the left, up 5 m/s; yaw rate 3 rad/s |
 
     ## Reward
-    Per second of flight, with the position error e [m], the alignment h of body x with the wanted
-    heading (1: aligned), the change of the action da and the body rates w:
+    In each step, with the position error e [m], the alignment h of body x with the wanted heading
+    (1: aligned), the change of the action da and the body rates w:
 
         exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
 
-    times the control period. At most 1.6 a second, so a circle flown perfectly returns 16; an
-    action that jumps from corner to corner costs 0.32 a second. `Waypoints` gives 1 a meter of
-    progress toward the next gate and 1 a gate instead of the two exponentials.
+    At most 1.6, so a circle flown perfectly for 500 steps returns 800; an action that jumps from
+    corner to corner costs 0.32. `Waypoints` has progress instead of the two exponentials: the speed
+    toward the next gate [m/s], and 1 s^-1 times the control rate (50) for a gate passed.
+    `reward_per="second"` multiplies all of this by the control period, so that returns do not
+    depend on the control rate: 16 for a perfect circle.
 
     ## Episode end
     Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by more than 100
@@ -92,8 +94,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     lost. `info["ending"]` says which.
 
     ## Start
-    "ground" (the report's): at rest at height 0 below the start of the reference, rotors stopped,
-    level, looking as wanted. "hover": hovering, with standard deviations of 0.3 m, 0.03 m/s, 0.2 rad
+    "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking
+    as wanted. A launch pad carries the vehicle until its thrust lifts it; with `pad=False`, as in
+    the report, it sinks while its rotors spin up. "hover": hovering, with standard deviations of 0.3 m, 0.03 m/s, 0.2 rad
     in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5, for training: a policy that has learned
     to hover then learns to take off. The filter starts from its first fix in each, or with
     `filter_start="warm"` as if it had been running for 10 s, as before any real take-off.
@@ -113,7 +116,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C), linear
     rotor drag, ground effect and a battery; `randomization={"mass": Uniform(0.8, 1.2,
     relative=True), "wind_speed": Uniform(0.0, 5.0)}` draws parameters anew for every episode. What
-    can be drawn is listed in `quad_gym.randomization.DRAWABLES`. The filter and the controller know
+    can be drawn is listed in `quad_gym.params.randomization.DRAWABLES`. The filter and the controller know
     of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
     know all but the wind and the ground). With `privileged=True` the truth ends with the wind in
     the body frame and the draws, each less the middle of its distribution over its spread.
@@ -126,7 +129,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.sensor_suites`), or
+        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.params.suites`), or
             a `SensorSuite`. "standard" has the laboratory's sensors and a consistent filter; "lab"
             is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
@@ -155,7 +158,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
         faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as "gnss_outage" or
             "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
-        radius, period, height, start, randomize, duration, out_of_bounds, ground, end_when_lost,
+        radius, period, height, start, pad, reward_per, randomize, duration, out_of_bounds, ground, end_when_lost,
             max_tilt, max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
             `quad_gym.TaskParams`.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
@@ -167,7 +170,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         ValueError: If a keyword is another task's, or its value is invalid.
 
     ## Version history
-    - v0: first version.
+    - v0: before the first release, rewards became sums over steps of the order of one each (they
+      were times the control period: `reward_per="second"`), and vehicles that start on the ground
+      stand on a launch pad (they fell while their rotors spun up: `pad=False`). Stable-Baselines3's
+      default settings did not learn the circle with the former.
     """
 
     metadata: dict[str, Any] = RENDERING_METADATA

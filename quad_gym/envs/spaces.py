@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
+from quad_gym.params import checks as check
 from quad_gym.records import COLUMNS, Control, Layout, Source
 
 OBSERVATIONS = {

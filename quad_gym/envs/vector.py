@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import (
     COLUMN,
     ENDINGS,
@@ -21,7 +22,6 @@ from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_o
 from quad_gym.envs.single import seeds_of, with_limit
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
-from quad_gym.starts import stream_keys
 
 _MODES = {
     AutoresetMode.NEXT_STEP: Autoreset.NEXT_STEP,

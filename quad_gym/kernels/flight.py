@@ -11,14 +11,15 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.maths.linalg import load3, load4, norm, sub
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import Supply
+from quad_gym.records import Start, Supply
 
 _DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
 _DELAY_ACTION = int(Stage.DELAY_ACTION)
 _CONTROL, _SUPPLY = int(Stage.CONTROL), int(Stage.SUPPLY)
 _MOVE, _MOVE_IN_AIR = int(Stage.MOVE), int(Stage.MOVE_IN_AIR)
+_REST_ON_PAD = int(Stage.REST_ON_PAD)
 _AVERAGE_IMU, _SATURATE_IMU = int(Stage.AVERAGE_IMU), int(Stage.SATURATE_IMU)
 _PREDICT, _INCREMENT, _UPDATE = int(Stage.PREDICT), int(Stage.INCREMENT), int(Stage.UPDATE)
 _DRIFT_BIASES, _ADVANCE_FAULTS = int(Stage.DRIFT_BIASES), int(Stage.ADVANCE_FAULTS)
@@ -89,12 +90,15 @@ def tick(flight, world, model, settings, work, stages):
     if settings.supply != Supply.NOMINAL:
         call_stage(stages, _SUPPLY, flight, world, model, settings, work, 0)
     flight.instant = flight.instant + _ONE
-    if settings.imu_averages:
+    resting = settings.pad > 0 and settings.start != Start.HOVER and any_of(flight.on_pad > 0.0)
+    if settings.imu_averages or resting:
         _store_start(flight, work)
     if settings.air:
         call_stage(stages, _MOVE_IN_AIR, flight, world, model, settings, work, 0)
     else:
         call_stage(stages, _MOVE, flight, world, model, settings, work, 0)
+    if resting:
+        call_stage(stages, _REST_ON_PAD, flight, world, model, settings, work, 0)
     if settings.run_filter:
         if settings.imu_averages:
             call_stage(stages, _AVERAGE_IMU, flight, world, model, settings, work, 0)

@@ -2,7 +2,7 @@
 
 Waking a thread takes longer than a step of some hundred flights. So a helper that has flown its
 range watches its mailbox for a while, and begins the next step the moment that it is posted. Where
-nothing comes it sleeps, and has to be woken by Python (`quad_gym.threads`).
+nothing comes it sleeps, and has to be woken by Python (`quad_gym.batch.threads`).
 
 A mailbox is a row of words. The caller writes COMMAND, then TICKET; the helper writes DONE. PRESENT
 says whether the helper watches: it clears it, and then looks at TICKET once more, while the caller

@@ -22,6 +22,7 @@ FLIGHT_FIELDS = (
     Field("w", (3,), "rad/s", "body rates w_B"),
     Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
     Field("voltages", (4,), "V", "motor voltages over the present tick"),
+    Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
     Field("disturbance", (3,), "N", "external force d_I on the body"),
     Field("b_a", (3,), "m/s^2", "accelerometer bias"),
     Field("b_g", (3,), "rad/s", "gyro bias"),
@@ -35,7 +36,7 @@ FLIGHT_FIELDS = (
     Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
     Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
     Field("charge", (), "-", "charge of the battery, 1: full"),
-    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.randomization`"),
+    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
     # the last measurements
     Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
     Field("w_before", (3,), "rad/s", "w_meas one sample before"),

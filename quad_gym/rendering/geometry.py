@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight
+from quad_gym.flights.record import Flight
 from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight
-from quad_gym.flight_stage import Stage
+from quad_gym.flights.record import Flight
+from quad_gym.flights.stage import Stage
 from quad_gym.records import Gate
 from quad_gym.rendering.canvas import GREY, INK, PALE, VERMILLION, WHITE, Canvas
 from quad_gym.rendering.strip import Box

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
-from quad_gym.flight_record import Flight, FlightRecorder
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.flights.record import Flight, FlightRecorder
+from quad_gym.params import checks as check
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.renderer import Renderer, tile
-from quad_gym.simulation import FlightBatch
 
 RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
 """What Gymnasium's `render_mode` may be, besides None."""

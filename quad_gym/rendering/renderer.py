@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
-from quad_gym.flight_record import Flight
-from quad_gym.flight_stage import Stage
+from quad_gym.flights.record import Flight
+from quad_gym.flights.stage import Stage
+from quad_gym.params import checks as check
 from quad_gym.records import FaultKind, FilterStatus, Gate
 from quad_gym.rendering.canvas import (
     BLUE,

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight
+from quad_gym.flights.record import Flight
 from quad_gym.records import Gate
 from quad_gym.rendering.canvas import (
     BLUE,

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.flight_record import Flight
-from quad_gym.metrics import STATE_DIMENSION, Interval, chi_square_band
+from quad_gym.analysis.metrics import STATE_DIMENSION, Interval, chi_square_band
+from quad_gym.flights.record import Flight
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,

@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym import validation as check
-from quad_gym.flight_record import Flight, FlightRecorder
+from quad_gym.flights.record import Flight, FlightRecorder
+from quad_gym.params import checks as check
 from quad_gym.rendering.renderer import Renderer, checked_size
 
 VIDEO_ENDINGS = (".mp4", ".gif", ".webp")

@@ -44,5 +44,5 @@ def actions_of(flight, steps):
 
 
 def state_of(env):
-    """The bits of all flights behind any of the three faces."""
+    """The bits of all flights behind any of the three interfaces."""
     return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()

@@ -1,39 +1,27 @@
 """The benchmark's script runs and writes what it says; no test asserts on a clock."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 import quad_gym
-from quad_gym.cli import parse
+from quad_gym.commands.benchmark import against, interfaces, stages
+from quad_gym.commands.benchmark import main as script
+from quad_gym.commands.options import parse
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.records import WIDTH
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "scripts" / "benchmark.py"
 
 
-@pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("benchmark", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    path = list(sys.path)
-    spec.loader.exec_module(module)
-    sys.path[:] = path
-    return module
-
-
-def run(script, folder, *options):
+def run(folder, *options):
     script.main(parse(script.Args, ["--quick", "--output", str(folder), *options]))
     return json.loads((folder / "benchmark.json").read_text())
 
 
-def test_the_filter_section_compares_all_filters(script, tmp_path, capsys):
-    found = run(script, tmp_path / "new", "--only", "filter", "--batch", "16")
+def test_the_filter_section_compares_all_filters(tmp_path, capsys):
+    found = run(tmp_path / "new", "--only", "filter", "--batch", "16")
     assert set(found) == {"sections", "configuration", "processor", "versions"}
     assert list(found["sections"]) == ["filter"]
     rows = found["sections"]["filter"]
@@ -54,8 +42,8 @@ def test_the_filter_section_compares_all_filters(script, tmp_path, capsys):
     assert "plain NumPy, 12 measurements" in printed.err
 
 
-def test_the_tick_section_names_every_stage_that_the_suites_fly_through(script, tmp_path):
-    rows = run(script, tmp_path, "--only", "tick", "--batch", "16")["sections"]["tick"]
+def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path):
+    rows = run(tmp_path, "--only", "tick", "--batch", "16")["sections"]["tick"]
     for suite in ("standard", "lab"):
         mine = {row["part"]: row for row in rows if row["suite"] == suite}
         batch = quad_gym.FlightBatch(1, sensors=suite)
@@ -76,7 +64,6 @@ def test_the_tick_section_names_every_stage_that_the_suites_fly_through(script, 
 
 def test_blocks_over_a_period_measure_as_often_as_the_sensors_do(script):
     """GNSS at 10 Hz and a camera at 25 Hz measure in 1 of 20 and 1 of 8 ticks of 5 ms."""
-    stages = sys.modules["benchmark_stages"]
     batch = stages.hovering(40 * WIDTH, sensors="rtk")
     blocks = stages.over_a_period(batch)
     ticks = blocks["tick"][:, 0]
@@ -85,15 +72,15 @@ def test_blocks_over_a_period_measure_as_often_as_the_sensors_do(script):
     assert batch.read("position_valid").mean() == pytest.approx(1 / 20, abs=0.02)
 
 
-def test_the_rendering_section_has_every_task_and_view(script, tmp_path, capsys):
+def test_the_rendering_section_has_every_task_and_view(tmp_path, capsys):
     pytest.importorskip("pygame")
-    rows = run(script, tmp_path, "--only", "rendering")["sections"]["rendering"]
+    rows = run(tmp_path, "--only", "rendering")["sections"]["rendering"]
     assert len({(row["task"], row["view"]) for row in rows}) == len(rows) == 10
     assert "frames/s" in capsys.readouterr().out
 
 
-def test_the_options_section_compares_each_with_everything_off(script, tmp_path):
-    found = run(script, tmp_path, "--only", "options", "--batch", "16")
+def test_the_options_section_compares_each_with_everything_off(tmp_path):
+    found = run(tmp_path, "--only", "options", "--batch", "16")
     rows = {row["name"]: row for row in found["sections"]["options"]}
     assert next(iter(rows)) == "everything off"
     assert {"gate", "gusts", "suite rtk", "extended Kalman filter"} < set(rows)
@@ -105,20 +92,19 @@ def test_the_options_section_compares_each_with_everything_off(script, tmp_path)
         assert row["seconds"] > 0.0
 
 
-def test_the_faces_name_the_suite_they_time(script, monkeypatch):
-    faces = sys.modules["benchmark_faces"]
+def test_the_interfaces_name_the_suite_they_time(monkeypatch):
     effort = script.Effort(1, 0.001)
     for options, suite in (({}, "standard"), ({"sensors": "lab"}, "lab")):
-        row = faces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
+        row = interfaces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
         assert row["suite"] == suite
         assert row["name"] == f"vector, estimate, 50 Hz, {suite}"
 
 
-def test_another_checkout_is_timed_by_turns_and_compared(script, tmp_path, capsys):
-    found = run(script, tmp_path, "--against", str(ROOT), "--envs", "8", "--threads", "1")
+def test_another_checkout_is_timed_by_turns_and_compared(tmp_path, capsys):
+    found = run(tmp_path, "--against", str(ROOT), "--envs", "8", "--threads", "1")
     assert list(found["sections"]) == ["against"]
     rows = found["sections"]["against"]
-    assert {"vector", "single"} <= {row["face"] for row in rows}
+    assert {"vector", "single"} <= {row["interface"] for row in rows}
     for row in rows:
         assert row["suite"] == "standard"
         assert row["ratio"] == pytest.approx(row["seconds"] / row["other"])
@@ -127,7 +113,6 @@ def test_another_checkout_is_timed_by_turns_and_compared(script, tmp_path, capsy
 
 
 def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(script):
-    against = sys.modules["benchmark_against"]
 
     class Other:
         folder = ROOT
@@ -148,9 +133,8 @@ def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(s
         against.common_suite((new, old))
 
 
-def test_a_row_that_the_other_checkout_refuses_is_left_out(script, monkeypatch, capsys):
-    against = sys.modules["benchmark_against"]
-    rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["face"] == "single"][:2]
+def test_a_row_that_the_other_checkout_refuses_is_left_out(monkeypatch, capsys):
+    rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["interface"] == "single"][:2]
     rows[0] = {**rows[0], "options": {"observation": "guess"}}
     monkeypatch.setattr(against, "rows_to_compare", lambda envs, threads, suite: rows)
     found = against.time_against(ROOT, 4, 1, script.Effort(1, 0.001))
@@ -160,8 +144,8 @@ def test_a_row_that_the_other_checkout_refuses_is_left_out(script, monkeypatch, 
 
 
 @pytest.mark.slow
-def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(script, tmp_path):
-    found = run(script, tmp_path, "--only", "compile")
+def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(tmp_path):
+    found = run(tmp_path, "--only", "compile")
     assert list(found["sections"]) == ["compile"]
     rows = {row["cache"]: row for row in found["sections"]["compile"]}
     assert list(rows) == ["empty", "full", "edit"]
@@ -171,7 +155,7 @@ def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(script, t
 
 def test_all_sections_are_those_that_do_not_compile(script):
     chosen = script.chosen_sections(parse(script.Args, []))
-    assert chosen == ["filter", "tick", "options", "faces", "memory", "rendering"]
+    assert chosen == ["filter", "tick", "options", "interfaces", "memory", "rendering"]
 
 
 @pytest.mark.parametrize(
@@ -189,7 +173,7 @@ def test_all_sections_are_those_that_do_not_compile(script):
     ],
     ids=" ".join,
 )
-def test_invalid_options_are_one_line_and_exit_code_2(script, options, capsys):
+def test_invalid_options_are_one_line_and_exit_code_2(options, capsys):
     with pytest.raises(SystemExit) as caught:
         parse(script.Args, options)
     assert caught.value.code == 2

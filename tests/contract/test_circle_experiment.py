@@ -1,33 +1,19 @@
 """The experiment's script: what it prints, what it writes, what it refuses."""
 
 import csv
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from quad_gym import pd_gains
-from quad_gym.cli import parse
+from quad_gym.commands import circle as script
+from quad_gym.commands.options import parse
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "circle_experiment.py"
 CASES = ("truth", "estimate", "estimate_without_camera")
-
-
-def load_script():
-    spec = importlib.util.spec_from_file_location("circle_experiment", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-script = load_script()
 
 
 def run(folder, line=""):

@@ -18,7 +18,7 @@ from gymnasium.vector import AsyncVectorEnv
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import quad_gym
-from quad_gym import threads
+from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels.compiling import cores
 from tests.contract.comparing import actions_of, assert_same
@@ -276,7 +276,11 @@ def test_without_any_writable_folder_kernels_are_compiled_in_every_process(tmp_p
 
 def cores_in_a_process(code, **environment):
     done = subprocess.run(
-        [sys.executable, "-c", f"{code}; from quad_gym.threads import *; print(available_cores())"],
+        [
+            sys.executable,
+            "-c",
+            f"{code}; from quad_gym.batch.threads import *; print(available_cores())",
+        ],
         env={**{k: v for k, v in os.environ.items() if k != "NUMBA_NUM_THREADS"}, **environment},
         capture_output=True,
         text=True,

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.console import plain
+
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
 
@@ -70,8 +72,8 @@ def test_evaluate_writes_what_it_prints(tmp_path):
 def test_evaluate_refuses_nonsense(tmp_path, more, message):
     done = run("evaluate.py", *more, where=tmp_path)
     assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert message in plain(done.stderr)
+    assert "Traceback" not in done.stderr
 
 
 def compare(where, *more):
@@ -144,4 +146,4 @@ def test_compare_refuses_nonsense(tmp_path):
     ):
         done = run("compare.py", *more, "--output", tmp_path / "x", where=tmp_path)
         assert done.returncode == 2, more
-        assert message in done.stderr
+        assert message in plain(done.stderr)

@@ -13,13 +13,13 @@ from quad_gym.envs.vector import QuadVectorEnv
 from tests.contract.comparing import assert_same, state_of
 
 COUNT = 3
-FACES = ("single", "vector", "sb3")
+INTERFACES = ("single", "vector", "sb3")
 
 
-def make(face, action="ctbr"):
-    if face == "single":
+def make(interface, action="ctbr"):
+    if interface == "single":
         env = QuadEnv("hover", action=action)
-    elif face == "vector":
+    elif interface == "vector":
         env = QuadVectorEnv(COUNT, "hover", action=action)
     else:
         env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", COUNT, action=action)
@@ -36,13 +36,13 @@ def begin(env):
         env.reset()
 
 
-def shape_of(face):
-    return (4,) if face == "single" else (COUNT, 4)
+def shape_of(interface):
+    return (4,) if interface == "single" else (COUNT, 4)
 
 
-def for_all(face, row):
-    """An action of one flight, for all flights of a face."""
-    return row if face == "single" else [row] * COUNT
+def for_all(interface, row):
+    """An action of one flight, for all flights of a interface."""
+    return row if interface == "single" else [row] * COUNT
 
 
 def refuses(env, action):
@@ -76,62 +76,63 @@ HOSTILE_ROWS = {
 }
 
 
-@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("interface", INTERFACES)
 @pytest.mark.parametrize("name", HOSTILE_ROWS)
-def test_a_row_that_makes_no_sense_is_refused(face, name):
-    refuses(make(face), for_all(face, HOSTILE_ROWS[name]))
+def test_an_invalid_row_is_refused(interface, name):
+    refuses(make(interface), for_all(interface, HOSTILE_ROWS[name]))
 
 
-@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("interface", INTERFACES)
 @pytest.mark.parametrize(
     "action",
     [None, "forward", 0.0, 7, {}, {"a": 1}, object(), (), [], np.zeros((2, 4)), np.zeros((4, 3))],
     ids=lambda action: repr(action).partition(" at ")[0],  # the same name in every process
 )
-def test_what_is_no_action_at_all_is_refused(face, action):
-    refuses(make(face), action)
+def test_what_is_no_action_at_all_is_refused(interface, action):
+    refuses(make(interface), action)
 
 
-@pytest.mark.parametrize("face", ["vector", "sb3"])
-def test_one_flights_bad_action_stops_the_step_of_all(face):
+@pytest.mark.parametrize("interface", ["vector", "sb3"])
+def test_one_flights_bad_action_stops_the_step_of_all(interface):
     actions = np.zeros((COUNT, 4))
     actions[1, 2] = np.nan
-    env = make(face)
+    env = make(interface)
     refuses(env, actions)
-    assert_same(env.step(np.zeros((COUNT, 4)))[0], make(face).step(np.zeros((COUNT, 4)))[0])
+    assert_same(env.step(np.zeros((COUNT, 4)))[0], make(interface).step(np.zeros((COUNT, 4)))[0])
 
 
-@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("interface", INTERFACES)
 @pytest.mark.parametrize("action", ["ctbr", "motor", "wrench", "attitude", "velocity"])
-def test_numbers_beyond_the_bounds_are_clipped(face, action):
-    env, twin = make(face, action), make(face, action)
-    wild = for_all(face, [1e308, -1e308, 1.0000001, -7.0])
+def test_numbers_beyond_the_bounds_are_clipped(interface, action):
+    env, twin = make(interface, action), make(interface, action)
+    wild = for_all(interface, [1e308, -1e308, 1.0000001, -7.0])
     assert_same(
-        env.step(np.array(wild))[0], twin.step(np.array(for_all(face, [1.0, -1.0, 1.0, -1.0])))[0]
+        env.step(np.array(wild))[0],
+        twin.step(np.array(for_all(interface, [1.0, -1.0, 1.0, -1.0])))[0],
     )
     assert state_of(env) == state_of(twin)
 
 
-@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("interface", INTERFACES)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.float16, np.int64, np.int8, bool])
-def test_any_type_of_real_numbers_is_flown(face, dtype):
-    env, twin = make(face), make(face)
+def test_any_type_of_real_numbers_is_flown(interface, dtype):
+    env, twin = make(interface), make(interface)
     row = np.array([1, 0, 1, 0], dtype)
-    env.step(np.array(for_all(face, row)))
-    twin.step(np.array(for_all(face, [1.0, 0.0, 1.0, 0.0])))
+    env.step(np.array(for_all(interface, row)))
+    twin.step(np.array(for_all(interface, [1.0, 0.0, 1.0, 0.0])))
     assert state_of(env) == state_of(twin)
 
 
-@pytest.mark.parametrize("face", FACES)
-def test_lists_and_tuples_and_strided_arrays_are_flown(face):
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_lists_and_tuples_and_strided_arrays_are_flown(interface):
     row = [0.1, -0.2, 0.3, -0.4]
-    as_list, as_tuple, strided, plain = (make(face) for _ in range(4))
-    as_list.step(for_all(face, row))
-    as_tuple.step(tuple(for_all(face, tuple(row))))
-    padded = np.full((*shape_of(face), 3), np.nan)
+    as_list, as_tuple, strided, plain = (make(interface) for _ in range(4))
+    as_list.step(for_all(interface, row))
+    as_tuple.step(tuple(for_all(interface, tuple(row))))
+    padded = np.full((*shape_of(interface), 3), np.nan)
     padded[..., 1] = row
     strided.step(padded[..., 1])
-    plain.step(np.array(for_all(face, row)))
+    plain.step(np.array(for_all(interface, row)))
     assert state_of(as_list) == state_of(as_tuple) == state_of(strided) == state_of(plain)
 
 
@@ -186,7 +187,7 @@ def meant(action, shape):
 
 @pytest.fixture(scope="module")
 def pairs():
-    return {face: (make(face), make(face)) for face in FACES}
+    return {interface: (make(interface), make(interface)) for interface in INTERFACES}
 
 
 @settings(max_examples=1500)

@@ -1,7 +1,7 @@
 """Hostile values for every keyword: refused by name, or flown without a number that is not finite.
 
-A table: every keyword of every face, of flights, filters, parameters, draws and faults, with values
-that are not numbers, not finite, too large, too small, of another kind, or of another shape.
+A table: every keyword of every interface, of flights, filters, parameters, draws and faults, with
+values that are not numbers, not finite, too large, too small, of another kind, or of another shape.
 """
 
 import dataclasses
@@ -103,26 +103,26 @@ def fly_sb3(task, **keywords):
     return seen
 
 
-FACES = {"make": fly_make, "make_vec": fly_make_vec, "make_sb3_vec_env": fly_sb3}
+INTERFACES = {"make": fly_make, "make_vec": fly_make_vec, "make_sb3_vec_env": fly_sb3}
 
 
 @pytest.mark.parametrize("name", [*environment_keywords(), "threads"])
-@pytest.mark.parametrize("face", FACES)
-def test_keywords_of_environments(face, name):
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_keywords_of_environments(interface, name):
     if name == "render_mode":
         pytest.skip("Gymnasium itself has a say in that keyword")
-    if (name == "threads" and face == "make") or name.startswith("render"):
+    if (name == "threads" and interface == "make") or name.startswith("render"):
         pytest.skip("another keyword's business")
     task = ONE_TASK.get(name, "Circle")
-    for value in [*NUMBERS[:: 1 + (face != "make")], *OTHERS]:
-        assert_refused_or_flown(lambda v: FACES[face](task, **{name: v}), name, value)
+    for value in [*NUMBERS[:: 1 + (interface != "make")], *OTHERS]:
+        assert_refused_or_flown(lambda v: INTERFACES[interface](task, **{name: v}), name, value)
 
 
-@pytest.mark.parametrize("face", FACES)
-def test_a_keyword_that_there_is_not(face):
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_a_keyword_that_there_is_not(interface):
     for value in OTHERS:
         with pytest.raises(TypeError, match="colour is not a keyword"):
-            FACES[face]("Hover", colour=value)
+            INTERFACES[interface]("Hover", colour=value)
 
 
 @pytest.mark.parametrize("name", ["position", "velocity", "yaw", "seed", "options", "colour"])
@@ -239,7 +239,7 @@ def test_fields_of_parameters(kind, name):
         )
 
 
-@pytest.mark.parametrize("drawable", quad_gym.randomization.DRAWABLES, ids=lambda d: d.name)
+@pytest.mark.parametrize("drawable", quad_gym.params.randomization.DRAWABLES, ids=lambda d: d.name)
 def test_ranges_of_draws(drawable):
     keywords = {"sensors": RTK, "world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())}
 

@@ -8,12 +8,12 @@ import pytest
 
 import quad_gym
 from baselines import PDPolicy
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import evaluate, roll_out
-from quad_gym.params import PDGains
+from quad_gym.params.control import PDGains
 from quad_gym.records import Control
-from quad_gym.simulation import FlightBatch
 from tests.contract.comparing import ACTIONS
 
 TRACKING = ("QuadGym/Hover-v0", "QuadGym/Circle-v0", "QuadGym/Lemniscate-v0")
@@ -132,7 +132,7 @@ def test_single_and_batched_predictions_agree(action, privileged):
         observation, *_ = env.step(together)
 
 
-def test_it_reads_its_environment_through_wrappers_and_all_faces():
+def test_it_reads_its_environment_through_wrappers_and_all_interfaces():
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=2)
     single = gymnasium.make("QuadGym/Hover-v0")
     observation, _ = single.reset(seed=2)

@@ -146,7 +146,7 @@ def global_state():
 
 
 @pytest.mark.parametrize("seed", [None, 4])
-def test_no_face_touches_the_global_random_states(seed):
+def test_no_interface_touches_the_global_random_states(seed):
     before = global_state()
     single, vector = QuadEnv("random_trajectory"), QuadVectorEnv(3, "hover")
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", 3, seed=seed)

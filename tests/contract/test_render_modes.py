@@ -1,4 +1,4 @@
-"""Every face renders what Gymnasium asks for, and a flight does not notice."""
+"""Every interface renders what Gymnasium asks for, and a flight does not notice."""
 
 import copy
 import os
@@ -256,7 +256,7 @@ def test_pygame_is_imported_only_when_something_is_drawn():
     done = run_python(
         """
 import sys, gymnasium, numpy as np, quad_gym
-from quad_gym.flight_record import FlightRecorder
+from quad_gym.flights.record import FlightRecorder
 import quad_gym.rendering
 env = gymnasium.make("QuadGym/Hover-v0")
 env.reset(seed=0), env.step(np.zeros(4, np.float32))

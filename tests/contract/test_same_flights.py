@@ -204,7 +204,7 @@ def test_a_copy_of_a_vector_environment_has_the_same_future(twin_of, mode, count
 
 
 @pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
-def test_a_copy_of_the_stable_baselines3_face_has_the_same_future(twin_of):
+def test_a_copy_of_the_stable_baselines3_interface_has_the_same_future(twin_of):
     env = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", n_envs=9, seed=3, **SHORT)
     env.reset()
     for k in range(7):

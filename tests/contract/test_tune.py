@@ -10,6 +10,7 @@ import pytest
 
 import quad_gym
 from baselines.policies import load_policy
+from tests.console import plain
 
 SCRIPT = Path(quad_gym.__file__).parents[1] / "scripts/tune.py"
 
@@ -52,8 +53,8 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
 def test_refuses_nonsense(options, message):
     done = tune(*options)
     assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert message in plain(done.stderr)
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("text", ["no JSON", "{}", '{"gains": {"wings": 2}}'])

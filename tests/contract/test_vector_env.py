@@ -273,7 +273,7 @@ def length_of_an_episode(step, limit):
         (60, {"duration": 1.0, "control_rate": 100}, 60),
     ],
 )
-def test_in_all_faces_the_earlier_of_duration_and_max_episode_steps_holds(limit, given, expected):
+def test_the_earlier_of_duration_and_max_episode_steps_holds_everywhere(limit, given, expected):
     keywords = {"observation": "truth", "action": "velocity", "max_episode_steps": limit, **given}
     single = gymnasium.make("QuadGym/Hover-v0", **keywords)
     vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **keywords)

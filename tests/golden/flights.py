@@ -14,8 +14,8 @@ import numpy as np
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.fault_presets import PRESETS
-from quad_gym.sensor_suites import SUITES
+from quad_gym.faults.presets import PRESETS
+from quad_gym.params.suites import SUITES
 
 DIGESTS = Path(__file__).with_name("flights.json")
 FLIGHTS, STEPS, SEED = 8, 300, 2026

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.fault_presets import PRESETS
+from quad_gym.faults.presets import PRESETS
 from quad_gym.records import FilterStatus, Gate, Source
 from tests.field_flights import fly, measured_now
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.consistency import flight_errors, start_matched
-from quad_gym.consistency_flights import endless, put_to_the_test
+from quad_gym.analysis.consistency import flight_errors, start_matched
+from quad_gym.analysis.consistency_flights import endless, measure_consistency
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
-from quad_gym.sensor_suites import FIELD_FILTER
-from quad_gym.simulation import FlightBatch
 
 LAB = quad_gym.sensor_suite("lab")
 
@@ -25,14 +25,14 @@ def flown(sensors, *, flights=3000, seconds=10.0, matched=False, **keywords):
     batch = FlightBatch(
         flights, sensors=sensors, task=task, gains="tuned", innovations=True, **keywords
     )
-    findings = put_to_the_test(batch, seeds=range(flights), duration=seconds, matched=matched)
+    findings = measure_consistency(batch, seeds=range(flights), duration=seconds, matched=matched)
     assert findings.failed == 0
     return findings
 
 
 def assert_consistent(findings, parts):
     for name, part in parts.items():
-        assert part.honest, (name, part.share_inside, part.overall)
+        assert part.consistent, (name, part.share_inside, part.overall)
     for name, white in findings.whiteness.items():
         assert white.white, (name, white.largest)
 
@@ -53,8 +53,8 @@ def test_a_suite_is_consistent_from_its_first_instant_on(suite, kind, start):
 def test_errors_with_a_consumer_receiver_are_as_claimed():
     """Its position drifts, which the filter takes for much white noise: the NIS of it is small."""
     findings = flown("consumer")
-    assert all(part.honest for part in findings.nees.values())
-    assert findings.nis["velocity"].honest
+    assert all(part.consistent for part in findings.nees.values())
+    assert findings.nis["velocity"].consistent
     assert findings.nis["position"].overall < 0.1
 
 
@@ -66,7 +66,7 @@ def test_the_laboratorys_sensors_can_have_a_consistent_filter(kind, gnss_rate):
         imu=LAB.imu.replace(samples="average"), estimator=FIELD_FILTER.replace(kind=kind)
     )
     findings = flown(sensors.with_rates(gnss=gnss_rate), matched=True)
-    assert all(part.honest for part in findings.nees.values())
+    assert all(part.consistent for part in findings.nees.values())
 
 
 @pytest.mark.slow

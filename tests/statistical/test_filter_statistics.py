@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.params import TaskParams
+from quad_gym.params.task import TaskParams
 from quad_gym.records import Source
-from quad_gym.simulation import FlightBatch
 from tests.reference_ukf import rotation_312
 
 LAB = quad_gym.sensor_suite("lab")

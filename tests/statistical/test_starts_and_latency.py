@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.consistency import PARTS, InnovationRecorder, NeesRecorder
+from quad_gym.analysis.consistency import PARTS, InnovationRecorder, NeesRecorder
 from tests.field_flights import attitudes, fly, nees, small_euler_angles, state_errors, steps
 
 ANY_YAW = {"start_yaw": Uniform(-np.pi, np.pi)}
@@ -48,9 +48,9 @@ def test_a_warm_filter_is_consistent_from_the_first_instant_on(kind, late):
     assert not batch.read("filter_status").any()
     found = recorder.nees()
     for name in PARTS:
-        assert found[name].honest, (name, found[name].share_inside, found[name].overall)
+        assert found[name].consistent, (name, found[name].share_inside, found[name].overall)
     for name, part in innovations.nis().items():
-        assert part.honest, (name, part.share_inside, part.overall)
+        assert part.consistent, (name, part.share_inside, part.overall)
     for name, correlation in innovations.whiteness().items():
         assert correlation.white, (name, correlation.largest)
 

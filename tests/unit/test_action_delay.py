@@ -6,9 +6,9 @@ import pytest
 
 import quad_gym
 from quad_gym import Uniform
-from quad_gym.params import TaskParams
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params.task import TaskParams
 from quad_gym.records import Autoreset, Control, Source
-from quad_gym.simulation import FlightBatch
 
 TRUTH = ("r", "v", "q", "w", "rotor_speeds")
 ESTIMATE = (*TRUTH, "r_hat", "v_hat", "R_hat", "L")

@@ -1,13 +1,11 @@
 """The camera: what it sees and where, against a projection in NumPy; points and lines of images."""
 
 import numpy as np
-import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import quad_gym
-from quad_gym import homogeneous
 from quad_gym.sensors import Camera
 from tests.unit.alarms import assert_normal
 
@@ -104,59 +102,3 @@ def test_noise_may_carry_a_pixel_over_the_edge_but_decides_nothing():
         assert (np.isfinite(pictures) == reported).all()
         if reported:
             assert (pictures[:, 0, 0] > HALF_IMAGE[0]).any()
-
-
-lines = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)
-
-
-@given(lines, lines)
-def test_two_lines_meet_where_their_cross_product_says(l_1, l_2):
-    (a_1, b_1, c_1), (a_2, b_2, c_2) = l_1, l_2
-    determinant = a_1 * b_2 - a_2 * b_1
-    assume(abs(determinant) > 1e-3)
-    x, y = homogeneous.from_homogeneous(homogeneous.intersect(l_1, l_2))
-    expected = np.linalg.solve([[a_1, b_1], [a_2, b_2]], [-c_1, -c_2])
-    size = 1.0 + np.abs(expected).max()
-    np.testing.assert_allclose([x, y], expected, rtol=0.0, atol=1e-10 * size)
-    assert abs(a_1 * x + b_1 * y + c_1) <= 1e-10 * size
-    assert abs(a_2 * x + b_2 * y + c_2) <= 1e-10 * size
-
-
-@given(lines, lines)
-def test_a_line_goes_through_the_two_points_that_make_it(p_1, p_2):
-    line = homogeneous.line_through(p_1, p_2)
-    assert abs(line @ p_1) <= 1e-12
-    assert abs(line @ p_2) <= 1e-12
-
-
-@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(1e-3, 1e3))
-def test_a_point_is_any_multiple_of_its_coordinates(x, y, k):
-    point = k * homogeneous.to_homogeneous([x, y])
-    np.testing.assert_allclose(homogeneous.from_homogeneous(point), [x, y], rtol=1e-14, atol=1e-300)
-    np.testing.assert_allclose(
-        homogeneous.from_homogeneous(-point), [x, y], rtol=1e-14, atol=1e-300
-    )
-
-
-@given(lines.filter(lambda v: np.abs(v[:2]).max() > 0.1), st.floats(-10.0, 10.0))
-def test_parallel_lines_meet_at_infinity(line, shift):
-    meeting = homogeneous.intersect(line, line + np.array([0.0, 0.0, shift]))
-    with pytest.raises(ValueError, match="infinity"):
-        homogeneous.from_homogeneous(meeting)
-
-
-@pytest.mark.parametrize(
-    ("name", "call"),
-    [
-        ("point", lambda bad: homogeneous.to_homogeneous(bad)),
-        ("point", lambda bad: homogeneous.from_homogeneous(bad)),
-        ("line_1", lambda bad: homogeneous.intersect(bad, [1.0, 2.0, 3.0])),
-        ("line_2", lambda bad: homogeneous.intersect([1.0, 2.0, 3.0], bad)),
-        ("point_1", lambda bad: homogeneous.line_through(bad, [1.0, 2.0, 3.0])),
-        ("point_2", lambda bad: homogeneous.line_through([1.0, 2.0, 3.0], bad)),
-    ],
-)
-def test_bad_points_and_lines_are_refused_by_name(name, call):
-    for bad in ([1.0], [1.0, np.nan], [1.0, 2.0, np.nan], "a", None):
-        with pytest.raises(ValueError, match=f"^{name} must"):
-            call(bad)

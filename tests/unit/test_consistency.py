@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from quad_gym import FilterParams, sensor_suite
-from quad_gym.consistency import (
+from quad_gym.analysis.consistency import (
     InnovationRecorder,
     MeanSquare,
     NeesRecorder,
@@ -14,8 +14,8 @@ from quad_gym.consistency import (
     start_matched,
     verdict,
 )
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK
-from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import assert_normal
 
 
@@ -50,7 +50,7 @@ def drawn(factor, instants=400, flights=500):
 
 def test_a_consistent_filter_is_called_consistent_and_others_by_how_much_they_err():
     consistent = drawn(1.0)
-    assert consistent.honest
+    assert consistent.consistent
     assert verdict(consistent).endswith(": consistent.")
     for factor, words in (
         (1.1, "overconfident, as errors are 10"),
@@ -58,7 +58,7 @@ def test_a_consistent_filter_is_called_consistent_and_others_by_how_much_they_er
         (2.5, "overconfident, as errors are 2.5 times what it claims"),
     ):
         part = drawn(factor)
-        assert not part.honest
+        assert not part.consistent
         assert part.share_inside < 0.05
         assert words in verdict(part)
 
@@ -157,7 +157,7 @@ def test_white_innovations_are_called_white_and_their_nis_consistent():
     assert white.band[0] == pytest.approx(1.96 / np.sqrt(300 * 0.7 * 200 * 3), rel=0.02)
     nis = recorder.nis()["position"]
     assert nis.time[0] == pytest.approx(0.25)
-    assert nis.honest
+    assert nis.consistent
 
 
 def test_innovations_with_memory_are_not_white_by_as_much_as_they_remember():
@@ -170,7 +170,7 @@ def test_innovations_with_memory_are_not_white_by_as_much_as_they_remember():
 def test_innovations_larger_than_expected_show_in_the_nis_and_not_in_the_correlation():
     recorder = recorded(0.0, factor=1.2)
     assert recorder.nis()["position"].overall == pytest.approx(1.44 * 3.0, rel=0.02)
-    assert not recorder.nis()["position"].honest
+    assert not recorder.nis()["position"].consistent
     assert recorder.whiteness()["position"].white
 
 

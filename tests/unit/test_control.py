@@ -11,7 +11,7 @@ from quad_gym.kernels.compiling import entry
 from quad_gym.kernels.maths.linalg import load3, store4
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.control import act, allocate
-from quad_gym.packing import params_block, params_record
+from quad_gym.packing.flight import params_block, params_record
 from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, Control, aligned_zeros
 
 LAB, GAINS, ACTIONS = (

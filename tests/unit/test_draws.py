@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym.kernels.single import sense_features, sense_gnss, sense_imu, step_biases
-from quad_gym.packing import params_record
+from quad_gym.packing.flight import params_record
 from quad_gym.records import FLIGHT
 from tests.unit.alarms import alarm_score
 

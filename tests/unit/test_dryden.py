@@ -10,6 +10,7 @@ from scipy import signal, stats
 from scipy.linalg import expm
 
 import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.vehicle.gusts import (
     first_order,
     gust_scales,
@@ -17,7 +18,6 @@ from quad_gym.kernels.vehicle.gusts import (
     sinh_less_argument,
 )
 from quad_gym.records import Control, Source
-from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import ALARM, alarm_score, assert_normal
 from tests.unit.compiled import Compiled
 

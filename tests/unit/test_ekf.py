@@ -174,7 +174,7 @@ def test_a_reset_turns_the_covariance_as_the_error_angles_turn(turn):
         np.testing.assert_array_equal(other.R_BI, plain.R_BI)
 
 
-# ---- one estimator, whatever the face ----
+# ---- one estimator, whatever the interface ----
 
 
 def test_it_estimates_about_as_well_as_the_ukf():

@@ -11,7 +11,6 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.fault_presets import ALL, PRESETS, faults_of
 from quad_gym.faults import (
     AccelBiasStep,
     BaselineLoss,
@@ -27,6 +26,7 @@ from quad_gym.faults import (
     RotorLoss,
     WrongAssociations,
 )
+from quad_gym.faults.presets import ALL, PRESETS, faults_of
 from quad_gym.frames import ecef_to_enu
 from quad_gym.records import POSITION_BLOCK, FaultKind, Source
 from quad_gym.rotations import quaternion_to_dcm

@@ -14,9 +14,9 @@ from baselines import PDPolicy
 from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
-from quad_gym.flight_files import table
-from quad_gym.flight_record import COLUMNS
-from quad_gym.flight_stage import Stage
+from quad_gym.flights.files import table
+from quad_gym.flights.record import COLUMNS
+from quad_gym.flights.stage import Stage
 from quad_gym.frames import ecef_to_enu
 from quad_gym.records import FaultKind, Gate
 from quad_gym.rendering import record_flight

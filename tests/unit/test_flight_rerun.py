@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from quad_gym.envs.single import QuadEnv
-from quad_gym.flight_record import FlightRecorder
+from quad_gym.flights.record import FlightRecorder
 from quad_gym.rotations import quaternion_to_dcm
 
 
@@ -148,5 +148,5 @@ def test_a_missing_rerun_gives_the_install_hint(monkeypatch):
 
 
 def test_rerun_is_imported_only_when_a_recording_is_made():
-    code = "import sys, quad_gym, quad_gym.flight_rerun; assert 'rerun' not in sys.modules"
+    code = "import sys, quad_gym, quad_gym.flights.rerun; assert 'rerun' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

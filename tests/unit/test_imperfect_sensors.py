@@ -11,13 +11,14 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.packing import params_record
-from quad_gym.params import TaskParams, VehicleParams
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.packing.flight import params_record
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import Autoreset, Control, Source
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
-from quad_gym.simulation import FlightBatch
 from quad_gym.vehicle import state_derivative
-from quad_gym.world_params import WorldParams
 
 LAB, STANDARD = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("standard")
 HOVER = TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e6, max_tilt=math.pi)

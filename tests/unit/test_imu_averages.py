@@ -8,12 +8,12 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.single import integrate_flight
-from quad_gym.packing import params_record
+from quad_gym.packing.flight import params_record
 from quad_gym.records import FLIGHT, Source
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 from quad_gym.sensors import Imu
-from quad_gym.simulation import FlightBatch
 from quad_gym.vehicle import state_derivative
 from tests.unit.alarms import assert_normal
 from tests.unit.test_imu import QUIET, random_state

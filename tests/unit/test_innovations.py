@@ -6,7 +6,7 @@ from scipy import stats
 
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.packing import params_record
+from quad_gym.packing.flight import params_record
 from quad_gym.records import (
     BASELINE_BLOCK,
     FEATURE_BLOCKS,

@@ -323,7 +323,7 @@ def test_pd_control_knows_the_length_of_its_observations():
         ({}, 500),
     ],
 )
-def test_a_limit_in_steps_holds_in_every_face_and_its_description(given, steps):
+def test_a_limit_in_steps_holds_in_every_interface_and_its_description(given, steps):
     still = {"observation": "truth", "action": "velocity", **given}
     single = gymnasium.make("QuadGym/Hover-v0", **still)
     vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **still)

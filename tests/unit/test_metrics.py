@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from quad_gym import metrics
+from quad_gym.analysis import metrics
 from quad_gym.rotations import euler_to_dcm
 
 
@@ -236,5 +236,5 @@ class TestPairedDifference:
 
 
 def test_scipy_is_imported_when_it_is_needed():
-    code = "import quad_gym.metrics, sys; sys.exit('scipy.stats' in sys.modules)"
+    code = "import quad_gym.analysis.metrics, sys; sys.exit('scipy.stats' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.packing import params_record
+from quad_gym.packing.flight import params_record
 from quad_gym.records import MAX_FEATURES, MAX_GATES
 
 CLASSES = [

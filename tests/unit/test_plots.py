@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from quad_gym import plots
+from quad_gym.analysis import plots
 
 pytest.importorskip("matplotlib")
 

@@ -10,12 +10,12 @@ from scipy import special, stats
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
-from quad_gym.distributions import Distribution
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.task.draws import normal_quantile
-from quad_gym.randomization import nominal_values
+from quad_gym.params.distributions import Distribution
+from quad_gym.params.randomization import nominal_values
 from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, Control, Source
 from quad_gym.rotations import euler_to_dcm
-from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import ALARM, alarm_score
 from tests.unit.compiled import Compiled
 

@@ -10,7 +10,7 @@ from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.task.episode import draw_reference
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
-from quad_gym.packing import settings_record
+from quad_gym.packing.flight import settings_record
 from quad_gym.records import (
     FLIGHT,
     FLIGHT_BLOCK,

@@ -5,7 +5,7 @@ import pytest
 
 from quad_gym import CameraParams, sensor_suite
 from quad_gym.envs.configuration import Flights
-from quad_gym.flight_record import FlightRecorder
+from quad_gym.flights.record import FlightRecorder
 from quad_gym.records import Autoreset
 from quad_gym.rendering.geometry import (
     View,

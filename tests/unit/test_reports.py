@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quad_gym import __version__
-from quad_gym.reports import as_json, text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import as_json, text_table, versions, write_csv, write_json
 
 
 @dataclasses.dataclass

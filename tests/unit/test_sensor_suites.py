@@ -5,9 +5,9 @@ import pytest
 from scipy import signal, stats
 
 import quad_gym
+from quad_gym.params.sensors import PlacementParams
+from quad_gym.params.suites import SUITES
 from quad_gym.records import VELOCITY_BLOCK
-from quad_gym.sensor_params import PlacementParams
-from quad_gym.sensor_suites import SUITES
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import attitudes, fly, state_errors, steps
 from tests.reference_ukf import east_north_up

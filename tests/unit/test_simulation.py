@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import AccelBiasStep, GnssOutage
-from quad_gym.params import TaskParams
+from quad_gym.params.task import TaskParams
 from quad_gym.records import FLIGHT, RESULTS, Autoreset, Control, Source
-from quad_gym.simulation import FlightBatch
 
 ENDLESS = TaskParams(duration=0)
 SEEDS = np.random.default_rng(5).permutation(1000)[:100].tolist()

@@ -5,7 +5,7 @@ import pytest
 
 import quad_gym
 from quad_gym import LogUniform, Normal, Uniform
-from quad_gym.randomization import DrawingTable, Randomization
+from quad_gym.params.randomization import DrawingTable, Randomization
 from tests.field_flights import fly, nees, steps
 
 FLIGHTS = 256

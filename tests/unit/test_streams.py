@@ -10,9 +10,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import quad_gym.kernels
-from quad_gym.distributions import Normal, Uniform
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import GnssJump, GnssOutage
-from quad_gym.params import TASKS, TaskParams
+from quad_gym.params.distributions import Normal, Uniform
+from quad_gym.params.task import TASKS, TaskParams
 from quad_gym.records import (
     DRAW_FAULTS,
     DRAW_RANGES,
@@ -22,7 +23,6 @@ from quad_gym.records import (
     FaultKind,
 )
 from quad_gym.records.streams import _claim
-from quad_gym.simulation import FlightBatch
 from tests.unit.alarms import alarm_score
 
 COUNT = 10_000

@@ -10,10 +10,10 @@ import time
 import numpy as np
 import pytest
 
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, Crew
 from quad_gym.kernels import mailbox
 from quad_gym.records import WIDTH, Control, Source
-from quad_gym.simulation import FlightBatch
-from quad_gym.threads import MIN_BLOCKS_PER_THREAD, Crew
 
 COUNT = 3 * MIN_BLOCKS_PER_THREAD * WIDTH + 3
 

@@ -5,8 +5,8 @@ import pytest
 
 import quad_gym
 from quad_gym.kernels import single
-from quad_gym.packing import params_record
-from quad_gym.params import VehicleParams
+from quad_gym.packing.flight import params_record
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import FLIGHT, WORK, FilterStatus
 from tests.circle_flight import record_circle
 from tests.lane_filter import EIGHT, STATE, LaneFilter

@@ -1,16 +1,16 @@
-"""Warm starts: errors as the covariance claims them from the first instant on, in every face."""
+"""Warm starts: from the first instant on, errors are as the covariance says, everywhere."""
 
 import numpy as np
 import pytest
 
 import quad_gym
 from quad_gym import Uniform
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.warm_start import WARM_UP
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.params.suites import SUITES
 from quad_gym.records import FLIGHT_FIELDS
-from quad_gym.sensor_suites import SUITES
-from quad_gym.simulation import FlightBatch
-from quad_gym.warm_start import WARM_UP
 from tests.field_flights import attitudes, fly, nees, state_errors, steps
 from tests.unit.alarms import assert_normal
 
@@ -185,10 +185,10 @@ def test_a_filter_that_cannot_know_its_heading_has_nothing_to_start_warm_with(ca
     FlightBatch(1, sensors=suite)  # cold it may fly
 
 
-# ---- the faces -------------------------------------------------------------------------------
+# ---- the interfaces --------------------------------------------------------------------------
 
 
-def test_every_face_starts_warm_alike():
+def test_every_interface_starts_warm_alike():
     keywords = {
         "sensors": "rtk",
         "filter_start": "warm",

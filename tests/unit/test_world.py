@@ -8,9 +8,9 @@ from scipy.optimize import brentq
 
 import quad_gym
 from quad_gym import BatteryParams, Uniform, WorldParams
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import Control, Source
 from quad_gym.rotations import quaternion_to_dcm
-from quad_gym.simulation import FlightBatch
 from quad_gym.vehicle import state_derivative
 from tests.unit.test_vehicle import LAB, NO_FORCE, SKEWED, at_rest, newton_and_euler, random_state
 
@@ -321,7 +321,7 @@ def test_air_that_does_nothing_changes_nothing_but_rounding():
 def test_presets_are_known_by_name_and_fly():
     for name in ("calm", "breeze", "fresh_breeze"):
         batch = states_after(world=name)
-        assert batch.world == quad_gym.world_params(name)
+        assert batch.world == quad_gym.params.world(name)
         assert np.isfinite(batch.read("r")).all()
     with pytest.raises(ValueError, match="world must be one of calm"):
         FlightBatch(1, world="storm")

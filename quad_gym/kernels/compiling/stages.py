@@ -22,7 +22,7 @@ from numba.extending import intrinsic
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
-from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, Supply
+from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, Start, Supply
 
 
 class Stage(IntEnum):
@@ -33,6 +33,7 @@ class Stage(IntEnum):
     SUPPLY = auto()
     MOVE = auto()
     MOVE_IN_AIR = auto()
+    REST_ON_PAD = auto()
     BEGIN_IN_AIR = auto()
     DRIFT_BIASES = auto()
     AVERAGE_IMU = auto()
@@ -104,6 +105,10 @@ def _lasting(s: Any) -> bool:
     return bool(s["run_filter"] and s["imu_errs"] + s["heading_errs"] > 0)
 
 
+def _pad(s: Any) -> bool:
+    return bool(s["pad"] and s["start"] != Start.HOVER)
+
+
 def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
@@ -137,6 +142,7 @@ SOURCES = {
     Stage.LOOK: Source("task.look", "look_stage", _always),
     Stage.JUDGE: Source("task.reward", "judge_stage", _always),
     Stage.DRIFT_BIASES: Source("sensors.measure", "drift_biases_stage", _filter),
+    Stage.REST_ON_PAD: Source("vehicle.pad", "rest_on_pad_stage", _pad),
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
     Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),

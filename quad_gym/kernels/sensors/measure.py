@@ -21,6 +21,7 @@ from quad_gym.kernels.maths.linalg import (
     load33,
     norm,
     scale,
+    select3,
     sub,
     unit_or,
 )
@@ -62,6 +63,8 @@ def specific_force(flight, p, R_BI):
     d_I = add(load3(flight.disturbance), load3(flight.air_force))
     a_I, dw_B = accelerations(R_BI, v_air_I, w_B, load4(flight.rotor_speeds), d_I, p)
     dw_B = add(dw_B, apply(load33(p.inertia_inverse), load3(flight.air_torque)))
+    rest, on_pad = (0.0, 0.0, 0.0), flight.on_pad > 0.0
+    a_I, dw_B = select3(on_pad, rest, a_I), select3(on_pad, rest, dw_B)
     a_I = imu_point_acceleration(R_BI, a_I, w_B, dw_B, load3(p.imu_lever_arm))
     return apply(R_BI, (a_I[0], a_I[1], a_I[2] + p.gravity))
 

@@ -4,7 +4,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import atan2, clip, maximum, minimum, sin_cos
-from quad_gym.kernels.maths.linalg import add, keep3, load3, multiply, scale
+from quad_gym.kernels.maths.linalg import add, dot, keep3, load3, multiply, scale
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
@@ -194,6 +194,9 @@ def draw_start(flight, p, model, settings, stream, mask):
     x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
     v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
     yaw = _given_or(given[6], yaw)
+    still = dot(v_I, v_I) + dot(w_B, w_B) <= 0.0
+    on_pad = select(on_ground & still, 1.0 * settings.pad, 0.0)
+    flight.on_pad = select(mask, on_pad, flight.on_pad)
     keep3(flight.r, mask, (x, y, z))
     keep3(flight.v, mask, v_I)
     keep3(flight.w, mask, w_B)

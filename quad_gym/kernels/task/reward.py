@@ -1,4 +1,4 @@
-"""The judge of a step: errors, reward and endings, from the true state alone."""
+"""Errors, reward and endings of a step, from the true state alone."""
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import exp, is_finite
@@ -88,7 +88,7 @@ def judge(flight, p, settings, active):
     ending = select(lost, _OUT_OF_BOUNDS, ending)
     ending = select(finished, _LAST_GATE, ending)
     error = select(sound, error, settings.out_of_bounds)
-    reward = select(sound, reward, 0.0)
+    reward = select(sound, settings.reward_scale * reward, 0.0)
     flight.position_error = select(active, error, flight.position_error)
     flight.reward = select(active, reward, 0.0)
     flight.terminated = select(terminated, 1.0, 0.0)

@@ -67,7 +67,7 @@ EDITS = {
     "a docstring at the end": ("quad_gym/kernels/maths/linalg.py", "", DOCSTRING, (0, 0, 0)),
     "a docstring": (HELPER, "What it does.", "What it did.", (0, 0, 0)),
     "a comment in a record": ("quad_gym/records/flight.py", "", COMMENT, (0, 0, 0)),
-    "metrics": ("quad_gym/metrics.py", "", STATEMENT, (0, 0, 0)),
+    "metrics": ("quad_gym/analysis/metrics.py", "", STATEMENT, (0, 0, 0)),
     "environments": ("quad_gym/envs/single.py", "", STATEMENT, (0, 0, 0)),
     "parameters": ("quad_gym/params.py", "", STATEMENT, (0, 0, 0)),
     "another test": ("tests/other.py", "", STATEMENT, (0, 0, 0)),

@@ -15,7 +15,7 @@ from quad_gym.kernels import single
 from quad_gym.kernels.compiling import decorators
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.vehicle.dynamics import move_stage
-from quad_gym.packing import params_block, params_record
+from quad_gym.packing.flight import params_block, params_record
 from quad_gym.records import FLIGHT_BLOCK, SETTINGS, WORK_BLOCK, aligned_zeros
 
 assert decorators.LEAN == (sys.argv[1] == "lean")

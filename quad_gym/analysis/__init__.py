@@ -1,0 +1,1 @@
+"""Metrics, filter consistency, figures and reports; what scripts make of flights."""

@@ -1,0 +1,193 @@
+"""Figures that set controllers side by side: errors over time, learning curves, matrices, paths.
+
+As in `plots`: no window opens, colors are those of Okabe and Ito, and every curve has a line style
+of its own too.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.analysis.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    VERMILLION,
+    Trace,
+    draw_path,
+    house_style,
+)
+
+Floats = NDArray[np.float64]
+
+_STYLES = (
+    (GREY, (0, (1, 1.2))),
+    (VERMILLION, "solid"),
+    (ORANGE, (0, (5, 2))),
+    (BLUE, "solid"),
+    (GREEN, (0, (3, 1, 1, 1))),
+    ("#CC79A7", (0, (5, 1))),
+    ("#56B4E9", (0, (2, 1))),
+)
+"""Color and dashes of the curves, in order."""
+
+
+def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Any:
+    """Errors over time: the median over episodes, and the middle nine tenths as a band.
+
+    Args:
+        curves: Instants (k,) [s] and (3, k) 5th, 50th and 95th percentile [m] of each curve, by its
+            label; NaN: not flown.
+        title: Of the figure.
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        figure, axes = _figure((7.0, 3.8), title)
+        for (label, (time, (low, middle, high))), (color, dashes) in zip(
+            curves.items(), _cycle(len(curves)), strict=True
+        ):
+            axes.fill_between(time, low, high, color=color, alpha=0.15, linewidth=0)
+            axes.plot(time, middle, color=color, linestyle=dashes, label=label)
+        axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
+        axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
+        axes.set_xlabel("time [s]")
+        axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
+        axes.legend(loc="upper right", ncols=1 + (len(curves) > 4))
+    return figure
+
+
+def learning_figure(
+    curves: Mapping[str, Sequence[tuple[Floats, Floats]]],
+    levels: Mapping[str, float],
+    title: str = "",
+    *,
+    unit: str = "million steps",
+) -> Any:
+    """How errors fall while training: one thin line a seed, their median bold.
+
+    Args:
+        curves: Abscissae (k,) and errors (k,) [m] of every seed, by label.
+        levels: Horizontal lines to compare with [m], by label.
+        title: Of the figure.
+        unit: Of the abscissae.
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        figure, axes = _figure((7.0, 3.8), title)
+        for (label, seeds), (color, dashes) in zip(
+            curves.items(), _cycle(len(curves), skip=1), strict=True
+        ):
+            for x, y in seeds:
+                axes.plot(x, y, color=color, alpha=0.35, linewidth=0.8)
+            shortest = min(len(x) for x, _ in seeds)
+            middle = np.median([y[:shortest] for _, y in seeds], axis=0)
+            axes.plot(
+                seeds[0][0][:shortest],
+                middle,
+                color=color,
+                linestyle=dashes,
+                linewidth=2.0,
+                label=f"{label} (median of {len(seeds)})" if len(seeds) > 1 else label,
+            )
+        for label, level in levels.items():
+            axes.axhline(level, color=INK, linewidth=1.0, linestyle=(0, (4, 3)), label=label)
+        axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
+        axes.set_xlim(left=0.0)
+        axes.set_xlabel(f"training [{unit}]")
+        axes.set_ylabel("mean position error [m]")
+        axes.legend(loc="upper right")
+    return figure
+
+
+def matrix_figure(
+    values: Floats,
+    cells: Sequence[Sequence[str]],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    title: str = "",
+) -> Any:
+    """A table whose cells are shaded by their value, on a logarithmic scale.
+
+    Args:
+        values: (rows, columns) [m]; NaN: not measured.
+        cells: Text of each cell.
+        rows: Headings of the rows.
+        columns: Headings of the columns.
+        title: Of the figure.
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        figure, axes = _figure((2.6 + 2.1 * len(columns), 1.2 + 0.55 * len(rows)), title)
+        shades = np.log10(values)
+        axes.imshow(shades, cmap="cividis_r", aspect="auto", alpha=0.75)
+        middle = 0.5 * (np.nanmin(shades) + np.nanmax(shades))
+        for i, line in enumerate(cells):
+            for j, text in enumerate(line):
+                dark = shades[i, j] > middle
+                axes.text(j, i, text, ha="center", va="center", color="white" if dark else INK)
+        axes.set_xticks(range(len(columns)), columns)
+        axes.set_yticks(range(len(rows)), rows)
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0)
+        axes.grid(False)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+    return figure
+
+
+def paths_figure(traces: Mapping[str, Trace], title: str = "") -> Any:
+    """Paths from above, side by side on one scale.
+
+    Args:
+        traces: Flights, by their label.
+        title: Of the figure.
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        from matplotlib.figure import Figure
+
+        columns = 2 if len(traces) == 4 else min(len(traces), 3)
+        rows = -(-len(traces) // columns)
+        figure = Figure(figsize=(3.6 * columns, 3.7 * rows), layout="constrained")
+        figure.suptitle(title)
+        for k, (label, trace) in enumerate(traces.items()):
+            axes: Any = figure.add_subplot(rows, columns, k + 1)
+            draw_path(axes, trace)
+            axes.set_title(label)
+            if k:
+                axes.get_legend().remove()
+    return figure
+
+
+def _figure(size: tuple[float, float], title: str) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(title)
+    return figure, axes
+
+
+def _cycle(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:
+    return [_STYLES[(k + skip) % len(_STYLES)] for k in range(count)]
+
+
+def _plain_numbers(axis: Any) -> None:
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,131 @@
+"""Figures of consistency: mean squares in their bands, errors beside claims, autocorrelations."""
+
+from typing import Any
+
+import numpy as np
+
+from quad_gym.analysis.consistency import (
+    NEGLIGIBLE_CORRELATION,
+    PARTS,
+    Floats,
+    MeanSquare,
+    Whiteness,
+)
+from quad_gym.analysis.plots import BLUE, GREY, INK, PALE, VERMILLION, require_matplotlib
+
+_TITLES = {
+    "state": "whole state",
+    "position": "position",
+    "velocity": "velocity",
+    "attitude": "attitude",
+    "accel_bias": "accelerometer bias",
+    "gyro_bias": "gyro bias",
+}
+_UNITS = {
+    "position": ("mm", 1e3),
+    "velocity": ("mm/s", 1e3),
+    "attitude": ("mrad", 1e3),
+    "accel_bias": ("mm/s²", 1e3),
+    "gyro_bias": ("deg/h", np.degrees(3600.0)),
+}
+
+
+def _grid(count: int, title: str, height: float = 2.1) -> tuple[Any, Any]:
+    """A figure of `count` pictures, three in a row; four are two by two."""
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    columns = 2 if count == 4 else 3
+    rows = -(-count // columns)
+    figure = Figure(figsize=(10.0, 0.6 + height * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for spare in axes[count:]:
+        spare.set_visible(False)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0)
+    for axis in axes[max(0, count - columns) : count]:
+        axis.set_xlabel("time [s]")
+    return figure, axes[:count]
+
+
+def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
+    """Draw a mean square over time with its band, and how often it lies inside.
+
+    Args:
+        axes: Where to.
+        part: The mean square.
+        settle: Instants before do not count for the share in the title [s].
+    """
+    axes.fill_between(part.time, part.low, part.high, color=PALE, linewidth=0.0)
+    axes.axhline(part.dimension, color=GREY, linewidth=0.8)
+    axes.plot(part.time, part.mean, color=BLUE, linewidth=1.2)
+    if settle > 0.0:
+        axes.axvline(settle, color=VERMILLION, linewidth=0.8, linestyle=":")
+    counted = part.since(settle)
+    title = _TITLES.get(part.name, part.name)
+    axes.set_title(f"{title}: {counted.overall:.2f}, inside {100 * counted.share_inside:.0f} %")
+    reach = 3.0 * (part.high - part.low).max()
+    gaps = np.abs(counted.mean - part.dimension)
+    limit = max(reach, 1.15 * float(np.percentile(gaps, 98.0)))  # not for the sake of one instant
+    axes.set_ylim(max(0.0, part.dimension - limit), part.dimension + limit)
+    axes.set_xlim(0.0, part.time[-1])
+
+
+def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
+    """NEES of the state and its blocks over time, each in its band."""
+    text = f"{title}\nMean NEES over flights (blue), in the 95 % band of a consistent filter (gray)"
+    figure, axes = _grid(len(parts), text)
+    for axis, part in zip(axes, parts.values(), strict=True):
+        draw_mean_square(axis, part, settle)
+    return figure
+
+
+def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
+    """Root mean square errors (t, 15) over flights, and the deviations that the filter claims."""
+    require_matplotlib()
+    from matplotlib.ticker import LogLocator
+
+    text = (
+        f"{title}\nError (blue) and what the filter claims (dashed), root mean square over flights"
+    )
+    blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
+    figure, axes = _grid(len(blocks), text)
+    for axis, (name, part) in zip(axes, blocks.items(), strict=True):
+        unit, factor = _UNITS[name]
+        for values, style in ((errors, {"color": BLUE}), (sigmas, {"color": INK})):
+            size = factor * np.sqrt((values[:, part] ** 2).sum(axis=1))
+            dashed = (0, (4, 3)) if values is sigmas else "-"
+            axis.plot(time, size, linestyle=dashed, linewidth=1.3, **style)
+        axis.set_title(f"{_TITLES[name]} [{unit}]")
+        axis.set_yscale("log")
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.tick_params(axis="y", which="minor", labelsize=7.0)
+        axis.set_xlim(0.0, time[-1])
+    return figure
+
+
+def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
+    """NIS of the sensors over time, each in its band."""
+    text = f"{title}\nMean NIS over flights (blue), in the 95 % band of a consistent filter (gray)"
+    figure, axes = _grid(len(parts), text)
+    for axis, part in zip(axes, parts.values(), strict=True):
+        draw_mean_square(axis, part, settle)
+    return figure
+
+
+def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
+    """Autocorrelation of the innovations of each sensor, with the band of white ones."""
+    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white ones (gray)"
+    figure, axes = _grid(len(found), text)
+    for axis, part in zip(axes, found.values(), strict=True):
+        lags = np.arange(1, part.correlation.size + 1)
+        axis.fill_between(lags, -part.band, part.band, color=PALE, linewidth=0.0)
+        axis.axhline(0.0, color=GREY, linewidth=0.8)
+        axis.vlines(lags, 0.0, part.correlation, color=BLUE, linewidth=1.6)
+        axis.plot(lags, part.correlation, color=BLUE, marker="o", markersize=3.0, linestyle="none")
+        limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
+        axis.set_ylim(-limit, limit)
+        axis.set_title(f"{_TITLES.get(part.name, part.name)}: at most {part.largest:+.3f}")
+        axis.set_xlabel("measurements apart")
+    return figure

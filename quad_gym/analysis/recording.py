@@ -1,0 +1,227 @@
+"""Fly a batch to the end and keep what tables and figures of a flight need.
+
+Nothing is kept of every instant of every flight but sums and percentiles, so that a hundred
+thousand flights fit into memory as well as ten.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.analysis.metrics import RunningSummary, TrackingSummary, nees, state_error
+from quad_gym.analysis.plots import Band, Trace
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.records import Ending, Source
+from quad_gym.rotations import quaternion_to_dcm
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What came of a batch of flights; arrays have one entry a flight."""
+
+    tracking: TrackingSummary
+    """distance of the true position from the reference [m]"""
+    estimation: TrackingSummary | None
+    """distance of the estimated from the true position [m]; None where nothing was estimated"""
+    ending: NDArray[np.int64]
+    """why a flight ended early, see `Ending`; 0: it did not"""
+    ended_at: Floats
+    """when [s]; NaN: it did not"""
+    trace: Trace
+    """the first flight, up to its ending"""
+    band: Band
+    """5th to 95th percentile of the tracking errors of the flights not yet ended"""
+    nees_time: Floats
+    """(k,) instants at which the filter's consistency was looked at [s]"""
+    nees: Floats
+    """(k, n) of the filter's whole state; NaN after an ending and where nothing was estimated"""
+
+    @property
+    def finished(self) -> NDArray[np.bool_]:
+        """Which flights flew to the end."""
+        return np.asarray(self.ending == Ending.NONE)
+
+    @property
+    def nees_last_half(self) -> Floats:
+        """NEES of all flights at all instants of the last half, (m,) without NaN."""
+        late = self.nees[self.nees_time >= 0.5 * self.nees_time[-1]]
+        return np.asarray(late[np.isfinite(late)])
+
+    def count(self, *, filter_failed: bool) -> int:
+        """How many flights ended early because the filter failed, or else because they crashed."""
+        of_filter = self.ending == Ending.FILTER_FAILED
+        return int((~self.finished & (of_filter == filter_failed)).sum())
+
+    def ending_names(self) -> list[str]:
+        """Why each flight ended early, or "finished"."""
+        names = {int(e): e.name.lower() for e in Ending} | {0: "finished"}
+        return [names[int(code)] for code in self.ending]
+
+
+def record_flights(
+    batch: FlightBatch,
+    seeds: Sequence[int],
+    steps: int,
+    *,
+    nees_samples: int = 20,
+    progress: Callable[[range], Iterable[int]] | None = None,
+) -> Recording:
+    """Fly all flights of a batch that flies by itself, and record them.
+
+    A flight counts up to the step that ends its episode; that step and what follows do not count.
+
+    Args:
+        batch: Flights of `Control.PD` without autoreset.
+        seeds: One per flight.
+        steps: Control periods to fly.
+        nees_samples: Instants, evenly spread over the flight, at which NEES is computed.
+        progress: Wraps the range of instants, as `tqdm.tqdm` does.
+
+    Returns:
+        The recording; the start counts as the first of `steps + 1` instants.
+    """
+    count = batch.count
+    times = np.arange(steps + 1, dtype=np.float64) / batch.clocks.control_rate
+    estimating = batch.source == Source.ESTIMATE
+    flying = np.ones(count, bool)
+    ending, ended_at = np.zeros(count, np.int64), np.full(count, np.nan)
+    tracking, estimation = RunningSummary(count, steps + 1), RunningSummary(count, steps + 1)
+    position, quaternion = np.empty((steps + 1, 3)), np.empty((steps + 1, 4))
+    error, percentiles = np.full(steps + 1, np.nan), np.full((2, steps + 1), np.nan)
+    samples = np.unique(np.linspace(0, steps, nees_samples + 1).round().astype(int)[1:])
+    nees_values = np.full((len(samples), count), np.nan)
+
+    instants = range(steps + 1)
+    for step in instants if progress is None else progress(instants):
+        if step == 0:
+            batch.reset(seeds=seeds)
+        else:
+            batch.step()
+            over = flying & (batch.result("terminated") + batch.result("truncated") > 0.0)
+            ending[over], ended_at[over] = batch.result("ending")[over], times[step]
+            flying &= ~over
+        errors = batch.read("position_error")
+        tracking.add(errors, flying)
+        estimation.add(batch.read("estimation_error"), flying)
+        if flying.any():
+            percentiles[:, step] = np.percentile(errors[flying], (5.0, 95.0))
+        position[step], quaternion[step] = batch.read("r")[0], batch.read("q")[0]
+        error[step] = errors[0]
+        row = int(np.searchsorted(samples, step))
+        if estimating and samples[row] == step and flying.any():
+            nees_values[row, flying] = nees_of_flights(batch, flying)
+
+    alike = bool(np.allclose(percentiles[0], percentiles[1], equal_nan=True))
+    share = "all" if alike else "5 to 95 % of"
+    shown = slice(0, len(times) if flying[0] else int((times < ended_at[0]).sum()))
+    return Recording(
+        tracking=tracking.result(),
+        estimation=estimation.result() if estimating else None,
+        ending=ending,
+        ended_at=ended_at,
+        trace=Trace(
+            time=times[shown],
+            position=position[shown],
+            heading=quaternion_to_dcm(quaternion[shown])[:, 0, :2],
+            reference=reference_of_flight(batch, 0, times[shown]),
+            error=error[shown],
+        ),
+        band=Band(
+            low=percentiles[0, shown],
+            high=percentiles[1, shown],
+            label=f"{share} {count:,} flights" if count > 1 else "the only flight",
+        ),
+        nees_time=times[samples],
+        nees=nees_values,
+    )
+
+
+class Tracer:
+    """Keeps how episodes go on over time: the error of all, the paths of the first few.
+
+    Hand its `add` to `evaluation.roll_out` as `watch`, of an environment that does not begin new
+    episodes within a step. Arrays have an entry for each instant, the start first.
+
+    Args:
+        paths: Flights whose path is kept.
+    """
+
+    def __init__(self, paths: int = 1) -> None:
+        self._paths = paths
+        self._errors: list[Floats] = []
+        self._positions: list[Floats] = []
+        self._headings: list[Floats] = []
+        self._references: Floats | None = None
+        self.control_rate = 0.0
+
+    def add(self, step: int, batch: FlightBatch, flying: NDArray[np.bool_]) -> None:
+        """Keep the present instant of flights that are still flying."""
+        first = np.arange(min(self._paths, batch.count))
+        if step == 0:
+            self.control_rate = batch.clocks.control_rate
+            times = np.arange(batch.max_steps + 1) / self.control_rate
+            gates = batch.read("gates", first)[:, : batch.task.gate_count]
+            course = batch.task.kind == "waypoints"
+            paths = [reference_of_flight(batch, int(i), times) for i in first]
+            self._references = gates if course else np.stack(paths)
+        here = flying[first, np.newaxis]
+        self._errors.append(np.where(flying, batch.read("position_error"), np.nan))
+        self._positions.append(np.where(here, batch.read("r", first), np.nan))
+        R_BI = quaternion_to_dcm(batch.read("q", first))
+        self._headings.append(np.where(here, R_BI[:, 0, :2], np.nan))
+
+    @property
+    def time(self) -> Floats:
+        """(k,) instants [s]."""
+        return np.arange(len(self._errors)) / self.control_rate
+
+    @property
+    def errors(self) -> Floats:
+        """(k, n) true position error [m]; NaN after an episode's end."""
+        return np.stack(self._errors)
+
+    @property
+    def percentiles(self) -> Floats:
+        """(3, k) 5th, 50th and 95th percentile of the error of the episodes not yet ended [m]."""
+        errors = self.errors
+        found = np.full((3, len(errors)), np.nan)
+        flown = np.isfinite(errors).any(axis=1)
+        found[:, flown] = np.nanpercentile(errors[flown], (5.0, 50.0, 95.0), axis=1)
+        return found
+
+    def trace(self, flight: int) -> Trace:
+        """The path of one of the first flights, up to its end."""
+        position = np.stack(self._positions)[:, flight]
+        shown = np.isfinite(position[:, 0])
+        assert self._references is not None
+        reference = self._references[flight]
+        return Trace(
+            time=self.time[shown],
+            position=position[shown],
+            heading=np.stack(self._headings)[shown, flight],
+            reference=reference[: len(shown)][shown] if len(reference) >= len(shown) else reference,
+            error=self.errors[shown, flight],
+        )
+
+
+def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
+    """Normalized estimation error squared of the chosen flights at the present instant, (m,)."""
+    names = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
+    truth: dict[str, Any] = {word: batch.read(name)[chosen] for word, name in names.items()}
+    estimate = {word: batch.read(f"{name}_hat")[chosen] for word, name in names.items()}
+    truth["R_BI"] = quaternion_to_dcm(batch.read("q")[chosen])
+    estimate["R_BI"] = batch.read("R_hat")[chosen]
+    return nees(state_error(truth, estimate), batch.covariance()[chosen])
+
+
+def reference_of_flight(batch: FlightBatch, flight: int, times: Floats) -> Floats:
+    """Where the reference of a flight is at given times [s], (n, 3) in I [m]."""
+    omega, center = batch.read("ref_omega")[flight], batch.read("ref_center")[flight]
+    cosines, sines = batch.read("ref_cos")[flight], batch.read("ref_sin")[flight]
+    angles = omega * np.outer(times, np.arange(1, len(cosines) + 1))
+    return np.asarray(center + np.cos(angles) @ cosines + np.sin(angles) @ sines)

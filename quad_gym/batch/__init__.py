@@ -1,0 +1,1 @@
+"""`FlightBatch`: owns the records of many flights; threads, starts and warm starts."""

@@ -1,0 +1,470 @@
+"""`FlightBatch`: many flights of one configuration, flown together."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
+from quad_gym.batch.threads import Crew, Fly, resolve_threads
+from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
+from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
+from quad_gym.kernels.batch import fly
+from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.packing.faults import pack_faults
+from quad_gym.packing.flight import (
+    pack_imperfections,
+    pack_latency,
+    params_block,
+    params_record,
+    settings_record,
+)
+from quad_gym.packing.world import pack_options
+from quad_gym.params import checks as check
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.control import ActionParams, PDGains, pd_gains
+from quad_gym.params.randomization import DrawingTable, Given, Randomization, check_draws
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import sensor_suite
+from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.vehicle import VehicleParams, vehicle_params
+from quad_gym.params.world import WorldParams, world_params
+from quad_gym.records import (
+    COLUMNS,
+    FLIGHT_BLOCK,
+    MAX_ACTION_DELAY,
+    RESULTS,
+    WIDTH,
+    WORK_BLOCK,
+    Autoreset,
+    Command,
+    Control,
+    Layout,
+    Source,
+    aligned_zeros,
+    field_of_flights,
+)
+
+_NO_BOUNDS = np.zeros(0)
+
+
+class FlightBatch:
+    """N flights of one configuration, advanced together by compiled kernels.
+
+    A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does
+    depends on its seed and its actions alone, not on the batch's size, its order or the number of
+    threads.
+
+    Args:
+        count: Number of flights.
+        vehicle: The vehicle, or the name of a preset.
+        sensors: The sensor suite, or the name of a preset.
+        gains: Gains of `Control.PD`, or the name of a preset.
+        actions: Scaling of actions and bandwidths of the inner loops.
+        task: Reference, start and endings.
+        source: What the controller sees.
+        control: What an action means; `Control.PD` flies by itself.
+        control_rate: Actions per second, a whole division of the IMU rate [Hz].
+        substeps: Runge-Kutta steps in a tick.
+        action_delay: How much later than commanded an action is carried out, at most
+            MAX_ACTION_DELAY, in whole ticks [control steps]. Before, a vehicle hovers.
+        layout: What an observation holds.
+        include_covariance: Whether an observation holds the filter's standard deviations.
+        privileged: Whether an observation ends with the truth.
+        bounds: (low, high) of the observation, each (n,); None: the batch observes nothing.
+        autoreset: When a flight whose episode is over begins the next one.
+        run_filter: Whether sensors and filter run; None: where something needs them.
+        filter_start: "cold": the filter starts from its first fix; "warm": it has converged in
+            `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn
+            from the covariance that it has reached.
+        innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
+            "innovation_sigma", "block_nis"; a gate keeps them anyway.
+        threads: Threads to use; None: as many as there are cores.
+        true_vehicle: The vehicle as it is, where it differs from the nominal one that the
+            controller knows.
+        true_sensors: The sensors as they are, where they differ from what the filter believes.
+        world: Wind, gusts, drag, ground and battery, or the name of a preset.
+        randomization: What is drawn anew for every episode, around `true_vehicle`, `true_sensors`
+            and `world`: a `Randomization`, or distributions by name.
+        faults: What goes wrong: faults, or names of presets, see `quad_gym.faults`.
+
+    Raises:
+        ValueError: If an argument is invalid; nothing is allocated then.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        vehicle: VehicleParams | str = "lab",
+        sensors: SensorSuite | str = "standard",
+        gains: PDGains | str = "lab",
+        actions: ActionParams | None = None,
+        task: TaskParams | None = None,
+        source: Source = Source.ESTIMATE,
+        control: Control = Control.PD,
+        control_rate: float | None = None,
+        substeps: int = 1,
+        action_delay: float = 0.0,
+        layout: Layout = Layout.RELATIVE,
+        include_covariance: bool = False,
+        privileged: bool = False,
+        bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+        autoreset: Autoreset = Autoreset.DISABLED,
+        run_filter: bool | None = None,
+        filter_start: str = "cold",
+        innovations: bool = False,
+        threads: int | None = None,
+        true_vehicle: VehicleParams | None = None,
+        true_sensors: SensorSuite | None = None,
+        world: WorldParams | str = "calm",
+        randomization: Randomization | Mapping[str, Given] | None = None,
+        faults: FaultsGiven = None,
+    ) -> None:
+        self.count = check.whole("count", count, most=10**7)
+        self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
+        self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
+        self.gains = pd_gains(gains) if isinstance(gains, str) else gains
+        self.actions = ActionParams() if actions is None else actions
+        self.task = TaskParams() if task is None else task
+        self.world = world_params(world) if isinstance(world, str) else world
+        self.randomization = Randomization.of(randomization)
+        for name, value, kind in (
+            ("vehicle", self.vehicle, VehicleParams),
+            ("sensors", self.sensors, SensorSuite),
+            ("gains", self.gains, PDGains),
+            ("actions", self.actions, ActionParams),
+            ("task", self.task, TaskParams),
+            ("true_vehicle", self.vehicle if true_vehicle is None else true_vehicle, VehicleParams),
+            ("true_sensors", self.sensors if true_sensors is None else true_sensors, SensorSuite),
+            ("world", self.world, WorldParams),
+        ):
+            check.instance(name, value, kind)
+        self.source, self.control = Source(source), Control(control)
+        rate = self.sensors.imu.rate if control_rate is None else control_rate
+        self.clocks = Clocks.of(self.sensors, rate, substeps)
+        check_limit(self.task, self.clocks.imu_rate, "IMU rate")
+        self.threads = resolve_threads(threads)
+        true_vehicle = self.vehicle if true_vehicle is None else true_vehicle
+        true_sensors = self.sensors if true_sensors is None else true_sensors
+        self.sensors.require_like(true_sensors)
+        self.faults = faults_of(faults, true_sensors)
+        self.innovations = check.flag("innovations", innovations)
+        check.flag("include_covariance", include_covariance)
+        check.flag("privileged", privileged)
+        check.choice("filter_start", filter_start, FILTER_STARTS)
+        if run_filter is None:
+            needed = include_covariance or innovations
+            run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
+        self.run_filter = check.flag("run_filter", run_filter)
+        watches = self.innovations or self.sensors.estimator.gate_false_alarm > 0.0
+        if self.task.end_when_lost and not (run_filter and watches):
+            raise ValueError(
+                "end_when_lost needs a filter that watches its innovations: a suite whose filter "
+                "gates, such as 'rtk', or innovations=True"
+            )
+        if run_filter:
+            self.sensors.require_filter()
+
+        self.action_delay = check.number(
+            "action_delay", action_delay, least=0.0, most=float(MAX_ACTION_DELAY)
+        )
+        draws = DrawingTable(
+            self.randomization, true_vehicle, true_sensors, self.world, self.action_delay
+        )
+        longest_delay = math.ceil(draws.high[COLUMNS["action_delay"]][0])
+        if longest_delay > 0 and self.control is Control.PD:
+            raise ValueError("action_delay needs actions: Control.PD flies without any")
+        check_draws(draws, true_vehicle, self.world, self.clocks)
+        model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
+        true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
+        true["action_delay"] = self.action_delay
+        self._model, self._world = params_block(model), params_block(true)
+        self._own = [self._world.copy() for _ in range(self.threads)]
+        self._settings = settings_record(
+            self.task,
+            self.clocks,
+            self.sensors,
+            source=self.source,
+            control=self.control,
+            layout=Layout(layout),
+            include_covariance=include_covariance,
+            privileged=privileged,
+            autoreset=Autoreset(autoreset),
+            run_filter=run_filter,
+            innovations=innovations,
+            lever_drawn=self.randomization.known
+            and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
+            gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
+        )
+        pack_options(
+            self._settings[0],
+            self.world,
+            draws,
+            known=self.randomization.known,
+            limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
+        )
+        self._settings["action_delays"] = longest_delay
+        pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
+        pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors.estimator)
+        pack_imperfections(self._settings[0], true_sensors)
+        if run_filter and filter_start == "warm":
+            pack_warm_start(
+                self._settings[0],
+                FlightBatch,
+                vehicle=self.vehicle,
+                sensors=self.sensors,
+                task=self.task,
+                substeps=substeps,
+            )
+        self._stages = needed_stages(self._settings[0])
+        self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
+        self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
+        lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
+        self._blocks["idle"] = lanes >= self.count
+        self._blocks["needs_reset"] = 1.0
+        for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
+            self._blocks[name] = np.nan
+        self._blocks["drawn"] = draws.low[:, np.newaxis]  # as it stays where nothing is drawn
+        self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
+        self._actions = np.zeros((self.count, 4))
+        self._resets = np.zeros(self.count, np.uint8)
+        self._begun = False
+        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
+        self._results = np.zeros((len(RESULTS), self.count))
+        self._observations = np.zeros((self.count, self._low.size), np.float32)
+        self._crew: Crew | None = None
+
+    # ---- flying -------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seeds: Sequence[int | None] | None = None,
+        keys: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        velocity: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
+    ) -> NDArray[np.float32]:
+        """Begin new episodes.
+
+        Args:
+            seeds: One per flight, seeding it as Gymnasium seeds an environment; None in it: fresh
+                entropy.
+            keys: (count, 2) keys of the random streams, instead of seeds. Without either, streams
+                go on.
+            mask: (count,) bool: which flights; None: all.
+            position: (3,) or (count, 3) in I, to start with instead of a drawn one [m].
+            velocity: (3,) or (count, 3) in I, likewise [m/s].
+            yaw: Scalar or (count,), likewise [rad].
+
+        Returns:
+            (count, n_observation) float32 observations of the present instant, of all flights.
+
+        Raises:
+            ValueError: If the arguments do not fit the number of flights; nothing has changed then.
+        """
+        chosen = checked_mask(self.count, mask)
+        given = checked_start(self.count, position, velocity, yaw, self.task)
+        words = checked_keys(self.count, seeds, keys)
+        if words is not None:
+            for flight in np.flatnonzero(chosen):
+                block, lane = divmod(int(flight), WIDTH)
+                self._blocks["key"][block, :, lane] = words[flight]
+                self._blocks["instant"][block, lane] = 0
+                self._blocks["episode"][block, lane] = 0.0
+        self._resets[:] = chosen
+        if given is None:
+            return self._run(Command.RESET)
+        lanes = np.full((len(self._blocks) * WIDTH, 7), np.nan)
+        lanes[: self.count] = given
+        self._blocks["start_given"] = lanes.reshape(-1, WIDTH, 7).transpose(0, 2, 1)
+        observations = self._run(Command.RESET)
+        self._blocks["start_given"] = np.nan
+        return observations
+
+    def step(self, actions: NDArray[Any] | None = None) -> NDArray[np.float32]:
+        """Fly one control period.
+
+        Args:
+            actions: (count, 4) in [-1, 1], already checked; None keeps the present ones.
+
+        Returns:
+            (count, n_observation) float32 observations; `results` holds the rest.
+
+        Raises:
+            ValueError: If flights have never been reset; it is a RuntimeError, too.
+        """
+        if not self._begun:
+            self._require_begun()
+        self._actions[:] = self.read("action") if actions is None else actions
+        return self._run(Command.STEP)
+
+    def _require_begun(self) -> None:
+        """Refuse to step flights that have no state; looked at until all flights have one."""
+        waiting = (self._blocks["episode"] == 0.0) & (self._blocks["idle"] == 0.0)
+        if waiting.any():
+            raise check.NotResetError(
+                f"call reset() before step(): {int(waiting.sum())} of {self.count} flights have "
+                "never been reset"
+            )
+        self._begun = True
+
+    def _run(self, command: Command) -> NDArray[np.float32]:
+        table = linked_table(self._stages)
+        if self._crew is None or self._crew.process != os.getpid():
+            self._crew = Crew(self._ranges(table), len(self._blocks), self.threads)
+        self._crew.run(int(command))
+        return self._observations.copy()
+
+    def _ranges(self, table: NDArray[Any]) -> Fly:
+        """What flies a range of blocks; it knows the arrays, not the batch, which may go."""
+        own, work = self._own, self._work
+        blocks, resets, world = self._blocks, self._resets, self._world
+        model = (self._model, self._settings)
+        after = (table, self._actions, self._low, self._high)
+        written = (self._observations, self.final_observations, self._results)
+
+        def fly_range(
+            number: int, first: int, last: int, words: NDArray[np.int64], serving: int
+        ) -> None:
+            fly(
+                blocks,
+                first,
+                last,
+                resets,
+                world,
+                own[number],
+                *model,
+                work[number],
+                *after,
+                *written,
+                words,
+                serving,
+            )
+
+        return fly_range
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the threads, which a copy makes anew."""
+        return self.__dict__ | {"_crew": None}
+
+    def limit(self, max_steps: int) -> None:
+        """Truncate episodes after this many steps; 0: never."""
+        self._settings["max_steps"] = check.whole("max_steps", max_steps, least=0)
+
+    @property
+    def max_steps(self) -> int:
+        """Steps after which an episode is truncated; 0: never."""
+        return int(self._settings["max_steps"][0])
+
+    def switch_sensors(self, *, gnss: bool | None = None, camera: bool | None = None) -> None:
+        """Let sensors of all flights fail, or measure again, from the next tick on.
+
+        The filter goes on without them. A new episode begins with all sensors measuring.
+
+        Args:
+            gnss: Whether GNSS measures; None: as it does now.
+            camera: Likewise.
+        """
+        for sensor, measures in (("gnss", gnss), ("camera", camera)):
+            waits = self._blocks[f"{sensor}_wait"]
+            if measures is not None and check.flag(sensor, measures):
+                waits[np.isinf(waits)] = 0.0
+            elif measures is not None:
+                waits[:] = np.inf  # it is never due
+
+    def switch_faults(self, active: bool) -> None:
+        """Let the faults of all flights come, or go, at the next tick, whatever their time is.
+
+        They stay so to the end of the episode, but for those that come at a rate.
+
+        Args:
+            active: Whether they come.
+        """
+        check.flag("active", active)
+        tick = self._blocks["tick"]
+        for fault in self.faults:
+            if active:
+                self._blocks["fault_from"][:, fault.kind] = tick
+            self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
+
+    # ---- reading ------------------------------------------------------------------------------
+
+    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """One field, such as "r" or "b_a_hat", or one drawn parameter, as a new array (n, ...).
+
+        Args:
+            name: The field; or what is drawn for every episode, such as "mass".
+            flights: Whose, by their numbers; None: all flights'.
+
+        Raises:
+            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
+        """
+        if name in self.randomization.names:
+            values = self.drawn()[name]
+            return values if flights is None else values[flights]
+        if name not in (FLIGHT_BLOCK.names or ()):
+            drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
+            raise ValueError(
+                f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
+                f"got {name!r}"
+            )
+        if flights is None:
+            return field_of_flights(self._blocks, name, self.count)
+        return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
+
+    @property
+    def results(self) -> NDArray[np.float64]:
+        """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
+        return self._results.T
+
+    def result(self, name: str) -> NDArray[np.float64]:
+        """One column of `RESULTS` of the last step, as a new array (count,)."""
+        return self._results[RESULTS.index(name)].copy()
+
+    def drawn(self) -> dict[str, NDArray[np.float64]]:
+        """What the present episodes have drawn, by name: (count,) or (count, components)."""
+        found = {}
+        for name in self.randomization.names:
+            values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
+            values = values.reshape(-1, values.shape[-1])[: self.count].copy()
+            found[name] = values[:, 0] if values.shape[1] == 1 else values
+        return found
+
+    def active_faults(self) -> dict[str, NDArray[np.bool_]]:
+        """Which of the faults that can come are there now, by name: (count,) each."""
+        return named_faults(self.faults, self.read("faults"))
+
+    def covariance(self) -> NDArray[np.float64]:
+        """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
+        factor = self.read("L")
+        return factor @ factor.transpose(0, 2, 1)
+
+    # ---- keeping ------------------------------------------------------------------------------
+
+    def snapshot(self) -> NDArray[Any]:
+        """A copy of all flights; `restore` brings them back to this instant bit for bit."""
+        return self._blocks.copy()
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Bring all flights back to a snapshot of this batch, or of one of the same size.
+
+        Raises:
+            ValueError: If the snapshot is of another size or kind.
+        """
+        fits = (
+            isinstance(snapshot, np.ndarray)
+            and snapshot.dtype == FLIGHT_BLOCK
+            and snapshot.shape == self._blocks.shape
+            and np.array_equal(snapshot["idle"], self._blocks["idle"])
+        )
+        if not fits:
+            raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
+        self._blocks[:] = snapshot
+        self._begun = False  # it may have been taken before a reset

@@ -1,0 +1,119 @@
+"""What a reset is given: random streams, which flights, and where they start."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.task import TaskParams
+
+MAX_SPEED = 1e4
+"""Fastest start [m/s]: some times faster than any bullet, and the drag still integrable."""
+
+MAX_YAW = 1e4
+"""Some thousand turns [rad]: a heading beyond is a mistake."""
+
+
+def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
+    """Draw the key of a flight's random stream, (2,) words."""
+    return rng.integers(0, 2**64, size=2, dtype=np.uint64, endpoint=False)
+
+
+def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
+    """Keys for flights seeded one by one, as Gymnasium seeds; None takes fresh entropy."""
+    checked = [check.seed("seeds", seed) for seed in seeds]
+    return np.array([stream_key(np.random.Generator(np.random.PCG64(seed))) for seed in checked])
+
+
+def checked_keys(
+    count: int, seeds: Sequence[int | None] | None, keys: ArrayLike | None
+) -> NDArray[np.uint64] | None:
+    """(count, 2) keys, those of the seeds if there are any; None if there are neither."""
+    if seeds is not None:
+        if isinstance(seeds, str) or not hasattr(seeds, "__len__"):
+            raise ValueError(f"seeds must hold {count} seeds, got {seeds!r}")
+        if len(seeds) != count:
+            raise ValueError(f"seeds must hold {count} seeds, got {len(seeds)}")
+        return stream_keys(seeds)
+    if keys is None:
+        return None
+    words = np.asarray(keys)
+    if words.shape != (count, 2) or words.dtype != np.uint64:
+        raise ValueError(
+            f"keys must be uint64 of shape ({count}, 2), got {words.dtype} of {words.shape}"
+        )
+    return words
+
+
+def checked_start(
+    count: int,
+    position: ArrayLike | None,
+    velocity: ArrayLike | None,
+    yaw: ArrayLike | None,
+    task: TaskParams,
+) -> NDArray[np.float64] | None:
+    """(count, 7) start values, NaN where they are to be drawn; None if all are.
+
+    Raises:
+        ValueError: If one has another shape, is not finite, or no flight can begin there: farther
+            from the origin than the task's bounds around any of its references, faster than
+            MAX_SPEED, or turned by more than MAX_YAW.
+    """
+    if position is None and velocity is None and yaw is None:
+        return None
+    given = np.full((count, 7), np.nan)
+    for name, value, columns in (
+        ("position", position, slice(0, 3)),
+        ("velocity", velocity, slice(3, 6)),
+        ("yaw", yaw, slice(6, 7)),
+    ):
+        if value is None:
+            continue
+        width = columns.stop - columns.start
+        try:
+            if np.asarray(value).dtype.kind not in "iuf":
+                raise TypeError
+            numbers = np.asarray(value, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(f"{name} must be numbers, got {value!r}") from None
+        if name == "yaw":
+            numbers = numbers[..., np.newaxis]
+        if numbers.shape not in ((width,), (count, width)):
+            shapes = "a number or (n,)" if name == "yaw" else "(3,) or (n, 3)"
+            raise ValueError(f"{name} must have shape {shapes}, got {np.shape(value)}")
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{name} must be finite, got {value!r}")
+        given[:, columns] = numbers
+    reach = 1.5 * task.radius + 1.3 * task.height  # of any reference from the origin
+    farthest = task.out_of_bounds + reach
+    with np.errstate(over="ignore"):  # infinite lengths are refused like others
+        distance = _largest(given[:, :3])
+        speed = _largest(given[:, 3:6])
+    if distance > farthest:
+        raise ValueError(
+            f"position must be within {farthest:g} m of the origin: farther, a start is beyond "
+            f"out_of_bounds={task.out_of_bounds:g} m of the reference, got {distance:g} m"
+        )
+    if speed > MAX_SPEED:
+        raise ValueError(f"velocity must be at most {MAX_SPEED:g} m/s, got {speed:g} m/s")
+    if np.abs(given[:, 6]).max() > MAX_YAW:
+        raise ValueError(f"yaw must be at most {MAX_YAW:g} rad either way, got {yaw!r}")
+    return given
+
+
+def _largest(rows: NDArray[np.float64]) -> float:
+    """The largest length of a row; NaN, which is larger than nothing, if none is given."""
+    return float(np.linalg.norm(rows, axis=1).max())
+
+
+def checked_mask(count: int, mask: ArrayLike | None) -> NDArray[np.bool_]:
+    """(count,) which flights; all without a mask."""
+    if mask is None:
+        return np.ones(count, bool)
+    chosen = np.asarray(mask)
+    if chosen.shape != (count,) or chosen.dtype != bool:
+        raise ValueError(
+            f"mask must be {count} booleans, got shape {chosen.shape} of {chosen.dtype}"
+        )
+    return chosen

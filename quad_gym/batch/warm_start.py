@@ -1,0 +1,156 @@
+"""Warm starts: the covariance that a filter has reached before a flight begins.
+
+Before any real take-off the filter has been running for a while. How sure it is then depends on the
+sensors and hardly on the flight, so that it is computed once for a configuration: flights hover
+where the task begins, each with noise of its own, and the mean of their covariances, turned to a
+common heading, is what every episode begins with.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import portable
+from quad_gym.params.sensors import ImuParams, SensorSuite
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.records import WARM_DRAWS, Autoreset, Control, Source
+from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
+
+FILTER_STARTS = ("cold", "warm")
+"""Values of the keyword `filter_start`."""
+
+WARM_UP = 10.0
+"""How long a filter has been running at a warm start [s]: some correlation times of its velocity
+and attitude, as between switching a vehicle on and its take-off."""
+
+FLIGHTS = 8
+"""Flights whose covariances are averaged."""
+
+LOST = 0.35
+"""Error of the attitude beyond which a filter is lost, whatever it claims [rad]: a linear model of
+it is wrong by its square over two. Overconfidence alone is no reason to refuse a warm start."""
+
+Floats = NDArray[np.float64]
+
+
+def pack_warm_start(settings: Any, make: Callable[..., Any], **configuration: Any) -> None:
+    """Fill the settings' fields of a warm start.
+
+    Args:
+        settings: One SETTINGS record.
+        make: Makes a batch of flights, called as `FlightBatch`.
+        configuration: Arguments of `converged_covariance`.
+    """
+    P = converged_covariance(make, **configuration)
+    W = root_with_biases(P, configuration["sensors"].imu)
+    settings["warm"] = True
+    settings["warm_root"], settings["warm_covariance"] = W, portable.product(W, W.T)
+
+
+@functools.lru_cache(maxsize=64)
+def converged_covariance(
+    make: Callable[..., Any],
+    *,
+    vehicle: VehicleParams,
+    sensors: SensorSuite,
+    task: TaskParams,
+    substeps: int,
+) -> Floats:
+    """The covariance that filters reach from a cold start in `WARM_UP` of hovering.
+
+    Args:
+        make: Makes a batch of flights, called as `FlightBatch`.
+        vehicle: As the controller believes it to be.
+        sensors: As the filter believes them to be.
+        task: Where its starts are; on the ground the flights hover at height 0.
+        substeps: Runge-Kutta steps in a tick.
+
+    Returns:
+        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east.
+
+    Raises:
+        ValueError: If a filter fails on the way, or is lost at its end, as one that has nothing to
+            tell it its heading.
+    """
+    batch = make(
+        FLIGHTS,
+        vehicle=vehicle,
+        sensors=sensors,
+        task=task.replace(start="hover"),
+        source=Source.TRUTH,
+        control=Control.VELOCITY,
+        control_rate=sensors.imu.rate / round(WARM_UP * sensors.imu.rate),
+        substeps=substeps,
+        run_filter=True,
+        autoreset=Autoreset.DISABLED,
+        threads=1,
+    )
+    batch.reset(seeds=range(FLIGHTS))
+    if task.start == "ground":
+        at_rest = np.zeros((FLIGHTS, 3))
+        batch.reset(
+            seeds=range(FLIGHTS), position=batch.read("r") * (1.0, 1.0, 0.0), velocity=at_rest
+        )
+    batch.step(np.zeros((FLIGHTS, 4)))  # one step, as long as the whole
+    if batch.read("filter_status").any():
+        raise ValueError(
+            f"filter_start must be 'cold' for these sensors: the filter fails within {WARM_UP:g} s "
+            "of hovering"
+        )
+    angle = float(np.abs(_attitude_errors(batch)).max())
+    if angle > LOST:
+        raise ValueError(
+            f"filter_start must be 'cold' for these sensors: after {WARM_UP:g} s of hovering the "
+            f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
+            "filter its heading, such as a level baseline or the mark of `placement`?"
+        )
+    mean = np.zeros((15, 15))
+    for q, L in zip(batch.read("q"), batch.read("L"), strict=True):
+        root = portable.product(_turned_east(q).T, L)
+        mean += portable.product(root, root.T) / FLIGHTS
+    return mean
+
+
+def _attitude_errors(batch: Any) -> Floats:
+    """(n, 3) Euler angles from the estimated to the true attitude [rad]."""
+    R_hat = batch.read("R_hat")
+    return dcm_to_euler(quaternion_to_dcm(batch.read("q")) @ R_hat.transpose(0, 2, 1))
+
+
+def _turned_east(q: Floats) -> Floats:
+    """(15, 15) turn of positions and velocities in I from a vehicle that looks east to this one."""
+    w, x, y, z = map(float, q)
+    forward = (w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z))
+    c, s = (component / portable.norm(forward) for component in forward)
+    turn = np.eye(15)
+    for block in (slice(0, 3), slice(3, 6)):
+        turn[block, block] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    return turn
+
+
+def root_with_biases(P: Floats, imu: ImuParams) -> Floats:
+    """W with W W^T = P, whose last six columns belong to the true biases.
+
+    A filter that started from the stationary distribution of the biases, of covariance S, has an
+    estimate that is independent of its error, so that cov(error, bias) = P_b, the columns of P for
+    the biases. Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals.
+
+    Args:
+        P: (15, 15) covariance, whose share of the biases is not larger than S.
+        imu: Says what S is.
+
+    Returns:
+        (15, WARM_DRAWS).
+    """
+    sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
+    with_biases = P[:, 9:] / sigma
+    # what the biases do not explain; where they explain everything, rounding leaves some of it
+    rest = portable.lower_root(P - portable.product(with_biases, with_biases.T), np.diag(P))
+    W = np.zeros((15, WARM_DRAWS))
+    W[:, :15], W[:, 15:] = rest, with_biases
+    return W

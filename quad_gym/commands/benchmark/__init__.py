@@ -1,0 +1,1 @@
+"""The benchmark, a module for each section; `main` runs them."""

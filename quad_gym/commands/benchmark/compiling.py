@@ -1,0 +1,115 @@
+"""The compiler's part of the benchmark: how long the first flight waits.
+
+A copy of the package flies in a temporary folder, which has the cache beside the kernels: so each
+configuration begins with an empty one, and sources can be edited.
+"""
+
+import compileall
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import quad_gym
+from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.timing import Row
+
+PACKAGE = Path(quad_gym.__file__).resolve().parent
+ENVS = 1024
+CIRCLE = """
+import time; began = time.perf_counter()
+import gymnasium, quad_gym
+{before}
+env = gymnasium.make_vec("QuadGym/Circle-v0", {envs}{options})
+env.reset(seed=0)
+{after}
+print(time.perf_counter() - began)
+"""
+LATE_SUITE = """
+suite = quad_gym.sensor_suite("rtk")
+suite = suite.replace(
+    gnss=suite.gnss.replace(latency=0.11), camera=suite.camera.replace(latency=0.06)
+)
+"""
+EVERYTHING = (
+    ', sensors=suite, faults="all", world="fresh_breeze", '
+    'randomization={"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}'
+)
+CONFIGURATIONS = {
+    "everything: late, faults, fresh_breeze, draws": ("rtk", LATE_SUITE, EVERYTHING),
+    "truth": (None, "", ', observation="truth"'),
+    "default": ("standard", "", ""),
+}
+"""Suite, what comes before the environment, and its keywords; edits are made with the last one."""
+
+EDITED = ("kernels/task/reward.py", "kernels/filter/predict.py")
+"""Sources that get one more constant, each after the other."""
+
+
+def seconds_of(folder: Path, before: str, options: str, after: str = "") -> float:
+    """Seconds that a new process takes with the copy of the package in a folder."""
+    code = CIRCLE.format(before=before, envs=ENVS, options=options, after=after)
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    environment.pop("NUMBA_CACHE_DIR", None)  # the cache is beside the kernels
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        check=True,
+    )
+    return float(done.stdout)
+
+
+def empty_cache(package: Path) -> None:
+    """Delete all compiled code of a copy of the package."""
+    for file in package.rglob("*.code"):
+        file.unlink()
+
+
+def time_compile(quick: bool) -> list[Row]:
+    """Imports included: the first reset with an empty and a full cache, a step after an edit.
+
+    Args:
+        quick: Only what compiles fast.
+    """
+    rows: list[Row] = []
+
+    def add(name: str, cache: str, suite: str | None, seconds: float) -> None:
+        print(f"  {name}, {cache}: {seconds:.1f} s", file=sys.stderr, flush=True)
+        rows.append({"name": name, "cache": cache, "suite": suite, "seconds": seconds})
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        package = folder / PACKAGE.name
+        shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+        compileall.compile_dir(package, quiet=1)  # as an installation does
+        for what in ("truth",) if quick else CONFIGURATIONS:
+            suite, before, options = CONFIGURATIONS[what]
+            empty_cache(package)
+            add(what, "empty", suite, seconds_of(folder, before, options))
+            warm = [seconds_of(folder, before, options) for _ in range(1 if quick else 3)]
+            add(what, "full", suite, min(warm))
+        # the cache now holds the last configuration, which flies on
+        for source in EDITED[: 1 if quick else None]:
+            with (package / source).open("a", encoding="utf-8") as file:
+                file.write("\n_EDITED = 1.0\n")
+            step = "env.step(env.action_space.sample())"
+            add(
+                f"first step after an edit of {source}",
+                "edit",
+                suite,
+                seconds_of(folder, before, options, step),
+            )
+    return rows
+
+
+def compile_table(rows: list[Row]) -> str:
+    """The compiler's figures."""
+    cells = [(r["name"], r["suite"] or "-", r["cache"], f"{r['seconds']:.1f}") for r in rows]
+    heading = f"A new process with {ENVS:,} flights of the circle"
+    return text_table({heading: ["up to the first reset", "suite", "cache", "s"]}, cells)

@@ -1,0 +1,146 @@
+"""The options' part of the benchmark: what each costs, over a tick with all of them off.
+
+Batches take turns, so that whatever else the machine does slows all of them alike.
+"""
+
+import itertools
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import quad_gym
+from quad_gym.analysis.reports import text_table
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.suites import SUITES
+
+LAB = quad_gym.sensor_suite("lab")
+OFF = "everything off"
+
+
+def filter_form(**changes: Any) -> dict[str, Any]:
+    """The laboratory's suite with another form of the filter, as a keyword of a batch."""
+    return {"sensors": LAB.replace(estimator=LAB.estimator.replace(**changes))}
+
+
+def in_a_world(**changes: Any) -> dict[str, Any]:
+    """Another world, as a keyword of a batch."""
+    return {"world": quad_gym.WorldParams(**changes)}
+
+
+def arriving_late(name: str, gnss: float, camera: float) -> dict[str, Any]:
+    """A suite whose measurements reach the filter late [s], as a keyword of a batch."""
+    suite = quad_gym.sensor_suite(name)
+    assert suite.gnss is not None
+    assert suite.camera is not None
+    gnss_late, camera_late = (
+        suite.gnss.replace(latency=gnss),
+        suite.camera.replace(latency=camera),
+    )
+    return {"sensors": suite.replace(gnss=gnss_late, camera=camera_late)}
+
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    OFF: {},
+    "extended Kalman filter": filter_form(kind="ekf"),
+    "averaged IMU samples": {
+        "sensors": LAB.replace(
+            imu=LAB.imu.replace(samples="average"),
+            estimator=LAB.estimator.replace(integration="midpoint"),
+        )
+    },
+    "midpoint integration": filter_form(integration="midpoint"),
+    "covariance turns at its reset": filter_form(covariance_reset="turn"),
+    "pixel noise as projected": filter_form(feature_noise_across="projected"),
+    "images in steps at the start": filter_form(gradual_above=0.01),
+    "innovations kept": {"innovations": True},
+    "gate": filter_form(gate_false_alarm=1e-4),
+    "measurements 10 ms late": arriving_late("lab", gnss=0.01, camera=0.01),
+    "wind and rotor drag": in_a_world(wind_I=(4.0, 0.0, 0.0), linear_drag_B=(0.4, 0.3, 0.0)),
+    "gusts": in_a_world(gust_wind_speed=4.0),
+    "ground effect": in_a_world(ground_effect=True),
+    "battery": in_a_world(battery=quad_gym.BatteryParams()),
+    "world breeze": {"world": "breeze"},
+    "all faults": {"faults": "all"},
+    "mass drawn anew each episode": {
+        "randomization": {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
+    },
+    **{f"suite {name}": {"sensors": name} for name in SUITES if name != "lab"},
+    "suite rtk, GNSS 110 ms and camera 60 ms late": arriving_late("rtk", gnss=0.11, camera=0.06),
+}
+"""What is switched on, as keywords of `FlightBatch`; without a suite, it is the laboratory's."""
+
+STARTS: dict[str, dict[str, Any]] = {
+    "reset of a flight, cold start": {"filter_start": "cold"},
+    "reset of a flight, warm start": {"filter_start": "warm"},
+}
+"""Likewise, of what is timed at its reset."""
+
+
+TICKS = 10
+"""Ticks in a turn: so few that flights with and without an option still see the same features, and
+that some turns pass undisturbed."""
+
+
+def time_options(count: int, effort: Effort) -> list[Row]:
+    """A tick of a flight with each option, and a reset with each start, on one core."""
+    task = TASK_DEFAULTS["hover"].replace(duration=0.0)
+    turns: dict[str, Callable[[], float]] = {}
+    for name, options in {**OPTIONS, **STARTS}.items():
+        options = {"sensors": "lab", **options}
+        batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
+        batch.reset(seeds=range(count))
+        for _ in range(50):  # the start, where images are processed in steps, is not what counts
+            batch.step()
+        turns[name] = turn_of(batch, batch.step if name in OPTIONS else batch.reset)
+    number = max(2, round(effort.repeats * effort.seconds / (TICKS * count * turns[OFF]())))
+    times: dict[str, list[float]] = {name: [] for name in turns}
+    for k, (name, turn) in itertools.product(range(number), turns.items()):
+        if name == OFF and k % 20 == 0:
+            print(f"  turn {k + 1} of {number}", file=sys.stderr, flush=True)
+        times[name].append(turn())
+    off = min(times[OFF])
+    rows = []
+    for name, found in times.items():
+        best = min(found)
+        timing = Timing(best, statistics.median(found) / best - 1.0)
+        rows.append(report(name, timing, times_off=best / off, suite=suite_of(name)))
+    return rows
+
+
+def suite_of(name: str) -> str:
+    """The suite that the flights of an option measure with, whose filter the option may change."""
+    return name.split(",")[0].removeprefix("suite ") if name.startswith("suite ") else "lab"
+
+
+def turn_of(batch: FlightBatch, job: Callable[[], Any]) -> Callable[[], float]:
+    """A function that does the job `TICKS` times from here on, and returns seconds a flight."""
+    start = batch.snapshot()
+
+    def turn() -> float:
+        batch.restore(start)
+        began = time.perf_counter()
+        for _ in range(TICKS):
+            job()
+        return (time.perf_counter() - began) / (TICKS * batch.count)
+
+    return turn
+
+
+def options_table(rows: list[Row]) -> str:
+    """The options' figures."""
+    cells = [
+        (
+            r["name"],
+            r["suite"],
+            f"{1e6 * r['seconds']:.3f}",
+            percent(r["spread"]),
+            f"{r['times_off']:.2f}",
+        )
+        for r in rows
+    ]
+    heading = "One flight's tick with one option on, one core"
+    return text_table({heading: ["option", "suite", "us", "spread", "x off"]}, cells)

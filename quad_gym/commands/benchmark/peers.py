@@ -1,0 +1,122 @@
+"""What the benchmark is compared with: the plain NumPy filter of the tests, and filterpy's."""
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym import SensorSuite
+
+REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
+"""The plain filter; where it is missing, nothing is compared with it."""
+
+
+class Measured(NamedTuple):
+    """What one flight measures at one instant."""
+
+    gyro: NDArray[np.float64]
+    accel: NDArray[np.float64]
+    gnss_position_G: NDArray[np.float64]
+    gnss_baseline_G: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+
+
+def load_reference() -> ModuleType | None:
+    """The module with `PlainUKF`, or None where the tests are not at hand."""
+    spec = importlib.util.spec_from_file_location("reference_ukf", REFERENCE)
+    if spec is None or spec.loader is None or not REFERENCE.exists():
+        return None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def plain_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None] | None:
+    """Cycles of the plain augmented filter over a flight, from its first fix on."""
+    module = load_reference()
+    if module is None:
+        return None
+
+    def run() -> None:
+        ukf = module.PlainUKF(sensors)
+        ukf.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
+        for now in flight:
+            ukf.update(now.gnss_position_G, now.gnss_baseline_G, now.pixels)
+            ukf.predict(now.gyro, now.accel)
+
+    return run
+
+
+def filterpy_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None] | None:
+    """Cycles of filterpy's filter over a flight; None where it is not installed.
+
+    It has the same models and the state dimension 15, but noise that is added to the covariance
+    instead of augmenting the state, and so fewer sigma points: 31 in place of 55 and 43 (55 with
+    two features). The attitude error is moved into the reference attitude after each half.
+    """
+    try:
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+    except ImportError:
+        return None
+    module = load_reference()
+    if module is None:
+        return None
+    plain: Any = module.PlainUKF(sensors)
+    rotation, rates, unit = module.rotation_312, module.euler_rate_matrix, module.unit
+    dt, features = plain.dt, len(plain.features)
+    choice = sensors.estimator
+
+    def f(x: Any, dt: float, R: Any, gyro: Any, accel: Any) -> Any:
+        r, v, e, b_a, b_g = np.split(x, 5)
+        a_I = (accel - b_a) @ (rotation(e) @ R) - plain.g_I
+        e_next = e + dt * (rates(e) @ (gyro - b_g))
+        b_a, b_g = plain.decay["accel"] * b_a, plain.decay["gyro"] * b_g
+        return np.concatenate([r + v * dt + a_I * dt**2 / 2, v + a_I * dt, e_next, b_a, b_g])
+
+    def h(x: Any, R: Any) -> Any:
+        r, R_BI = x[:3], rotation(x[6:9]) @ R
+        parts = [r + plain.l_p @ R_BI, unit(plain.l_b @ R_BI)]
+        for X_I in plain.features:
+            parts.append(plain.R_CB @ unit(R_BI @ (X_I - r) - plain.l_c))
+        return np.concatenate(parts)
+
+    def measurement(now: Measured, R: Any, r: Any) -> tuple[Any, Any]:
+        z = [plain.R_IG @ now.gnss_position_G, unit(plain.R_IG @ now.gnss_baseline_G)]
+        direction = unit(R.T @ plain.l_b)
+        noise = [plain.R_position, plain._direction_noise(direction, plain.baseline_variance)]
+        for k in range(features):
+            camera = sensors.camera
+            assert camera is not None
+            ray = camera.pixel_size * np.array([*now.pixels[k], camera.focal_length])
+            variance = (camera.pixel_sigma * camera.pixel_size) ** 2 / (ray @ ray)
+            z.append(unit(ray))
+            across = plain.R_CB @ unit(R @ (plain.features[k] - r) - plain.l_c)
+            noise.append(plain._direction_noise(across, variance))
+        return np.concatenate(z), module.block_diagonal(*noise)
+
+    def run() -> None:
+        plain.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
+        points = MerweScaledSigmaPoints(15, choice.alpha, choice.beta, choice.kappa)
+        ukf = UnscentedKalmanFilter(15, 6 + 3 * features, dt, h, f, points)
+        ukf.x, ukf.P, R = plain._state(), plain.P.copy(), plain.R
+        spread = np.zeros((15, 12))  # from the noises (gyro, gyro bias, accel, accel bias)
+        spread[0:3, 6:9], spread[3:6, 6:9] = -(dt**2) / 2 * R.T, -dt * R.T
+        spread[6:9, 0:3] = -dt * np.eye(3)
+        spread[9:12, 9:12] = spread[12:15, 3:6] = np.eye(3)
+        ukf.Q = spread @ plain.Q @ spread.T
+        for k, now in enumerate(flight):
+            if k == 0:  # its update uses the sigma points of a prediction
+                ukf.sigmas_f = points.sigma_points(ukf.x, ukf.P)
+            z, noise = measurement(now, R, ukf.x[:3])
+            ukf.update(z, R=noise, hx=lambda x, R=R: h(x, R))
+            R, ukf.x[6:9], ukf.P = rotation(ukf.x[6:9]) @ R, 0.0, (ukf.P + ukf.P.T) / 2
+            ukf.predict(R=R, gyro=now.gyro, accel=now.accel)
+            R = rotation(ukf.x[6:9]) @ R
+            ukf.sigmas_f[:, 6:9] -= ukf.x[6:9]
+            ukf.x[6:9], ukf.P = 0.0, (ukf.P + ukf.P.T) / 2
+
+    return run

@@ -1,0 +1,95 @@
+"""Compile the kernels ahead of their first use, into the cache.
+
+Environments compile what they fly through when the first one is reset, which takes some tens of
+seconds once. A container or a CI job that does it beforehand starts at once:
+
+    RUN quad-gym compile                     # in a Dockerfile: everything
+    quad-gym compile --stages truth          # training on the true state: seconds
+    quad-gym compile --stages plain single
+    NUMBA_CACHE_DIR=/cache quad-gym compile  # and set it so where the environments run
+
+What is in the cache is not compiled again. The code is for the processor, the versions of Python
+and Numba, and the sources that it was compiled with; elsewhere it is compiled again on first use.
+
+The exit code is 1 if the code cannot be kept.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Kind = Literal["plain", "truth", "single", "all"]
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to compile."""
+
+    stages: tuple[Kind, ...] = ("all",)
+    """truth (an environment that observes the truth), plain (the default environment, with
+    sensors and filter), single (the classes for one vehicle, such as UnscentedKalmanFilter), all
+    (these, and every option of the environments)"""
+    processes: int | None = None
+    """processes that compile; if not given, one per core"""
+
+    def __post_init__(self) -> None:
+        """Check that there is something to compile, and someone who does it."""
+        if not self.stages:
+            raise ValueError("--stages must name at least one, got none")
+        if self.processes is not None and self.processes < 1:
+            raise ValueError(f"--processes must be at least 1, got {self.processes}")
+
+
+def names_of_kinds(kinds: Sequence[str]) -> list[str]:
+    """The compiled functions that some of KINDS stand for, the longest to compile first."""
+    from quad_gym.envs.configuration import Flights
+    from quad_gym.kernels.compiling.linked import names_of
+    from quad_gym.kernels.compiling.stages import Stage, needed_stages
+    from quad_gym.kernels.single import SINGLE
+    from quad_gym.records import Autoreset
+
+    needed: frozenset[Stage] = frozenset()
+    for kind, observation in (("plain", "estimate"), ("truth", "truth")):
+        if kind in kinds:
+            flights = Flights("circle", 1, Autoreset.NEXT_STEP, observation=observation)
+            needed |= needed_stages(flights.batch._settings[0])
+    if "all" in kinds:
+        needed = frozenset(Stage)
+    names = names_of(needed) if needed else []
+    if {"single", "all"} & set(kinds):  # the scalar filter takes longest of all
+        names = [*SINGLE[:2], *names, *SINGLE[2:]]
+    return names
+
+
+def main(args: Args) -> int:
+    """Compile, and list on stdout what was compiled and what was in the cache.
+
+    Returns:
+        The exit code.
+    """
+    from quad_gym.kernels.compiling.cache import where_cached
+    from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
+
+    names = names_of_kinds(args.stages)
+    missing = [name for name in names if not dispatcher_of(name).is_cached()]
+    began = time.monotonic()
+    if missing:
+        prepare(missing, args.processes)
+    for name in names:
+        print(f"{'compiled' if name in missing else 'in cache'}  {name}")
+    lost = [name for name in missing if not _is_kept(dispatcher_of(name))]
+    folders = {dispatcher_of(name)._cache.folder for name in names}
+    print(
+        f"{len(missing)} of {len(names)} functions compiled in {time.monotonic() - began:.0f} s "
+        f"({where_cached(*folders)})"
+    )
+    if lost:
+        print(f"error: {len(lost)} of them could not be written to the cache", file=sys.stderr)
+    return 1 if lost else 0
+
+
+def _is_kept(dispatcher: Any) -> bool:
+    """Whether the code is on disk."""
+    return bool(dispatcher._cache.holds(dispatcher.signature, dispatcher.targetctx))

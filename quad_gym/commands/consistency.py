@@ -1,0 +1,280 @@
+"""Filter consistency: compare errors with the covariance that the filter claims, over many flights.
+
+Flies random trajectories (or another task) by PD control and takes the normalized estimation error
+squared (NEES) of the 15 states and of each block of three, over time, and the normalized innovation
+squared (NIS) of each sensor. If the covariance is right, means over 1,000 flights lie in known
+bands at 95 % of the instants, and innovations are white. The truth is the simulator's.
+
+Prints tables and a verdict, and writes figures (PNG and SVG) and all numbers with the whole
+configuration and the seeds (consistency.json). For example:
+
+  quad-gym consistency                             the suite "rtk"
+  quad-gym consistency --sensors indoor --start warm
+  quad-gym consistency --sensors lab                 the report's filter
+  quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
+  quad-gym consistency --estimator ekf             an extended Kalman filter
+  quad-gym consistency --mass-factor 1.2           a vehicle heavier than it is taken for
+  quad-gym consistency --noise-factor 1.5          sensors worse than the filter believes
+"""
+
+import math
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
+from quad_gym.analysis.consistency import CONSISTENT_SHARE, MeanSquare
+from quad_gym.analysis.consistency_flights import Findings, endless, measure_consistency
+from quad_gym.analysis.consistency_plots import (
+    errors_figure,
+    nees_figure,
+    nis_figure,
+    whiteness_figure,
+)
+from quad_gym.analysis.plots import house_style, require_matplotlib, save_figure
+from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.options import SuiteName, usage_errors
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.suites import FIELD_FILTER
+from quad_gym.records import Source
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the experiment."""
+
+    flights: int = 4000
+    """flights"""
+    first_seed: int = 0
+    """seed of the first flight; the others follow it"""
+    duration: float = 10.0
+    """length of a flight [s]"""
+    task: Literal["random_trajectory", "hover", "circle", "lemniscate"] = "random_trajectory"
+    """what is flown"""
+    fly_on: Literal["estimate", "truth"] = "estimate"
+    """what the controller sees"""
+    start: Literal["cold", "warm", "matched"] = "cold"
+    """the filter's start: from its first fix; after some seconds of hovering; or with errors
+    drawn from its own covariance, which tests the filter apart from its start"""
+    every: float = 0.05
+    """time between two looks at the errors [s]"""
+    settle: float = 0.0
+    """time at the start that does not count [s]"""
+    output: Path = Path("results/consistency")
+    """folder for figures and numbers; made if it is missing"""
+    threads: int | None = None
+    """threads; if not given, as many as there are cores; results do not depend on it"""
+
+    sensors: SuiteName = "rtk"
+    form: Literal["suite", "report", "corrected", "mended"] = "suite"
+    """form of filter and IMU: as the suite has it, the report's, or with all corrections
+    (formerly mended)"""
+    samples: Literal["instant", "average"] | None = None
+    """in place of the form's"""
+    integration: Literal["euler", "midpoint"] | None = None
+    """in place of the form's"""
+    covariance_reset: Literal["none", "turn"] | None = None
+    """in place of the form's"""
+    feature_noise_across: Literal["measured", "predicted", "projected"] | None = None
+    """in place of the form's"""
+    estimator: Literal["ukf", "ekf"] | None = None
+    """in place of the suite's"""
+    camera: bool = True
+    """measure with the camera, if the suite has one"""
+    imu_rate: float | None = None
+    """in place of the suite's [Hz]"""
+    gnss_rate: float | None = None
+    """in place of the suite's [Hz]"""
+    camera_rate: float | None = None
+    """in place of the suite's [Hz]"""
+
+    mass_factor: float = 1.0
+    """true mass, as a multiple of what the controller believes"""
+    motor_lag_factor: float = 1.0
+    """true lag of the motors, likewise"""
+    world: str = "calm"
+    """what air, ground and battery do: calm, breeze or fresh_breeze"""
+    faults: str | None = None
+    """what goes wrong with sensors and rotors: presets joined by +, as gnss_outage+rotor_loss"""
+    noise_factor: float = 1.0
+    """true white noise, as a multiple of what the filter believes"""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.flights < 2:
+            raise ValueError(f"--flights must be at least 2, got {self.flights}")
+        for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value}")
+        if not 0.0 <= self.settle < self.duration:
+            raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
+
+
+def suite_of(args: Args) -> SensorSuite:
+    """The sensor suite that the options describe."""
+    suite = sensor_suite(args.sensors)
+    if not args.camera:
+        suite = suite.replace(camera=None)
+    samples = suite.imu.samples
+    if args.form != "suite":
+        samples = "instant" if args.form == "report" else "average"
+        form = FilterParams() if args.form == "report" else FIELD_FILTER
+        suite = suite.replace(estimator=form)
+    chosen = {"kind": args.estimator} if args.estimator is not None else {}
+    for name in ("integration", "covariance_reset", "feature_noise_across"):
+        if getattr(args, name) is not None:
+            chosen[name] = getattr(args, name)
+    suite = suite.replace(
+        imu=suite.imu.replace(samples=args.samples or samples),
+        estimator=suite.estimator.replace(**chosen),
+    )
+    camera_rate = args.camera_rate if args.camera else None
+    return suite.with_rates(imu=args.imu_rate, gnss=args.gnss_rate, camera=camera_rate)
+
+
+def batch_of(args: Args) -> FlightBatch:
+    """Flights that nothing ends before their time."""
+    suite, vehicle = suite_of(args), vehicle_params("lab")
+    true_vehicle = vehicle.replace(
+        mass=args.mass_factor * vehicle.mass,
+        motor_time_constant=args.motor_lag_factor * vehicle.motor_time_constant,
+    )
+    return FlightBatch(
+        args.flights,
+        vehicle=vehicle,
+        sensors=suite,
+        gains="tuned",
+        task=endless(TASK_DEFAULTS[args.task]),
+        source=Source.ESTIMATE if args.fly_on == "estimate" else Source.TRUTH,
+        filter_start="warm" if args.start == "warm" else "cold",
+        innovations=True,
+        threads=args.threads,
+        true_vehicle=true_vehicle,
+        true_sensors=suite.scaled_noise(args.noise_factor),
+        world=args.world,
+        faults=args.faults,
+    )
+
+
+def fly(args: Args, batch: FlightBatch) -> Findings:
+    """Fly all flights to their end, looking at the errors on the way."""
+    shown = time.monotonic()
+
+    def progress(flown: float) -> None:
+        nonlocal shown
+        if time.monotonic() > shown + 2.0:
+            shown = time.monotonic()
+            print(f"  {flown:.1f} of {args.duration:g} s flown", file=sys.stderr, flush=True)
+
+    return measure_consistency(
+        batch,
+        seeds=range(args.first_seed, args.first_seed + args.flights),
+        duration=args.duration,
+        every=args.every,
+        settle=args.settle,
+        matched=args.start == "matched",
+        progress=progress,
+    )
+
+
+def title_of(batch: FlightBatch, args: Args) -> str:
+    """What was flown, in a line."""
+    sensors = batch.sensors
+    choices = sensors.estimator
+    parts = [
+        f"{choices.kind.upper()}, suite {args.sensors}, {args.start} start",
+        f"{sensors.imu.samples} samples",
+        f"{choices.integration}",
+        f"reset {choices.covariance_reset}",
+    ]
+    if sensors.camera is not None:
+        parts.append(f"feature noise across the {choices.feature_noise_across} direction")
+    return ", ".join(parts)
+
+
+def table_of(quantity: str, parts: dict[str, MeanSquare]) -> str:
+    """Mean squares, for the screen."""
+    rows = [
+        (
+            part.name,
+            f"{part.overall:.2f}",
+            f"{part.mean[-1]:.2f}",
+            f"{part.low[-1]:.2f} to {part.high[-1]:.2f}",
+            f"{100 * part.share_inside:.0f}%",
+        )
+        for part in parts.values()
+    ]
+    columns = ["over time", "at the end", "band", "inside"]
+    return text_table({quantity: ["of"], "mean over flights": columns}, rows)
+
+
+def report_of(findings: Findings) -> str:
+    """Tables and the verdict, for the screen."""
+    tables = [table_of("NEES", findings.nees)]
+    if findings.nis:
+        tables.append(table_of("NIS", findings.nis))
+    lines = [
+        "The filter is consistent."
+        if findings.consistent
+        else "The filter is not consistent in everything:",
+        *(f"  {text}" for text in findings.sentences().values()),
+        f"  Filters that failed in a cycle: {findings.failed}. Flights astray: "
+        f"{findings.astray.sum()}.",
+    ]
+    return "\n\n".join([*tables, "\n".join(lines)])
+
+
+def main(args: Args) -> None:
+    """Fly, measure, judge, draw and write."""
+    with usage_errors():
+        require_matplotlib()
+        batch = batch_of(args)
+        args.output.mkdir(parents=True, exist_ok=True)
+    began, title = time.monotonic(), title_of(batch, args)
+    print(f"{title}; {args.flights:,} flights of {args.duration:g} s, {args.task}.\n")
+    whole = fly(args, batch)
+    findings = whole.since(args.settle)
+    print(report_of(findings))
+
+    files = []
+    with house_style():
+        figures = {
+            "nees": nees_figure(whole.nees, title, args.settle),
+            "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
+        }
+        if whole.nis:
+            figures["nis"] = nis_figure(whole.nis, title, args.settle)
+        if findings.whiteness:
+            figures["whiteness"] = whiteness_figure(findings.whiteness, title)
+        for name, figure in figures.items():
+            files += save_figure(figure, args.output / name)
+    squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
+    found = {
+        "consistent": findings.consistent,
+        "consistent_share": CONSISTENT_SHARE,
+        "verdicts": findings.sentences(),
+        "share_inside": {name: part.share_inside for name, part in squares.items()},
+        "overall": {name: part.overall for name, part in squares.items()},
+        "filters_failed": findings.failed,
+        "flights_astray": int(findings.astray.sum()),
+        "mean_tracking_error": float(findings.tracking.mean.mean()),
+        "configuration": args,
+        "sensors": batch.sensors,
+        "vehicle": batch.vehicle,
+        "world": batch.world,
+        "faults": batch.faults,
+        "seeds": [args.first_seed, args.first_seed + args.flights - 1],
+        "versions": versions("numpy", "numba", "scipy"),
+        "nees": whole.nees,
+        "nis": whole.nis,
+        "whiteness": findings.whiteness,
+        "rms_errors": whole.errors,
+        "rms_claimed": whole.claimed,
+    }
+    files.append(write_json(args.output / "consistency.json", found))
+    seconds = time.monotonic() - began
+    print(f"\nWrote {len(files)} files to {args.output} after {seconds:.1f} s.")

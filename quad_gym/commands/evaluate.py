@@ -1,0 +1,229 @@
+"""Fly policies on what they see, and measure how well by the true state.
+
+    quad-gym evaluate QuadGym/Circle-v0 --policy pd pretrained
+    quad-gym evaluate --policy results/train/circle/ppo_seed_0/best.zip --sensors rtk
+
+Every policy flies the same episodes (the same seeds) on every observation. Prints a table, and
+writes episodes.csv (one row per episode), summary.json (all numbers, and what they were found
+with), and figures of paths and errors over time (PNG and SVG).
+"""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+
+from baselines.policies import load_policy, task_of
+from baselines.seeds import first_seed
+from quad_gym import IDS
+from quad_gym.analysis import plots
+from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
+from quad_gym.analysis.metrics import bootstrap_interval
+from quad_gym.analysis.recording import Tracer
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, usage_errors
+from quad_gym.evaluation import Episodes, Policy, roll_out
+from quad_gym.faults.presets import felt_without_sensors
+from quad_gym.params.suites import sensor_suite
+from quad_gym.rendering.video import checked_video_path, flight_of, save_video
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the evaluation."""
+
+    env_id: EnvId = "QuadGym/Circle-v0"
+    policy: tuple[str, ...] = ("pd", "pretrained")
+    """policies: pd (tuned gains), pd:lab (the report's), pd:FILE.json (of quad-gym tune),
+    pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz)"""
+    observation: tuple[str, ...] = ("truth", "estimate")
+    """what to fly on: estimate, truth, noisy"""
+    sensors: SuiteName = "standard"
+    env: Keywords = field(default_factory=dict)
+    """further keywords of the environment, such as camera=false gnss_rate=10"""
+    episodes: int = 1000
+    """flown in each case"""
+    seed: int = 0
+    """of the first episode; the others follow it; no training has flown any of them"""
+    threads: int | None = None
+    """threads; if not given, one per core"""
+    video: Literal["none", "mp4", "gif", "webp"] = "none"
+    """also write a video of the first episode of each case, of this kind"""
+    output: Path | None = None
+    """folder for figures and numbers; if not given, results/evaluate/TASK"""
+
+
+Case = tuple[str, str]
+"""A policy and an observation."""
+
+
+def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
+    """Check all options, and make every policy with its environment.
+
+    Raises:
+        ValueError: If an option is invalid or a policy does not fit.
+        OSError: If nothing can be written to the folder.
+        ImportError: If a package is missing.
+    """
+    if args.env_id not in IDS:
+        raise ValueError(f"ENV_ID must be one of {', '.join(IDS)}, got {args.env_id!r}")
+    for name, least in (("episodes", 1), ("seed", 0)):
+        if getattr(args, name) < least:
+            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
+    plots.require_matplotlib()
+    folder = args.output or Path("results/evaluate") / IDS[args.env_id]
+    cases: dict[Case, tuple[Policy, Any]] = {}
+    for observation in args.observation:
+        for name in args.policy:
+            env = make_flights(args, observation, args.episodes)
+            cases[name, observation] = (load_policy(name, env), env)
+    require_writable("--output", folder)
+    if args.video != "none":
+        checked_video_path(folder / f"video.{args.video}")
+    return cases, folder
+
+
+def make_flights(args: Args, observation: str, count: int) -> Any:
+    """The environment of an observation."""
+    names = ("observation", "sensors", "threads")
+    keywords = dict(leave(args.env, {name: f"--{name}" for name in names}))
+    if observation in ("truth", "noisy") and "faults" in keywords:
+        keywords["faults"] = felt_without_sensors(keywords["faults"], sensor_suite(args.sensors))
+    return gymnasium.make_vec(
+        args.env_id,
+        num_envs=count,
+        observation=observation,
+        sensors=args.sensors,
+        threads=args.threads,
+        **keywords,
+    )
+
+
+def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
+    """A video of the first episode of each case."""
+    from tqdm import tqdm
+
+    files = []
+    for name, observation in tqdm(cases, desc="filming", unit=" videos"):
+        env = make_flights(args, observation, 1)
+        about = {"env_id": args.env_id, "policy": name, "observation": observation}
+        flight = flight_of(load_policy(name, env), env, seed=args.seed, about=about)
+        stem = _short(name).replace("/", "_").replace(":", "_")
+        files.append(folder / f"video_{stem}_{observation}.{args.video}")
+        save_video(flight, files[-1])
+    return files
+
+
+def table(results: dict[Case, Episodes], env: Any) -> str:
+    """Errors and endings of each case, for people."""
+    gates = env.unwrapped.flights.task.gate_count
+    course = task_of(env) == "QuadGym/Waypoints-v0"
+    rows = []
+    for (name, observation), episodes in results.items():
+        found = episodes.summary()
+        row = [f"{_short(name)} on {observation}"]
+        if course:
+            done = episodes.ending == "last_gate"
+            seconds = episodes.lengths[done].mean() / env.unwrapped.flights.control_rate
+            row += [
+                f"{found['gates_passed'] / gates:.1%}",
+                f"{seconds:.2f} s" if any(done) else "-",
+            ]
+        else:
+            row += [_with_interval(episodes.mean_error), f"{1e3 * found['late_error']:.1f}"]
+        rows.append(
+            [
+                *row,
+                f"{1e3 * found['estimation_error']:.1f}",
+                f"{found['crash_rate']:.1%}",
+                f"{found['return']:.2f}",
+            ]
+        )
+    tracking = (
+        {"course": ["gates passed", "time"]}
+        if course
+        else {"tracking error [mm]": ["whole episode", "second half"]}
+    )
+    return text_table(
+        {"": ["policy"], **tracking, "estimation": ["error [mm]"], " ": ["crashed", "return"]}, rows
+    )
+
+
+def _with_interval(values: Any) -> str:
+    if len(values) < 2:
+        return f"{1e3 * values.mean():.1f}"
+    low, high = bootstrap_interval(values)
+    return f"{1e3 * values.mean():.1f} [{1e3 * low:.1f}, {1e3 * high:.1f}]"
+
+
+def _short(name: str) -> str:
+    """A policy's name for the table: of a file, its folder and its name."""
+    path = Path(name)
+    return f"{path.parent.name}/{path.stem}" if path.suffix else name
+
+
+def write(
+    results: dict[Case, Episodes], tracers: dict[Case, Tracer], args: Args, folder: Path
+) -> list[Path]:
+    """Numbers and figures."""
+    columns: dict[str, list[Any]] = {}
+    for (name, observation), episodes in results.items():
+        block = {
+            "policy": [name] * args.episodes,
+            "observation": [observation] * args.episodes,
+            "seed": range(args.seed, args.seed + args.episodes),
+            **{name: getattr(episodes, name) for name in Episodes._fields},
+        }
+        for name, values in block.items():
+            columns.setdefault(name, []).extend(values)
+    summary = {
+        "cases": [
+            {"policy": name, "observation": observation, **episodes.summary()}
+            for (name, observation), episodes in results.items()
+        ],
+        "units": {"errors": "m", "rates": "share of episodes"},
+        "arguments": args,
+        "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
+    }
+    written = [
+        write_csv(folder / "episodes.csv", columns),
+        write_json(folder / "summary.json", summary),
+    ]
+    labels = {case: f"{_short(case[0])} on {case[1]}" for case in results}
+    figures = {
+        "paths": paths_figure({labels[c]: t.trace(0) for c, t in tracers.items()}),
+        "errors": error_over_time_figure(
+            {labels[c]: (t.time, t.percentiles) for c, t in tracers.items()}
+        ),
+    }
+    for name, figure in figures.items():
+        written += plots.save_figure(figure, folder / name)
+    return written
+
+
+def main(args: Args) -> None:
+    """Evaluate."""
+    from tqdm import tqdm
+
+    with usage_errors():
+        cases, folder = configure(args)
+    began = time.perf_counter()
+    results, tracers = {}, {}
+    for case in tqdm(cases, desc="flying", unit=" cases"):
+        policy, env = cases[case]
+        tracers[case] = Tracer()
+        results[case] = roll_out(policy, env, seed=args.seed, watch=tracers[case].add)
+    print(
+        f"\n{args.env_id}, sensors {args.sensors}; {args.episodes:,} episodes in each case, "
+        f"from seed {args.seed}.\n"
+    )
+    print(table(results, next(iter(cases.values()))[1]))
+    if args.episodes > 1:
+        print("In brackets: bootstrap 95 % interval of the mean over episodes.")
+    written = write(results, tracers, args, folder)
+    if args.video != "none":
+        written += write_videos(cases, args, folder)
+    print(f"\nWrote {len(written)} files to {folder} after {time.perf_counter() - began:.1f} s.")

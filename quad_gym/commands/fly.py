@@ -1,0 +1,318 @@
+"""Watch a flight: live in a window, as a video, or in the Rerun viewer; and keep its numbers.
+
+    quad-gym fly --task lemniscate
+    quad-gym fly --task circle --no-camera --fault gnss_outage --fault-time 4 7
+    quad-gym fly --task circle --fault rotor_loss --output results/outage.mp4
+    quad-gym fly --replay results/outage.npz --view chase
+    quad-gym fly --replay results/outage.npz --output results/outage.rrd
+
+The blue vehicle is the truth. The orange ghost is where the filter believes it to be, with the
+ellipsoid that holds it with 3 sigma; the controller flies on that belief, unless --observation says
+otherwise.
+
+In the window: C and G switch camera and GNSS off and on, F makes the faults of --fault come and go,
+V changes the view, the space bar stops time, R begins the next episode, and Q or Escape ends the
+program.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import gymnasium
+import numpy as np
+from tyro.conf import arg
+
+from baselines.policies import load_policy
+from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
+from quad_gym.analysis.reports import require_writable
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands.options import Keywords, SuiteName, leave, usage_errors
+from quad_gym.evaluation import Policy
+from quad_gym.faults import Fault
+from quad_gym.faults.presets import PRESETS, faults_of
+from quad_gym.flights.rerun import load_rerun
+from quad_gym.rendering import Renderer, save_video
+from quad_gym.rendering.live import WINDOW_RATE, Window
+from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
+
+ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
+FAULTS = tuple(name for name in PRESETS if name != "none")
+OTHER_ENDINGS = (".npz", ".csv", ".rrd")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the flight."""
+
+    task: Literal["hover", "circle", "lemniscate", "random_trajectory", "waypoints"] = "circle"
+    """what to fly"""
+    policy: str = "pd"
+    """who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for the
+    task), or a file of quad-gym train (.zip or .npz)"""
+    observation: Literal["estimate", "truth", "noisy", "sensors"] = "estimate"
+    """what the controller sees"""
+    action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] = "ctbr"
+    """what the controller commands"""
+    seed: int = 0
+    """of the episode; in the window, the next ones follow it"""
+    duration: float | None = None
+    """time limit [s]; if not given, the task's"""
+    env: Keywords = field(default_factory=dict)
+    """further keywords of the environment, such as control_rate=100 estimator=ekf"""
+
+    sensors: SuiteName = "standard"
+    camera: bool = True
+    """measure with the camera"""
+    gnss_rate: float | None = None
+    """GNSS fixes per second [Hz]; if not given, the suite's"""
+    camera_rate: float | None = None
+    """images per second [Hz]; if not given, the suite's"""
+    fault: Annotated[tuple[str, ...], arg(help=f"what goes wrong: {', '.join(FAULTS)}")] = ()
+    fault_time: tuple[float, float] | None = None
+    """when it comes and when it goes [s]; if not given, as each fault has it"""
+
+    view: Literal["fixed", "chase"] = "fixed"
+    """from outside, or from behind the vehicle"""
+    size: tuple[int, int] = (640, 480)
+    """width and height [pixels]"""
+    speed: float = 1.0
+    """seconds of flight per second of watching; 0.5: slow motion"""
+    fps: float = 25.0
+    """pictures per second of a video"""
+    output: Path | None = None
+    """write this file instead of opening a window: a video (.mp4, .gif or .webp), with the
+    flight as .npz beside it; numbers alone (.npz or .csv); or a recording for the Rerun
+    viewer (.rrd)"""
+    replay: Path | None = None
+    """show this .npz file instead of flying"""
+
+
+class Switches:
+    """What the keys have switched: sensors off and on, and faults on and off."""
+
+    def __init__(self) -> None:
+        self._off = {"gnss": False, "camera": False}
+        self._turn_faults = False
+
+    def press(self, key: str) -> None:
+        """Take notice of a key."""
+        for letter, sensor in (("c", "camera"), ("g", "gnss")):
+            if key == letter:
+                self._off[sensor] = not self._off[sensor]
+        if key == "f":
+            self._turn_faults = True
+
+    def apply(self, batch: FlightBatch) -> None:
+        """Switch a batch."""
+        batch.switch_sensors(**{sensor: not off for sensor, off in self._off.items()})
+        if self._turn_faults:
+            there = any(active.any() for active in batch.active_faults().values())
+            batch.switch_faults(not there)
+            self._turn_faults = False
+
+
+def check_options(args: Args) -> None:
+    """Refuse invalid options before anything is flown.
+
+    Raises:
+        ValueError: If one does.
+        ImportError: If a library that writes a file is not installed.
+    """
+    for name in ("speed", "fps"):
+        value = getattr(args, name)
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(f"--{name} must be greater than 0, got {value:g}")
+    if args.fault_time is not None:
+        start, end = args.fault_time
+        if not 0.0 <= start < end:
+            raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
+        if not args.fault:
+            raise ValueError("--fault-time needs a --fault")
+    if args.output is not None:
+        if args.output.suffix.lower() not in VIDEO_ENDINGS + OTHER_ENDINGS:
+            endings = ", ".join(VIDEO_ENDINGS + OTHER_ENDINGS)
+            raise ValueError(f"--output must end in one of {endings}, got {args.output}")
+        if args.output.suffix.lower() in VIDEO_ENDINGS:
+            checked_video_path(args.output)
+        if args.output.suffix.lower() == ".rrd":
+            load_rerun()
+        require_writable("--output", args.output.parent)
+    Renderer(args.view, args.size)
+
+
+def faults_of_args(args: Args) -> tuple[Fault, ...]:
+    """What goes wrong, at its own time or at that of `--fault-time`.
+
+    Raises:
+        ValueError: If there is no such fault, or the sensors lack what it concerns.
+    """
+    sensors = sensor_suite(args.sensors)
+    faults = faults_of(args.fault, sensors if args.camera else sensors.replace(camera=None))
+    if args.fault_time is None:
+        return faults
+    start, end = args.fault_time
+    return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
+
+
+def make_env(args: Args) -> Any:
+    """An environment of one flight.
+
+    Raises:
+        ValueError: If an option is invalid.
+    """
+    options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
+    named = {name: f"--{name.replace('_', '-')}" for name in options}
+    keywords = leave(args.env, {**named, "faults": "--fault"})
+    return gymnasium.make_vec(
+        ID_OF_TASK[args.task],
+        num_envs=1,
+        autoreset_mode="Disabled",
+        observation=args.observation,
+        action=args.action,
+        sensors=args.sensors,
+        camera=args.camera,
+        gnss_rate=args.gnss_rate,
+        camera_rate=args.camera_rate,
+        duration=args.duration,
+        faults=faults_of_args(args),
+        **keywords,
+    )
+
+
+def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> Iterator[Flight]:
+    """Fly an episode, and yield the flight so far after every step; it ends with the episode."""
+    batch = env.unwrapped.flights.batch
+    recorder = FlightRecorder(batch, about=about | {"seed": seed})
+    observation, _ = env.reset(seed=seed)
+    recorder.keep()
+    yield recorder.flight
+    state, starts, over = None, np.ones(1, bool), False
+    while not over:
+        switches.apply(batch)
+        action, state = policy.predict(
+            observation, state=state, episode_start=starts, deterministic=True
+        )
+        observation, _, terminated, truncated, info = env.step(action)
+        starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
+        recorder.keep()
+        yield recorder.flight
+    print(
+        f"seed {seed}: {str(info['ending'][0]).replace('_', ' ')} after {in_words(recorder.flight)}"
+    )
+
+
+def replayed(flight: Flight) -> Iterator[Flight]:
+    """A saved flight, yielded as if it were flown."""
+    for time in flight["time"]:
+        yield flight.until(time)
+
+
+def in_words(flight: Flight) -> str:
+    """How long a flight was and how well it went."""
+    error = 1e3 * flight["position_error"].mean()
+    words = f"{flight['time'][-1]:.2f} s, mean tracking error {error:.1f} mm"
+    if flight.stage.observation != "truth":
+        words += f", mean estimation error {1e3 * flight['estimation_error'].mean():.1f} mm"
+    return words
+
+
+def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switches) -> bool:
+    """Show a flight while it is flown; return whether to go on to the next one."""
+    renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
+    for flight in flights:
+        waiting += 1.0 / flight.stage.control_rate / args.speed
+        if waiting < 0.999 / WINDOW_RATE:
+            continue
+        seconds, waiting = min(waiting, 1.0), 0.0
+        window.show(renderer.draw(flight), seconds)
+        stopped = False
+        while True:
+            for key in window.pressed_keys():
+                if key in ("q", "escape"):
+                    return False
+                if key == "r":
+                    return True
+                if key == "space":
+                    stopped = not stopped
+                if key == "v":
+                    renderer = Renderer("chase" if renderer.view == "fixed" else "fixed", args.size)
+                switches.press(key)
+            if window.closed:
+                return False
+            if not stopped:
+                break
+            window.show(renderer.draw(flight), 1.0 / WINDOW_RATE)
+    return True
+
+
+def open_window(args: Args) -> Window:
+    """A window to watch in.
+
+    Raises:
+        OSError: If there is no screen.
+    """
+    try:
+        return Window(args.size, f"quad_gym: {args.task}", watched=True)
+    except RuntimeError as error:
+        raise OSError(f"{error}; --output writes a video instead") from None
+
+
+def write(flight: Flight, path: Path, args: Args) -> list[Path]:
+    """Write the flight to a file, and a video's numbers beside it; return what was written."""
+    from tqdm import tqdm
+
+    if path.suffix.lower() == ".npz":
+        return [flight.save(path)]
+    if path.suffix.lower() == ".csv":
+        return [flight.to_csv(path)]
+    if path.suffix.lower() == ".rrd":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        recording = flight.to_rerun()
+        recording.save(path)
+        recording.disconnect()  # which completes the file
+        return [path]
+    video = save_video(
+        flight,
+        path,
+        view=args.view,
+        size=args.size,
+        fps=args.fps,
+        speed=args.speed,
+        progress=lambda times: tqdm(times, desc="drawing", unit=" pictures"),
+    )
+    return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
+
+
+def main(args: Args) -> None:
+    """Fly or replay, and show or write."""
+    with usage_errors():
+        check_options(args)
+        saved = Flight.load(args.replay) if args.replay else None
+        env = make_env(args) if saved is None else None
+        if env is not None and args.output and not env.unwrapped.flights.batch.max_steps:
+            raise ValueError("--output needs a flight with an end: a --duration above 0")
+        policy = None if env is None else load_policy(args.policy, env)
+    about = {"task": args.task, "policy": args.policy, "sensors": args.sensors, "fault": args.fault}
+
+    def flights(seed: int, switches: Switches) -> Iterator[Flight]:
+        if saved is not None:
+            return replayed(saved)
+        assert policy is not None
+        return fly(env, policy, seed, switches, about)
+
+    if args.output:
+        *_, flight = flights(args.seed, Switches())
+        for file in write(flight, args.output, args):
+            print(f"Wrote {file} ({file.stat().st_size / 1e6:.1f} MB).")
+        return
+    with usage_errors():
+        window = open_window(args)
+    seed, goes_on = args.seed, True
+    while goes_on:
+        switches = Switches()
+        goes_on = watch(flights(seed, switches), args, window, switches)
+        seed += 1
+    window.close()

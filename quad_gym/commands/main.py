@@ -1,0 +1,75 @@
+"""`quad-gym COMMAND`: finds the command's module and runs it; each imports only what it needs."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from quad_gym.commands.options import USAGE_ERROR, parse
+
+COMMANDS = {
+    "circle": "fly the laboratory's experiment over many seeds: tables and figures",
+    "train": "train a controller on the estimate, the truth, or anything else it may see",
+    "evaluate": "fly policies over many episodes: errors, crashes, films",
+    "compare": "train on truth, noise and the estimate with several seeds, and compare",
+    "tune": "tune the gains of the PD controller",
+    "fly": "watch one flight in a window, or film it",
+    "consistency": "is the filter's covariance right? NEES and NIS over many flights",
+    "ablation": "what each correction of the filter is worth, and what wrong models cost",
+    "benchmark": "measure the speed of everything",
+    "compile": "compile the kernels ahead of their first use, into the cache",
+    "version": "print the version",
+}
+"""Names of commands, with what each does."""
+
+PROGRAM = "quad-gym"
+
+
+def usage() -> str:
+    """The help of `quad-gym` itself."""
+    width = max(map(len, COMMANDS))
+    lines = "\n".join(f"  {name:{width}}   {text}" for name, text in COMMANDS.items())
+    return (
+        f"usage: {PROGRAM} COMMAND [options]\n\ncommands:\n{lines}\n\n"
+        f"{PROGRAM} COMMAND --help explains a command.\n"
+        f"{PROGRAM} COMMAND --tyro-print-completion bash|zsh|tcsh prints its completion.\n"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        argv: The command and its options; None: those of the process.
+
+    Returns:
+        The exit code.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] in (["-h"], ["--help"]):
+        print(usage(), end="")
+        return 0
+    if not words or words[0] not in COMMANDS:
+        got = f"got {words[0]!r}" if words else "none given"
+        print(
+            f"{PROGRAM}: error: the command must be one of {', '.join(COMMANDS)}, {got} "
+            "(--help explains them)",
+            file=sys.stderr,
+        )
+        return USAGE_ERROR
+    return run(words[0], words[1:], program=f"{PROGRAM} {words[0]}")
+
+
+def run(command: str, argv: Sequence[str] | None = None, *, program: str | None = None) -> int:
+    """Parse the options of one command and run it.
+
+    Args:
+        command: One of COMMANDS.
+        argv: Its options; None: those of the process.
+        program: Its name in messages; None: that of the process.
+
+    Returns:
+        The exit code.
+    """
+    name = "benchmark.main" if command == "benchmark" else command
+    module = importlib.import_module(f"quad_gym.commands.{name}")
+    return module.main(parse(module.Args, argv, description=module.__doc__, program=program)) or 0

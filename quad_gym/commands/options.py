@@ -1,0 +1,129 @@
+"""Command lines: a frozen dataclass of options becomes a parser, through tyro.
+
+A command declares its options once, with their types, defaults and, in the docstring below each,
+its help text. Wrong options end the program with a message on stderr and exit code 2, as is the
+custom on Unix.
+"""
+
+import ast
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from quad_gym.envs import IDS
+from quad_gym.params.suites import SUITES
+
+USAGE_ERROR = 2
+"""Exit code of a program that was called with invalid arguments."""
+
+_Args = TypeVar("_Args")
+
+
+def parse(
+    kind: type[_Args],
+    argv: Sequence[str] | None = None,
+    *,
+    description: str | None = None,
+    program: str | None = None,
+) -> _Args:
+    """Options from the command line as an instance of a dataclass.
+
+    A ValueError of the dataclass's own checks ends the program as a wrong option does.
+
+    Args:
+        kind: Dataclass whose fields are the options.
+        argv: Arguments without the program's name; None: those of the process.
+        description: Text above the options in the help.
+        program: Name of the program in its messages; None: that of the process.
+    """
+    return tyro.cli(kind, args=argv, description=description, prog=program)
+
+
+@contextmanager
+def usage_errors(
+    kinds: tuple[type[Exception], ...] = (ValueError, OSError, ImportError),
+) -> Iterator[None]:
+    """Turn what is raised while options are checked into one line on stderr and exit code 2.
+
+    Args:
+        kinds: Errors that the user can correct.
+    """
+    try:
+        yield
+    except kinds as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(USAGE_ERROR) from None
+
+
+def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[str, Any]:
+    """Keywords of an environment given by `--env`, none of which has an option of its own.
+
+    Args:
+        keywords: What was given.
+        options: Names of keywords, with the options that are there for them.
+
+    Raises:
+        ValueError: If one of them was given.
+    """
+    for name, instead in options.items():
+        if name in keywords:
+            raise ValueError(f"--env must leave {name} to {instead}")
+    return keywords
+
+
+def flying_options(keywords: Mapping[str, Any]) -> str:
+    """Options of `quad-gym evaluate` for keywords of an environment, each after a space."""
+    rest = dict(keywords)
+    words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors") if k in rest]
+    if rest:
+        words.append("--env " + " ".join(shlex.quote(f"{k}={v}") for k, v in rest.items()))
+    return "".join(" " + word for word in words)
+
+
+_WORDS = {"true": "True", "false": "False", "none": "None"}
+
+
+def _pairs(words: Sequence[str]) -> dict[str, Any]:
+    """`key=value` pairs, values as Python writes numbers, tuples, True and None; else texts.
+
+    Raises:
+        ValueError: If a word is no pair.
+    """
+    found = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not (equals and key.isidentifier()):
+            raise ValueError(f"expected KEY=VALUE, got {word!r}")
+        try:
+            found[key] = ast.literal_eval(_WORDS.get(value, value))
+        except (ValueError, SyntaxError):
+            found[key] = value
+    return found
+
+
+Keywords = Annotated[
+    dict[str, Any],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="KEY=VALUE ...",
+        instance_from_str=_pairs,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=lambda value: [f"{k}={v}" for k, v in value.items()],
+    ),
+]
+"""Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
+
+EnvId = tyro.conf.Positional[Annotated[str, tyro.conf.arg(help=f"what to fly: {', '.join(IDS)}")]]
+"""The id of an environment, given without the option's name."""
+
+SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(SUITES)}")]
+"""The name of a sensor suite."""
+
+SuiteNames = Annotated[
+    tuple[str, ...], tyro.conf.arg(help=f"sensor suites, of {', '.join(SUITES)}")
+]
+"""Names of sensor suites."""

@@ -1,0 +1,134 @@
+"""Train a controller on what a filter estimates, on the truth, or on anything else it may see.
+
+    quad-gym train QuadGym/Circle-v0
+    quad-gym train QuadGym/Hover-v0 --algorithm sac --seed 3 --env observation=truth
+
+The hyper-parameters are those of baselines/recipes.py for the task and the algorithm. While
+training, the policy is evaluated on the task itself, by its true position error, and kept: last.zip
+and best.zip, which Stable-Baselines3 loads and quad-gym evaluate flies, with training.json
+(everything needed to repeat the run), evaluations.csv, and TensorBoard's files. A run that was
+stopped, by Ctrl-C or otherwise, goes on with --resume, exactly where its last evaluation left it.
+"""
+
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from quad_gym import IDS
+from quad_gym.commands.options import EnvId, Keywords, flying_options, usage_errors
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the training."""
+
+    env_id: EnvId = "QuadGym/Circle-v0"
+    algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
+    """how to learn"""
+    env: Keywords = field(default_factory=dict)
+    """keywords of the environment, such as observation=truth sensors=rtk camera=false"""
+    steps: int | None = None
+    """environment steps; if not given, the recipe's"""
+    n_envs: int | None = None
+    """flights at a time; if not given, the recipe's"""
+    set: Keywords = field(default_factory=dict)
+    """parameters of the algorithm in place of the recipe's, such as gamma=0.98"""
+    seed: int = 0
+    """of the networks, and of the flights in training and in its evaluations, which no other
+    seed shares and quad-gym evaluate does not fly"""
+
+    output: Path | None = None
+    """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED"""
+    resume: bool = False
+    """go on with the run in the folder"""
+    evaluations: int = 20
+    """evaluations, and checkpoints, over the run"""
+    episodes: int = 100
+    """flown in an evaluation"""
+    threads: int | None = None
+    """threads of the flights; if not given, one per core; no result depends on them"""
+    tensorboard: bool = True
+    """write files for TensorBoard"""
+    progress: bool = True
+    """show a progress bar"""
+    export: Path | None = None
+    """write the best policy to this .npz too, which needs NumPy alone to fly"""
+
+
+def configure(args: Args) -> tuple[Any, Path]:
+    """Check all options before anything is trained.
+
+    Raises:
+        ValueError: If an option is invalid.
+        OSError: If nothing can be written to the folder.
+        ImportError: If Stable-Baselines3 is missing.
+    """
+    from baselines.recipes import recipe
+    from quad_gym.analysis.reports import require_writable
+
+    try:
+        from baselines.plans import Plan, make_model
+    except ImportError as error:
+        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
+    chosen = recipe(args.env_id, args.algorithm)
+    given = {"steps": args.steps, "n_envs": args.n_envs}
+    chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})
+    chosen = chosen.replace(parameters={**chosen.parameters, **args.set})
+    plan = Plan(
+        env_id=args.env_id,
+        environment=args.env,
+        recipe=chosen,
+        seed=args.seed,
+        threads=args.threads,
+        evaluations=args.evaluations,
+        episodes=args.episodes,
+    )
+    make_model(plan, plan.make_flights())
+    plan.make_judge().close()
+    task = IDS[args.env_id]
+    folder = args.output or Path("results/train") / task / f"{args.algorithm}_seed_{args.seed}"
+    require_writable("--output", folder)
+    if args.export is not None and args.export.suffix != ".npz":
+        raise ValueError(f"--export must end in .npz, got {args.export}")
+    if args.export is not None and args.algorithm == "recurrent_ppo":
+        raise ValueError("--export takes no recurrent_ppo, whose policies have a memory")
+    return plan, folder
+
+
+def main(args: Args) -> None:
+    """Train."""
+    from_start = time.perf_counter()
+    with usage_errors():
+        plan, folder = configure(args)
+    from baselines.checkpoints import RunError
+    from baselines.training import export, train
+
+    print(
+        f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
+        f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
+    )
+    with usage_errors((RunError,)):
+        done = train(
+            plan,
+            folder,
+            resume=args.resume,
+            tensorboard=args.tensorboard,
+            quiet=not args.progress,
+        )
+    total = time.perf_counter() - from_start
+    print(
+        f"{done.steps:,} steps in {done.seconds:.0f} s of training, "
+        f"{done.steps / max(done.seconds, 1e-9):,.0f} a second ({total:.0f} s in all).\n"
+        f"Best evaluation, after {done.best['steps']:,.0f} steps: true position error "
+        f"{done.best['mean_error']:.4f} m, {done.best['crash_rate']:.1%} crashed."
+    )
+    if not done.finished:
+        print("Stopped. Start the same command again with --resume to go on.", file=sys.stderr)
+        raise SystemExit(130)
+    if args.export is not None:
+        export(done, args.export)
+        print(f"Wrote {args.export}.")
+    policy = f"--policy {done.best_policy}{flying_options(plan.environment)}"
+    print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")

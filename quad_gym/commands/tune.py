@@ -1,0 +1,266 @@
+"""Tune the gains of PD control on what it sees: the estimate, the truth, any sensors.
+
+    quad-gym tune                                         # the four tracking tasks, lab
+    quad-gym tune --tasks QuadGym/Circle-v0 --sensors consumer
+    quad-gym evaluate QuadGym/Circle-v0 --policy pd pd:results/tune/gains.json
+
+Differential evolution (scipy.optimize) searches gains between a third and three times those it
+starts from, for the smallest true position error: for each task relative to the gains at the start,
+geometric mean over the tasks, episodes that crash counted as far off. Every candidate flies the
+same episodes; at the end the best flies fresh ones, beside the gains at the start. Prints both,
+and writes gains.json and search.csv.
+"""
+
+import math
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from tyro.conf import arg
+
+from baselines.pd import PDPolicy
+from baselines.seeds import first_seed
+from quad_gym import IDS, PDGains, pd_gains
+from quad_gym.analysis.metrics import paired_difference
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.commands.options import Keywords, SuiteName, flying_options, leave, usage_errors
+from quad_gym.evaluation import roll_out
+
+Floats = NDArray[np.float64]
+
+TRACKING = tuple(env_id for env_id, task in IDS.items() if task != "waypoints")
+CRASH_FACTOR = 10.0
+"""An episode that crashed counts as this many times the error at the start."""
+RANGE = 3.0
+"""Gains are searched from 1 / RANGE to RANGE times those at the start."""
+POPULATION = 8
+"""Candidates of a generation, for each gain."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the search."""
+
+    tasks: Annotated[tuple[str, ...], arg(help=f"what to fly: {', '.join(TRACKING)}")] = TRACKING
+    observation: Literal["estimate", "truth", "noisy"] = "estimate"
+    """what control sees"""
+    sensors: SuiteName = "standard"
+    env: Keywords = field(default_factory=dict)
+    """further keywords of the environment, such as action=wrench control_rate=200"""
+    start: Literal["lab", "tuned"] = "lab"
+    """gains to start from"""
+    candidates: int = 400
+    """gains to try, at least"""
+    episodes: int = 32
+    """that each candidate flies on each task"""
+    fresh_episodes: int = 500
+    """flown at the end, with seeds that the search never saw"""
+    seed: int = 0
+    """of the search, whose episodes follow from it, and of the first fresh episode"""
+    threads: int | None = None
+    """threads; if not given, one per core"""
+    output: Path = Path("results/tune")
+    """folder for gains and numbers"""
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Which gains are searched, as the logarithms of factors on those at the start."""
+
+    start: PDGains
+    torques: bool
+    """whether Kd matters by itself; with rates or tilt commanded, only K / Kd does"""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is turned."""
+        names = ("position", "velocity", "attitude, tilt", "attitude, yaw")
+        return (*names, "body rates, tilt", "body rates, yaw") if self.torques else names
+
+    def gains(self, x: Floats) -> PDGains:
+        """The gains at a point of the search."""
+        f = np.exp(np.concatenate([x, np.zeros(6 - len(x))]))
+        tilt_yaw = np.array([f[2], f[2], f[3]]), np.array([f[4], f[4], f[5]])
+        return PDGains(
+            position=f[0] * self.start.position,
+            velocity=f[1] * self.start.velocity,
+            attitude=tuple(tilt_yaw[0] * self.start.attitude),
+            body_rates=tuple(tilt_yaw[1] * self.start.body_rates),
+        )
+
+
+@dataclass
+class Search:
+    """Flies candidates, and remembers what came of them."""
+
+    envs: dict[str, Any]
+    knobs: Knobs
+    first_seed: int
+    """of the episodes that every candidate flies"""
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    yardstick: dict[str, float] = field(default_factory=dict)
+    """mean error of each task with the gains at the start [m]"""
+
+    def cost(self, x: Floats) -> float:
+        """Logarithm of the mean error relative to that at the start, mean over tasks."""
+        gains = self.knobs.gains(np.asarray(x))
+        logs = []
+        for env_id, env in self.envs.items():
+            episodes = roll_out(PDPolicy(env, gains=gains), env, seed=self.first_seed)
+            fine = np.where(episodes.crashed, np.nan, episodes.mean_error)
+            if env_id not in self.yardstick:  # the first candidate is the start itself
+                if episodes.crashed.all():
+                    raise ValueError(f"every episode of {env_id} crashes with the gains at --start")
+                self.yardstick[env_id] = float(np.nanmean(fine))
+            scale = self.yardstick[env_id]
+            logs.append(
+                math.log(float(np.nan_to_num(fine, nan=CRASH_FACTOR * scale).mean() / scale))
+            )
+        cost = float(np.mean(logs))
+        self.rows.append({"relative_error": math.exp(cost), **_flat(gains)})
+        return cost
+
+
+def _flat(gains: PDGains) -> dict[str, float]:
+    names = {"attitude": gains.attitude, "body_rates": gains.body_rates}
+    return {
+        "position": gains.position,
+        "velocity": gains.velocity,
+        **{
+            f"{name}_{axis}": v
+            for name, k in names.items()
+            for axis, v in zip("xyz", k, strict=True)
+        },
+    }
+
+
+def make_envs(args: Args, episodes: int) -> dict[str, Any]:
+    """The environment of each task."""
+    return {
+        env_id: gymnasium.make_vec(
+            env_id,
+            num_envs=episodes,
+            observation=args.observation,
+            sensors=args.sensors,
+            threads=args.threads,
+            **args.env,
+        )
+        for env_id in args.tasks
+    }
+
+
+def configure(args: Args) -> Search:
+    """Check all options before anything flies.
+
+    Raises:
+        ValueError: If an option is invalid.
+        OSError: If nothing can be written to the folder.
+    """
+    for env_id in args.tasks:
+        if env_id not in TRACKING:
+            raise ValueError(f"--tasks must be among {', '.join(TRACKING)}, got {env_id!r}")
+    for name, least in (("candidates", 1), ("episodes", 1), ("fresh_episodes", 2), ("seed", 0)):
+        if getattr(args, name) < least:
+            option_name = name.replace("_", "-")
+            raise ValueError(f"--{option_name} must be at least {least}, got {getattr(args, name)}")
+    names = ("observation", "sensors", "threads")
+    leave(args.env, {name: f"--{name}" for name in names})
+    envs = make_envs(args, args.episodes)
+    for env in envs.values():
+        PDPolicy(env, gains=args.start)  # refuses actions and layouts that do not admit it
+    require_writable("--output", args.output)
+    torques = args.env.get("action") in ("motor", "wrench")
+    first = first_seed("training", args.seed, args.episodes)
+    first_seed("test", args.seed, args.fresh_episodes)  # refuses too large seeds before the search
+    return Search(envs, Knobs(pd_gains(args.start), torques), first)
+
+
+def search(args: Args, found: Search) -> PDGains:
+    """The best gains that differential evolution finds."""
+    from scipy.optimize import differential_evolution
+    from tqdm import tqdm
+
+    n = len(found.knobs.names)
+    found.cost(np.zeros(n))  # the yardstick
+    generations = max(1, math.ceil(args.candidates / (POPULATION * n)) - 1)
+    bounds = [(-math.log(RANGE), math.log(RANGE))] * n
+    total = POPULATION * n * (generations + 1)
+    with tqdm(total=total, desc="tuning", unit=" candidates") as bar:
+
+        def cost(x: Floats) -> float:
+            value = found.cost(x)
+            bar.update()
+            bar.set_postfix(error=f"{min(row['relative_error'] for row in found.rows):.1%}")
+            return value
+
+        best = differential_evolution(
+            cost,
+            bounds,
+            x0=np.zeros(n),
+            popsize=POPULATION,
+            maxiter=generations,
+            rng=args.seed,
+            polish=False,
+            tol=0.0,
+        )
+    return found.knobs.gains(best.x)
+
+
+def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
+    """Fly gains on fresh episodes: a table, and the numbers."""
+    first = first_seed("test", args.seed, args.fresh_episodes)
+    rows, numbers = [], {}
+    for env_id, env in make_envs(args, args.fresh_episodes).items():
+        flown = {k: roll_out(PDPolicy(env, gains=g), env, seed=first) for k, g in gains.items()}
+        start, tuned = flown.values()
+        both = ~(start.crashed | tuned.crashed)
+        change = paired_difference(tuned.mean_error[both], start.mean_error[both])
+        row = [env_id]
+        for episodes in (start, tuned):
+            row += [f"{1e3 * episodes.mean_error.mean():.1f}", f"{episodes.crashed.mean():.1%}"]
+        text = f"{1e3 * change.spread.mean:+.1f}"
+        if change.interval is not None:
+            text += f" [{1e3 * change.interval.low:+.1f}, {1e3 * change.interval.high:+.1f}]"
+        row.append(text)
+        rows.append(row)
+        numbers[env_id] = {name: episodes.summary() for name, episodes in flown.items()}
+    cells = ["error [mm]", "crashed"]
+    groups = {"": ["task"], **{name: list(cells) for name in gains}, "change": ["[mm]"]}
+    return text_table(groups, rows), numbers
+
+
+def main(args: Args) -> None:
+    """Tune."""
+    began = time.perf_counter()
+    with usage_errors():
+        found = configure(args)
+    tuned = search(args, found)
+    start = f"gains at the start ({args.start})"
+    text, numbers = judge(args, {start: found.knobs.start, "tuned gains": tuned})
+    print(
+        f"\nPD on the {args.observation}, sensors {args.sensors}; "
+        f"{args.fresh_episodes:,} fresh episodes of each task.\n\n{text}\n"
+        "Change: mean over pairs of episodes that did not crash, with its bootstrap 95 % interval."
+    )
+    print("\n" + "\n".join(f"{name:14} {value:.3g}" for name, value in _flat(tuned).items()))
+    record = {
+        "gains": tuned,
+        "start": found.knobs.start,
+        "candidates": len(found.rows),
+        "fresh_episodes": numbers,
+        "arguments": args,
+        "versions": versions("numpy", "scipy", "numba"),
+    }
+    columns = {name: [row[name] for row in found.rows] for name in found.rows[0]}
+    written = [
+        write_json(args.output / "gains.json", record),
+        write_csv(args.output / "search.csv", columns),
+    ]
+    seconds = time.perf_counter() - began
+    print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")
+    same = flying_options({"sensors": args.sensors, **args.env})
+    print(f"quad-gym evaluate {args.tasks[0]} --policy pd pd:{written[0]}{same}")

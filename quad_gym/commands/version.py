@@ -1,0 +1,15 @@
+"""Print the version."""
+
+from dataclasses import dataclass
+
+import quad_gym
+
+
+@dataclass(frozen=True)
+class Args:
+    """`version` has no options."""
+
+
+def main(args: Args) -> None:
+    """Print it."""
+    print(quad_gym.__version__)

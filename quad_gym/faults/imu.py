@@ -1,0 +1,80 @@
+"""Faults of the IMU."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from quad_gym.faults.base import DirectedFault, Fault, Span, span
+from quad_gym.params import checks as check
+from quad_gym.records import FaultKind
+
+
+@dataclass(frozen=True, kw_only=True)
+class AccelBiasStep(DirectedFault):
+    """A step of the accelerometer's true bias, in addition to its slow wandering; B axes.
+
+    Consumer parts are off by up to 50 milli-g (TDK ICM-20948 data sheet); a knock or a change of
+    temperature moves them by some of that, our judgment.
+    """
+
+    size: Span = (0.05, 0.2)
+    """[m/s^2]"""
+
+    kind = FaultKind.ACCEL_BIAS_STEP
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(span, "size", open_end=True)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What kernels read of it."""
+        return {"size": self.size, "direction": self.unit}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GyroBiasStep(DirectedFault):
+    """A step of the gyro's true bias, likewise.
+
+    Consumer parts are off by up to 5 deg/s (TDK ICM-20948 data sheet); some tenths of that, our
+    judgment.
+    """
+
+    size: Span = (math.radians(0.2), math.radians(1.0))
+    """[rad/s]"""
+
+    kind = FaultKind.GYRO_BIAS_STEP
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(span, "size", open_end=True)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What kernels read of it."""
+        return {"size": self.size, "direction": self.unit}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSaturation(Fault):
+    """Samples end at the IMU's ranges; the default is the smallest of a consumer part.
+
+    TDK ICM-20948 data sheet: 2, 4, 8 or 16 g; 250, 500, 1000 or 2000 deg/s. The gyro's reading that
+    the inner loops use saturates, too.
+    """
+
+    accel_range: float = 2.0 * 9.80665
+    """per axis [m/s^2]"""
+    gyro_range: float = math.radians(250.0)
+    """per axis [rad/s]"""
+
+    kind = FaultKind.IMU_SATURATION
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(check.positive, "accel_range", "gyro_range")
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What kernels read of it."""
+        return {"imu_range": (self.accel_range, self.gyro_range)}

@@ -1,0 +1,131 @@
+"""Faults by name, and what the keyword `faults` may hold."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.faults import (
+    AccelBiasStep,
+    BaselineLoss,
+    CameraOcclusion,
+    Fault,
+    GnssJump,
+    GnssOutage,
+    GnssOutliers,
+    GnssRamp,
+    GyroBiasStep,
+    ImuSaturation,
+    PositionJump,
+    RotorLoss,
+    WrongAssociations,
+)
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.records import FAULT_KINDS
+
+FaultsGiven = str | Fault | Iterable[str | Fault] | None
+"""A fault, the name of a preset or several joined by "+", several of both, or None."""
+
+_SOON = (2.0, 5.0)
+"""An instant [s] at which vehicles have left the ground and most of an episode lies ahead."""
+_A_WHILE = (2.0, 5.0)
+"""Some seconds [s]: a bridge, a tree, a shadow; our judgment, for episodes of 10 s."""
+
+PRESETS: dict[str, tuple[Fault, ...]] = {
+    "none": (),
+    "gnss_outage": (GnssOutage(start=_SOON, duration=_A_WHILE),),
+    "gnss_outliers": (GnssOutliers(),),
+    "gnss_ramp": (GnssRamp(start=_SOON),),
+    "gnss_jump": (GnssJump(start=_SOON, duration=_A_WHILE),),
+    "baseline_loss": (BaselineLoss(start=_SOON, duration=_A_WHILE),),
+    "position_jump": (PositionJump(start=_SOON),),
+    "camera_occlusion": (CameraOcclusion(start=_SOON, duration=_A_WHILE),),
+    "wrong_associations": (WrongAssociations(),),
+    "imu_bias_step": (AccelBiasStep(start=_SOON), GyroBiasStep(start=_SOON)),
+    "imu_saturation": (ImuSaturation(),),
+    "rotor_loss": (RotorLoss(start=_SOON),),
+}
+"""Faults by name, made for episodes of ten seconds and more."""
+
+ALL = "all"
+"""The name of all of them that a sensor suite can have."""
+
+
+def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
+    """What the keyword `faults` means, in the order of `FaultKind`.
+
+    Args:
+        given: See `FaultsGiven`; "all" stands for every preset that the suite can have.
+        sensors: The suite that they affect.
+
+    Returns:
+        One fault of each kind at most.
+
+    Raises:
+        ValueError: If a name is unknown, a kind comes twice, or the suite lacks what one concerns.
+    """
+    if isinstance(given, (str, Fault)) or given is None:
+        given = () if given is None else (given,)
+    try:
+        parts = list(given)
+    except TypeError:
+        raise ValueError(f"faults must be faults or names of presets, got {given!r}") from None
+    found: list[Fault | None] = [None] * FAULT_KINDS
+    for part in parts:
+        for fault in _named(part, sensors) if isinstance(part, str) else (part,):
+            if not isinstance(fault, Fault):
+                raise ValueError(f"faults must be faults or names of presets, got {fault!r}")
+            if found[fault.kind] is not None:
+                raise ValueError(
+                    f"faults must hold one of a kind, got two {type(fault).__name__}; one that "
+                    "comes again and again has a rate"
+                )
+            fault.check_suite(sensors)
+            found[fault.kind] = fault
+    return tuple(fault for fault in found if fault is not None)
+
+
+def needs_sensors(fault: Fault) -> bool:
+    """Whether a fault concerns measurements alone, and nothing where no sensors run."""
+    return not isinstance(fault, (PositionJump, RotorLoss))
+
+
+def felt_without_sensors(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
+    """Those of the faults that affect the vehicle itself, so that they are felt on the truth.
+
+    For comparisons of control on the estimate, which all of the faults affect, with control on the
+    truth, which sensor faults do not concern.
+    """
+    return tuple(fault for fault in faults_of(given, sensors) if not needs_sensors(fault))
+
+
+def _named(names: str, sensors: SensorSuite) -> Iterable[Fault]:
+    """The faults of presets joined by "+"."""
+    for name in names.split("+"):
+        if name == ALL:
+            everything = (fault for preset in PRESETS.values() for fault in preset)
+            yield from (fault for fault in everything if _possible(fault, sensors))
+        elif name in PRESETS:
+            yield from PRESETS[name]
+        else:
+            raise ValueError(f"faults must be one of {', '.join([*PRESETS, ALL])}, got {name!r}")
+
+
+def _possible(fault: Fault, sensors: SensorSuite) -> bool:
+    try:
+        fault.check_suite(sensors)
+    except ValueError:
+        return False
+    return True
+
+
+def named_faults(faults: Iterable[Fault], bits: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
+    """Which faults are active, by name.
+
+    Args:
+        faults: Those that can come.
+        bits: (...,) sums of 2^FaultKind over the active ones, as of a flight's field "faults".
+    """
+    whole = bits.astype(np.int64)
+    return {fault.name: (whole >> fault.kind) % 2 > 0 for fault in faults}

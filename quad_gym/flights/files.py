@@ -1,0 +1,201 @@
+"""Files of a `Flight`: a NumPy archive that keeps every bit, and tables for other programs.
+
+The archive (`.npz`, readable by `numpy.load` alone) holds
+
+| entry | what |
+|---|---|
+| `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and what the stage has in single numbers |
+| `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.record.COLUMNS` |
+| `stage/NAME` | one float64 array per array of `quad_gym.flights.stage.Stage` |
+
+A table has the same columns with one number each, vectors as `_x`, `_y`, `_z` (`_w`, `_x`, `_y`,
+`_z` for quaternions, `_1` ... where there are no axes), and in place of the covariance the square
+roots of its diagonal as `sigma_...`.
+"""  # noqa: E501 - a table
+
+import csv
+import dataclasses
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.flights.record import COLUMNS, Column, Flight, row_dtype
+from quad_gym.flights.stage import Stage
+
+if TYPE_CHECKING:
+    import pandas
+
+FORMAT, VERSION = "quad_gym flight", 1
+_STATES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+
+
+def save_flight(flight: Flight, path: Path) -> Path:
+    """Write the archive; the file is complete or not there.
+
+    Returns:
+        The file.
+
+    Raises:
+        TypeError: If `about` holds something that JSON does not know.
+    """
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "about": flight.about}
+    arrays: dict[str, Any] = {
+        f"columns/{c.name}": np.ascontiguousarray(flight[c.name]) for c in COLUMNS
+    }
+    for field in dataclasses.fields(Stage):
+        value = getattr(flight.stage, field.name)
+        if isinstance(value, np.ndarray):
+            arrays[f"stage/{field.name}"] = value
+        else:
+            header[field.name] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(path.name + ".part")
+    try:
+        with unfinished.open("wb") as stream:
+            np.savez_compressed(stream, header=np.array(json.dumps(header)), **arrays)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return path
+
+
+def load_flight(path: Path) -> Flight:
+    """Read an archive.
+
+    Raises:
+        FileNotFoundError: If there is no file.
+        ValueError: If it is damaged, of another kind, or of an unknown version.
+    """
+    try:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError(f"{path} is not a flight: it is a single array")
+        with archive:
+            entries = {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, KeyError) as error:
+        raise ValueError(f"{path} is damaged or cut off: {error}") from None
+    except ValueError as error:
+        if "not a flight" in str(error):
+            raise
+        raise ValueError(f"{path} is not a flight, or damaged: {error}") from None
+    header = _header(path, entries)
+    try:
+        stage = _stage(header, entries)
+        rows = _rows(entries, len(stage.features_I))
+        return Flight(rows, stage, dict(header["about"]))
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{path} is not a complete flight: {error}") from None
+
+
+def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    try:
+        header = json.loads(str(entries["header"]))
+        known = header["format"] == FORMAT
+    except (KeyError, TypeError, ValueError):
+        known = False
+    if not known:
+        raise ValueError(f"{path} is not a flight: it was not written by quad_gym")
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path} has version {header.get('version')!r} of the format; this quad_gym reads "
+            f"version {VERSION}: use the quad_gym that wrote it, or a newer one"
+        )
+    return dict(header)
+
+
+def _stage(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> Stage:
+    names = [field.name for field in dataclasses.fields(Stage)]
+    values: dict[str, Any] = {
+        name: entries.get(f"stage/{name}", header.get(name)) for name in names
+    }
+    missing = [name for name, value in values.items() if value is None]
+    if missing:
+        raise ValueError(f"it lacks {missing[0]}")
+    return Stage(**values)
+
+
+def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
+    count = len(entries.get("columns/time", ()))
+    if not count:
+        raise ValueError("it has no rows")
+    rows = np.zeros(count, row_dtype(features))
+    for column in COLUMNS:
+        if f"columns/{column.name}" not in entries:
+            raise ValueError(f"it lacks columns/{column.name}")
+        values = entries[f"columns/{column.name}"]
+        if values.shape != rows[column.name].shape or values.dtype != np.float64:
+            raise ValueError(
+                f"column {column.name} must be float64 of shape {rows[column.name].shape}, "
+                f"got {values.dtype} of {values.shape}"
+            )
+        rows[column.name] = values
+    return rows
+
+
+def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
+    """The columns of a flight with one number a row each, by their names in a table."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for column in COLUMNS:
+        values = flight[column.name]
+        if column.name == "covariance":
+            sigmas = np.sqrt(np.maximum(np.diagonal(values, axis1=1, axis2=2), 0.0))
+            names = [f"sigma_{state}_{axis}" for state in _STATES for axis in "xyz"]
+            found |= {name: sigmas[:, k] for k, name in enumerate(names)}
+        elif column.name == "pixels":
+            for k in range(values.shape[1]):
+                found |= {f"pixels_{k + 1}_{axis}": values[:, k, j] for j, axis in enumerate("xy")}
+        elif values.ndim == 1:
+            found[column.name] = values
+        else:
+            for k, part in enumerate(_parts(column, values.shape[1])):
+                found[f"{column.name}_{part}"] = values[:, k]
+    return found
+
+
+def _parts(column: Column, count: int) -> Sequence[str]:
+    """What the numbers of a row of a column are called."""
+    if column.name == "gnss_gate":
+        return "position", "baseline", "velocity"
+    if column.name in ("action", "rotor_speeds", "feature_gate"):
+        return [str(k + 1) for k in range(count)]
+    return "wxyz" if column.name.endswith("attitude") else "xyz"
+
+
+def write_flight_csv(flight: Flight, path: Path) -> Path:
+    """Write the table as CSV; what is missing is an empty cell, and numbers keep every bit.
+
+    Returns:
+        The file.
+    """
+    columns = table(flight)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+            writer.writerow(["" if cell != cell else repr(cell) for cell in row])
+    return path
+
+
+def flight_frame(flight: Flight) -> "pandas.DataFrame":
+    """The table as a pandas DataFrame, indexed by time.
+
+    Raises:
+        ImportError: If pandas is not installed.
+    """
+    try:
+        import pandas
+    except ImportError:
+        raise ImportError(
+            'to_pandas needs pandas, which is not installed: pip install "quad-gym[pandas]"'
+        ) from None
+    return pandas.DataFrame(table(flight)).set_index("time")

@@ -1,0 +1,349 @@
+"""`Flight`: what happened in one flight, instant by instant, to keep, export, look at and replay.
+
+A flight has one row per control step, the start included; `COLUMNS` says what a row holds. Where
+something was not measured since the last row, or nothing was estimated, a row holds NaN.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.analysis.metrics import nees, state_error
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.flights.stage import Stage
+from quad_gym.packing.flight import params_record
+from quad_gym.records import FEATURE_BLOCKS, Source
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+
+if TYPE_CHECKING:
+    import pandas
+    import rerun
+
+Floats = NDArray[np.float64]
+
+
+class Column(NamedTuple):
+    """One quantity of a flight."""
+
+    name: str
+    shape: tuple[int, ...]
+    """of one row; FEATURES stands for the number of the camera's features"""
+    unit: str
+    frame: str
+    """I: inertial (east, north, up), B: body, C: image; "-": none"""
+    meaning: str
+
+
+FEATURES = -1
+
+# fmt: off
+COLUMNS = (
+    Column("time", (), "s", "-", "since the start of the episode"),
+    # the truth
+    Column("position", (3,), "m", "I", "true position of the center of mass"),
+    Column("velocity", (3,), "m/s", "I", "true velocity"),
+    Column("attitude", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
+    Column("body_rates", (3,), "rad/s", "B", "true body rates"),
+    Column("rotor_speeds", (4,), "rad/s", "-", "true rotor speeds"),
+    Column("accel_bias", (3,), "m/s^2", "B", "true accelerometer bias"),
+    Column("gyro_bias", (3,), "rad/s", "B", "true gyro bias"),
+    Column("disturbance", (3,), "N", "I", "external force on the body"),
+    Column("wind", (3,), "m/s", "I", "velocity of the air"),
+    Column("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`"),
+    # the filter
+    Column("estimated_position", (3,), "m", "I", "the filter's"),
+    Column("estimated_velocity", (3,), "m/s", "I", "the filter's"),
+    Column("estimated_attitude", (4,), "-", "B to I", "the filter's, as a quaternion"),
+    Column("estimated_accel_bias", (3,), "m/s^2", "B", "the filter's"),
+    Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's"),
+    Column("covariance", (15, 15), "mixed", "mixed", "of position, velocity, attitude error, accelerometer and gyro bias"),
+    Column("filter_status", (), "bits", "-", "failures of the filter so far, see `FilterStatus`"),
+    Column("nees", (), "-", "-", "normalized estimation error squared; 15 on average if the filter is consistent"),
+    Column("nis", (), "-", "-", "normalized innovation squared of the last update"),
+    Column("nis_dimension", (), "-", "-", "measurements in the last update"),
+    # what the controller saw
+    Column("seen_position", (3,), "m", "I", "position that the controller believed in"),
+    Column("seen_attitude", (4,), "-", "B to I", "attitude that the controller believed in"),
+    # the last measurements since the row before
+    Column("gyro", (3,), "rad/s", "B", "angular rate"),
+    Column("accel", (3,), "m/s^2", "B", "specific force"),
+    Column("gnss_position", (3,), "m", "I", "primary antenna"),
+    Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
+    Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
+    Column("gnss_gate", (3,), "-", "-", "what the filter made of position, baseline and velocity, see `Gate`; 0: it has no gate"),
+    Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's center"),
+    Column("feature_gate", (FEATURES,), "-", "-", "what the filter made of them, likewise"),
+    # the task
+    Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),
+    Column("reference_position", (3,), "m", "I", "where the vehicle should be; on a course, the next gate"),
+    Column("gates_passed", (), "-", "-", "on a course of gates"),
+    Column("reward", (), "-", "-", "of the step that led to this row"),
+    Column("position_error", (), "m", "-", "distance of the true position from the reference"),
+    Column("estimation_error", (), "m", "-", "distance of the seen from the true position"),
+)
+# fmt: on
+
+_DIRECT = {
+    "position": "r",
+    "velocity": "v",
+    "attitude": "q",
+    "body_rates": "w",
+    "rotor_speeds": "rotor_speeds",
+    "accel_bias": "b_a",
+    "gyro_bias": "b_g",
+    "disturbance": "disturbance",
+    "wind": "wind",
+    "faults": "faults",
+    "seen_position": "r_seen",
+    "action": "action",
+    "gates_passed": "gate_next",
+    "reward": "reward",
+    "position_error": "position_error",
+    "estimation_error": "estimation_error",
+}
+"""Columns that are fields of a flight's record as they stand."""
+
+_ESTIMATED = {
+    "estimated_position": "r_hat",
+    "estimated_velocity": "v_hat",
+    "estimated_accel_bias": "b_a_hat",
+    "estimated_gyro_bias": "b_g_hat",
+    "filter_status": "filter_status",
+    "nis": "nis",
+    "nis_dimension": "nis_dimension",
+}
+"""Likewise, where a filter runs."""
+
+_WITH_FILTER = (
+    *_ESTIMATED,
+    *("estimated_attitude", "covariance", "nees"),
+    *("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "gnss_gate"),
+    *("pixels", "feature_gate"),
+)
+"""Columns that hold NaN where no filter, and so no sensor, runs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """One flight; `flight["position"]` is a column, (n, ...) with one row per control step.
+
+    Args:
+        rows: (n,) records with the fields of `COLUMNS`.
+        stage: Where it takes place.
+        about: What else is worth knowing, such as seed and policy; of the types of JSON.
+    """
+
+    rows: NDArray[Any]
+    stage: Stage
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return np.asarray(self.rows[name])
+
+    @property
+    def estimated(self) -> bool:
+        """Whether a filter ran."""
+        return bool(np.isfinite(self.rows["estimated_position"][-1]).all())
+
+    def until(self, time: float) -> "Flight":
+        """The flight up to a time [s], without copying; at least its first row."""
+        count = int(np.searchsorted(self.rows["time"], time + 1e-9, side="right"))
+        return dataclasses.replace(self, rows=self.rows[: max(count, 1)])
+
+    def save(self, path: Path | str) -> Path:
+        """Write a compressed NumPy archive (npz); see `quad_gym.flights.files`."""
+        from quad_gym.flights.files import save_flight
+
+        return save_flight(self, Path(path))
+
+    @classmethod
+    def load(cls, path: Path | str) -> "Flight":
+        """Read what `save` wrote, bit for bit.
+
+        Raises:
+            ValueError: If the file is damaged, of another kind, or of an unknown version.
+        """
+        from quad_gym.flights.files import load_flight
+
+        return load_flight(Path(path))
+
+    def to_csv(self, path: Path | str) -> Path:
+        """Write a table for spreadsheets, with the covariance's standard deviations."""
+        from quad_gym.flights.files import write_flight_csv
+
+        return write_flight_csv(self, Path(path))
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The same table as a pandas DataFrame, indexed by time.
+
+        Raises:
+            ImportError: If pandas is not installed.
+        """
+        from quad_gym.flights.files import flight_frame
+
+        return flight_frame(self)
+
+    def to_rerun(self) -> "rerun.RecordingStream":
+        """A recording for the Rerun viewer: 3D, the camera's image and plots on one time line.
+
+        `flight.to_rerun().spawn()` opens the viewer; `flight.to_rerun().save("flight.rrd")` writes
+        a file for it. See `quad_gym.flights.rerun` for what it holds.
+
+        Raises:
+            ImportError: If rerun-sdk is not installed.
+        """
+        from quad_gym.flights.rerun import rerun_recording
+
+        return rerun_recording(self)
+
+
+def row_dtype(features: int) -> np.dtype[Any]:
+    """The record of a row, with a camera that knows so many features."""
+    return np.dtype(
+        [(c.name, "f8", tuple(features if n == FEATURES else n for n in c.shape)) for c in COLUMNS]
+    )
+
+
+class FlightRecorder:
+    """Keeps one flight of a batch; it reads the batch and never changes it.
+
+    Args:
+        batch: The flights.
+        flight: Which of them.
+        about: Kept with the flight.
+
+    Raises:
+        ValueError: If there is no such flight.
+    """
+
+    def __init__(
+        self, batch: FlightBatch, flight: int = 0, about: dict[str, Any] | None = None
+    ) -> None:
+        if not 0 <= flight < batch.count:
+            raise ValueError(f"flight must be within 0 and {batch.count - 1}, got {flight}")
+        self._batch, self._which = batch, np.array([flight])
+        self._about = dict(about or {})
+        camera = batch.sensors.camera
+        features = 0 if camera is None else len(camera.features_I)
+        self._rows = np.zeros(256, row_dtype(features))
+        self._count = 0
+        self._stage: Stage | None = None
+        model = params_record(batch.vehicle, batch.sensors)[0]
+        self._R_IG, self._model = model["R_IG"], model
+
+    @property
+    def flight(self) -> Flight:
+        """What was kept since the start of the present episode; it goes on sharing memory.
+
+        Raises:
+            ValueError: If nothing was kept yet.
+        """
+        if self._stage is None:
+            raise ValueError("there is no flight yet: reset the environment first")
+        return Flight(self._rows[: self._count], self._stage, self._about)
+
+    def keep(self) -> None:
+        """Keep the present instant; the first of an episode begins a new flight."""
+        tick = self._read("tick")
+        if tick == 0.0 or self._stage is None:
+            self._rows, self._count = np.zeros_like(self._rows), 0  # earlier flights live on
+            self._stage = self._stage_of_episode()
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._fill(self._rows[self._count], tick)
+        self._count += 1
+
+    def _read(self, name: str) -> Any:
+        return self._batch.read(name, self._which)[0]
+
+    def _fill(self, row: Any, tick: float) -> None:
+        row["time"] = tick * self._batch.sensors.imu.dt
+        for column, name in _DIRECT.items():
+            row[column] = self._read(name)
+        assert self._stage is not None
+        row["reference_position"] = self._stage.reference(row["time"])[0]
+        if self._stage.task == "waypoints":
+            row["reference_position"] = self._read("ref_center")
+        row["seen_attitude"] = _quaternion(self._read("R_seen"))
+        if self._batch.run_filter:
+            self._fill_estimate(row)
+            self._fill_measurements(row)
+        else:
+            for name in _WITH_FILTER:
+                row[name] = np.nan
+
+    def _fill_estimate(self, row: Any) -> None:
+        for column, name in _ESTIMATED.items():
+            row[column] = self._read(name)
+        factor, R_hat = self._read("L"), self._read("R_hat")
+        row["covariance"] = factor @ factor.T
+        row["estimated_attitude"] = _quaternion(R_hat)
+        words = ("position", "velocity", "accel_bias", "gyro_bias")
+        truth = {word: row[word] for word in words}
+        estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
+        try:
+            truth["R_BI"] = quaternion_to_dcm(row["attitude"])
+            row["nees"] = nees(state_error(truth, estimate), row["covariance"])
+        except ValueError:  # a state that is not finite, or a singular covariance: nothing to say
+            row["nees"] = np.nan
+
+    def _fill_measurements(self, row: Any) -> None:
+        row["gyro"], row["accel"] = self._read("gyro"), self._read("accel")
+        gnss, gate = self._batch.sensors.gnss, self._read("gate")
+        gives_velocity = gnss is not None and gnss.velocity_sigma is not None
+        for block, (column, flag, given) in enumerate(
+            (
+                ("gnss_position", "position", True),
+                ("gnss_baseline", "baseline", True),
+                ("gnss_velocity", "position", gives_velocity),
+            )
+        ):
+            # at the start nothing is "fresh" but everything has been measured
+            measured = given and self._read(f"{flag}_fresh") + self._read(f"{flag}_valid") > 0.0
+            row[column] = self._R_IG @ self._read(column) if measured else np.nan
+            row["gnss_gate"][block] = gate[block] if measured else np.nan
+        features = row["pixels"].shape[0]
+        if features:
+            seen = self._read("feature_fresh") + self._read("feature_valid") > 0.0
+            pixels = np.where(seen[:, np.newaxis], self._read("pixels"), np.nan)
+            row["pixels"] = pixels[:features]
+            row["feature_gate"] = np.where(seen, gate[FEATURE_BLOCKS:], np.nan)[:features]
+
+    def _stage_of_episode(self) -> Stage:
+        batch, model = self._batch, self._model
+        camera = batch.sensors.camera
+        antennas_B = np.array([model["antenna"], model["antenna"] + model["baseline"]])
+        gate_count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
+        return Stage(
+            task=batch.task.kind,
+            observation=Source(batch.source).name.lower(),
+            control_rate=batch.clocks.control_rate,
+            rotor_positions_B=np.array(batch.vehicle.rotor_positions_B),
+            max_rotor_speed=float(model["motor_gain"] * model["max_voltage"]),
+            hover_rotor_speed=float(model["motor_gain"] * model["hover_voltage"]),
+            antennas_B=antennas_B if batch.sensors.gnss else np.full((2, 3), np.nan),
+            camera_B=np.array(camera.position_B if camera else [np.nan] * 3),
+            R_CB=np.array(model["R_CB"]),
+            camera_rate=camera.rate if camera else 0.0,
+            focal_length=float(model["focal_length"]),
+            half_image=np.array(model["half_image"]),
+            features_I=np.array(camera.features_I if camera else np.zeros((0, 3))),
+            gates_I=self._read("gates")[:gate_count],
+            gate_radius=batch.task.gate_radius,
+            reference_omega=float(self._read("ref_omega")),
+            reference_center=self._read("ref_center"),
+            reference_cos=self._read("ref_cos"),
+            reference_sin=self._read("ref_sin"),
+        )
+
+
+def _quaternion(R_BI: Floats) -> Floats:
+    """The quaternion of an attitude, NaN where a flight has left the finite numbers."""
+    return dcm_to_quaternion(R_BI) if np.isfinite(R_BI).all() else np.full(4, np.nan)

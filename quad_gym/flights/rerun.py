@@ -1,0 +1,336 @@
+"""A `Flight` as a Rerun recording: 3D, the camera's image and plots on one time line.
+
+| entity | what |
+|---|---|
+| `world/reference`, `world/gates`, `world/features` | the path, the course, the features |
+| `world/truth`, `world/estimate` | the vehicle where it is and where the filter believes it to be |
+| `world/truth/camera/image` | the image plane: features as measured, and as the estimate predicts |
+| `world/ellipsoid` | where the filter expects the position with 3 sigma, at its true size |
+| `world/gnss`, `world/rays` | fixes as they arrive, features while the camera sees them |
+| `world/trail` | where truth and estimate were |
+| `plots` | errors, position errors with the filter's 3 sigma, NEES with its band, rotors, actions |
+
+Times are seconds since the start of the episode, lengths meters, in east, north, up; Rerun keeps
+what it draws in single precision, and what it plots in double.
+"""
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
+from quad_gym.flights.record import Flight
+from quad_gym.records import Gate
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+
+Floats = NDArray[np.float64]
+
+TIMELINE = "flight"
+SIGMAS = 3.0
+TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
+ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
+"""[m]"""
+
+# those of Okabe and Ito, which people with a color vision deficiency can tell apart; the viewer's
+# ground is dark
+TRUTH, ESTIMATE, REFERENCE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
+FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
+
+
+def rerun_recording(flight: Flight) -> Any:
+    """The recording of a flight.
+
+    Args:
+        flight: The flight.
+
+    Returns:
+        The `rerun.RecordingStream`.
+
+    Raises:
+        ImportError: If rerun-sdk is not installed.
+    """
+    rr = load_rerun()
+    recording = rr.RecordingStream("quad_gym")
+    log = _Log(flight, rr, recording)
+    log.stage()
+    log.vehicles()
+    log.reference()
+    log.plots()
+    if flight.estimated:
+        log.estimate()
+        log.fixes()
+        if flight.stage.has_camera:
+            log.camera()
+    recording.send_blueprint(_blueprint(flight))
+    return recording
+
+
+def load_rerun() -> Any:
+    """The module rerun.
+
+    Raises:
+        ImportError: If it is missing; the message says how to install it.
+    """
+    try:
+        import rerun
+    except ImportError:
+        raise ImportError(
+            'to_rerun needs rerun-sdk, which is not installed: pip install "quad-gym[rerun]"'
+        ) from None
+    return rerun
+
+
+class _Log:
+    """Sends the columns of a flight, one entity after the other."""
+
+    def __init__(self, flight: Flight, rr: Any, recording: Any) -> None:
+        self._flight, self._stage, self._rr, self._recording = flight, flight.stage, rr, recording
+
+    def _static(self, entity: str, what: Any) -> None:
+        self._recording.log(entity, what, static=True, strict=True)
+
+    def _send(self, entity: str, columns: Any, chosen: NDArray[np.bool_] | None = None) -> None:
+        times = self._flight["time"]
+        index = self._rr.TimeColumn(TIMELINE, duration=times if chosen is None else times[chosen])
+        self._recording.send_columns(entity, indexes=[index], columns=columns, strict=True)
+
+    # ---- the world ----------------------------------------------------------------------------
+
+    def stage(self) -> None:
+        """What stays as it is."""
+        rr, stage = self._rr, self._stage
+        self._static("about", rr.TextDocument(self._about(), media_type=rr.MediaType.MARKDOWN))
+        self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        if stage.reference_period and not len(stage.gates_I):
+            path = stage.reference(np.linspace(0.0, stage.reference_period, 241))
+            self._static("world/reference/path", rr.LineStrips3D([path], colors=[NEUTRAL]))
+        if len(stage.gates_I):
+            self._static(
+                "world/gates",
+                rr.Ellipsoids3D(
+                    centers=stage.gates_I,
+                    half_sizes=np.full((len(stage.gates_I), 3), stage.gate_radius),
+                    colors=[REFERENCE],
+                    labels=_numbers(len(stage.gates_I)),
+                ),
+            )
+        if stage.has_camera:
+            self._static(
+                "world/features",
+                rr.Points3D(
+                    stage.features_I,
+                    radii=0.04,
+                    colors=[NEUTRAL],
+                    labels=_numbers(len(stage.features_I)),
+                ),
+            )
+
+    def _about(self) -> str:
+        stage = self._stage
+        about = {"task": stage.task, "observation": stage.observation, **self._flight.about}
+        rows = [f"| {name} | {json.dumps(value)} |" for name, value in about.items()]
+        return "\n".join(["| | |", "|---|---|", *rows])
+
+    def reference(self) -> None:
+        """Where the vehicle should be, and where in the next second."""
+        rr, flight, stage = self._rr, self._flight, self._stage
+        at = rr.Points3D.columns(positions=flight["reference_position"])
+        self._static("world/reference/now", rr.Points3D.from_fields(radii=0.05, colors=[REFERENCE]))
+        self._send("world/reference/now", at)
+        if stage.reference_period and not len(stage.gates_I):
+            ahead = flight["time"][:, np.newaxis] + np.linspace(0.0, AHEAD_SECONDS, 13)
+            strips = stage.reference(ahead.ravel()).reshape(len(flight), -1, 3)
+            style = rr.LineStrips3D.from_fields(radii=0.015, colors=[REFERENCE])
+            self._static("world/reference/next_second", style)
+            self._send("world/reference/next_second", rr.LineStrips3D.columns(strips=strips))
+
+    # ---- what flies ---------------------------------------------------------------------------
+
+    def vehicles(self) -> None:
+        """The vehicle where it is, with body axes."""
+        self._body("world/truth", "position", "attitude", TRUTH)
+        axes = 0.42 * np.eye(3)
+        arrows = self._rr.Arrows3D(vectors=axes, colors=[NEUTRAL], labels=list("xyz"))
+        self._static("world/truth/axes", arrows)
+        self._trail("truth", "position", TRUTH)
+
+    def estimate(self) -> None:
+        """The vehicle where the filter believes it to be, and how sure it is."""
+        rr, flight = self._rr, self._flight
+        self._body("world/estimate", "estimated_position", "estimated_attitude", ESTIMATE)
+        self._trail("estimate", "estimated_position", ESTIMATE)
+        good = np.isfinite(flight["covariance"]).all(axis=(1, 2))
+        values, vectors = np.linalg.eigh(flight["covariance"][good, :3, :3])
+        turns = vectors * np.sign(np.linalg.det(vectors))[:, np.newaxis, np.newaxis]
+        # the columns are the axes in I, so that this is the turn from the axes to I
+        quaternions = dcm_to_quaternion(np.swapaxes(turns, 1, 2))
+        self._static("world/ellipsoid", rr.Ellipsoids3D.from_fields(colors=[ESTIMATE]))
+        columns = rr.Ellipsoids3D.columns(
+            centers=flight["estimated_position"][good],
+            half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
+            quaternions=_xyzw(quaternions),
+        )
+        self._send("world/ellipsoid", columns, good)
+
+    def _body(self, entity: str, position: str, attitude: str, color: tuple[int, ...]) -> None:
+        rr, flight, hubs = self._rr, self._flight, self._stage.rotor_positions_B
+        good = np.isfinite(flight[position]).all(axis=1) & np.isfinite(flight[attitude]).all(axis=1)
+        columns = rr.Transform3D.columns(
+            translation=flight[position][good], quaternion=_xyzw(flight[attitude][good])
+        )
+        self._send(entity, columns, good)
+        angle = np.linspace(0.0, 2.0 * np.pi, 25)
+        ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+        arms = [np.stack([np.zeros(3), hub]) for hub in hubs]
+        rings = [hub + ROTOR_RADIUS * ring for hub in hubs]
+        self._static(f"{entity}/body", rr.LineStrips3D([*arms, *rings], radii=0.01, colors=[color]))
+
+    def _trail(self, name: str, position: str, color: tuple[int, ...]) -> None:
+        """A piece per row, of which the view shows those of the last seconds."""
+        rr, places = self._rr, self._flight[position]
+        good = np.isfinite(places).all(axis=1)
+        pieces = np.stack([np.concatenate([places[:1], places[:-1]]), places], axis=1)
+        good &= np.isfinite(pieces).all(axis=(1, 2))
+        entity = f"world/trail/{name}"
+        self._static(entity, rr.LineStrips3D.from_fields(radii=0.008, colors=[color]))
+        self._send(entity, rr.LineStrips3D.columns(strips=pieces[good]), good)
+
+    # ---- sensors ------------------------------------------------------------------------------
+
+    def fixes(self) -> None:
+        """GNSS fixes when they arrive; gray where the filter's gate has rejected them."""
+        rr, fixes = self._rr, self._flight["gnss_position"]
+        measured = np.isfinite(fixes).all(axis=1)
+        if measured.any():
+            refused = self._flight["gnss_gate"][measured, 0] == Gate.REJECTED
+            colors = np.where(refused[:, np.newaxis], NEUTRAL, FIX).astype(np.uint8)
+            self._static("world/gnss", rr.Points3D.from_fields(radii=0.025))
+            points = rr.Points3D.columns(positions=fixes[measured], colors=colors)
+            self._send("world/gnss", points, measured)
+
+    def camera(self) -> None:
+        """The image plane with what was measured and what the estimate predicts, and the rays."""
+        rr, flight, stage = self._rr, self._flight, self._stage
+        turn = _xyzw(dcm_to_quaternion(stage.R_CB))
+        camera = "world/truth/camera"
+        self._static(camera, rr.Transform3D(translation=stage.camera_B, quaternion=turn))
+        self._static(
+            f"{camera}/image",
+            rr.Pinhole(
+                resolution=2.0 * stage.half_image,
+                focal_length=stage.focal_length,
+                principal_point=stage.half_image,
+                image_plane_distance=FRUSTUM_DEPTH,
+                color=RAY,
+            ),
+        )
+        size = float(stage.half_image[0]) / 60.0
+        R_BI = quaternion_to_dcm(np.nan_to_num(flight["estimated_attitude"], nan=1.0))
+        predicted = stage.project_features(flight["estimated_position"], R_BI)
+        inside = (np.abs(predicted) <= stage.half_image).all(axis=2)
+        seen = np.isfinite(flight["pixels"]).all(axis=2)
+        for name, pixels, shown, color, radius in (
+            ("predicted", predicted, inside, ESTIMATE, 1.6 * size),
+            ("measured", flight["pixels"], seen, TRUTH, size),
+        ):
+            entity = f"{camera}/image/{name}"
+            self._static(entity, rr.Points2D.from_fields(radii=radius, colors=[color]))
+            points = rr.Points2D.columns(positions=(pixels + stage.half_image)[shown])
+            self._send(entity, points.partition(shown.sum(axis=1)))
+
+        eyes = flight["position"] + np.einsum(
+            "nij,i->nj", quaternion_to_dcm(flight["attitude"]), stage.camera_B
+        )
+        row, feature = np.nonzero(seen)
+        strips = np.stack([eyes[row], stage.features_I[feature]], axis=1)
+        self._static("world/rays", rr.LineStrips3D.from_fields(radii=0.005, colors=[RAY]))
+        if len(strips):
+            rays = rr.LineStrips3D.columns(strips=strips)
+            self._send("world/rays", rays.partition(seen.sum(axis=1)))
+
+    # ---- plots --------------------------------------------------------------------------------
+
+    def plots(self) -> None:
+        """Errors, the filter's consistency, rotors and actions over time."""
+        flight = self._flight
+        self._plot("errors/tracking", flight["position_error"], TRUTH, "tracking error [m]")
+        if self._stage.observation != "truth":
+            words = "estimation error [m]"
+            self._plot("errors/estimation", flight["estimation_error"], ESTIMATE, words)
+        if flight.estimated:
+            low, high = chi_square_band(STATE_DIMENSION)
+            self._plot("consistency/nees", flight["nees"], ESTIMATE, "NEES")
+            for name, value in (("lower", low), ("upper", high)):
+                band = np.full(len(flight), value)
+                self._plot(f"consistency/{name}", band, NEUTRAL, "95 % band")
+            errors = flight["estimated_position"] - flight["position"]
+            sigmas = np.sqrt(np.diagonal(flight["covariance"], axis1=1, axis2=2)[:, :3])
+            for k, axis in enumerate(("east", "north", "up")):
+                at = f"position/{axis}"
+                self._plot(f"{at}/error", errors[:, k], ESTIMATE, f"{axis} error [m]")
+                for sign, name in ((1.0, "upper"), (-1.0, "lower")):
+                    sigma = sign * SIGMAS * sigmas[:, k]
+                    self._plot(f"{at}/{name}", sigma, NEUTRAL, "3 sigma of the filter")
+        colors = (TRUTH, ESTIMATE, REFERENCE, FIX)
+        for k, color in enumerate(colors):
+            speed = flight["rotor_speeds"][:, k]
+            self._plot(f"rotors/{k + 1}", speed, color, f"rotor {k + 1} [rad/s]")
+            self._plot(f"actions/{k + 1}", flight["action"][:, k], color, f"action {k + 1}")
+
+    def _plot(self, name: str, values: Floats, color: tuple[int, ...], words: str) -> None:
+        entity, rr = f"plots/{name}", self._rr
+        self._static(entity, rr.SeriesLines(colors=[color], names=[words]))
+        good = np.isfinite(values)
+        if good.any():
+            self._send(entity, rr.Scalars.columns(scalars=values[good]), good)
+
+
+def _blueprint(flight: Flight) -> Any:
+    """How the viewer lays it out: 3D on the left, the camera and the plots on the right."""
+    import rerun.blueprint as rrb
+
+    def last(seconds: float) -> Any:
+        start = rrb.TimeRangeBoundary.cursor_relative(seconds=-seconds)
+        end = rrb.TimeRangeBoundary.cursor_relative()
+        return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=start, end=end))
+
+    trails = ("world/trail/truth", "world/trail/estimate")
+    world = rrb.Spatial3DView(
+        origin="world",
+        name="flight",
+        overrides={trail: [last(TRAIL_SECONDS)] for trail in trails}
+        | {"world/gnss": [last(FIX_SECONDS)]},
+    )
+    plots = [rrb.TimeSeriesView(origin="plots/errors", name="errors")]
+    image = []
+    if flight.estimated:
+        plots.append(rrb.TimeSeriesView(origin="plots/consistency", name="consistency"))
+        axes = [
+            rrb.TimeSeriesView(origin=f"plots/position/{axis}", name=f"position error {axis}")
+            for axis in ("east", "north", "up")
+        ]
+        plots.append(rrb.Tabs(*axes))
+        if flight.stage.has_camera:
+            image = [rrb.Spatial2DView(origin="world/truth/camera/image", name="camera")]
+    plots.append(
+        rrb.Tabs(
+            rrb.TimeSeriesView(origin="plots/rotors", name="rotor speeds"),
+            rrb.TimeSeriesView(origin="plots/actions", name="actions"),
+            rrb.TextDocumentView(origin="about", name="about"),
+        )
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(world, rrb.Vertical(*image, *plots), column_shares=[3, 2]),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
+    )
+
+
+def _numbers(count: int) -> list[str]:
+    return [str(k + 1) for k in range(count)]
+
+
+def _xyzw(q: Floats) -> Floats:
+    """Quaternions (..., 4) in Rerun's order, from (w, x, y, z)."""
+    return np.roll(q, -1, axis=-1)

@@ -1,0 +1,47 @@
+"""Faults as numbers in the settings record that kernels read."""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from quad_gym.faults import Fault, Span, ends
+from quad_gym.kernels.sensors.faults import NEVER
+
+
+def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
+    """Write faults into a settings record.
+
+    Args:
+        s: The settings.
+        faults: One of a kind at most.
+        dt: The tick [s].
+    """
+    for fault in faults:
+        k = fault.kind
+        s["faults"], s["fault_on"][k] = True, True
+        s["fault_rate"][k] = fault.rate * dt
+        s["fault_start"][k] = _ticks(fault.start, dt)
+        s["fault_duration"][k] = _ticks(fault.duration, dt, least=1.0)
+        s["fault_probability"][k] = fault.probability
+        for name, value in fault.numbers.items():
+            if name == "size":
+                s["fault_size"][k] = _low_and_range(value)
+            elif name in ("share", "direction"):
+                s[f"fault_{name}"][k] = value
+            else:
+                s[name] = value
+
+
+def _low_and_range(value: Span) -> tuple[float, float]:
+    low, high = ends(value)
+    return low, high - low
+
+
+def _ticks(value: Span, dt: float, least: float = 0.0) -> tuple[float, float]:
+    """Time in ticks: a number in whole ones, of a range the lower end and the length."""
+    low, high = ends(value)
+    if math.isinf(high):
+        return NEVER, 0.0
+    if low == high:
+        return max(float(round(low / dt)), least), 0.0
+    return low / dt, (high - low) / dt

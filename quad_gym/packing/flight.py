@@ -1,0 +1,273 @@
+"""Parameters as records: from the dataclasses that users write to the numbers that kernels read."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from quad_gym.frames import ecef_to_enu
+from quad_gym.packing.world import pack_world
+from quad_gym.params import portable
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.control import ActionParams, PDGains
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.sensors import ImuParams, SensorSuite, delay_ticks
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
+from quad_gym.records import (
+    BASELINE_BLOCK,
+    FREEDOMS,
+    MAX_HARMONICS,
+    PARAMS,
+    PARAMS_BLOCK,
+    POSITION_BLOCK,
+    SETTINGS,
+    Autoreset,
+    Control,
+    FilterForm,
+    Layout,
+    Source,
+    Start,
+    Task,
+    aligned_zeros,
+)
+
+
+def params_record(
+    vehicle: VehicleParams,
+    sensors: SensorSuite,
+    gains: PDGains | None = None,
+    actions: ActionParams | None = None,
+    world: WorldParams | None = None,
+) -> NDArray[Any]:
+    """The numbers of a vehicle, its sensors, gains and world as one scalar record, shape (1,)."""
+    gains = PDGains() if gains is None else gains
+    actions = ActionParams() if actions is None else actions
+    imu, gnss, estimator = sensors.imu, sensors.gnss, sensors.estimator
+    record = np.zeros(1, PARAMS)
+    p = record[0]
+
+    p["gravity"], p["mass"] = vehicle.gravity, vehicle.mass
+    p["inertia"], p["inertia_inverse"] = vehicle.inertia, portable.inverse(vehicle.inertia)
+    p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
+    p["kF"] = vehicle.thrust_coefficient
+    p["effectiveness"] = p["sound_effectiveness"] = vehicle.effectiveness
+    p["allocation"] = portable.inverse(vehicle.effectiveness)
+    p["motor_tau"], p["motor_gain"] = vehicle.motor_time_constant, vehicle.motor_speed_per_volt
+    p["max_voltage"], p["max_rotor_force"] = vehicle.max_voltage, vehicle.max_rotor_force
+    p["hover_voltage"] = vehicle.hover_voltage
+    pack_world(p, vehicle, WorldParams() if world is None else world)
+    p["gain_k"], p["gain_kd"] = gains.position, gains.velocity
+    p["gain_K"], p["gain_Kd"] = gains.attitude, gains.body_rates
+
+    p["rate_bandwidth"], p["attitude_bandwidth"] = (
+        actions.rate_bandwidth,
+        actions.attitude_bandwidth,
+    )
+    p["velocity_bandwidth"], p["velocity_scale"] = (
+        actions.velocity_bandwidth,
+        actions.velocity_scale,
+    )
+    p["rate_scale"], p["tilt_scale"] = actions.rate_scale, actions.tilt_scale
+    p["torque_scale"] = vehicle.hover_torques
+
+    p["dt"], p["imu_lever_arm"] = imu.dt, imu.lever_arm_B
+    p["accel_sigma"] = imu.accel_noise_density / math.sqrt(imu.dt)
+    p["gyro_sigma"] = imu.gyro_noise_density / math.sqrt(imu.dt)
+    p["accel_noise"], p["gyro_noise"] = imu.believed_accel_sigma, imu.believed_gyro_sigma
+    hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
+    for sensor in ("accel", "gyro"):
+        p[f"{sensor}_scale_sigma"] = getattr(imu, f"{sensor}_scale_sigma")
+        p[f"{sensor}_misalignment_sigma"] = getattr(imu, f"{sensor}_misalignment_sigma")
+        p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / hover_speed**2
+        sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
+        p[f"{sensor}_bias_sigma"] = sigma
+        p[f"{sensor}_bias_decay"] = math.exp(-imu.dt / tau)
+        p[f"{sensor}_bias_drive"] = sigma * math.sqrt(-math.expm1(-2.0 * imu.dt / tau))
+
+    if gnss is not None:
+        p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
+        p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
+        p["baseline_length"] = portable.norm(gnss.baseline_B)
+        p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
+        p["heading_error_sigma"] = gnss.heading_error_sigma
+        p["first_baseline_sigma"] = gnss.first_baseline_sigma
+        p["baseline_noise"] = gnss.believed_baseline_sigma
+        p["position_sigma"], p["velocity_sigma"] = gnss.believed_sigma_I, gnss.velocity_sigma or 0.0
+        period = 1.0 / (gnss.rate * gnss.drift_tau)
+        p["drift_decay"] = math.exp(-period)
+        p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
+    else:  # the place of the start, as if its center and its x axis had been measured
+        p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
+        p["gnss_sigma"] = sensors.placement.position_sigma
+        p["position_sigma"] = sensors.placement.position_sigma
+        p["baseline_sigma"] = sensors.placement.heading_sigma
+        p["first_baseline_sigma"] = p["baseline_noise"] = sensors.placement.heading_sigma
+
+    p["heading_sigma"] = sensors.placement.heading_sigma
+
+    if sensors.camera is not None:
+        camera = sensors.camera
+        p["camera"], p["R_CB"] = camera.position_B, portable.euler_dcm(camera.attitude)
+        p["pixel_size"], p["focal_length"] = camera.pixel_size, camera.focal_length
+        p["half_image"] = np.array(camera.image_size) / 2
+        p["pixel_sigma"] = camera.pixel_sigma
+        p["max_range"], p["blur"] = camera.max_range, camera.blur
+        p["features"][: len(camera.features_I)] = camera.features_I
+
+    p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
+    p["sigma_kappa"] = estimator.kappa
+    p["direction_floor"] = estimator.direction_variance_floor
+    p["noise_at_prediction"] = estimator.feature_noise_across != "measured"
+    p["noise_projected"] = estimator.feature_noise_across == "projected"
+    p["initial_velocity_variance"] = estimator.initial_velocity_variance
+    p["initial_scale"] = estimator.initial_scale
+    p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
+    p["gradual_above"] = estimator.gradual_above or 0.0
+    alarm = estimator.gate_false_alarm
+    p["gate_position"] = special.chdtri(FREEDOMS[POSITION_BLOCK], alarm)
+    p["gate_direction"] = special.chdtri(FREEDOMS[BASELINE_BLOCK], alarm)
+    p["gate_patience"] = estimator.gate_patience
+    p["gate_uncertainty"] = np.inf if gnss is None else estimator.gate_direction_sigma**2
+    noisy = sensors.noisy
+    p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
+    return record
+
+
+def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
+    """How a filter differs from the report's, and what it keeps, for the kernels.
+
+    Args:
+        estimator: The filter.
+        innovations: Whether it keeps innovations.
+        lever_arm: How it takes the accelerometer's lever arm into account, see `lever_form`.
+    """
+    form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
+    if estimator.kind == "ekf":
+        form |= FilterForm.EKF
+    if estimator.integration == "midpoint":
+        form |= FilterForm.MIDPOINT
+    if estimator.covariance_reset == "turn":
+        form |= FilterForm.TURN
+    if estimator.gate_false_alarm > 0.0:
+        form |= FilterForm.GATE
+    if estimator.gradual_above is not None:
+        form |= FilterForm.GRADUAL
+    return FilterForm(form | lever_arm)
+
+
+def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
+    """How a filter takes the accelerometer's lever arm into account, where there is one.
+
+    Args:
+        imu: As the filter believes it.
+        drawn: Whether the filter knows a lever arm that each episode draws.
+    """
+    if not (drawn or any(imu.lever_arm_B)):
+        return FilterForm(0)
+    averages = imu.samples == "average"
+    return FilterForm.LEVER_AVERAGES if averages else FilterForm.LEVER_SAMPLES
+
+
+_HARMONICS = {Task.CIRCLE: 1, Task.LEMNISCATE: 2, Task.RANDOM_TRAJECTORY: MAX_HARMONICS}
+"""Terms of the series of a task's reference; none elsewhere."""
+
+
+def _phase_ticks(phase: float | None, period: int) -> int:
+    """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
+    return -1 if phase is None else min(round(phase * period), period - 1)
+
+
+def pack_latency(
+    settings: Any, measures: SensorSuite, clocks: Clocks, believes: FilterParams
+) -> None:
+    """Fill the settings' fields of late measurements.
+
+    Args:
+        settings: One SETTINGS record.
+        measures: The sensors as they are.
+        clocks: When they measure.
+        believes: What the filter makes of it.
+
+    Raises:
+        ValueError: If a sensor is too late for its rate.
+    """
+    for name in ("gnss", "camera"):
+        sensor = getattr(measures, name)
+        if sensor is not None:
+            label = f"{type(sensor).__name__}.latency"
+            rate = getattr(clocks, f"{name}_rate")
+            settings[f"{name}_delay"] = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
+    settings["rewinds"] = believes.late_measurements == "rewind"
+
+
+def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
+    """Fill the settings' fields of what sensors as they are (`measures`) do wrong."""
+    imu, gnss, camera = measures.imu, measures.gnss, measures.camera
+    settings["imu_errs"], settings["imu_vibrates"] = imu.errs, imu.vibrates
+    settings["heading_errs"] = gnss is not None and gnss.heading_error_sigma > 0.0
+    if camera is not None:
+        settings["camera_limited"] = camera.limited
+        settings["camera_blurs"] = camera.exposure > 0.0
+        settings["ground_hides"] = camera.ground_hides
+
+
+def params_block(record: NDArray[Any]) -> NDArray[Any]:
+    """A scalar parameter record repeated for the eight flights of a block, shape (1,)."""
+    block = aligned_zeros(1, PARAMS_BLOCK)
+    for name in PARAMS.names or ():
+        block[name][...] = record[name][..., np.newaxis]
+    return block
+
+
+def settings_record(
+    task: TaskParams,
+    clocks: Clocks,
+    sensors: SensorSuite,
+    *,
+    source: Source,
+    control: Control,
+    layout: Layout,
+    include_covariance: bool,
+    privileged: bool,
+    autoreset: Autoreset,
+    run_filter: bool,
+    innovations: bool = False,
+    gnss_drifts: bool = False,
+    lever_drawn: bool = False,
+) -> NDArray[Any]:
+    """What a batch does, as one scalar record, shape (1,)."""
+    record = np.zeros(1, SETTINGS)
+    s = record[0]
+    s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")
+    s["form"] = form_of(sensors.estimator, innovations, lever_form(sensors.imu, lever_drawn))
+    s["imu_averages"] = sensors.imu.samples == "average"
+    if sensors.gnss is not None:
+        s["gnss_ticks"] = clocks.ticks_between("gnss")
+        s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
+        s["gnss_phase"] = _phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
+    s["gnss_drifts"] = gnss_drifts
+    s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
+    if sensors.camera is not None:
+        s["camera_ticks"] = clocks.ticks_between("camera")
+        s["camera_phase"] = _phase_ticks(sensors.camera.phase, s["camera_ticks"])
+        s["feature_count"] = len(sensors.camera.features_I)
+    s["source"], s["control"], s["layout"] = source, control, layout
+    s["include_covariance"], s["privileged"] = include_covariance, privileged
+    s["autoreset"], s["run_filter"] = autoreset, run_filter
+    s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
+    s["pad"], s["randomize"] = task.pad, task.randomize
+    s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
+    s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], 0)
+    s["max_steps"] = round(task.duration * clocks.control_rate)
+    s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
+    s["end_when_lost"] = task.end_when_lost
+    s["least_up"] = math.cos(task.max_tilt)
+    s["radius"], s["period"], s["height"] = task.radius, task.period, task.height
+    s["max_speed"], s["max_acceleration"] = task.max_speed, task.max_acceleration
+    s["gate_count"], s["gate_radius"] = task.gate_count, task.gate_radius
+    s["preview"] = task.preview
+    return record

@@ -1,0 +1,76 @@
+"""The world and its randomization as numbers in the records that kernels read."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params.randomization import DrawingTable, Randomization
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import BatteryParams, WorldParams
+from quad_gym.records import COLUMNS, SETTINGS, Supply
+
+
+def pack_world(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
+    """Write the numbers of a world around a vehicle into a parameter record."""
+    east, north, _ = world.wind_I
+    p["kN"], p["rotors"] = vehicle.torque_coefficient, vehicle.rotor_positions_B
+    p["half_disc"] = 0.5 * vehicle.disc_area * vehicle.air_density
+    p["wind"], p["gust_wind_speed"] = world.wind_I, world.gust_wind_speed
+    p["wind_speed"], p["wind_direction"] = math.hypot(east, north), math.atan2(north, east)
+    p["linear_drag"], p["rotor_drag"] = world.linear_drag_B, world.rotor_drag_B
+    p["rotor_radius"], p["ground_height"] = world.rotor_radius, world.ground_height
+    battery = BatteryParams() if world.battery is None else world.battery
+    p["battery_charge"], p["battery_energy"] = battery.charge, battery.energy
+    p["battery_empty"], p["battery_resistance"] = battery.empty_voltage, battery.resistance
+    p["motor_efficiency"] = battery.motor_efficiency
+
+
+def pack_options(
+    s: Any, world: WorldParams, draws: DrawingTable, *, known: bool, limited: bool
+) -> None:
+    """Write into a settings record which parts of a world there are, and what is drawn.
+
+    Args:
+        s: The settings.
+        world: The world without draws.
+        draws: What is drawn.
+        known: Whether filter and controller know the world as it is.
+        limited: Whether the motors have a largest voltage that the controller does not know.
+    """
+
+    def present(name: str, *values: float) -> bool:
+        return any(values) or bool(draws.kind[COLUMNS[name]].any())
+
+    winds = [present(f"wind_{part}") for part in ("east", "north", "up", "speed", "direction")]
+    s["gusts"] = present("gust_wind_speed", world.gust_wind_speed)
+    s["linear_drag"] = present("linear_drag_B", *world.linear_drag_B) or present(
+        "rotor_drag_B", *world.rotor_drag_B
+    )
+    s["ground_effect"] = world.ground_effect
+    s["air"] = (
+        any(world.wind_I) or any(winds) or s["gusts"] or s["linear_drag"] or s["ground_effect"]
+    )
+    s["supply"] = Supply.LIMIT if limited or present("max_voltage") else Supply.NOMINAL
+    if world.battery is not None:
+        s["supply"] = Supply.BATTERY
+    s["observe_world"] = s["privileged"] and (world != WorldParams() or bool(draws.names))
+    if "start_velocity_I" in draws.names:
+        s["start_velocity_variance"] = draws.mean_square("start_velocity_I")
+    for i, name in enumerate(("start_roll", "start_pitch")):
+        if name in draws.names:
+            # no angle is less known than one that may be any
+            s["start_tilt_variance"][i] = min(draws.mean_square(name)[0], math.pi**2 / 3.0)
+    s["randomized"], s["known"] = bool(draws.names), known
+    for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
+        s[f"draw_{name}"] = np.asarray(getattr(draws, name))
+
+
+def world_settings(world: WorldParams) -> NDArray[Any]:
+    """A settings record that holds a world's options alone, shape (1,)."""
+    settings = np.zeros(1, SETTINGS)
+    draws = DrawingTable(Randomization({}), VehicleParams(), SensorSuite(), world)
+    pack_options(settings[0], world, draws, known=False, limited=False)
+    return settings

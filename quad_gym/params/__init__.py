@@ -1,0 +1,1 @@
+"""Parameters: frozen dataclasses with units, checks, sources and presets; they import no kernel."""

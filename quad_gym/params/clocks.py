@@ -1,0 +1,45 @@
+"""Clocks: how often each part of a flight acts."""
+
+from dataclasses import dataclass
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
+from quad_gym.params.sensors import SensorSuite
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clocks(Checked):
+    """How often each part acts. A tick is an IMU sample; all periods are whole multiples of it."""
+
+    imu_rate: float = 200.0
+    """[Hz]"""
+    control_rate: float = 200.0
+    """[Hz] at which a new action is taken"""
+    gnss_rate: float = 200.0
+    """[Hz]"""
+    camera_rate: float = 200.0
+    """[Hz]"""
+    substeps: int = 1
+    """Runge-Kutta steps in a tick"""
+
+    def __post_init__(self) -> None:
+        self._check(check.positive, "imu_rate", most=1e6)
+        for name in ("control_rate", "gnss_rate", "camera_rate"):
+            check.ticks(name, getattr(self, name), self.imu_rate)
+        self._check(check.whole, "substeps", most=1000)
+
+    @classmethod
+    def of(cls, sensors: SensorSuite, control_rate: float, substeps: int = 1) -> "Clocks":
+        """The clocks of a sensor suite, with a control rate [Hz]."""
+        camera = sensors.camera
+        return cls(
+            imu_rate=sensors.imu.rate,
+            control_rate=control_rate,
+            gnss_rate=sensors.gnss.rate if sensors.gnss is not None else sensors.imu.rate,
+            camera_rate=camera.rate if camera is not None else sensors.imu.rate,
+            substeps=substeps,
+        )
+
+    def ticks_between(self, name: str) -> int:
+        """Ticks between two events of the clock `name`, such as "control"."""
+        return check.ticks(f"{name}_rate", getattr(self, f"{name}_rate"), self.imu_rate)

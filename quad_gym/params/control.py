@@ -1,0 +1,79 @@
+"""Control: gains of the PD baseline, and what an action means to the inner loops."""
+
+import math
+from dataclasses import dataclass
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Vector
+
+
+@dataclass(frozen=True, kw_only=True)
+class PDGains(Checked):
+    """Gains of the PD controller of position and attitude."""
+
+    position: float = 5.0
+    """k [N/m]; laboratory"""
+    velocity: float = 3.1
+    """kd [N s/m]; laboratory"""
+    attitude: Vector = (1.0, 0.95, 0.21)
+    """(3,) diagonal of K [N m]; laboratory"""
+    body_rates: Vector = (0.25, 0.25, 0.12)
+    """(3,) diagonal of Kd [N m s]; laboratory"""
+
+    def __post_init__(self) -> None:
+        self._check(check.number, "position", "velocity", least=0.0)
+        self._check(check.vector, "attitude", "body_rates", length=3)
+        if min(self.attitude + self.body_rates) < 0.0:
+            raise ValueError("PDGains.attitude and PDGains.body_rates must be at least 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionParams(Checked):
+    """Scaling of actions and bandwidths of the inner loops that carry them out at every tick."""
+
+    rate_scale: Vector = (6.0, 6.0, 3.0)
+    """(3,) body rates at full action [rad/s]"""
+    tilt_scale: float = math.radians(45.0)
+    """roll and pitch at full action [rad]"""
+    velocity_scale: float = 5.0
+    """each component of the velocity at full action [m/s]"""
+    rate_bandwidth: float = 14.0
+    """k_w: torque J k_w (w* - w) + w x J w [1/s]"""
+    attitude_bandwidth: float = 7.0
+    """k_a: body rates k_a (e3 x z*) [1/s]"""
+    velocity_bandwidth: float = 4.0
+    """k_v: acceleration k_v (v* - v) [1/s]"""
+
+    def __post_init__(self) -> None:
+        self._check(
+            check.positive,
+            "tilt_scale",
+            "velocity_scale",
+            "rate_bandwidth",
+            "attitude_bandwidth",
+            "velocity_bandwidth",
+        )
+        self._check(check.vector, "rate_scale", length=3)
+        if min(self.rate_scale) <= 0.0:
+            raise ValueError(
+                f"ActionParams.rate_scale must be greater than 0, got {self.rate_scale}"
+            )
+        if self.tilt_scale >= math.pi / 2:
+            raise ValueError(
+                f"ActionParams.tilt_scale must be less than pi/2, got {self.tilt_scale}"
+            )
+
+
+_GAINS = {
+    "lab": PDGains(),
+    # by random search for small errors on Hover, Circle, Lemniscate and RandomTrajectory, each
+    # relative to that of the laboratory's gains, on the estimate at 50 Hz with thrust and rates
+    "tuned": PDGains(
+        position=10.6, velocity=3.44, attitude=(1.29, 1.29, 0.138), body_rates=(0.25, 0.25, 0.12)
+    ),
+}
+
+
+def pd_gains(name: str) -> PDGains:
+    """PD gains by name: "lab", the report's, or "tuned", for small errors on all tracking tasks."""
+    return _GAINS[check.choice("gains", name, tuple(_GAINS))]

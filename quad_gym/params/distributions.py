@@ -1,0 +1,154 @@
+"""Distributions that a parameter can be drawn from, and how the kernel reads them."""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
+from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
+
+
+class Affine(NamedTuple):
+    """A distribution as the kernel reads it; u is uniform on (0, 1)."""
+
+    kind: int
+    """UNIFORM: a + b u; LOG_UNIFORM: a e^(b u); NORMAL: a + b Phi^-1(c + d u)"""
+    a: float
+    b: float
+    c: float = 0.0
+    d: float = 1.0
+
+
+@dataclass(frozen=True)
+class Distribution(Checked):
+    """How a parameter is drawn: as it is, or in relation to its nominal value."""
+
+    relative: bool = field(default=False, kw_only=True)
+    """the draw is multiplied by the nominal value"""
+    offset: bool = field(default=False, kw_only=True)
+    """the draw is added to the nominal value"""
+
+    def __post_init__(self) -> None:
+        self._check(check.flag, "relative", "offset")
+        if self.relative and self.offset:
+            raise ValueError(f"{type(self).__name__} must be relative or an offset, not both")
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The least and the largest draw."""
+        raise NotImplementedError
+
+    def placed(self, factor: float, shift: float) -> Affine:
+        """The distribution of `factor` times the draw plus `shift`."""
+        raise NotImplementedError
+
+    @property
+    def center_and_spread(self) -> tuple[float, float]:
+        """The middle of the draws and a scale of their deviation from it."""
+        low, high = self.support
+        return 0.5 * (low + high), 0.5 * (high - low)
+
+    def _check_order(self, low: float, high: float) -> None:
+        if low > high:
+            raise ValueError(
+                f"{type(self).__name__}.low must be at most its high, got {low:g} and {high:g}"
+            )
+
+
+@dataclass(frozen=True)
+class Uniform(Distribution):
+    """Uniform on [low, high]."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(check.number, "low", "high")
+        self._check_order(self.low, self.high)
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The bounds."""
+        return self.low, self.high
+
+    def placed(self, factor: float, shift: float) -> Affine:
+        """Uniform between the moved bounds."""
+        return Affine(UNIFORM, factor * self.low + shift, factor * (self.high - self.low))
+
+
+@dataclass(frozen=True)
+class LogUniform(Distribution):
+    """Its logarithm is uniform: for scales that are known to a factor, on [low, high] above 0."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(check.positive, "low", "high")
+        self._check_order(self.low, self.high)
+        if self.offset:
+            raise ValueError("LogUniform.offset must be False: a logarithm is relative")
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The bounds."""
+        return self.low, self.high
+
+    def placed(self, factor: float, shift: float) -> Affine:
+        """Log-uniform between the multiplied bounds."""
+        return Affine(LOG_UNIFORM, factor * self.low, math.log(self.high / self.low))
+
+
+@dataclass(frozen=True)
+class Normal(Distribution):
+    """Normal with mean and standard deviation, truncated to [low, high]."""
+
+    mean: float
+    sigma: float
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(check.number, "mean")
+        self._check(check.positive, "sigma")
+        for name in ("low", "high"):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float, np.number)) and not math.isnan(value)):
+                raise ValueError(f"Normal.{name} must be a number, got {value!r}")
+            self._set(name, float(value))
+        self._check_order(self.low, self.high)
+        if self._probabilities[1] < 1e-6:
+            raise ValueError(
+                "Normal.low and Normal.high must leave a probability of 1e-6 at least, got "
+                f"[{self.low:g}, {self.high:g}] for mean {self.mean:g} and sigma {self.sigma:g}"
+            )
+
+    @property
+    def _probabilities(self) -> tuple[float, float]:
+        """Of lying below `low`, and between the bounds."""
+        below, under = (
+            0.5 * math.erfc((self.mean - bound) / (self.sigma * math.sqrt(2.0)))
+            for bound in (self.low, self.high)
+        )
+        return below, under - below
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The bounds."""
+        return self.low, self.high
+
+    @property
+    def center_and_spread(self) -> tuple[float, float]:
+        """Mean and standard deviation before truncation."""
+        return self.mean, self.sigma
+
+    def placed(self, factor: float, shift: float) -> Affine:
+        """The moved normal with the same truncated tails."""
+        below, between = self._probabilities
+        return Affine(NORMAL, factor * self.mean + shift, factor * self.sigma, below, between)

@@ -1,0 +1,105 @@
+"""Parameters of the Kalman filter."""
+
+import math
+from dataclasses import dataclass
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
+from quad_gym.params.gravity import GRAVITY
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterParams(Checked):
+    """The Kalman filter's own choices; the defaults are the report's form."""
+
+    kind: str = "ukf"
+    """"ukf", the report's unscented filter, or "ekf", an error-state extended one with the same
+    state, models and noise; the fields of the unscented transform do not concern it"""
+    integration: str = "euler"
+    """how the prediction carries the estimate over a tick: "euler", as if the sample of its start
+    held (report), or "midpoint", turning the attitude exactly and the force with the attitude
+    halfway, which belongs to `ImuParams.samples` "average\""""
+    covariance_reset: str = "none"
+    """what becomes of the covariance when the mean error angles go over into the attitude: "none"
+    (report), or "turn", S^-1 P S^-T, as the error angles are counted from another attitude then"""
+    alpha: float = 1e-3
+    """spread of the sigma points; laboratory"""
+    beta: float = 2.0
+    """weight of the central point's excess, 2 for Gaussians; laboratory"""
+    kappa: float = 0.0
+    """secondary scaling; laboratory"""
+    direction_variance_floor: float = 1e-8
+    """added to the diagonal of a direction's covariance, of rank 2 [-]; report section 3.1"""
+    feature_noise_across: str = "measured"
+    """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
+    across the "predicted" one, as the baseline's does. The first takes the angle between the two,
+    tens of milliradians in the first second, for information that it trusts to 0.1 mrad.
+    "projected": across the predicted one, and less toward the image's center, as pixels far out
+    subtend smaller angles there; the report takes the noise for equal about both axes"""
+    initial_velocity_variance: float = 1e-3
+    """[m^2/s^2]; laboratory"""
+    initial_scale: float = 2.0
+    """factor on the first fix's covariance; laboratory"""
+    initial_tilt_sigma: float | None = None
+    """how level the start is, per axis [rad]: the filter starts level, looking as the baseline
+    says; None: the attitude solves Wahba's problem for the baseline and the vertical, with the
+    baseline's noise about every axis, as in the laboratory"""
+    reuse_first_fix: bool = True
+    """whether the fix that starts the filter is also its first measurement, as in the laboratory;
+    that counts it twice, so suites other than "lab" do not"""
+    gradual_above: float | None = None
+    """deviation of the attitude above which images are processed in steps, each about the estimate
+    that the one before has left [rad]; None: always whole (report). The derivatives of pixels are
+    off by the square of the attitude's error, more than a precise camera's noise at a rough start
+    """
+    gate_false_alarm: float = 0.0
+    """probability that a valid measurement is rejected: a position, baseline, velocity or feature
+    whose normalized innovation squared exceeds the chi-square quantile of this alarm level is left
+    out of the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to
+    Tracking and Navigation, section 5.4); 0: everything is taken"""
+    gate_patience: int = 10
+    """positions, baselines, velocities or images rejected in a row after which the filter doubts
+    itself instead: it adds the square of the innovation to the covariance of what the sensor
+    measures, and takes the next one"""
+    gate_direction_sigma: float = 0.2
+    """[rad] a gating filter leaves out features whose direction it predicts more vaguely than that,
+    as after a long outage: what its model neglects, half the square, is ten times the noise of a
+    good camera then. GNSS has to bring such a filter home; one without GNSS takes all features, as
+    it has nothing else"""
+    late_measurements: str = "rewind"
+    """what becomes of a measurement that reaches the filter late: "rewind" takes the estimate back
+    to its time stamp over the IMU's samples since then, updates it there, and takes it on again;
+    "as_fresh" ignores the time stamp"""
+    gravity: float = GRAVITY
+    """[m/s^2] that a filter which works by itself subtracts; in flights it is the vehicle's"""
+
+    def __post_init__(self) -> None:
+        self._check(
+            check.positive,
+            "alpha",
+            "direction_variance_floor",
+            "initial_velocity_variance",
+            "initial_scale",
+            "gate_direction_sigma",
+            "gravity",
+        )
+        self._check(check.number, "beta", least=0.0)
+        self._check(check.choice, "kind", choices=("ukf", "ekf"))
+        self._check(check.choice, "integration", choices=("euler", "midpoint"))
+        self._check(check.choice, "covariance_reset", choices=("none", "turn"))
+        self._check(check.choice, "late_measurements", choices=("rewind", "as_fresh"))
+        self._check(
+            check.choice, "feature_noise_across", choices=("measured", "predicted", "projected")
+        )
+        self._check(check.flag, "reuse_first_fix")
+        if self.initial_tilt_sigma is not None:
+            self._check(check.positive, "initial_tilt_sigma", most=math.pi)
+        if self.gradual_above is not None:
+            self._check(check.positive, "gradual_above")
+        self._check(check.whole, "gate_patience")
+        self._check(check.number, "gate_false_alarm", least=0.0)
+        if self.gate_false_alarm >= 0.5:
+            raise ValueError(
+                f"FilterParams.gate_false_alarm must be below 0.5, got {self.gate_false_alarm}"
+            )
+        self._check(check.number, "kappa", least=-14.0)

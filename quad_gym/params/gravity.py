@@ -1,0 +1,4 @@
+"""Gravity."""
+
+GRAVITY = 9.8
+"""Standard gravity as the laboratory rounds it [m/s^2]."""

@@ -1,0 +1,359 @@
+"""Domain randomization: which parameters can be drawn anew for every episode, and from what.
+
+Draws happen inside the kernel from each flight's own random stream, so the parameters of an episode
+depend on its flight's seed alone.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.distributions import Distribution, Uniform
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import LEAST_MOMENT, RK4_LIMIT, VehicleParams, check_lag, check_moments
+from quad_gym.params.world import BatteryParams, WorldParams
+from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL, UNIFORM, Drawable
+
+FAST = 100.0
+"""Vehicles fly slower than this [m/s]."""
+
+Given = Distribution | Sequence[Distribution | None]
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """Which parameters are drawn anew for every episode, and from what distributions.
+
+    The names are those of `quad_gym.params.randomization.DRAWABLES`. Of a parameter with several
+    components each is drawn by itself, from the same distribution or from those of a sequence,
+    where None keeps a component.
+
+    Args:
+        parameters: Distributions by name.
+        known: Whether the filter and the controller know the vehicle and the sensors as they are,
+            draws included. By default they believe the nominal parameters. Of wind and ground they
+            never know.
+
+    Raises:
+        ValueError: If a name is unknown, or something is no distribution.
+
+    Example:
+        `Randomization({"mass": Uniform(0.8, 1.2, relative=True), "wind_speed": Uniform(0.0, 5.0),
+        "wind_direction": Uniform(-math.pi, math.pi)})`
+    """
+
+    parameters: Mapping[str, Given]
+    known: bool = False
+
+    def __post_init__(self) -> None:
+        check.flag("Randomization.known", self.known)
+        if not isinstance(self.parameters, Mapping):
+            raise ValueError(
+                f"Randomization.parameters must be distributions by name, got {self.parameters!r}"
+            )
+        unknown = sorted(set(self.parameters) - set(COLUMNS), key=str)
+        if unknown:
+            raise ValueError(
+                f"randomization of {unknown[0]!r} is unknown; what can be drawn is "
+                f"{', '.join(COLUMNS)}"
+            )
+        if {"wind_speed", "wind_direction"} & set(self.parameters) and {
+            "wind_east",
+            "wind_north",
+        } & set(self.parameters):
+            raise ValueError(
+                "randomization must draw the wind by wind_speed and wind_direction or by wind_east "
+                "and wind_north, not by both"
+            )
+        for drawable in DRAWABLES:
+            if drawable.name in self.parameters:
+                self.distributions(drawable.name)
+
+    @classmethod
+    def of(cls, given: "Randomization | Mapping[str, Given] | None") -> "Randomization":
+        """What a keyword may hold: a randomization, distributions by name, or None for nothing."""
+        return given if isinstance(given, Randomization) else cls({} if given is None else given)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """What is drawn, in the order of `DRAWABLES`."""
+        return tuple(name for name in COLUMNS if name in self.parameters)
+
+    def distributions(self, name: str) -> tuple[Distribution | None, ...]:
+        """The distribution of each component of a parameter; None: it is not drawn."""
+        size = COLUMNS[name].stop - COLUMNS[name].start
+        given = self.parameters.get(name)
+        if given is None or isinstance(given, Distribution):
+            if name in self.parameters and given is None:
+                raise ValueError(f"randomization of {name!r} must be a distribution, got None")
+            return (given,) * size
+        if not isinstance(given, (tuple, list)) or len(given) != size:
+            wanted = "a distribution" if size == 1 else f"a distribution or {size} of them"
+            raise ValueError(f"randomization of {name!r} must be {wanted}, got {given!r}")
+        for part in given:
+            if not (part is None or isinstance(part, Distribution)):
+                raise ValueError(f"randomization of {name!r} must hold distributions, got {part!r}")
+        return tuple(given)
+
+
+class DrawingTable:
+    """A randomization in numbers: how each column of a flight's field `drawn` is drawn.
+
+    Args:
+        randomization: What is drawn.
+        vehicle: The vehicle without draws.
+        sensors: The sensors without draws.
+        world: The world without draws.
+        action_delay: Likewise [control steps].
+
+    Raises:
+        ValueError: If a range holds invalid values, such as a vehicle too heavy to
+            hover.
+    """
+
+    def __init__(
+        self,
+        randomization: Randomization,
+        vehicle: VehicleParams,
+        sensors: SensorSuite,
+        world: WorldParams,
+        action_delay: float = 0.0,
+    ) -> None:
+        self.names = randomization.names
+        self.kind = np.zeros(DRAWN_SIZE, np.int64)
+        self.a, self.b, self.c, self.d = np.zeros((4, DRAWN_SIZE))
+        nominal = nominal_values(vehicle, sensors, world)
+        nominal[COLUMNS["action_delay"]] = action_delay
+        self.low, self.high = nominal.copy(), nominal.copy()
+        self.center, self.spread = np.zeros(DRAWN_SIZE), np.ones(DRAWN_SIZE)
+        for drawable in DRAWABLES:
+            if drawable.name in self.names:
+                first = COLUMNS[drawable.name].start
+                for k, part in enumerate(randomization.distributions(drawable.name)):
+                    self._fill(drawable, first + k, part, nominal[first + k])
+        _check_hovering(self, vehicle, world)
+        if "inertia" in self.names:
+            _check_inertia(self)
+
+    def mean_square(self, name: str) -> NDArray[np.float64]:
+        """(size,) mean square of each component of a parameter, over its distribution."""
+        u, quantile = (np.arange(4096) + 0.5) / 4096, NormalDist().inv_cdf
+        found = []
+        for k in range(COLUMNS[name].start, COLUMNS[name].stop):
+            kind, a, b = int(self.kind[k]), self.a[k], self.b[k]
+            if kind == UNIFORM:
+                values = a + b * u
+            elif kind == LOG_UNIFORM:
+                values = a * np.exp(b * u)
+            elif kind == NORMAL:
+                values = a + b * np.array([quantile(p) for p in self.c[k] + self.d[k] * u])
+            else:
+                values = np.zeros(1)
+            found.append(math.fsum(values * values) / values.size)
+        return np.array(found)
+
+    def _fill(
+        self, drawable: Drawable, column: int, part: Distribution | None, nominal: float
+    ) -> None:
+        name = drawable.name
+        if np.isnan(nominal):
+            raise ValueError(f"randomization of {name!r} needs {_MISSING[name]}, there is none")
+        if part is None:  # a component that stays among others that are drawn
+            part = Uniform(nominal, nominal)
+        if part.relative and nominal == 0.0:
+            raise ValueError(
+                f"randomization of {name!r} must not be relative: its nominal value is 0"
+            )
+        factor, shift = (nominal, 0.0) if part.relative else (1.0, nominal * part.offset)
+        low, high = sorted(factor * bound + shift for bound in part.support)
+        too_low = low < drawable.least or (low <= drawable.above > -math.inf)
+        if too_low or high > drawable.most:
+            raise ValueError(
+                f"randomization of {name!r} must stay {_range_in_words(drawable)}, got "
+                f"{part!r}, which reaches from {low:g} to {high:g}"
+            )
+        reached = max((abs(bound) for bound in (low, high) if math.isfinite(bound)), default=0.0)
+        farthest = _FARTHEST.get(name, check.LARGEST)
+        if reached > farthest:
+            raise ValueError(
+                f"randomization of {name!r} must stay within {farthest:g} {drawable.unit} either "
+                f"way, got {part!r}"
+            )
+        if name == "inertia" and low < LEAST_MOMENT:
+            raise ValueError(
+                f"randomization of {name!r} must stay above {LEAST_MOMENT:g} kg m^2, got {part!r}"
+            )
+        self.kind[column], self.a[column], self.b[column], self.c[column], self.d[column] = (
+            part.placed(factor, shift)
+        )
+        self.low[column], self.high[column] = low, high
+        center, spread = part.center_and_spread
+        self.center[column] = factor * center + shift
+        self.spread[column] = abs(factor * spread) or 1.0
+
+
+_FARTHEST = {
+    "center_of_mass_B": 10.0,
+    "start_position_I": 1e6,
+    "start_velocity_I": 1e4,
+    "start_body_rates": 1e3,
+}
+"""What can be drawn at most, either way, where larger numbers are mistakes."""
+
+
+def _range_in_words(drawable: Drawable) -> str:
+    words = []
+    if drawable.above > -math.inf:
+        words.append(f"above {drawable.above:g}")
+    if drawable.least > -math.inf:
+        words.append(f"at least {drawable.least:g}")
+    if drawable.most < math.inf:
+        words.append(f"at most {drawable.most:g}")
+    return f"{' and '.join(words)} {'' if drawable.unit == '-' else drawable.unit}".strip()
+
+
+_CAMERA = ("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length")
+_GNSS = ("position_sigma_I", "baseline_sigma", "primary_antenna_B", "secondary_antenna_B")
+_MISSING = (
+    dict.fromkeys(_CAMERA, "a camera")
+    | dict.fromkeys(_GNSS, "GNSS")
+    | dict.fromkeys(("battery_charge", "battery_resistance"), "a battery (WorldParams.battery)")
+)
+
+
+def nominal_values(
+    vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
+) -> NDArray[np.float64]:
+    """(DRAWN_SIZE,) what the columns of `drawn` are without draws; NaN: there is no such part."""
+    imu, gnss, camera, battery = sensors.imu, sensors.gnss, sensors.camera, world.battery
+    east, north, up = world.wind_I
+    known: dict[str, Any] = {
+        "inertia": np.diag(vehicle.inertia),
+        "rotor_efficiency": 1.0,
+        "wind_east": east,
+        "wind_north": north,
+        "wind_up": up,
+        "wind_speed": math.hypot(east, north),
+        "wind_direction": math.atan2(north, east),
+        "battery_charge": math.nan if battery is None else battery.charge,
+        "battery_resistance": math.nan if battery is None else battery.resistance,
+        "camera_position_B": math.nan if camera is None else camera.position_B,
+        "camera_rotation": math.nan if camera is None else 0.0,
+        "pixel_sigma": math.nan if camera is None else camera.pixel_sigma,
+        "focal_length": math.nan if camera is None else camera.focal_length,
+        **(dict.fromkeys(_GNSS, math.nan) if gnss is None else {}),
+    }
+    values = np.zeros(DRAWN_SIZE)
+    for drawable in DRAWABLES:
+        for part in (known, vehicle, world, imu, gnss):
+            if isinstance(part, dict):
+                found = part.get(drawable.name)
+            else:
+                found = getattr(part, drawable.name, None)
+            if found is not None:
+                values[COLUMNS[drawable.name]] = found
+                break
+    return values
+
+
+def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldParams) -> None:
+    """Refuse a randomization whose worst case cannot carry its weight."""
+
+    def least(name: str) -> float:
+        return float(table.low[COLUMNS[name]].min())
+
+    mass = float(table.high[COLUMNS["mass"]][0])
+    full = least("max_voltage")
+    if world.battery is not None:
+        full *= _open_circuit(world.battery, least("battery_charge"))
+    speed = least("motor_speed_per_volt") * full
+    thrust = 4.0 * least("thrust_coefficient") * least("rotor_efficiency") * speed**2
+    if mass * vehicle.gravity >= thrust:
+        raise ValueError(
+            f"randomization must leave the vehicle able to hover: at worst it weighs "
+            f"{mass * vehicle.gravity:.1f} N and its rotors lift {thrust:.1f} N; limit mass, "
+            "max_voltage, motor_speed_per_volt, thrust_coefficient or rotor_efficiency"
+        )
+
+
+def check_draws(
+    table: DrawingTable, vehicle: VehicleParams, world: WorldParams, clocks: Clocks
+) -> None:
+    """Refuse rotors that are too fast, or drag that is too large, for the integration.
+
+    Args:
+        table: What is drawn.
+        vehicle: As it is without draws.
+        world: Likewise.
+        clocks: Say how long a Runge-Kutta step is.
+
+    Raises:
+        ValueError: If they are, or may be drawn so.
+    """
+    _check_drag(table, vehicle, world, clocks)
+    name = "motor_time_constant"
+    if name in table.names:
+        least = float(table.low[COLUMNS[name]].min())
+        check_lag(f"randomization of {name!r} at its smallest draw", least, clocks)
+    else:
+        check_lag(name, vehicle.motor_time_constant, clocks)
+
+
+def _check_drag(
+    table: DrawingTable, vehicle: VehicleParams, world: WorldParams, clocks: Clocks
+) -> None:
+    """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
+
+    def most(name: str) -> float:
+        """The largest draw; of a normal without bounds that of six standard deviations."""
+        columns = COLUMNS[name]
+        high, low = table.high[columns], table.low[columns]
+        far = np.abs(table.center[columns]) + 6.0 * table.spread[columns]
+        reached = np.maximum(np.abs(high), np.abs(low))
+        return float(np.where(np.isinf(reached), far, reached).max())
+
+    wind = sum(most(f"wind_{part}") for part in ("east", "north", "up", "speed"))
+    speed = FAST + wind + float(np.linalg.norm(world.wind_I)) + most("gust_wind_speed")
+    disc = most("drag_coefficient") * vehicle.disc_area * vehicle.air_density * speed
+    rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
+    drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
+    columns = COLUMNS["mass"]
+    mass = float(table.low[columns][0])
+    if "mass" in table.names:  # of a normal with far bounds that of six standard deviations
+        mass = max(mass, float((table.center[columns] - 6.0 * table.spread[columns])[0]))
+    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    if step * drag > RK4_LIMIT * mass:
+        raise ValueError(
+            f"drag must slow the vehicle down by less than {RK4_LIMIT * mass / step:.3g} N s/m, "
+            f"where the integration is stable, got {drag:.3g} N s/m at {speed:.3g} m/s (by mass, "
+            "drag_coefficient, disc_area, air_density, linear_drag_B, rotor_drag_B, wind_I and "
+            "gust_wind_speed)"
+        )
+
+
+def _check_inertia(table: DrawingTable) -> None:
+    """Refuse a range of moments of inertia all of which no body has.
+
+    A range in which some draws break the rule that each moment is at most the sum of the other two
+    is taken: components are drawn independently, so that 20 % either way of flat vehicles has such
+    draws, and they fly as well as any. See `params.check_moments`.
+    """
+    columns = COLUMNS["inertia"]
+    low, high = table.low[columns], table.high[columns]
+    for k in range(3):
+        most = np.where(np.arange(3) == k, low, high)  # the others as large as they can be
+        if 2.0 * low[k] > most.sum() * (1.0 + 1e-9):
+            check_moments("randomization of 'inertia' at its most favorable draw", most)
+
+
+def _open_circuit(battery: BatteryParams, charge: float) -> float:
+    """Voltage of an unloaded battery over that of a full one."""
+    return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge

@@ -1,0 +1,246 @@
+"""Sensor suites by name, with the source of every number.
+
+| name | GNSS | camera and features | IMU |
+|---|---|---|---|
+| `standard` | as `lab` | as `lab` | as `lab`, but samples are means over the tick |
+| `lab` | RTK, two antennas, every tick | every tick, two points at the origin | the report's |
+| `rtk` | RTK, two antennas, 10 Hz | 25 Hz, twelve markers on the ground | industrial MEMS |
+| `consumer` | single frequency, slowly drifting, and a compass, 10 Hz | none | cheap MEMS |
+| `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
+
+The IMU runs at 200 Hz, so that cameras of 30 Hz run at 25 Hz, a whole division of it. Outside `lab`
+the phases of GNSS and camera are drawn anew in each episode, the fix that starts the filter is
+counted once, and a gate of false alarm 1e-4 guards the filter.
+
+`rtk`, `consumer` and `indoor` also do what real sensors do beside noise and bias: measurements
+arrive late, accelerometer axes are not quite orthogonal, rotors shake the IMU, headings have a
+constant error, the camera blurs and does not see far. Gyros have no error of scale or alignment by
+default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
+place (docs/sensors-and-filter.md says what it does).
+
+The noise of `observation="noisy"` is the size of each suite's own errors. Outside `lab` it is the
+root mean square error per axis of what control on the estimate sees from 20 s to 30 s after the
+start, in 256 flights of the circle (hovering start, tuned PD control, seeds 5000 to 5255); that of
+the body rates is the gyro's noise together with the error of its estimated bias.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.params import checks as check
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.sensors import (
+    CameraParams,
+    GnssParams,
+    ImuParams,
+    NoisyObservationParams,
+    PlacementParams,
+    SensorSuite,
+)
+
+_MILLI_G = 9.80665e-3
+_DEG_PER_HOUR = math.radians(1.0) / 3600.0
+
+_GNSS_LATENCY = 0.1
+"""[s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)"""
+_CAMERA_LATENCY = 0.04
+"""[s]; exposure, transfer and search for markers; typical of small computers, 30 to 60 ms"""
+_EXPOSURE = 0.003
+"""[s]; daylight, or a well-lit hall; our judgment"""
+_MARKER_RANGE = 13.0
+"""[m]; there a marker of 0.2 m subtends 25 pixels of the laboratory's camera; our judgment"""
+
+FIELD_FILTER = FilterParams(
+    integration="midpoint",
+    covariance_reset="turn",
+    feature_noise_across="projected",
+    initial_scale=1.0,
+    initial_tilt_sigma=0.03,  # how level vehicles stand or hover at the start of an episode
+    initial_velocity_variance=0.03**2,  # and how still
+    reuse_first_fix=False,
+    gradual_above=0.01,  # its square is below what a pixel subtends
+    gate_false_alarm=1e-4,
+)
+"""The filter outside the laboratory: consistent from its start on, and gated."""
+
+RTK = SensorSuite(
+    imu=ImuParams(
+        samples="average",
+        # Analog Devices ADIS16470 data sheet: rate noise density 0.008 deg/s/sqrt(Hz), noise
+        # density 100 ug/sqrt(Hz), in-run bias stability 8 deg/h and 13 ug
+        gyro_noise_density=math.radians(0.008),
+        accel_noise_density=0.1 * _MILLI_G,
+        # what turning on and temperature leave of its factory calibration; our judgment, some ten
+        # times the in-run stability of the gyro, and what a level on the ground leaves of the
+        # accelerometer
+        gyro_bias_sigma=80.0 * _DEG_PER_HOUR,
+        accel_bias_sigma=2.0 * _MILLI_G,
+        # time constants of MEMS biases, hundreds of seconds: N. El-Sheimy, H. Hou and X. Niu, IEEE
+        # Trans. Instrumentation and Measurement 57(1), 2008
+        gyro_bias_tau=300.0,
+        accel_bias_tau=300.0,
+        # what its factory calibration leaves, 0.1 % and 0.03 deg; our judgment
+        accel_scale_sigma=0.001,
+        accel_misalignment_sigma=0.0005,
+        # balanced rotors, an isolated IMU, and its filters; our judgment
+        accel_vibration=0.05,
+        gyro_vibration=0.002,
+    ),
+    gnss=GnssParams(
+        latency=_GNSS_LATENCY,
+        rate=10.0,  # u-blox ZED-F9P data sheet: RTK up to 20 Hz, moving base up to 10 Hz
+        # the same: 0.01 m + 1 ppm CEP, so sigma = 0.0085 m an axis at short range, twice that up
+        position_sigma_I=(0.0085, 0.0085, 0.017),
+        # the same: heading 0.4 deg with antennas 1 m apart, so 7 mm, on the laboratory's 0.19 m
+        baseline_sigma=math.radians(0.4) / 0.19,
+        # antennas' phase centers are unequal by some millimeters that depend on the direction of
+        # satellites and hardly change in a flight, and mounted to a degree or so; our judgment
+        heading_error_sigma=math.radians(0.5),
+        velocity_sigma=0.05,  # the same
+        phase=None,
+    ),
+    camera=CameraParams(
+        rate=25.0,
+        # markers are found within a pixel (S. Garrido-Jurado and others, Pattern Recognition 47(6),
+        # 2014), a calibration of lens and mounting leaves one or two; our judgment
+        pixel_sigma=2.5,
+        latency=_CAMERA_LATENCY,
+        exposure=_EXPOSURE,
+        max_range=_MARKER_RANGE,
+        ground_hides=True,
+        # three rows of four markers on the ground of the flying field
+        features_I=tuple((x, y, 0.0) for x in (-4.5, -1.5, 1.5, 4.5) for y in (-3.0, 0.0, 3.0)),
+        phase=None,
+    ),
+    estimator=FIELD_FILTER,
+    noisy=NoisyObservationParams(
+        position=0.0012, velocity=0.002, attitude=0.00018, body_rates=0.002
+    ),  # measured, see above
+)
+"""A survey vehicle: real-time kinematic GNSS with two antennas, and markers on the ground."""
+
+CONSUMER = SensorSuite(
+    imu=ImuParams(
+        samples="average",
+        # TDK InvenSense ICM-20948 data sheet: 0.015 deg/s/sqrt(Hz), 230 ug/sqrt(Hz), zero-g
+        # tolerance +-50 mg on the board, taken for two sigma
+        gyro_noise_density=math.radians(0.015),
+        accel_noise_density=0.23 * _MILLI_G,
+        accel_bias_sigma=25.0 * _MILLI_G,
+        # what zeroing the gyro at rest before each flight leaves, 0.1 deg/s; our judgment
+        gyro_bias_sigma=math.radians(0.1),
+        gyro_bias_tau=300.0,
+        accel_bias_tau=300.0,
+        # the same data sheet: scale +-0.5 %, taken for two sigma, and cross-axis sensitivity +-2 %,
+        # of which a calibration in six orientations leaves a quarter; our judgment
+        accel_scale_sigma=0.0025,
+        accel_misalignment_sigma=0.005,
+        # rotors that nobody has balanced, an IMU on foam; our judgment
+        accel_vibration=0.2,
+        gyro_vibration=0.01,
+    ),
+    gnss=GnssParams(
+        latency=_GNSS_LATENCY,
+        rate=10.0,  # u-blox MAX-M10S data sheet: 10 Hz with four constellations
+        # fixes scatter by decimeters from one to the next; our judgment
+        position_sigma_I=(0.2, 0.2, 0.4),
+        # the same data sheet: 1.5 m CEP, so sigma = 1.27 m an axis over a day; half of it within a
+        # correlation time of a minute (D. L. Wilson's records of a hand-held receiver), the rest
+        # slower than a flight and so the same at the place of the start
+        drift_sigma_I=(0.6, 0.6, 1.0),
+        drift_tau=60.0,
+        velocity_sigma=0.05,  # the same data sheet: velocity accuracy 0.05 m/s
+        # one antenna has no baseline. Yaw comes from a compass: some 2 deg of noise, and 4 deg that
+        # iron and a calibration leave for a whole flight; our judgment. It is modeled as the
+        # direction of the body x axis, here the line between the two "antennas"
+        primary_antenna_B=(0.0, 0.0, 0.0472),
+        secondary_antenna_B=(0.1, 0.0, 0.0472),
+        baseline_sigma=math.radians(2.0),
+        heading_error_sigma=math.radians(4.0),
+        phase=None,
+    ),
+    camera=None,
+    estimator=FIELD_FILTER,
+    noisy=NoisyObservationParams(
+        position=0.28, velocity=0.02, attitude=0.0061, body_rates=0.004
+    ),  # measured, see above
+)
+"""A hobby vehicle: one single-frequency receiver, a compass, a cheap IMU, no camera."""
+
+
+def _on_walls(distance: float, low: float, high: float) -> tuple[tuple[float, ...], ...]:
+    """Sixteen markers around a square room, alternately low and high, evenly spread in azimuth."""
+    points = []
+    for k in range(16):
+        azimuth = 2.0 * math.pi * (k + 0.5) / 16
+        direction = np.array([math.cos(azimuth), math.sin(azimuth)])
+        x, y = distance * direction / np.abs(direction).max()
+        points.append((float(x), float(y), high if k % 2 else low))
+    return tuple(points)
+
+
+INDOOR = SensorSuite(
+    imu=ImuParams(
+        samples="average",
+        # Bosch BMI088 data sheet: 0.014 deg/s/sqrt(Hz), 175 ug/sqrt(Hz), zero-g offset 20 mg
+        gyro_noise_density=math.radians(0.014),
+        accel_noise_density=0.175 * _MILLI_G,
+        accel_bias_sigma=20.0 * _MILLI_G,
+        # what zeroing at rest leaves; our judgment
+        gyro_bias_sigma=math.radians(0.05),
+        gyro_bias_tau=300.0,
+        accel_bias_tau=300.0,
+        # typical of consumer MEMS, of the order of the ICM-20948's; our judgment
+        accel_scale_sigma=0.0025,
+        accel_misalignment_sigma=0.005,
+        # the IMU withstands vibration well; our judgment
+        accel_vibration=0.1,
+        gyro_vibration=0.005,
+    ),
+    gnss=None,
+    placement=PlacementParams(position_sigma=0.05, heading_sigma=0.05),
+    camera=CameraParams(
+        rate=25.0,
+        attitude=(math.radians(90.0), 0.0, math.radians(90.0)),  # looking level ahead
+        pixel_sigma=2.5,  # as in `rtk`, like what follows
+        latency=_CAMERA_LATENCY,
+        exposure=_EXPOSURE,
+        max_range=_MARKER_RANGE,
+        ground_hides=True,
+        features_I=_on_walls(distance=8.0, low=0.5, high=3.0),  # a hall of 16 m by 16 m
+        phase=None,
+    ),
+    estimator=FIELD_FILTER,
+    noisy=NoisyObservationParams(
+        position=0.0066, velocity=0.0103, attitude=0.00046, body_rates=0.0035
+    ),  # measured, see above
+)
+"""A hall without GNSS: the camera sees markers on the walls wherever it looks."""
+
+STANDARD = SensorSuite(
+    imu=ImuParams(samples="average"),
+    # the laboratory's pixels are coarse, so that images need not be processed in steps, and no
+    # measurement of it is corrupted, so that none has to be rejected
+    estimator=FIELD_FILTER.replace(gradual_above=None, gate_false_alarm=0.0),
+    noisy=NoisyObservationParams(
+        position=0.0020, velocity=0.0150, attitude=0.0011, body_rates=0.0124
+    ),
+)
+"""The environments' default: the laboratory's sensors, and a filter that is consistent."""
+
+_SUITES = {
+    "standard": STANDARD,
+    "lab": SensorSuite(),
+    "rtk": RTK,
+    "consumer": CONSUMER,
+    "indoor": INDOOR,
+}
+
+SUITES = tuple(_SUITES)
+"""Names of the sensor suites."""
+
+
+def sensor_suite(name: str) -> SensorSuite:
+    """The sensor suite called `name`: one of SUITES; "lab" is the report's to the letter."""
+    return _SUITES[check.choice("sensors", name, SUITES)]

@@ -1,0 +1,115 @@
+"""The task: what the vehicle is to do, and when an episode is over."""
+
+import math
+from dataclasses import dataclass
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Vector
+from quad_gym.records import MAX_GATES, Start, Task
+
+TASKS = tuple(task.name.lower() for task in Task)
+"""Kinds of task."""
+
+STARTS = tuple(start.name.lower() for start in Start)
+"""How episodes begin."""
+
+FARTHEST = 1000.0
+"""Positions of references are observed within this [m]."""
+
+MIN_PERIOD = 0.01
+"""No vehicle follows a faster reference [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskParams(Checked):
+    """What the vehicle is to do, and when an episode is over."""
+
+    kind: str = "circle"
+    """one of TASKS"""
+    radius: float = 4.0
+    """size of the reference, at most 1000 [m]; report section 4.2"""
+    period: float = 10.0
+    """of the reference, at least 0.01 [s]; report section 4.2"""
+    height: float = 1.0
+    """of the reference, at most 1000 [m]; report section 4.2"""
+    start: str = "ground"
+    """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
+    "hover": hovering at rest within some decimeters of the reference; "mixed": either, with
+    probability 0.5"""
+    pad: bool = True
+    """whether a launch pad carries a vehicle that starts on the ground until its thrust lifts it;
+    without one it sinks while its rotors spin up, as in the report"""
+    reward_per: str = "step"
+    """"step": a reward of the order of one in each step, as learning algorithms expect; "second":
+    the same times the control period"""
+    randomize: bool = False
+    """draw the reference anew each episode: phase, radius, period and sense of circle and
+    lemniscate, the heading of a random trajectory and of a course of gates"""
+    duration: float = 10.0
+    """time limit of an episode [s], at least half a control period; 0: none; report section 4.2"""
+    out_of_bounds: float = 3.0
+    """distance from the reference at which an episode ends [m]"""
+    ground: float = -0.5
+    """height at which an episode ends [m]; below 0, as a vehicle without a launch pad sinks while
+    its rotors spin up"""
+    end_when_lost: bool = False
+    """whether an episode is truncated where the filter finds that it is lost"""
+    max_tilt: float = math.radians(100.0)
+    """angle between the body z axis and the vertical at which an episode ends [rad]"""
+    max_speed: float = 2.5
+    """bound of a random trajectory [m/s]"""
+    max_acceleration: float = 3.0
+    """bound of a random trajectory [m/s^2]"""
+    gate_count: int = 5
+    """gates of a course, at most MAX_GATES"""
+    gate_radius: float = 0.3
+    """distance at which a gate counts as passed [m]"""
+    preview: Vector = (0.2, 0.4)
+    """(2,) how far ahead an observation shows the reference [s]"""
+
+    def __post_init__(self) -> None:
+        self._check(check.choice, "kind", choices=TASKS)
+        self._check(check.choice, "start", choices=STARTS)
+        self._check(check.choice, "reward_per", choices=("step", "second"))
+        self._check(check.flag, "pad")
+        self._check(
+            check.positive,
+            "out_of_bounds",
+            "max_speed",
+            "max_acceleration",
+            "gate_radius",
+        )
+        self._check(check.positive, "radius", "height", most=FARTHEST)
+        self._check(check.number, "period", least=MIN_PERIOD)
+        self._check(check.number, "duration", least=0.0, most=1e9)
+        self._check(check.number, "ground")
+        self._check(check.flag, "randomize")
+        self._check(check.vector, "preview", length=2)
+        self._check(check.whole, "gate_count")
+        if self.gate_count > MAX_GATES:
+            raise ValueError(
+                f"TaskParams.gate_count must be at most {MAX_GATES}, got {self.gate_count}"
+            )
+        check.flag("TaskParams.end_when_lost", self.end_when_lost)
+        if not 0.0 < check.number("TaskParams.max_tilt", self.max_tilt) <= math.pi:
+            raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
+        if min(self.preview) < 0.0:
+            raise ValueError(f"TaskParams.preview must be at least 0, got {self.preview}")
+
+
+def check_limit(task: TaskParams, rate: float, name: str) -> None:
+    """Refuse a time limit of less than a step, which would round to none.
+
+    Args:
+        task: Has the limit.
+        rate: Of steps [Hz].
+        name: Of that rate.
+
+    Raises:
+        ValueError: If it is.
+    """
+    if task.duration > 0.0 and round(task.duration * rate) == 0:
+        raise ValueError(
+            f"duration must be 0 (no limit) or at least one step, {1.0 / rate:g} s at {name}="
+            f"{rate:g} Hz, got {task.duration:g} s"
+        )

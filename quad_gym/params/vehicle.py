@@ -1,0 +1,193 @@
+"""The vehicle: rigid body, rotors and drag.
+
+Everything is SI (radians too); body frame B: x forward, z up along the thrust. The laboratory's
+numbers come from the Aerial Robotics course (ASE 479W, The University of Texas at Austin) whose
+third laboratory report this package implements.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.gravity import GRAVITY
+
+LEAST_MOMENT = 1e-9
+"""Of inertia, beyond which numbers are mistaken; a quadrotor of 10 g has 1e-6 [kg m^2]."""
+
+MAX_LIFT = 1000.0
+"""Thrust over weight beyond which numbers are mistaken; racing drones reach 15."""
+
+MAX_TORQUE_ARM = 10.0
+"""Torque over thrust of a rotor beyond which numbers are mistaken; of propellers it is 0.02 [m]."""
+
+RK4_LIMIT = 2.78
+"""Largest step of the classic Runge-Kutta method over the time constant of a decay, beyond which
+its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleParams(Checked):
+    """A quadrotor: rigid body, four rotors with first-order speed response, drag of a flat disc."""
+
+    mass: float = 0.78
+    """[kg]; laboratory vehicle"""
+    inertia: Matrix = ((1.7565e-3, 0.0, 0.0), (0.0, 3.5723e-3, 0.0), (0.0, 0.0, 4.7134e-3))
+    """(3, 3) about the center of mass, in B [kg m^2]; laboratory vehicle"""
+    rotor_positions_B: Matrix = (
+        (0.21, -0.21, 0.0),
+        (0.21, 0.21, 0.0),
+        (-0.21, 0.21, 0.0),
+        (-0.21, -0.21, 0.0),
+    )
+    """(4, 3) rotor hubs relative to the center of mass, in B [m]; laboratory vehicle"""
+    rotor_spins: Vector = (1.0, -1.0, 1.0, -1.0)
+    """(4,) sense of rotation about body z, opposite to the reaction torque; laboratory vehicle"""
+    thrust_coefficient: float = 6.11e-8 / 0.104719755**2
+    """F = kF W^2 [N/(rad/s)^2]; laboratory vehicle, given there per rpm^2"""
+    torque_coefficient: float = 1.5e-9 / 0.104719755**2
+    """N = kN W^2 [N m/(rad/s)^2]; laboratory vehicle, given there per rpm^2"""
+    motor_time_constant: float = 0.05
+    """lag of the rotor speed behind the voltage [s]; laboratory vehicle"""
+    motor_speed_per_volt: float = 200.0
+    """steady rotor speed per volt [rad/s/V]; laboratory vehicle"""
+    max_voltage: float = 12.0
+    """[V]; laboratory vehicle"""
+    disc_area: float = 0.01
+    """area of the drag disc [m^2]; laboratory vehicle"""
+    drag_coefficient: float = 0.3
+    """of the drag disc; laboratory vehicle"""
+    air_density: float = 1.225
+    """[kg/m^3]; standard atmosphere at sea level"""
+    gravity: float = GRAVITY
+    """[m/s^2]"""
+
+    def __post_init__(self) -> None:
+        self._check(
+            check.positive,
+            "thrust_coefficient",
+            "torque_coefficient",
+            "motor_time_constant",
+            "motor_speed_per_volt",
+            "max_voltage",
+            "gravity",
+        )
+        self._check(check.positive, "mass", least=1e-3)
+        self._check(check.number, "disc_area", "drag_coefficient", "air_density", least=0.0)
+        self._check(check.matrix, "inertia", rows=3, columns=3)
+        self._check(check.matrix, "rotor_positions_B", rows=4, columns=3)
+        self._check(check.vector, "rotor_spins", length=4)
+        inertia = np.array(self.inertia)
+        if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
+            raise ValueError("VehicleParams.inertia must be symmetric")
+        smallest = np.linalg.eigvalsh(inertia)[0]
+        if 0.0 < smallest < LEAST_MOMENT:
+            raise ValueError(
+                f"VehicleParams.inertia must be at least {LEAST_MOMENT:g} kg m^2 about every "
+                f"axis, got {smallest:g} kg m^2"
+            )
+        if smallest <= 1e-9 * abs(inertia).max():
+            raise ValueError(
+                "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
+                f"{smallest:g}"
+            )
+        check_moments("VehicleParams.inertia", np.linalg.eigvalsh(inertia))
+        if self.hover_voltage >= self.max_voltage:
+            raise ValueError(
+                f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: it takes "
+                f"{self.hover_voltage:.3g} V of {self.max_voltage:g} V (by mass, gravity, "
+                "thrust_coefficient, motor_speed_per_volt and max_voltage)"
+            )
+        if 4.0 * self.max_rotor_force > MAX_LIFT * self.mass * self.gravity:
+            raise ValueError(
+                f"VehicleParams.thrust_coefficient must lift at most {MAX_LIFT:g} times the weight "
+                f"at full voltage, got {4.0 * self.max_rotor_force:g} N and "
+                f"{self.mass * self.gravity:g} N (by mass, gravity, thrust_coefficient, "
+                "motor_speed_per_volt and max_voltage)"
+            )
+        if self.torque_coefficient > MAX_TORQUE_ARM * self.thrust_coefficient:
+            raise ValueError(
+                f"VehicleParams.torque_coefficient must be at most {MAX_TORQUE_ARM:g} m times "
+                f"thrust_coefficient, got {self.torque_coefficient:g}"
+            )
+        if any(abs(spin) != 1.0 for spin in self.rotor_spins):
+            raise ValueError(f"VehicleParams.rotor_spins must be +1 or -1, got {self.rotor_spins}")
+        if abs(np.linalg.det(self.effectiveness)) < 1e-12:
+            raise ValueError(
+                "VehicleParams.rotor_positions_B must let the rotors turn the body about all axes "
+                "(and rotor_spins, with torque_coefficient over thrust_coefficient as their arm)"
+            )
+
+    @property
+    def max_rotor_force(self) -> float:
+        """Thrust of one rotor at full voltage [N]."""
+        return self.thrust_coefficient * (self.motor_speed_per_volt * self.max_voltage) ** 2
+
+    @property
+    def hover_voltage(self) -> float:
+        """Voltage at which four rotors carry the weight [V]."""
+        force = self.mass * self.gravity / 4
+        return math.sqrt(force / self.thrust_coefficient) / self.motor_speed_per_volt
+
+    @property
+    def hover_torques(self) -> tuple[float, float, float]:
+        """Torques about the body axes that the weight makes on the rotors' lever arms [N m]."""
+        weight = self.mass * self.gravity
+        x, y, _ = np.abs(np.array(self.rotor_positions_B)).mean(axis=0)
+        return weight * y, weight * x, weight * self.torque_coefficient / self.thrust_coefficient
+
+    @property
+    def effectiveness(self) -> np.ndarray:
+        """(4, 4): total thrust [N] and torque in B [N m] per unit of each rotor's thrust."""
+        positions, spins = np.array(self.rotor_positions_B), np.array(self.rotor_spins)
+        torque_per_thrust = self.torque_coefficient / self.thrust_coefficient
+        return np.stack([np.ones(4), positions[:, 1], -positions[:, 0], -torque_per_thrust * spins])
+
+
+def check_moments(name: str, moments: ArrayLike) -> None:
+    """Refuse moments of inertia that no mass has: each is at most the sum of the other two.
+
+    Args:
+        name: What they belong to.
+        moments: (3,) about the principal axes, or about any three orthogonal ones [kg m^2].
+
+    Raises:
+        ValueError: If one is larger, by more than rounding.
+    """
+    values = np.asarray(moments, np.float64)
+    if 2.0 * values.max() > values.sum() * (1.0 + 1e-9):
+        raise ValueError(
+            f"{name} must be that of a body: no moment can be larger than the sum of the other "
+            f"two, got {', '.join(f'{value:g}' for value in values)} kg m^2"
+        )
+
+
+def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
+    """Refuse rotors that are too fast for the integration.
+
+    Args:
+        name: What the time constant belongs to.
+        time_constant: Of the rotors' lag [s].
+        clocks: Say how long a Runge-Kutta step is.
+
+    Raises:
+        ValueError: If the step is too long, so that the computed rotor speeds would diverge.
+    """
+    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    if step > RK4_LIMIT * time_constant:
+        raise ValueError(
+            f"{name} must be at least {step / RK4_LIMIT:.3g} s at {clocks.imu_rate:g} Hz with "
+            f"substeps={clocks.substeps}, where the integration is stable, got {time_constant:g} s"
+        )
+
+
+_VEHICLES = {"lab": VehicleParams()}
+
+
+def vehicle_params(name: str) -> VehicleParams:
+    """The vehicle called `name`: "lab", the report's."""
+    return _VEHICLES[check.choice("vehicle", name, tuple(_VEHICLES))]

@@ -1,0 +1,126 @@
+"""The world around a vehicle: wind and gusts, drag of rotors, ground effect, battery.
+
+As in `params`: frozen, keyword-only, SI units, the source with every number. By default the air is
+still, the ground far away and the battery never empty, as in the laboratory's model.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Vector
+
+MAX_WIND = 200.0
+"""The strongest tornadoes blow at some 135 m/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatteryParams(Checked):
+    """A battery whose voltage falls with what was drawn from it and with what is drawn now.
+
+    With the charge s in [0, 1], `s' = -P / energy` and `P = sum(kN W_i^3) / motor_efficiency`; the
+    open-circuit voltage is `U0 = max_voltage (empty_voltage + (1 - empty_voltage) s)`, and the
+    motors get at most U with `U = U0 - resistance P / U`. At s = 0 the battery cuts off.
+    """
+
+    energy: float = 88e3
+    """of a full battery [J]; three lithium-polymer cells of 2.2 A h: 3 x 3.7 V x 2.2 A h"""
+    charge: float = 1.0
+    """at the start of an episode, in (0, 1]"""
+    empty_voltage: float = 0.83
+    """open-circuit voltage of an empty over that of a full battery; 3.5 V over 4.2 V a cell"""
+    resistance: float = 0.03
+    """inside the battery and its leads [ohm]; some 10 milliohm a cell"""
+    motor_efficiency: float = 0.75
+    """mechanical power of the rotors over electrical power; typical of small brushless motors"""
+
+    def __post_init__(self) -> None:
+        self._check(check.positive, "energy", "charge", "empty_voltage", "motor_efficiency")
+        self._check(check.number, "resistance", least=0.0)
+        for name in ("charge", "empty_voltage", "motor_efficiency"):
+            if getattr(self, name) > 1.0:
+                raise ValueError(
+                    f"BatteryParams.{name} must be at most 1, got {getattr(self, name)}"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldParams(Checked):
+    """What the air, the ground and the battery do to a vehicle.
+
+    Drag of the disc and of the rotors is that of the vehicle's velocity relative to the air. The
+    filter and the controller know nothing of this world.
+    """
+
+    wind_I: Vector = (0.0, 0.0, 0.0)
+    """(3,) steady velocity of the air in I: east, north, up [m/s]"""
+    gust_wind_speed: float = 0.0
+    """W20, the wind speed 20 feet above ground that sets the strength of Dryden gusts [m/s]; 0: no
+    gusts. MIL-F-8785C, 3.7.3.4: 7.7 is light, 15.4 moderate, 23.2 severe turbulence"""
+    linear_drag_B: Vector = (0.0, 0.0, 0.0)
+    """(3,) force along each body axis per air velocity along it, opposing it [N s/m]; M. Faessler,
+    A. Franchi, D. Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag",
+    RA-L 2018: mass times (0.544, 0.386, 0) 1/s for their vehicle"""
+    rotor_drag_B: Vector = (0.0, 0.0, 0.0)
+    """(3,) likewise, per rad/s of the sum of the rotor speeds [N s/m per rad/s]; J. Svacha, K.
+    Mohta, V. Kumar, "Improving quadrotor trajectory tracking by compensating for aerodynamic
+    effects", ICUAS 2017"""
+    ground_effect: bool = False
+    """whether thrust grows near the ground: by 1 / (1 - (radius / (4 z))^2) for a rotor at the
+    height z; I. C. Cheeseman, W. E. Bennett, "The effect of the ground on a helicopter rotor in
+    forward flight", ARC R&M 3021, 1955. Heights below half a radius count as that, so that thrust
+    grows by a third at most; when the vehicle tips the gain falls as the cosine of its tilt"""
+    rotor_radius: float = 0.127
+    """[m]; ten-inch propellers"""
+    ground_height: float = -0.1
+    """height of the ground in I, for ground effect and gusts [m]; the center of mass of a vehicle
+    that stands on its legs is at height 0"""
+    battery: BatteryParams | None = None
+    """None: always full voltage"""
+
+    def __post_init__(self) -> None:
+        self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)
+        self._check(check.number, "gust_wind_speed", least=0.0, most=MAX_WIND)
+        if np.linalg.norm(self.wind_I) > MAX_WIND:
+            raise ValueError(
+                f"WorldParams.wind_I must be at most {MAX_WIND:g} m/s, got {self.wind_I}"
+            )
+        self._check(check.flag, "ground_effect")
+        self._check(check.positive, "rotor_radius")
+        self._check(check.number, "ground_height")
+        for name in ("linear_drag_B", "rotor_drag_B"):
+            if min(getattr(self, name)) < 0.0:
+                raise ValueError(
+                    f"WorldParams.{name} must be at least 0, got {getattr(self, name)}"
+                )
+        if self.battery is not None:
+            check.instance("WorldParams.battery", self.battery, BatteryParams)
+
+
+_LAB_ROTOR_DRAG = (0.78 * 0.544, 0.78 * 0.386, 0.0)  # Faessler et al., for the laboratory's mass
+
+_WORLDS = {
+    "calm": WorldParams(),
+    # a gentle breeze (Beaufort 3) that an outdoor flight meets on most days
+    "breeze": WorldParams(
+        wind_I=(4.0, 0.0, 0.0),
+        gust_wind_speed=4.0,
+        linear_drag_B=_LAB_ROTOR_DRAG,
+        ground_effect=True,
+        battery=BatteryParams(),
+    ),
+    # a fresh breeze (Beaufort 5), near the limit of small vehicles
+    "fresh_breeze": WorldParams(
+        wind_I=(8.0, 0.0, 0.0),
+        gust_wind_speed=8.0,
+        linear_drag_B=_LAB_ROTOR_DRAG,
+        ground_effect=True,
+        battery=BatteryParams(),
+    ),
+}
+
+
+def world_params(name: str) -> WorldParams:
+    """The world called `name`: "calm" (the report's), "breeze" (4 m/s), "fresh_breeze" (8 m/s)."""
+    return _WORLDS[check.choice("world", name, tuple(_WORLDS))]

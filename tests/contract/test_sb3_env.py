@@ -1,0 +1,193 @@
+"""The interface for Stable-Baselines3: what its algorithms and wrappers rely on."""
+
+import gymnasium
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+
+import quad_gym
+from quad_gym.envs.single import QuadEnv
+from tests.contract.comparing import actions_of, assert_same, state_of
+
+SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
+
+
+def make(n_envs=5, env_id="QuadGym/Hover-v0", seed=50, **keywords):
+    return quad_gym.make_sb3_vec_env(env_id, n_envs=n_envs, seed=seed, **keywords)
+
+
+def without_times(infos):
+    for info in infos:
+        info.get("episode", {}).pop("t", None)
+    return infos
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+def test_it_does_what_a_dummy_vec_env_of_monitored_environments_does(privileged):
+    keywords = {**SHORT, "privileged": privileged}
+    env = make(**keywords)
+    dummy = DummyVecEnv([lambda: Monitor(QuadEnv("hover", **keywords))] * 5)
+    dummy.seed(50)
+    assert_same(env.reset(), dict(dummy.reset()) if privileged else dummy.reset())
+    ended = 0
+    for k in range(70):
+        actions = np.stack([actions_of(i, 70)[k] for i in range(5)])
+        mine, other = env.step(actions), dummy.step(actions)
+        assert_same(mine[0], dict(other[0]) if privileged else other[0])
+        assert_same(mine[1:3], other[1:3])
+        for info, expected in zip(mine[3], other[3], strict=True):
+            assert ("terminal_observation" in info) == ("terminal_observation" in expected)
+            assert info["TimeLimit.truncated"] == expected["TimeLimit.truncated"]
+            assert info["position_error"] == expected["position_error"]
+            assert info["estimation_error"] == expected["estimation_error"]
+            if "terminal_observation" in info:
+                ended += 1
+                assert_same(info["terminal_observation"], expected["terminal_observation"])
+                assert info["ending"] == expected["ending"]
+                assert info["episode"]["l"] == expected["episode"]["l"]
+                assert info["episode"]["r"] == pytest.approx(expected["episode"]["r"], abs=1e-6)
+    assert ended > 10
+
+
+def test_an_episode_ends_with_its_return_its_length_its_time_and_its_error():
+    env = make(3, max_episode_steps=10, observation="truth")
+    env.reset()
+    total, errors = np.zeros(3), np.zeros(3)
+    for _ in range(10):
+        _, rewards, dones, infos = env.step(np.zeros((3, 4)))
+        total += rewards
+        errors += [info["position_error"] for info in infos]
+    assert dones.all()
+    for i, info in enumerate(infos):
+        assert {"r", "l", "t"} <= set(info["episode"])
+        assert info["episode"]["r"] == pytest.approx(total[i], rel=1e-6)
+        assert info["episode"]["l"] == 10
+        assert info["episode"]["t"] >= 0.0
+        assert info["episode"]["e"] == pytest.approx(errors[i] / 10)
+        assert info["TimeLimit.truncated"] is True
+        assert info["ending"] == "time_limit"
+
+
+def test_a_crash_is_not_reported_as_truncation():
+    env = make(2, "QuadGym/Circle-v0")
+    env.reset()
+    for _ in range(60):
+        _, _, dones, infos = env.step(np.tile([-1.0, 0, 0, 0], (2, 1)))
+        if dones.any():
+            break
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
+    assert infos[0]["ending"] == "on_the_ground"
+
+
+def test_a_seed_holds_for_the_next_reset_only():
+    env = make(4, seed=None)
+    env.seed(9)
+    first, second = env.reset(), env.reset()
+    assert (first != second).any()
+    env.seed(9)
+    assert_same(env.reset(), first)
+    assert_same(env.reset(), second)
+
+
+def test_flight_i_is_seeded_with_seed_plus_i():
+    observation = make(4, seed=20).reset()
+    for i in range(4):
+        assert_same(observation[i], QuadEnv("hover").reset(seed=20 + i)[0])
+
+
+def test_options_hold_for_the_next_reset_only():
+    env = make(3)
+    env.set_options({"position": [3.0, 1.0, 2.0], "yaw": 1.0})
+    env.reset()
+    np.testing.assert_array_equal(env.flights.batch.read("r"), np.tile([3.0, 1.0, 2.0], (3, 1)))
+    env.reset()
+    assert (env.flights.batch.read("r") != [3.0, 1.0, 2.0]).all()
+
+
+def test_options_may_be_given_one_by_one():
+    env = make(2)
+    env.set_options([{"position": [1.0, 0.0, 1.0]}, {"position": [0.0, 1.0, 2.0]}])
+    env.reset()
+    np.testing.assert_array_equal(env.flights.batch.read("r"), [[1.0, 0.0, 1.0], [0.0, 1.0, 2.0]])
+
+
+def test_unknown_options_change_nothing():
+    env = make(2)
+    env.reset()
+    before = state_of(env)
+    env.set_options({"height": 2.0})
+    with pytest.raises(ValueError, match="height"):
+        env.reset()
+    assert state_of(env) == before
+
+
+def test_what_is_returned_has_the_stated_types_and_is_fresh():
+    env = make(3)
+    assert isinstance(env, VecEnv)
+    first = env.reset()
+    observation, rewards, dones, infos = env.step(np.zeros((3, 4), np.float32))
+    assert observation.dtype == rewards.dtype == np.float32
+    assert dones.dtype == np.bool_
+    assert len(infos) == len({id(info) for info in infos}) == 3
+    second = env.step(np.zeros((3, 4), np.float32))
+    assert not np.shares_memory(first, observation)
+    assert not np.shares_memory(observation, second[0])
+    assert not np.shares_memory(rewards, second[1])
+    assert not np.shares_memory(dones, second[2])
+
+
+def test_waiting_for_a_step_that_was_not_asked_for_is_an_error():
+    env = make(2)
+    env.reset()
+    with pytest.raises(RuntimeError, match="step_async"):
+        env.step_wait()
+
+
+def test_stepping_before_the_first_reset_is_an_error():
+    with pytest.raises((RuntimeError, gymnasium.error.ResetNeeded), match="reset"):
+        make(2).step(np.zeros((2, 4)))
+
+
+def test_attributes_and_methods_are_shared_by_all_flights():
+    env = make(3)
+    assert env.get_attr("num_envs", indices=[0, 2]) == [3, 3]
+    env.set_attr("metadata", {"render_modes": [], "note": 1})
+    assert env.get_attr("metadata")[1]["note"] == 1
+    with pytest.raises(ValueError, match="indices"):
+        env.set_attr("metadata", {}, indices=[0])
+    with pytest.raises((ValueError, AttributeError)):
+        env.set_attr("no_such_attribute", 1)
+    assert env.env_is_wrapped(Monitor) == [True] * 3
+    assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=1) == [False]
+    env.close()
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:The environment is already wrapped:UserWarning")
+@pytest.mark.parametrize("wrapper", [VecMonitor, VecNormalize])
+def test_the_usual_wrappers_fit(wrapper):
+    env = wrapper(make(4, **SHORT))
+    env.reset()
+    lengths = []
+    for k in range(60):
+        observation, _, _, infos = env.step(np.stack([actions_of(i, 60)[k] for i in range(4)]))
+        assert np.isfinite(observation).all()
+        lengths += [info["episode"]["l"] for info in infos if "episode" in info]
+    assert max(lengths) == 25
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+def test_ppo_learns_on_it(privileged):
+    env = make(16, max_episode_steps=20, privileged=privileged)
+    policy = "MultiInputPolicy" if privileged else "MlpPolicy"
+    model = PPO(policy, env, n_steps=16, batch_size=64, n_epochs=1, seed=0, device="cpu")
+    model.learn(512)
+    assert model.num_timesteps == 512
+    assert len(model.ep_info_buffer) >= 16
+    assert all(0 < episode["l"] <= 20 for episode in model.ep_info_buffer)
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=16, warn=True)
+    assert np.isfinite(mean)

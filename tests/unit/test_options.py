@@ -1,0 +1,130 @@
+"""From dataclasses to command lines."""
+
+import shlex
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from quad_gym.commands.options import (
+    EnvId,
+    Keywords,
+    SuiteNames,
+    flying_options,
+    leave,
+    parse,
+    usage_errors,
+)
+from tests.console import plain
+
+
+@dataclass(frozen=True)
+class Args:
+    env_id: EnvId = "QuadGym/Circle-v0"
+    seeds: int = 10
+    """flights"""
+    rate: float | None = None
+    """rate [Hz]; 50 % of the other if not given"""
+    gains: tuple[float, float] = (1.0, 2.0)
+    """gains"""
+    camera: bool = True
+    """see"""
+    kind: Literal["a", "b"] = "a"
+    """kind"""
+    output: Path | None = None
+    """folder"""
+    sensors: SuiteNames = ("standard",)
+    env: Keywords = field(default_factory=dict)
+    """keywords"""
+
+    def __post_init__(self):
+        if self.seeds < 1:
+            raise ValueError("seeds must be at least 1")
+
+
+def test_defaults():
+    assert parse(Args, []) == Args()
+
+
+def test_all_types():
+    line = (
+        "QuadGym/Hover-v0 --seeds 3 --rate 2.5 --gains 3 4 --no-camera --kind b "
+        "--output some/where --sensors rtk lab --env a=1 b=(2,3) c=true d=none e=x=y f=1e-3"
+    )
+    keywords = {"a": 1, "b": (2, 3), "c": True, "d": None, "e": "x=y", "f": 1e-3}
+    want = Args(
+        "QuadGym/Hover-v0",
+        3,
+        2.5,
+        (3.0, 4.0),
+        False,
+        "b",
+        Path("some/where"),
+        ("rtk", "lab"),
+        keywords,
+    )
+    assert parse(Args, line.split()) == want
+
+
+def test_help_has_description_defaults_and_texts(capsys):
+    with pytest.raises(SystemExit) as end:
+        parse(Args, ["--help"], description="What it does.", program="it")
+    assert end.value.code == 0
+    text = plain(capsys.readouterr().out)
+    for part in ("What it does.", "(default: 10)", "(default: 1.0 2.0)", "--no-camera"):
+        assert part in text
+    assert "50 % of the other if not given" in text
+    assert "QuadGym/Waypoints-v0" in text
+    assert "consumer" in text
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("--seeds x", "x"),
+        ("--seeds 0", "seeds must be at least 1"),
+        ("--kind c", "--kind"),
+        ("--gains 1", "--gains"),
+        ("--see 3", "--seeds"),
+        ("QuadGym/Hover-v0 stray", "stray"),
+        ("--env a", "KEY=VALUE"),
+        ("--env 1=2", "KEY=VALUE"),
+    ],
+)
+def test_wrong_options_end_with_a_message_that_names_them(line, told, capsys):
+    with pytest.raises(SystemExit) as end:
+        parse(Args, line.split(), program="it")
+    assert end.value.code == 2
+    message = plain(capsys.readouterr().err)
+    assert told in message
+    assert "it --help" in message
+
+
+@pytest.mark.parametrize("error", [ValueError("why"), OSError("why"), ImportError("why")])
+def test_usage_errors_end_with_one_line(error, capsys):
+    with pytest.raises(SystemExit) as end, usage_errors():
+        raise error
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "error: why\n"
+
+
+def test_bugs_are_not_taken_for_usage_errors():
+    with pytest.raises(KeyError), usage_errors():
+        raise KeyError("bug")
+
+
+def test_keywords_with_an_option_of_their_own_are_refused():
+    keywords = {"radius": 2.0, "sensors": "rtk"}
+    assert leave(keywords, {"faults": "--fault"}) == keywords
+    with pytest.raises(ValueError, match=r"^--env must leave sensors to --sensors$"):
+        leave(keywords, {"faults": "--fault", "sensors": "--sensors"})
+
+
+def test_keywords_become_options_that_are_parsed_as_they_were():
+    assert flying_options({}) == ""
+    assert flying_options({"sensors": "rtk"}) == " --sensors rtk"
+    keywords = {"camera": False, "faults": "gnss_jump+rotor_loss", "observation": "noisy"}
+    words = shlex.split(flying_options({**keywords, "world": "a b"}))
+    assert words[:3] == ["--observation", "noisy", "--env"]
+    assert words[3:] == ["camera=False", "faults=gnss_jump+rotor_loss", "world=a b"]

@@ -1,0 +1,138 @@
+"""The launch pad: a vehicle on the ground stands still until its thrust lifts it."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import FlightBatch, TaskParams, vehicle_params
+from quad_gym.records import Control, Source
+
+LAB = vehicle_params("lab")
+GRAVITY = 9.8
+
+
+def batch(count=3, control=Control.MOTOR, **options):
+    task = {"kind": "circle", "start": "ground", "duration": 0.0, "out_of_bounds": 1e3}
+    options = {"sensors": "lab", "source": Source.TRUTH, "control_rate": 200.0} | options
+    return FlightBatch(
+        count, task=TaskParams(**task | options.pop("task", {})), control=control, **options
+    )
+
+
+def stopped(count):
+    return np.full((count, 4), -1.0)  # voltage 0
+
+
+def test_a_vehicle_stands_still_for_a_minute():
+    flights = batch(run_filter=True)
+    flights.reset(seeds=[1, 2, 3])
+    start = {name: flights.read(name) for name in ("r", "q", "v", "w")}
+    for _ in range(60 * 200):
+        flights.step(stopped(3))
+    for name, value in start.items():
+        assert (flights.read(name) == value).all(), name
+    assert (flights.read("on_pad") == 1.0).all()
+    assert (flights.read("needs_reset") == 0.0).all()
+
+
+@pytest.mark.parametrize("sensors", ["lab", "standard"])
+def test_the_accelerometer_feels_the_pad(sensors):
+    flights = batch(256, sensors=sensors, run_filter=True)
+    flights.reset(seeds=range(256))
+    means = np.zeros((256, 3))
+    gyro = np.zeros((256, 3))
+    for _ in range(100):
+        flights.step(stopped(256))
+        means += (flights.read("accel") - flights.read("b_a")) / 100
+        gyro += (flights.read("gyro") - flights.read("b_g")) / 100
+    suite = quad_gym.sensor_suite(sensors)
+    sigma = suite.imu.accel_noise_density * np.sqrt(suite.imu.rate)
+    error = (means - [0.0, 0.0, GRAVITY]) / (sigma / np.sqrt(100))
+    # the bias is read after its step, which is far smaller than the noise of a sample
+    assert np.abs(error.mean(0)).max() < 5 / np.sqrt(256)
+    sigma = suite.imu.gyro_noise_density * np.sqrt(suite.imu.rate)
+    assert np.abs((gyro / (sigma / np.sqrt(100))).mean(0)).max() < 5 / np.sqrt(256)
+
+
+@pytest.mark.parametrize("action", [0.05, 0.3, 1.0])
+def test_it_lifts_off_when_thrust_exceeds_weight(action):
+    """W(t) = cm ea (1 - exp(-t / tau)) reaches the speed of hover at a time in closed form."""
+    flights = batch(1)
+    flights.reset(seeds=[0])
+    hover = LAB.hover_voltage
+    voltage = min(hover * (1.0 + action), LAB.max_voltage)
+    expected = -LAB.motor_time_constant * np.log(1.0 - hover / voltage)
+    ticks = 0
+    while flights.read("on_pad")[0]:
+        flights.step(np.full((1, 4), action))
+        ticks += 1
+    assert abs(ticks / 200.0 - expected) <= 1.0 / 200.0 + 1e-9
+    assert flights.read("v")[0, 2] == 0.0
+    heights = []
+    for _ in range(50):
+        flights.step(np.full((1, 4), action))
+        heights.append(flights.read("r")[0, 2])
+    assert (np.diff(heights) > 0.0).all()
+    assert heights[0] > 0.0
+
+
+def test_thrust_below_the_weight_does_not_lift_it():
+    flights = batch(1)
+    flights.reset(seeds=[0])
+    for _ in range(2000):
+        flights.step(np.full((1, 4), -1e-6))
+    assert flights.read("on_pad")[0] == 1.0
+
+
+def test_without_a_pad_it_falls_as_free_bodies_do():
+    flights = batch(1, task={"pad": False})
+    flights.reset(seeds=[0])
+    for _ in range(20):
+        flights.step(stopped(1))
+    # drag of the disc at 1 m/s is below 1 % of the weight
+    assert flights.read("v")[0, 2] == pytest.approx(-GRAVITY * 0.1, rel=0.01)
+    assert flights.read("r")[0, 2] == pytest.approx(-GRAVITY * 0.1**2 / 2, rel=0.01)
+
+
+def test_a_start_with_a_velocity_is_not_on_the_pad():
+    flights = batch(2)
+    flights.reset(seeds=[0, 1], velocity=[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert flights.read("on_pad").tolist() == [1.0, 0.0]
+
+
+def test_a_hovering_start_is_not_on_the_pad():
+    flights = batch(64, task={"start": "mixed"})
+    flights.reset(seeds=range(64))
+    on_ground = flights.read("r")[:, 2] == 0.0
+    assert 10 < on_ground.sum() < 54
+    assert (flights.read("on_pad") == on_ground).all()
+
+
+def test_wind_does_not_move_it():
+    still = batch(
+        1, world=quad_gym.WorldParams(wind_I=(8.0, 0.0, 0.0), linear_drag_B=(0.3, 0.3, 0.3))
+    )
+    still.reset(seeds=[0])
+    for _ in range(200):
+        still.step(stopped(1))
+    assert (still.read("v") == 0.0).all()
+
+
+def test_the_default_environment_starts_on_a_pad_and_the_reports_does_not():
+    for pad in (True, False):
+        env = gymnasium.make_vec("QuadGym/Circle-v0", 2, observation="truth", pad=pad)
+        env.reset(seed=0)
+        for _ in range(5):
+            env.step(np.zeros((2, 4)))  # hover thrust, once the rotors have spun up
+        height = env.unwrapped.flights.batch.read("r")[:, 2]
+        assert (height == 0.0).all() if pad else (height < -0.03).all()
+
+
+def test_reward_per_step_is_that_per_second_times_the_control_rate():
+    rewards = {}
+    for per in ("step", "second"):
+        env = gymnasium.make_vec("QuadGym/Waypoints-v0", 4, reward_per=per, control_rate=100)
+        env.reset(seed=0)
+        rewards[per] = np.array([env.step(np.full((4, 4), 0.1))[1] for _ in range(30)])
+    np.testing.assert_allclose(rewards["step"], 100.0 * rewards["second"], rtol=1e-12)
