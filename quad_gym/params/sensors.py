@@ -485,6 +485,29 @@ class SensorSuite(Checked):
             imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params
         )
 
+    def simplified(self) -> "SensorSuite":
+        """A copy whose measurements arrive at once, with white noise, bias and drift alone.
+
+        To tell what latency, vibration, misalignment, constant heading errors, blur, range and
+        ground do to a flight. White noise stays as it is.
+        """
+        gnss, camera = self.gnss, self.camera
+        if gnss is not None:
+            gnss = gnss.replace(latency=0.0, heading_error_sigma=0.0)
+        if camera is not None:
+            camera = camera.replace(
+                latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False
+            )
+        imu = self.imu.replace(
+            accel_scale_sigma=0.0,
+            gyro_scale_sigma=0.0,
+            accel_misalignment_sigma=0.0,
+            gyro_misalignment_sigma=0.0,
+            accel_vibration=0.0,
+            gyro_vibration=0.0,
+        )
+        return self.replace(imu=imu, gnss=gnss, camera=camera)  # type: ignore[no-any-return]
+
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """A copy whose white noise is `factor` times as large, as a filter of this suite knows."""
         check.positive("factor", factor)

@@ -115,7 +115,7 @@ RTK = SensorSuite(
     ),
     estimator=FIELD_FILTER,
     noisy=NoisyObservationParams(
-        position=0.0012, velocity=0.002, attitude=0.00018, body_rates=0.002
+        position=0.00135, velocity=0.0032, attitude=0.00021, body_rates=0.0028
     ),  # measured, see above
 )
 """A survey vehicle: real-time kinematic GNSS with two antennas, and markers on the ground."""
@@ -163,7 +163,7 @@ CONSUMER = SensorSuite(
     camera=None,
     estimator=FIELD_FILTER,
     noisy=NoisyObservationParams(
-        position=0.28, velocity=0.02, attitude=0.0061, body_rates=0.004
+        position=0.28, velocity=0.024, attitude=0.021, body_rates=0.011
     ),  # measured, see above
 )
 """A hobby vehicle: one single-frequency receiver, a compass, a cheap IMU, no camera."""
@@ -213,7 +213,7 @@ INDOOR = SensorSuite(
     ),
     estimator=FIELD_FILTER,
     noisy=NoisyObservationParams(
-        position=0.0066, velocity=0.0103, attitude=0.00046, body_rates=0.0035
+        position=0.0077, velocity=0.0128, attitude=0.00056, body_rates=0.0061
     ),  # measured, see above
 )
 """A hall without GNSS: the camera sees markers on the walls wherever it looks."""

@@ -127,7 +127,7 @@ def test_a_new_episode_forgets_the_actions_before_it():
 
 
 def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
-    """While the delay lasts nothing but the cost of changes, 0.02 |da|^2 a second, differs."""
+    """While the delay lasts nothing but the cost of changes, 0.02 |da|^2 a step, differs."""
     last = quad_gym.observation_layout("truth")[-1]
     assert last.name == "last_action"
     keywords = {"observation": "truth", "start": "hover"}
@@ -141,7 +141,7 @@ def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
         np.testing.assert_array_equal(observation[last.slice], action)
         other, unchanged, *_ = idle.step(zeros)
         np.testing.assert_array_equal(observation[: last.slice.start], other[: last.slice.start])
-        cost = 0.02 * np.sum((action - before) ** 2) / 50.0
+        cost = 0.02 * np.sum((action - before) ** 2)
         assert unchanged - reward == pytest.approx(cost, rel=1e-9)
         before = action
     observation, *_ = late.step(zeros)  # carries out the first action
