@@ -347,7 +347,8 @@ def test_field_suites_measure_late_and_imperfectly_by_default(name):
         assert suite.camera.latency == 0.04
         assert suite.camera.limited
     plain = suite.simplified()
-    assert not (plain.imu.errs or plain.imu.vibrates)
+    assert not plain.imu.errs
+    assert not plain.imu.vibrates
     assert plain.estimator == suite.estimator
     if plain.gnss is not None:
         assert plain.gnss.latency == plain.gnss.heading_error_sigma == 0.0
