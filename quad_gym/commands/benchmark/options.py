@@ -13,10 +13,10 @@ from typing import Any
 import quad_gym
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.records import Control
 from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import SUITES
+from quad_gym.records import Control
 
 LAB = quad_gym.sensor_suite("lab")
 OFF = "everything off"

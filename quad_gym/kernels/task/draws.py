@@ -218,9 +218,6 @@ def _impose_noise(flight, nominal, own, settings):
     for i in range(3):
         if settings.draw_kind[_POSITION_SIGMA + i] != FIXED:
             own.gnss_sigma[i] = flight.drawn[_POSITION_SIGMA + i]
-            own.position_sigma[i] = _all_noise(
-                own.gnss_sigma[i], nominal.gnss_sigma[i], nominal.position_sigma[i]
-            )
     if settings.draw_kind[_BASELINE_SIGMA] != FIXED:
         white, own.baseline_sigma = nominal.baseline_sigma, flight.drawn[_BASELINE_SIGMA]
         own.baseline_noise = _all_noise(own.baseline_sigma, white, nominal.baseline_noise)
