@@ -163,7 +163,7 @@ CONSUMER = SensorSuite(
     camera=None,
     estimator=FIELD_FILTER,  # with the slow error among its states
     noisy=NoisyObservationParams(
-        position=0.126, velocity=0.02, attitude=0.0061, body_rates=0.004
+        position=0.125, velocity=0.024, attitude=0.021, body_rates=0.011
     ),  # measured, see above
 )
 """A hobby vehicle: one single-frequency receiver, a compass, a cheap IMU, no camera."""
