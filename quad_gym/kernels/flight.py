@@ -36,7 +36,7 @@ _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
 
 
 @kernel
-def sense(flight, world, model, settings, work, stages, mask, starting):
+def sense(flight, world, model, settings, work, stages, mask, starting, within):
     """Measure at the present instant, update the filter and look, where `mask`.
 
     Args:
@@ -48,6 +48,7 @@ def sense(flight, world, model, settings, work, stages, mask, starting):
         stages: Table of stages.
         mask: Which lanes.
         starting: 1 at the first instant of their episode, else 0.
+        within: 1 within a control period, where an action's inner loop alone looks, else 0.
     """
     work.mask = select(mask, 1.0, 0.0)
     if settings.run_filter:
@@ -70,7 +71,7 @@ def sense(flight, world, model, settings, work, stages, mask, starting):
             features = settings.feature_count
             update = _UPDATE_WITH_DRIFT if settings.estimates_drift else _UPDATE
             call_stage(stages, update, flight, world, model, settings, work, features)
-    call_stage(stages, _LOOK, flight, world, model, settings, work, 0)
+    call_stage(stages, _LOOK, flight, world, model, settings, work, within)
 
 
 @kernel
@@ -85,8 +86,8 @@ def _store_start(flight, work):
 
 
 @kernel
-def tick(flight, world, model, settings, work, stages):
-    """Fly one tick."""
+def tick(flight, world, model, settings, work, stages, last):
+    """Fly one tick; `last`: whether it is the last one of a control period."""
     everyone = flight.tick >= 0.0
     work.mask = 1.0
     call_stage(stages, _CONTROL, flight, world, model, settings, work, 0)
@@ -115,7 +116,7 @@ def tick(flight, world, model, settings, work, stages):
     flight.tick = flight.tick + 1.0
     if settings.faults:
         call_stage(stages, _ADVANCE_FAULTS, flight, world, model, settings, work, 0)
-    sense(flight, world, model, settings, work, stages, everyone, 0)
+    sense(flight, world, model, settings, work, stages, everyone, 0, 0 if last else 1)
 
 
 @kernel
@@ -140,7 +141,7 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:
         call_stage(stages, _BEGIN_FAULTS, flight, world, model, settings, work, 0)
-    sense(flight, world, model, settings, work, stages, mask, 1)
+    sense(flight, world, model, settings, work, stages, mask, 1, 0)
     r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     error = norm(sub(r_ref, load3(flight.r)))
     flight.position_error = select(mask, error, flight.position_error)

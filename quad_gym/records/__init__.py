@@ -3,6 +3,9 @@
 As a flight is nothing but its record, snapshot, restore, pickling and copying are array copies.
 """
 
+from quad_gym.records.call import (
+    Call,
+)
 from quad_gym.records.draws import (
     COLUMNS,
     DRAWABLES,
@@ -30,6 +33,7 @@ from quad_gym.records.enums import (
 )
 from quad_gym.records.flight import (
     FLIGHT_FIELDS,
+    PARTS,
 )
 from quad_gym.records.layout import (
     FLIGHT,
@@ -39,9 +43,12 @@ from quad_gym.records.layout import (
     SETTINGS,
     WORK,
     WORK_BLOCK,
+    Room,
     aligned_zeros,
     block_dtype,
     field_of_flights,
+    offset_of,
+    room_of,
     scalar_dtype,
 )
 from quad_gym.records.params import (
@@ -152,6 +159,7 @@ __all__ = [
     "PARAMS",
     "PARAMS_BLOCK",
     "PARAMS_FIELDS",
+    "PARTS",
     "POSITION_BLOCK",
     "RESULTS",
     "SENSOR_GROUPS",
@@ -166,6 +174,7 @@ __all__ = [
     "WORK_BLOCK",
     "WORK_FIELDS",
     "Autoreset",
+    "Call",
     "Command",
     "Control",
     "Drawable",
@@ -177,6 +186,7 @@ __all__ = [
     "Gate",
     "Layout",
     "Result",
+    "Room",
     "Source",
     "Start",
     "Supply",
@@ -184,5 +194,7 @@ __all__ = [
     "aligned_zeros",
     "block_dtype",
     "field_of_flights",
+    "offset_of",
+    "room_of",
     "scalar_dtype",
 ]

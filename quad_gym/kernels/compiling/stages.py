@@ -22,7 +22,15 @@ from numba.extending import intrinsic
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
-from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, Start, Supply
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    PARAMS_BLOCK,
+    SETTINGS,
+    WORK_BLOCK,
+    FilterForm,
+    Start,
+    Supply,
+)
 
 
 class Stage(IntEnum):
@@ -169,6 +177,20 @@ STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
 def needed_stages(settings: Any) -> frozenset[Stage]:
     """The stages that a batch of these settings (a SETTINGS record) flies through."""
     return frozenset(stage for stage, source in SOURCES.items() if source.needed(settings))
+
+
+def used_parts(settings: Any) -> frozenset[str]:
+    """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
+    watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
+    uses = {
+        "faults": _faults(settings),
+        "draws": _drawn(settings),
+        "filter": _filter(settings),
+        "watch": _filter(settings) and bool(watches),
+        "late": _late(settings),
+        "drift": _with_drift(settings),
+    }
+    return frozenset(name for name, used in uses.items() if used)
 
 
 _DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)
