@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
+from quad_gym.records import SHOWN
 from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.tasks.lazy import Group, Lazy, frozen
+from quad_gym.tasks.lazy import Group, Lazy, Shown, frozen
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
+_POSITION_ERROR = SHOWN["position_error"].start
 _JUDGED = ("reward", "terminated", "truncated", "ending")
 
 
@@ -27,48 +29,17 @@ class Truth(Group):
         super().__init__(flights)
         self._view = view
 
-    @Lazy
-    def position(self) -> Floats:
-        """(n, 3) in I [m]."""
-        return self._flights.rows("r")
+    position = Shown("r", "(n, 3) in I [m].")
 
-    @Lazy
-    def velocity(self) -> Floats:
-        """(n, 3) in I [m/s]."""
-        return self._flights.rows("v")
+    velocity = Shown("v", "(n, 3) in I [m/s].")
 
-    @Lazy
-    def quaternion(self) -> Floats:
-        """(n, 4) (w, x, y, z), B to I."""
-        return self._flights.rows("q")
+    quaternion = Shown("q", "(n, 4) (w, x, y, z), B to I.")
 
-    @Lazy
-    def R_BI(self) -> Floats:
-        """(n, 3, 3), v_B = R_BI v_I."""
-        w, x, y, z = q = self.quaternion.T
-        doubled = 2.0 * q
-        ww, wx, wy, wz = doubled[0] * w, doubled[1] * w, doubled[2] * w, doubled[3] * w
-        xx, xy, xz = doubled[1] * x, doubled[2] * x, doubled[3] * x
-        yy, yz, zz = doubled[2] * y, doubled[3] * y, doubled[3] * z
-        R = np.empty((3, 3, len(w)))
-        R[0, 0], R[1, 1], R[2, 2] = ww + xx - 1.0, ww + yy - 1.0, ww + zz - 1.0
-        R[0, 1], R[1, 0] = xy + wz, xy - wz
-        R[0, 2], R[2, 0] = xz - wy, xz + wy
-        R[1, 2], R[2, 1] = yz + wx, yz - wx
-        return np.ascontiguousarray(R.transpose(2, 0, 1))
+    R_BI = Shown("R_BI", "(n, 3, 3), v_B = R_BI v_I.")
 
-    @Lazy
-    def forward(self) -> Floats:
-        """(n, 3) the body x axis in I, first row of `R_BI`."""
-        w, x, y, z = self.quaternion.T
-        return np.stack(
-            [2.0 * (w * w + x * x) - 1.0, 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)]
-        ).T
+    forward = Shown("R_BI", "(n, 3) the body x axis in I, first row of `R_BI`.", 3)
 
-    @Lazy
-    def body_rates(self) -> Floats:
-        """(n, 3) [rad/s]."""
-        return self._flights.rows("w")
+    body_rates = Shown("w", "(n, 3) [rad/s].")
 
     @Lazy
     def rotor_speeds(self) -> Floats:
@@ -90,10 +61,7 @@ class Truth(Group):
         """(n, 3) velocity of the air in I [m/s]."""
         return self._flights.rows("wind")
 
-    @Lazy
-    def position_error(self) -> Floats:
-        """(n,) distance of the position from the reference [m]."""
-        return self._flights.columns("position_error")
+    position_error = Shown("position_error", "(n,) distance of the position from the reference [m].")
 
     @Lazy
     def estimation_error(self) -> Floats:
@@ -109,7 +77,7 @@ class Truth(Group):
             target = view.gates[every, np.maximum(view.gates_passed - 1, 0)]
             of_gate = np.linalg.norm(target - self.position, axis=1)
             distance = np.where(view.gate_passed, of_gate, distance)
-        speed = (self._flights.before.position_error - distance) / view.period
+        speed = (self._flights.before[_POSITION_ERROR] - distance) / view.period
         return np.where(view.began, 0.0, speed)
 
     @Lazy
@@ -260,25 +228,19 @@ class Estimate(Group):
 class Seen(Group):
     """What the controller goes by: the estimate, the truth, or the truth with noise."""
 
-    @Lazy
-    def position(self) -> Floats:
-        """(n, 3) in I [m]."""
-        return self._flights.rows("r_seen")
+    position = Shown("r_seen", "(n, 3) in I [m].")
 
-    @Lazy
-    def velocity(self) -> Floats:
-        """(n, 3) in I [m/s]."""
-        return self._flights.rows("v_seen")
+    velocity = Shown("v_seen", "(n, 3) in I [m/s].")
 
-    @Lazy
-    def R_BI(self) -> Floats:
-        """(n, 3, 3), v_B = R_BI v_I."""
-        return self._flights.rows("R_seen")
+    R_BI = Shown("R_seen", "(n, 3, 3), v_B = R_BI v_I.")
 
-    @Lazy
-    def body_rates(self) -> Floats:
-        """(n, 3) [rad/s]."""
-        return self._flights.rows("w_seen")
+    body_rates = Shown("w_seen", "(n, 3) [rad/s].")
+    position_error = Shown("position_gap", "(n, 3) reference less position, in B [m].")
+    velocity_error = Shown("velocity_gap", "(n, 3) reference less velocity, in B [m/s].")
+    up = Shown("up", "(n, 3) the vertical in B.")
+    heading = Shown("heading", "(n, 3) direction that body x is to point in, in B.")
+    reference_acceleration = Shown("acceleration", "(n, 3) of the reference in B [m/s^2].")
+    preview = Shown("ahead", "(n, 2, 3) the reference a little later, less the present one, in B [m].")
 
 
 class Measured(Group):

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.records import SHOWN
 from quad_gym.tasks.groups import Estimate, Measured, Seen, Shipped, Truth
-from quad_gym.tasks.lazy import Group, Lazy
-from quad_gym.tasks.reference import Series
+from quad_gym.tasks.lazy import Group, Lazy, Shown
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
+_GATE_NEXT = SHOWN["gate_next"].start
 _GROUPS = ("estimate", "seen", "measured", "state", "own_shipped")
 
 
@@ -30,7 +31,7 @@ class View(Group):
     the other states. `view.state` holds what the task keeps.
     """
 
-    __slots__ = ("_hidden", "_on_course", "_series", "_truth")
+    __slots__ = ("_hidden", "_truth")
 
     estimate: Estimate
     seen: Seen
@@ -42,8 +43,6 @@ class View(Group):
     def __init__(self, flights: "TaskBatch", state: State) -> None:
         super().__init__(flights)
         self._hidden = False
-        self._series: Series | None = None
-        self._on_course = flights.task.kind == "waypoints"
         self._truth = Truth(flights, self)
         self._keep(state)
 
@@ -66,8 +65,6 @@ class View(Group):
         mine.update(kept)
         for group in (self._truth, self.estimate, self.seen, self.measured):
             group.forget()
-        if self._on_course:
-            self._series = None
 
     def step_over(self) -> None:
         """Forget all arrays, as a step has been flown."""
@@ -77,7 +74,6 @@ class View(Group):
     def begin(self, chosen: Truths) -> None:
         """Forget what belongs to the last episodes of flights that have begun others."""
         self.forget()
-        self._series = None
         self.own_shipped.begin(chosen)
 
     def hide(self, hidden: bool) -> None:
@@ -177,10 +173,7 @@ class View(Group):
         """Of control, from step to step [s]."""
         return self._flights.period  # type: ignore[no-any-return]
 
-    @Lazy
-    def time(self) -> Floats:
-        """(n,) since the start of the episode [s]."""
-        return self._flights.columns("tick") * self._flights.sensors.imu.dt
+    time = Shown("time", "(n,) since the start of the episode [s].")
 
     @Lazy
     def step(self) -> NDArray[np.int64]:
@@ -192,74 +185,34 @@ class View(Group):
         """(n,) whether the episode has just begun, and nothing was flown in it."""
         return self._flights.began.copy()
 
-    @Lazy
-    def action(self) -> Floats:
-        """(n, 4) action of this step, in [-1, 1]."""
-        return self._flights.rows("action")
+    action = Shown("action", "(n, 4) action of this step, in [-1, 1].")
 
-    @Lazy
-    def last_action(self) -> Floats:
-        """(n, 4) the one before it."""
-        return self._flights.rows("last_action")
+    last_action = Shown("last_action", "(n, 4) the one before it.")
 
-    @property
-    def _references(self) -> Series:
-        if self._series is None:
-            self._series = Series.of(self._flights.columns, self._flights.harmonics)
-        return self._series
+    reference_position = Shown("r_ref", "(n, 3) where the vehicle should be, in I [m]; on a course, the next gate.")
 
-    @Lazy
-    def reference_position(self) -> Floats:
-        """(n, 3) where the vehicle should be, in I [m]; on a course, the next gate."""
-        return self._references.position(self.time).T
+    reference_velocity = Shown("v_ref", "(n, 3) of the reference in I [m/s].")
 
-    @Lazy
-    def _motion(self) -> tuple[Floats, Floats]:
-        return self._references.derivatives(self.time)
+    reference_acceleration = Shown("a_ref", "(n, 3) of the reference in I [m/s^2].")
 
-    @Lazy
-    def reference_velocity(self) -> Floats:
-        """(n, 3) of the reference in I [m/s]."""
-        return self._motion[0].T
+    reference_heading = Shown("x_ref", "(n, 3) horizontal direction that body x is to point in, in I.")
 
-    @Lazy
-    def reference_acceleration(self) -> Floats:
-        """(n, 3) of the reference in I [m/s^2]."""
-        return self._motion[1].T
-
-    @Lazy
-    def reference_heading(self) -> Floats:
-        """(n, 3) horizontal direction that body x is to point in, in I."""
-        velocity = self.reference_velocity.T
-        return self._references.heading(self.reference_position.T, velocity).T
-
-    @Lazy
-    def preview(self) -> Floats:
-        """(n, 2, 3) the reference a little later in I [m]; on a course, the gates after the next."""
-        if self._on_course:
-            every, ahead = np.arange(self.count), self.gates_passed[:, np.newaxis] + (1, 2)
-            last = self._flights.task.gate_count - 1
-            return self._flights.gates()[every[:, np.newaxis], np.minimum(ahead, last)]
-        later = [self.time + ahead for ahead in self._flights.task.preview]
-        r = np.stack([self._references.position(t) for t in later])
-        return np.ascontiguousarray(r.transpose(2, 0, 1))
+    preview = Shown("preview", "(n, 2, 3) the reference a little later in I [m]; on a course, the gates after the next.")
 
     @Lazy
     def gates(self) -> Floats:
         """(n, gates, 3) of a course in I [m], in order; none elsewhere."""
-        if not self._on_course:
-            return np.zeros((self.count, 0, 3))
         return self._flights.gates()
 
     @Lazy
     def gates_passed(self) -> NDArray[np.int64]:
         """(n,) in this episode."""
-        return self._flights.columns("gate_next").astype(np.int64)
+        return self._flights.shown[_GATE_NEXT].astype(np.int64)
 
     @Lazy
     def gate_passed(self) -> Truths:
         """(n,) whether this step passed a gate."""
-        return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
+        return (self.gates_passed > self._flights.before[_GATE_NEXT]) & ~self._flights.began
 
     @property
     def features(self) -> Floats:
