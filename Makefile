@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark clean
+.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark wheel clean
 
 setup: $(VENV)/.developer
 
@@ -56,6 +56,13 @@ lint: setup  ## style, types and import rules
 
 benchmark: setup  ## steps per second of every face and the cost of each part
 	$(BIN)/quad-gym benchmark --output results/benchmark
+
+wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they hold
+	rm -rf dist
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine check-wheel-contents
+	$(BIN)/python -m build --installer pip
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
 	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis

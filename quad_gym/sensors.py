@@ -47,7 +47,7 @@ class GnssReceiver(_Sensor):
     def __init__(self, params: GnssParams, rng: np.random.Generator) -> None:
         imu = ImuParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
-        self._drifts = any(params.drift_sigma_I)
+        self._drifts = params.drifts
 
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.calls import Calls
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
-from quad_gym.batch.threads import Crew, Fly, resolve_threads
+from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
-from quad_gym.kernels.batch import fly
 from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.faults import pack_faults
 from quad_gym.packing.flight import pack_latency, params_block, params_record, settings_record
 from quad_gym.packing.world import pack_options
@@ -33,15 +33,21 @@ from quad_gym.records import (
     WIDTH,
     WORK_BLOCK,
     Autoreset,
+    Call,
     Command,
     Control,
     Layout,
     Source,
     aligned_zeros,
     field_of_flights,
+    room_of,
 )
 
 _NO_BOUNDS = np.zeros(0)
+_UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
+"""Fields that are NaN at first, all others are zero."""
+_WORTH_NO_COPY = 1 << 16
+"""Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
 
 
 class FlightBatch:
@@ -179,7 +185,7 @@ class FlightBatch:
             innovations=innovations,
             lever_drawn=self.randomization.known
             and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
-            gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
+            gnss_drifts=true_sensors.drifts,
         )
         pack_options(
             self._settings[0],
@@ -194,6 +200,7 @@ class FlightBatch:
             pack_warm_start(
                 self._settings[0],
                 FlightBatch,
+                true_sensors,
                 vehicle=self.vehicle,
                 sensors=self.sensors,
                 task=self.task,
@@ -201,20 +208,25 @@ class FlightBatch:
             )
         self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
-        self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
+        self._room = room_of(used_parts(self._settings[0]))
+        self._blocks = aligned_zeros(-(-self.count // WIDTH), self._room.dtype)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
         self._blocks["idle"] = lanes >= self.count
         self._blocks["needs_reset"] = 1.0
-        for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
-            self._blocks[name] = np.nan
-        self._blocks["drawn"] = draws.low[:, np.newaxis]  # as it stays where nothing is drawn
+        for name in _UNKNOWN:
+            if self._room.holds(name):
+                self._blocks[name] = np.nan
+        self._undrawn = draws.low  # as it stays where nothing is drawn
+        if self._room.holds("drawn"):
+            self._blocks["drawn"] = draws.low[:, np.newaxis]
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
-        self._actions = np.zeros((self.count, 4))
+        padded = len(self._blocks) * WIDTH
+        self._actions = np.zeros((padded, 4))
         self._resets = np.zeros(self.count, np.uint8)
         self._begun = False
-        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
-        self._results = np.zeros((len(RESULTS), self.count))
         self._observations = np.zeros((self.count, self._low.size), np.float32)
+        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
+        self._results = np.zeros((len(RESULTS), padded))
         self._crew: Crew | None = None
 
     # ---- flying -------------------------------------------------------------------------------
@@ -280,7 +292,7 @@ class FlightBatch:
         """
         if not self._begun:
             self._require_begun()
-        self._actions[:] = self.read("action") if actions is None else actions
+        self._actions[: self.count] = self.read("action") if actions is None else actions
         return self._run(Command.STEP)
 
     def _require_begun(self) -> None:
@@ -294,43 +306,43 @@ class FlightBatch:
         self._begun = True
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        table = linked_table(self._stages)
         if self._crew is None or self._crew.process != os.getpid():
-            self._crew = Crew(self._ranges(table), len(self._blocks), self.threads)
+            self._calls = self._calls_of_threads()
+            self._crew = Crew(self._calls, len(self._blocks), self.threads)
+        self._crew.gather()
+        if self._observations.nbytes < _WORTH_NO_COPY:
+            self._crew.run(int(command))
+            return self._observations.copy()
+        self._observations = np.empty_like(self._observations)
+        self._calls.observe_into(self._observations)
         self._crew.run(int(command))
-        return self._observations.copy()
+        return self._observations
 
-    def _ranges(self, table: NDArray[Any]) -> Fly:
-        """What flies a range of blocks; it knows the arrays, not the batch, which may go."""
-        own, work = self._own, self._work
-        blocks, resets, world = self._blocks, self._resets, self._world
-        model = (self._model, self._settings)
-        after = (table, self._actions, self._low, self._high)
-        written = (self._observations, self.final_observations, self._results)
-
-        def fly_range(
-            number: int, first: int, last: int, words: NDArray[np.int64], serving: int
-        ) -> None:
-            fly(
-                blocks,
-                first,
-                last,
-                resets,
-                world,
-                own[number],
-                *model,
-                work[number],
-                *after,
-                *written,
-                words,
-                serving,
-            )
-
-        return fly_range
+    def _calls_of_threads(self) -> Calls:
+        """What the threads call the compiled code with."""
+        shared = {
+            Call.RESETS: self._resets,
+            Call.WORLD: self._world,
+            Call.MODEL: self._model,
+            Call.SETTINGS: self._settings,
+            Call.STAGES: linked_table(self._stages),
+            Call.ACTIONS: self._actions,
+            Call.LOW: self._low,
+            Call.HIGH: self._high,
+            Call.OBSERVATIONS: self._observations,
+            Call.FINAL_OBSERVATIONS: self.final_observations,
+            Call.RESULTS: self._results,
+        }
+        numbers = {
+            Call.COUNT: self.count,
+            Call.SIZE: self._low.size,
+            Call.RESULT_PITCH: self._results.strides[0],
+        }
+        return Calls(self._blocks, self._room, shared, numbers, self._own, self._work)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""
-        return self.__dict__ | {"_crew": None}
+        return self.__dict__ | {"_crew": None, "_calls": None}
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: never."""
@@ -393,18 +405,27 @@ class FlightBatch:
                 f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
                 f"got {name!r}"
             )
+        if not self._room.holds(name):
+            return self._unused(name, self.count if flights is None else len(flights))
         if flights is None:
             return field_of_flights(self._blocks, name, self.count)
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
 
+    def _unused(self, name: str, count: int) -> NDArray[Any]:
+        """A field that flights of this configuration do not use, and have no room for."""
+        if name == "drawn":
+            return np.tile(self._undrawn, (count, 1))
+        base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
+        return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
+
     @property
     def results(self) -> NDArray[np.float64]:
         """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
-        return self._results.T
+        return self._results[:, : self.count].T
 
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
-        return self._results[RESULTS.index(name)].copy()
+        return self._results[RESULTS.index(name), : self.count].copy()
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
         """What the present episodes have drawn, by name: (count,) or (count, components)."""
@@ -438,7 +459,7 @@ class FlightBatch:
         """
         fits = (
             isinstance(snapshot, np.ndarray)
-            and snapshot.dtype == FLIGHT_BLOCK
+            and snapshot.dtype == self._blocks.dtype
             and snapshot.shape == self._blocks.shape
             and np.array_equal(snapshot["idle"], self._blocks["idle"])
         )

@@ -5,17 +5,12 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register, registry
 
 from quad_gym.params import checks as check
+from quad_gym.params.task import TASKS
 
 if TYPE_CHECKING:
     from quad_gym.envs.sb3 import QuadVecEnv
 
-IDS = {
-    "QuadGym/Hover-v0": "hover",
-    "QuadGym/Circle-v0": "circle",
-    "QuadGym/Lemniscate-v0": "lemniscate",
-    "QuadGym/RandomTrajectory-v0": "random_trajectory",
-    "QuadGym/Waypoints-v0": "waypoints",
-}
+IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in TASKS}
 """The registered environments and their tasks."""
 
 

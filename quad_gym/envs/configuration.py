@@ -278,13 +278,13 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
     """Whether actions need neither a check nor clipping; NaN and infinity are not within bounds."""
-    return (
-        isinstance(actions, np.ndarray)
-        and actions.dtype.kind == "f"
-        and actions.shape == shape
-        and bool(actions.max() <= 1.0)
-        and bool(actions.min() >= -1.0)
-    )
+    if not (
+        isinstance(actions, np.ndarray) and actions.dtype.kind == "f" and actions.shape == shape
+    ):
+        return False
+    if actions.ndim == 1:  # a few numbers are sooner looked at than handed to NumPy
+        return all(-1.0 <= number <= 1.0 for number in actions.tolist())
+    return bool(actions.max() <= 1.0 and actions.min() >= -1.0)
 
 
 def named_options(options: Any) -> dict[str, Any]:

@@ -14,21 +14,10 @@ from numpy.typing import NDArray
 from quad_gym.params import checks as check
 from quad_gym.records import COLUMNS, Control, Layout, Source
 
-OBSERVATIONS = {
-    "estimate": Source.ESTIMATE,
-    "truth": Source.TRUTH,
-    "noisy": Source.NOISY,
-    "sensors": Source.SENSORS,
-}
+OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
 
-ACTIONS = {
-    "ctbr": Control.CTBR,
-    "motor": Control.MOTOR,
-    "wrench": Control.WRENCH,
-    "attitude": Control.ATTITUDE,
-    "velocity": Control.VELOCITY,
-}
+ACTIONS = {control.name.lower(): control for control in Control if control is not Control.PD}
 """Values of the keyword `action`."""
 
 LAYOUTS = {"relative": Layout.RELATIVE, "absolute": Layout.ABSOLUTE}

@@ -13,7 +13,7 @@ from quad_gym.params import portable
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.sensors import ImuParams, SensorSuite, delay_ticks
+from quad_gym.params.sensors import LEAST_DRIFT, ImuParams, SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
@@ -88,14 +88,17 @@ def params_record(
         p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
         p["baseline_length"] = portable.norm(gnss.baseline_B)
         p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
-        p["position_sigma"], p["velocity_sigma"] = gnss.believed_sigma_I, gnss.velocity_sigma or 0.0
+        p["velocity_sigma"] = gnss.velocity_sigma or 0.0
         period = 1.0 / (gnss.rate * gnss.drift_tau)
         p["drift_decay"] = math.exp(-period)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
+        period = imu.dt / gnss.drift_tau
+        p["drift_tick_decay"] = math.exp(-period)
+        believed = np.maximum(gnss.drift_sigma_I, LEAST_DRIFT)
+        p["drift_tick_drive"] = believed * math.sqrt(-math.expm1(-2.0 * period))
     else:  # the place of the start, as if its center and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
         p["gnss_sigma"] = sensors.placement.position_sigma
-        p["position_sigma"] = sensors.placement.position_sigma
         p["baseline_sigma"] = sensors.placement.heading_sigma
 
     p["heading_sigma"] = sensors.placement.heading_sigma
@@ -228,7 +231,7 @@ def settings_record(
         s["gnss_ticks"] = clocks.ticks_between("gnss")
         s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
         s["gnss_phase"] = _phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
-    s["gnss_drifts"] = gnss_drifts
+    s["gnss_drifts"], s["estimates_drift"] = gnss_drifts, sensors.drifts
     s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
     if sensors.camera is not None:
         s["camera_ticks"] = clocks.ticks_between("camera")

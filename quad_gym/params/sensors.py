@@ -15,6 +15,10 @@ from quad_gym.params.checks import Checked, Matrix, Vector
 from quad_gym.params.filter import FilterParams
 from quad_gym.records import MAX_FEATURES, MAX_UNDER_WAY
 
+LEAST_DRIFT = 1e-6
+"""Slow error that a filter assumes in an axis that has none beside one that has [m]: its covariance
+stays regular."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParams(Checked):
@@ -84,7 +88,7 @@ class GnssParams(Checked):
     of a first-order Gauss-Markov process that is zero at the start of an episode, for positions are
     relative to the place of the start [m]"""
     drift_tau: float = 60.0
-    """its correlation time [s]"""
+    """its correlation time [s]; the filter estimates the slow error, as three more states"""
     latency: float = 0.0
     """from when a measurement is taken to when it reaches the filter, with its time stamp, in whole
     ticks; at most MAX_UNDER_WAY periods [s]. Receivers take about 0.1 s: the autopilot PX4 assumes
@@ -133,18 +137,9 @@ class GnssParams(Checked):
         return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
 
     @property
-    def believed_sigma_I(self) -> np.ndarray:
-        """(3,) standard deviation of a position that the filter takes for white [m].
-
-        The slow error is counted as white noise of the same spectral density at frequency zero,
-        `sigma^2 (1 + a) / (1 - a)` with `a = exp(-1 / (rate tau))`. That is its sum over time as a
-        filter that averages for longer than tau meets it; for any shorter memory it is more than
-        there is, so that the filter errs on the side of doubt (R. G. Brown and P. Y. C. Hwang,
-        Introduction to Random Signals and Applied Kalman Filtering, on colored measurement noise).
-        """
-        a = math.exp(-1.0 / (self.rate * self.drift_tau))
-        slow = np.square(self.drift_sigma_I) * (1.0 + a) / (1.0 - a)
-        return np.sqrt(np.square(self.position_sigma_I) + slow)
+    def drifts(self) -> bool:
+        """Whether positions have a slow error."""
+        return any(self.drift_sigma_I)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,6 +274,11 @@ class SensorSuite(Checked):
             delay_ticks(
                 "CameraParams.latency", self.camera.latency, self.camera.rate, self.imu.rate
             )
+
+    @property
+    def drifts(self) -> bool:
+        """Whether GNSS positions have a slow error, so that a filter estimates it."""
+        return self.gnss is not None and self.gnss.drifts
 
     def require_filter(self) -> None:
         """Refuse a suite whose filter mistakes the samples of the IMU, or would overflow.

@@ -3,6 +3,9 @@
 As a flight is nothing but its record, snapshot, restore, pickling and copying are array copies.
 """
 
+from quad_gym.records.call import (
+    Call,
+)
 from quad_gym.records.draws import (
     COLUMNS,
     DRAWABLES,
@@ -30,6 +33,7 @@ from quad_gym.records.enums import (
 )
 from quad_gym.records.flight import (
     FLIGHT_FIELDS,
+    PARTS,
 )
 from quad_gym.records.layout import (
     FLIGHT,
@@ -39,9 +43,12 @@ from quad_gym.records.layout import (
     SETTINGS,
     WORK,
     WORK_BLOCK,
+    Room,
     aligned_zeros,
     block_dtype,
     field_of_flights,
+    offset_of,
+    room_of,
     scalar_dtype,
 )
 from quad_gym.records.params import (
@@ -76,6 +83,7 @@ from quad_gym.records.sizes import (
     SENSOR_GROUPS,
     VELOCITY_BLOCK,
     WARM_DRAWS,
+    WARM_DRIFT_DRAWS,
     WIDTH,
     Field,
 )
@@ -101,6 +109,7 @@ from quad_gym.records.streams import (
     DRAW_START,
     DRAW_VELOCITY,
     DRAW_WARM,
+    DRAW_WARM_DRIFT,
     DRAWS_OF_FAULT,
 )
 from quad_gym.records.work import (
@@ -135,6 +144,7 @@ __all__ = [
     "DRAW_START",
     "DRAW_VELOCITY",
     "DRAW_WARM",
+    "DRAW_WARM_DRIFT",
     "FAULT_KINDS",
     "FEATURE_BLOCKS",
     "FIXED",
@@ -154,6 +164,7 @@ __all__ = [
     "PARAMS",
     "PARAMS_BLOCK",
     "PARAMS_FIELDS",
+    "PARTS",
     "POSITION_BLOCK",
     "RESULTS",
     "SENSOR_GROUPS",
@@ -165,11 +176,13 @@ __all__ = [
     "UNIFORM",
     "VELOCITY_BLOCK",
     "WARM_DRAWS",
+    "WARM_DRIFT_DRAWS",
     "WIDTH",
     "WORK",
     "WORK_BLOCK",
     "WORK_FIELDS",
     "Autoreset",
+    "Call",
     "Command",
     "Control",
     "Drawable",
@@ -181,6 +194,7 @@ __all__ = [
     "Gate",
     "Layout",
     "Result",
+    "Room",
     "Source",
     "Start",
     "Supply",
@@ -188,5 +202,7 @@ __all__ = [
     "aligned_zeros",
     "block_dtype",
     "field_of_flights",
+    "offset_of",
+    "room_of",
     "scalar_dtype",
 ]

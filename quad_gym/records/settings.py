@@ -1,7 +1,7 @@
 """What a batch does, the same for all its flights."""
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import FAULT_KINDS, WARM_DRAWS, Field
+from quad_gym.records.sizes import FAULT_KINDS, WARM_DRAWS, WARM_DRIFT_DRAWS, Field
 
 # fmt: off
 SETTINGS_FIELDS = (
@@ -13,6 +13,7 @@ SETTINGS_FIELDS = (
     Field("camera_phase", (), "ticks", "from the start to the first image; -1: at random", "i8"),
     Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
     Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),
+    Field("estimates_drift", (), "0 or 1", "whether the filter has this slow error among its states", "i8"),
     Field("reuse_first_fix", (), "0 or 1", "whether the fix that starts the filter is its first measurement, too", "i8"),
     Field("warm", (), "0 or 1", "whether the filter has converged before an episode begins", "i8"),
     Field("feature_count", (), "-", "features in use", "i8"),
@@ -46,8 +47,9 @@ SETTINGS_FIELDS = (
     Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
     Field("start_velocity_variance", (3,), "m^2/s^2", "mean square of what is drawn on top of the start's velocity"),
     Field("start_tilt_variance", (3,), "rad^2", "likewise of roll and pitch, then 0"),
-    Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
-    Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
+    Field("warm_covariance", (18, 18), "mixed", "of a converged filter whose vehicle looks east; the last three: of the slow error, if it has that"),
+    Field("warm_root", (18, WARM_DRAWS + WARM_DRIFT_DRAWS), "mixed", "W with W W^T = warm_covariance; six columns from the 16th on: of the true biases; the last three: of the true slow error"),
+    Field("warm_drift_sigma", (3,), "m", "of the true slow error after the filter's convergence"),
     # late measurements
     Field("gnss_delay", (), "ticks", "until a GNSS measurement reaches the filter", "i8"),
     Field("camera_delay", (), "ticks", "until an image reaches the filter", "i8"),

@@ -29,6 +29,8 @@ MAX_OBSERVATION = 256
 """Numbers that an observation can hold."""
 WARM_DRAWS = 21
 """Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""
+WARM_DRIFT_DRAWS = 6
+"""More of them, for the slow error of GNSS positions: three, and three that make the true one."""
 FAULT_KINDS = len(FaultKind)
 """Number of kinds of faults."""
 

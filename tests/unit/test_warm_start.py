@@ -107,8 +107,6 @@ def test_the_covariance_is_that_of_a_filter_that_has_run_as_long(name):
 def test_nees_is_right_from_the_first_instant_on(name):
     """Means over 500 flights, five deviations wide; the band itself is for longer flights."""
     suite = quad_gym.sensor_suite(name)
-    if name == "consumer":  # whose filter takes the slow error for white, and errs on the safe side
-        suite = suite.replace(gnss=suite.gnss.replace(drift_sigma_I=(0.0, 0.0, 0.0)))
     batch = fly(suite, 500, filter_start="warm")
     means = [nees(batch).mean()]
     for _ in range(10):

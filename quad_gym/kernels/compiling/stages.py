@@ -22,7 +22,15 @@ from numba.extending import intrinsic
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
-from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, Start, Supply
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    PARAMS_BLOCK,
+    SETTINGS,
+    WORK_BLOCK,
+    FilterForm,
+    Start,
+    Supply,
+)
 
 
 class Stage(IntEnum):
@@ -58,6 +66,10 @@ class Stage(IntEnum):
     LOOK = auto()
     JUDGE = auto()
     OBSERVE = auto()
+    PREDICT_WITH_DRIFT = auto()
+    UPDATE_WITH_DRIFT = auto()
+    LATE_UPDATE_WITH_DRIFT = auto()
+    WARM_WITH_DRIFT = auto()
 
 
 class Source(NamedTuple):
@@ -92,6 +104,18 @@ def _late(s: Any) -> bool:
     return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
 
 
+def _rewinds(s: Any) -> bool:
+    return bool(_late(s) and s["rewinds"] > 0)
+
+
+def _with_drift(s: Any) -> bool:
+    return bool(s["run_filter"] and s["estimates_drift"])
+
+
+def _without_drift(s: Any) -> bool:
+    return bool(s["run_filter"] and not s["estimates_drift"])
+
+
 def _pad(s: Any) -> bool:
     return bool(s["pad"] and s["start"] != Start.HOVER)
 
@@ -101,10 +125,15 @@ def _drawn(s: Any) -> bool:
 
 
 SOURCES = {
-    Stage.UPDATE: Source("filter.update", "update_stage", _filter),
-    Stage.PREDICT: Source("filter.predict", "predict_stage", _filter),
+    Stage.UPDATE_WITH_DRIFT: Source("filter.update", "update_with_drift_stage", _with_drift),
+    Stage.UPDATE: Source("filter.update", "update_stage", _without_drift),
+    Stage.PREDICT_WITH_DRIFT: Source("filter.predict", "predict_with_drift_stage", _with_drift),
+    Stage.PREDICT: Source("filter.predict", "predict_stage", _without_drift),
+    Stage.LATE_UPDATE_WITH_DRIFT: Source(
+        "filter.late", "late_update_with_drift_stage", lambda s: _with_drift(s) and _rewinds(s)
+    ),
     Stage.LATE_UPDATE: Source(
-        "filter.late", "late_update_stage", lambda s: _late(s) and s["rewinds"] > 0
+        "filter.late", "late_update_stage", lambda s: _without_drift(s) and _rewinds(s)
     ),
     Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
     Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
@@ -118,7 +147,10 @@ SOURCES = {
     Stage.CONTROL: Source("vehicle.control", "control_stage", _always),
     Stage.MOVE: Source("vehicle.dynamics", "move_stage", lambda s: not _air(s)),
     Stage.BEGIN_IN_AIR: Source("vehicle.air", "begin_in_air_stage", _air),
-    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _filter(s) and s["warm"] > 0),
+    Stage.WARM_WITH_DRIFT: Source(
+        "filter.warm", "warm_with_drift_stage", lambda s: _with_drift(s) and s["warm"] > 0
+    ),
+    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_drift(s) and s["warm"] > 0),
     Stage.AVERAGE_IMU: Source(
         "sensors.measure", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
     ),
@@ -145,6 +177,20 @@ STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
 def needed_stages(settings: Any) -> frozenset[Stage]:
     """The stages that a batch of these settings (a SETTINGS record) flies through."""
     return frozenset(stage for stage, source in SOURCES.items() if source.needed(settings))
+
+
+def used_parts(settings: Any) -> frozenset[str]:
+    """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
+    watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
+    uses = {
+        "faults": _faults(settings),
+        "draws": _drawn(settings),
+        "filter": _filter(settings),
+        "watch": _filter(settings) and bool(watches),
+        "late": _late(settings),
+        "drift": _with_drift(settings),
+    }
+    return frozenset(name for name, used in uses.items() if used)
 
 
 _DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)

@@ -1,6 +1,7 @@
 """Which sensors measure at the present instant, and when they measure next."""
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.linalg import keep3, load3
 from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.measure import (
@@ -33,7 +34,8 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
     """Measure by GNSS where it is due, and the place of the start for the filter to start from."""
     due = mask & (flight.gnss_wait <= 0.0) & (settings.gnss_ticks > 0)
     if settings.gnss_drifts > 0 and not starting and any_of(due):
-        drift_gnss(flight, world, due)
+        share = minimum(flight.tick / settings.gnss_ticks, 1.0)
+        drift_gnss(flight, world, due, share)
     measured = mask if starting else due
     paired = measured
     sound = starting and not settings.warm  # the fix that starts the filter

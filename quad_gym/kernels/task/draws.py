@@ -207,10 +207,7 @@ def _impose_noise(flight, nominal, own, settings):
         own.gyro_bias_drive = own.gyro_bias_sigma * math.sqrt((1.0 - g) * (1.0 + g))
     for i in range(3):
         if settings.draw_kind[_POSITION_SIGMA + i] != FIXED:
-            white, all_of_it = nominal.gnss_sigma[i], nominal.position_sigma[i]
-            slow = (all_of_it - white) * (all_of_it + white)  # taken for white by the filter, too
             own.gnss_sigma[i] = flight.drawn[_POSITION_SIGMA + i]
-            own.position_sigma[i] = math.sqrt(own.gnss_sigma[i] * own.gnss_sigma[i] + slow)
     own.baseline_sigma = _value(flight, settings, _BASELINE_SIGMA, nominal.baseline_sigma)
     own.pixel_sigma = _value(flight, settings, _PIXEL_SIGMA, nominal.pixel_sigma)
 
