@@ -98,9 +98,7 @@ def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
     return found
 
 
-def require(
-    sound: Truths, task: Task, method: str, values: NDArray[Any], wanted: str
-) -> None:
+def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted: str) -> None:
     """Refuse values of flights that are not `sound`.
 
     Args:
@@ -135,5 +133,3 @@ def _of(name: str) -> str:
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-

@@ -61,7 +61,9 @@ class Truth(Group):
         """(n, 3) velocity of the air in I [m/s]."""
         return self._flights.rows("wind")
 
-    position_error = Shown("position_error", "(n,) distance of the position from the reference [m].")
+    position_error = Shown(
+        "position_error", "(n,) distance of the position from the reference [m]."
+    )
 
     @Lazy
     def estimation_error(self) -> Floats:
@@ -99,7 +101,9 @@ class Truth(Group):
         X_B = (R_BI @ (self._view.features - r)[..., np.newaxis])[..., 0] - p["camera"]
         X_C = (p["R_CB"] @ X_B[..., np.newaxis])[..., 0]
         in_front = X_C[..., 2] > 1e-9
-        pixels = X_C[..., :2] * (p["focal_length"] / np.where(in_front, X_C[..., 2], 1.0))[..., None]
+        pixels = (
+            X_C[..., :2] * (p["focal_length"] / np.where(in_front, X_C[..., 2], 1.0))[..., None]
+        )
         return in_front & (np.abs(pixels) <= p["half_image"]).all(axis=-1)
 
     @Lazy
@@ -240,7 +244,9 @@ class Seen(Group):
     up = Shown("up", "(n, 3) the vertical in B.")
     heading = Shown("heading", "(n, 3) direction that body x is to point in, in B.")
     reference_acceleration = Shown("acceleration", "(n, 3) of the reference in B [m/s^2].")
-    preview = Shown("ahead", "(n, 2, 3) the reference a little later, less the present one, in B [m].")
+    preview = Shown(
+        "ahead", "(n, 2, 3) the reference a little later, less the present one, in B [m]."
+    )
 
 
 class Measured(Group):

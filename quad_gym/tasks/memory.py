@@ -26,7 +26,8 @@ class ReadableBatch(FlightBatch):
         """(SHOWN_SIZE, n) the numbers of `quad_gym.records.SHOWN` at the present instant."""
         if self._shown is None:
             shown = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH))
-            show(self._blocks, self._settings, self._model, self._work[0], shown)
+            calls = getattr(self, "_calls", None) or self._calls_of_threads()
+            show(calls.words, shown)
             self._shown = shown[:, : self.count]
             self._shown.flags.writeable = False
         return self._shown

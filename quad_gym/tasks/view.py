@@ -189,15 +189,22 @@ class View(Group):
 
     last_action = Shown("last_action", "(n, 4) the one before it.")
 
-    reference_position = Shown("r_ref", "(n, 3) where the vehicle should be, in I [m]; on a course, the next gate.")
+    reference_position = Shown(
+        "r_ref", "(n, 3) where the vehicle should be, in I [m]; on a course, the next gate."
+    )
 
     reference_velocity = Shown("v_ref", "(n, 3) of the reference in I [m/s].")
 
     reference_acceleration = Shown("a_ref", "(n, 3) of the reference in I [m/s^2].")
 
-    reference_heading = Shown("x_ref", "(n, 3) horizontal direction that body x is to point in, in I.")
+    reference_heading = Shown(
+        "x_ref", "(n, 3) horizontal direction that body x is to point in, in I."
+    )
 
-    preview = Shown("preview", "(n, 2, 3) the reference a little later in I [m]; on a course, the gates after the next.")
+    preview = Shown(
+        "preview",
+        "(n, 2, 3) the reference a little later in I [m]; on a course, the gates after the next.",
+    )
 
     @Lazy
     def gates(self) -> Floats:
