@@ -61,6 +61,11 @@ from quad_gym.records.results import (
 from quad_gym.records.settings import (
     SETTINGS_FIELDS,
 )
+from quad_gym.records.shown import (
+    SHOWN,
+    SHOWN_SHAPES,
+    SHOWN_SIZE,
+)
 from quad_gym.records.sizes import (
     BASELINE_BLOCK,
     DELAY_SLOTS,
@@ -175,6 +180,9 @@ __all__ = [
     "SENSOR_GROUPS",
     "SETTINGS",
     "SETTINGS_FIELDS",
+    "SHOWN",
+    "SHOWN_SHAPES",
+    "SHOWN_SIZE",
     "UNIFORM",
     "VELOCITY_BLOCK",
     "WARM_DRAWS",
