@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.starts import checked_mask, checked_start
 from quad_gym.params import checks as check
-from quad_gym.records import SHOWN_SIZE, WIDTH, Autoreset, Result
+from quad_gym.records import WIDTH, Autoreset, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.endings import endings
@@ -27,6 +27,13 @@ _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
 _STARTS: dict[str, tuple[int, ...]] = {"position": (3,), "velocity": (3,), "yaw": ()}
 """What `reset` may return, with the shapes of its rows."""
 _TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
+
+
+class Before(NamedTuple):
+    """What flights were like before a step."""
+
+    position_error: Floats
+    gates_passed: Floats
 
 
 class Part(NamedTuple):
@@ -84,7 +91,9 @@ class TaskBatch(ReadableBatch):
         self._nobody = np.zeros(self.count, bool)
         self._failed = self._nobody.copy()
         self.began, self.began_some = self._nobody, False
-        self.before = np.zeros((SHOWN_SIZE, self.count))
+        self.before = Before(np.zeros(self.count), np.zeros(self.count))
+        bounds = [(part.low, part.high) for part in self._parts.values() for _ in range(part.size)]
+        self._own_low, self._own_high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
         self._finals = np.zeros((self.count, self._size_of_observation()), np.float32)
         self._view: View | None = None
 
@@ -131,7 +140,8 @@ class TaskBatch(ReadableBatch):
             )
         if not self._begun:
             self._require_begun()
-        self.before, returns = self.shown, self.columns("episode_return")
+        self.before = Before(self.columns("position_error"), self.columns("gate_next"))
+        returns = self.columns("episode_return")
         began = self.columns("needs_reset") > 0.0 if self._in_kernel else self._nobody
         shipped = super().step(actions)
         try:
@@ -142,9 +152,8 @@ class TaskBatch(ReadableBatch):
 
     def _after_step(self, shipped: Singles, began: Truths, returns: Floats) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
-        self.show_anew()
         self.view.step_over()
-        self.began, self.began_some = began, bool(began.any())
+        self.began, self.began_some = began, np.count_nonzero(began) > 0
         if self.began_some:
             shipped = self._begin(began, {}, shipped)
         if "update" in self.methods:
@@ -168,7 +177,6 @@ class TaskBatch(ReadableBatch):
 
     def _begin(self, chosen: Truths, given: Start, shipped: Singles) -> Singles:
         """Ask the task about episodes that the kernels have begun; return what these observe."""
-        self.show_anew()
         self.began, self.began_some = chosen, True
         self._state.begin(chosen)
         self.view.begin(chosen)
@@ -188,7 +196,6 @@ class TaskBatch(ReadableBatch):
         self._blocks["instant"][again] -= np.uint64(1)
         self._blocks["episode"][again] -= 1.0
         shipped = super().reset(mask=chosen, **start)
-        self.show_anew()
         self.view.forget()
         return shipped
 
@@ -298,23 +305,27 @@ class TaskBatch(ReadableBatch):
         found = self.ask_parts()
         if found.keys() != self._parts.keys():
             self._refuse_parts(found)
-        own = []
-        for name, part in self._parts.items():
-            values = found[name]
-            if values.shape[1] != part.size:
-                self._refuse_parts(found)
-            flat = values.ravel()
-            if not np.isfinite(np.dot(flat, flat)):
-                sound = np.isfinite(values).all(axis=1)
+        if any(found[name].shape[1] != part.size for name, part in self._parts.items()):
+            self._refuse_parts(found)
+        own = [found[name] for name in self._parts]
+        kept, rest = shipped[:, self._kept], shipped[:, self._split :]
+        parts = [*([kept] if kept.shape[1] else []), *own, *([rest] if rest.shape[1] else [])]
+        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        ours = joined[:, kept.shape[1] : joined.shape[1] - rest.shape[1]]
+        flat = joined.ravel()
+        if not np.isfinite(np.dot(flat, flat)):
+            self._require_finite(found, ours)
+        np.clip(ours, self._own_low, self._own_high, out=ours)
+        return joined
+
+    def _require_finite(self, found: Mapping[str, NDArray[Any]], ours: Singles) -> None:
+        """Refuse what `observe` returned if it is not finite; of flights that are no more, clear it."""
+        for name, values in found.items():
+            sound = np.isfinite(values).all(axis=1)
+            if not sound.all():
                 sound |= ~self.finite(~sound)
                 answers.require(sound, self.custom, "observe", values, f"finite {name!r}")
-                values = np.nan_to_num(values, nan=part.low)
-            own.append(np.minimum(np.maximum(values, part.low), part.high))
-        if self._split == shipped.shape[1] and self.custom.replaces_observation:
-            joined = own
-        else:
-            joined = [shipped[:, self._kept], *own, shipped[:, self._split :]]
-        return np.concatenate(joined, axis=1, dtype=np.float32, casting="same_kind")
+        np.nan_to_num(ours, copy=False)
 
     def _refuse_parts(self, found: Mapping[str, NDArray[Any]]) -> None:
         sizes = {name: part.shape[1] for name, part in found.items()}
@@ -367,12 +378,11 @@ class TaskBatch(ReadableBatch):
         if len(self._state):
             self._state.read_from(snapshot["state"])
         self._failed = self._nobody.copy()
-        self.show_anew()
         self._view = None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads and the view, which a copy makes anew."""
-        return super().__getstate__() | {"_view": None, "_shown": None}
+        return super().__getstate__() | {"_view": None}
 
     # ---- calling the task ---------------------------------------------------------------------
 

@@ -219,7 +219,7 @@ class View(Group):
     @Lazy
     def gate_passed(self) -> Truths:
         """(n,) whether this step passed a gate."""
-        return (self.gates_passed > self._flights.before[_GATE_NEXT]) & ~self._flights.began
+        return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
 
     @property
     def features(self) -> Floats:
