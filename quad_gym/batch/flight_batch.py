@@ -1,5 +1,6 @@
 """`FlightBatch`: many flights of one configuration, flown together."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +16,13 @@ from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.faults import pack_faults
-from quad_gym.packing.flight import pack_latency, params_block, params_record, settings_record
+from quad_gym.packing.flight import (
+    pack_imperfections,
+    pack_latency,
+    params_block,
+    params_record,
+    settings_record,
+)
 from quad_gym.packing.world import pack_options
 from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
@@ -29,6 +36,7 @@ from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
     COLUMNS,
     FLIGHT_BLOCK,
+    MAX_ACTION_DELAY,
     RESULTS,
     WIDTH,
     WORK_BLOCK,
@@ -68,6 +76,8 @@ class FlightBatch:
         control: What an action means; `Control.PD` flies by itself.
         control_rate: Actions per second, a whole division of the IMU rate [Hz].
         substeps: Runge-Kutta steps in a tick.
+        action_delay: How much later than commanded an action is carried out, at most
+            MAX_ACTION_DELAY, in whole ticks [control steps]. Before, a vehicle hovers.
         layout: What an observation holds.
         include_covariance: Whether an observation holds the filter's standard deviations.
         privileged: Whether an observation ends with the truth.
@@ -105,6 +115,7 @@ class FlightBatch:
         control: Control = Control.PD,
         control_rate: float | None = None,
         substeps: int = 1,
+        action_delay: float = 0.0,
         layout: Layout = Layout.RELATIVE,
         include_covariance: bool = False,
         privileged: bool = False,
@@ -165,10 +176,19 @@ class FlightBatch:
         if run_filter:
             self.sensors.require_filter()
 
-        draws = DrawingTable(self.randomization, true_vehicle, true_sensors, self.world)
+        self.action_delay = check.number(
+            "action_delay", action_delay, least=0.0, most=float(MAX_ACTION_DELAY)
+        )
+        draws = DrawingTable(
+            self.randomization, true_vehicle, true_sensors, self.world, self.action_delay
+        )
+        longest_delay = math.ceil(draws.high[COLUMNS["action_delay"]][0])
+        if longest_delay > 0 and self.control is Control.PD:
+            raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
+        true["action_delay"] = self.action_delay
         self._model, self._world = params_block(model), params_block(true)
         self._own = [self._world.copy() for _ in range(self.threads)]
         self._settings = settings_record(
@@ -194,8 +214,10 @@ class FlightBatch:
             known=self.randomization.known,
             limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
         )
+        self._settings["action_delays"] = longest_delay
         pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
         pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors.estimator)
+        pack_imperfections(self._settings[0], true_sensors)
         if run_filter and filter_start == "warm":
             pack_warm_start(
                 self._settings[0],

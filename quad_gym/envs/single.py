@@ -152,6 +152,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
             no GNSS; "warm": it has been running for 10 s before the episode and has converged.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
+        action_delay: How much later than commanded the vehicle carries out an action, in control
+            steps (whole ticks), at most 10; 0 by default. Until the first action arrives it carries
+            out zeros, which hover. `last_action` in the observation is the commanded one.
         imu_rate: In place of the suite's [Hz].
         gnss_rate: In place of the suite's [Hz].
         camera_rate: In place of the suite's [Hz].

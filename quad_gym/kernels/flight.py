@@ -15,6 +15,8 @@ from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Start, Supply
 
+_DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
+_DELAY_ACTION = int(Stage.DELAY_ACTION)
 _CONTROL, _SUPPLY = int(Stage.CONTROL), int(Stage.SUPPLY)
 _MOVE, _MOVE_IN_AIR = int(Stage.MOVE), int(Stage.MOVE_IN_AIR)
 _REST_ON_PAD = int(Stage.REST_ON_PAD)
@@ -90,6 +92,8 @@ def tick(flight, world, model, settings, work, stages, last):
     """Fly one tick; `last`: whether it is the last one of a control period."""
     everyone = flight.tick >= 0.0
     work.mask = 1.0
+    if settings.action_delays > 0:
+        call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 0)
     call_stage(stages, _CONTROL, flight, world, model, settings, work, 0)
     if settings.supply != Supply.NOMINAL:
         call_stage(stages, _SUPPLY, flight, world, model, settings, work, 0)
@@ -106,6 +110,8 @@ def tick(flight, world, model, settings, work, stages, last):
     if settings.run_filter:
         if settings.imu_averages:
             call_stage(stages, _AVERAGE_IMU, flight, world, model, settings, work, 0)
+            if settings.imu_errs + settings.imu_vibrates > 0:
+                call_stage(stages, _DISTURB_IMU, flight, world, model, settings, work, 0)
             if settings.faults:
                 call_stage(stages, _SATURATE_IMU, flight, world, model, settings, work, 0)
         predict = _PREDICT_WITH_DRIFT if settings.estimates_drift else _PREDICT
@@ -134,9 +140,13 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.randomized:
         call_stage(stages, _DRAW, flight, world, nominal, settings, work, 0)
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
+    if settings.action_delays > 0:
+        call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
     if settings.gnss_delay + settings.camera_delay > 0:
         call_stage(stages, _BEGIN_LATE, flight, world, model, settings, work, 0)
     call_stage(stages, _BEGIN, flight, world, model, settings, work, 0)
+    if settings.run_filter and settings.imu_errs + settings.heading_errs > 0:
+        call_stage(stages, _BEGIN_IMPERFECT, flight, world, model, settings, work, 0)
     if settings.air:
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:

@@ -46,8 +46,35 @@ class ImuParams(Checked):
     """correlation time [s]; laboratory"""
     gyro_bias_tau: float = 100.0
     """correlation time [s]; laboratory"""
+    accel_scale_sigma: float = 0.0
+    """standard deviation of each axis' scale factor error, constant in an episode [-]. Errors of
+    scale and alignment act on what differs from rest on level ground, where biases are defined:
+    `(I + D) (f - g e3)`, `(I + D) w`, with the scale errors on the diagonal of D"""
+    gyro_scale_sigma: float = 0.0
+    """likewise [-]"""
+    accel_misalignment_sigma: float = 0.0
+    """standard deviation of each entry of D off its diagonal: axes that are not orthogonal, and the
+    sensor's turn in its housing [rad]"""
+    gyro_misalignment_sigma: float = 0.0
+    """likewise [rad]"""
+    accel_vibration: float = 0.0
+    """standard deviation that the rotors' vibration adds to a sample in hover, per axis, after the
+    IMU's own filters [m/s^2]. It is white and grows with the square of the rotor speeds, as
+    the forces of unbalanced masses do"""
+    gyro_vibration: float = 0.0
+    """likewise [rad/s]"""
 
     def __post_init__(self) -> None:
+        self._check(
+            check.number,
+            "accel_scale_sigma",
+            "gyro_scale_sigma",
+            "accel_misalignment_sigma",
+            "gyro_misalignment_sigma",
+            least=0.0,
+            most=0.1,
+        )
+        self._check(check.number, "accel_vibration", "gyro_vibration", least=0.0)
         self._check(check.positive, "rate", least=1.0, most=1e6)
         self._check(check.positive, "accel_bias_tau", "gyro_bias_tau")
         self._check(check.positive, "accel_noise_density", "gyro_noise_density")
@@ -59,6 +86,37 @@ class ImuParams(Checked):
     def dt(self) -> float:
         """The tick: time between two samples [s]."""
         return 1.0 / self.rate
+
+    @property
+    def errs(self) -> bool:
+        """Whether there are errors of scale or alignment."""
+        return any(
+            (
+                self.accel_scale_sigma,
+                self.gyro_scale_sigma,
+                self.accel_misalignment_sigma,
+                self.gyro_misalignment_sigma,
+            )
+        )
+
+    @property
+    def vibrates(self) -> bool:
+        """Whether the rotors' vibration reaches the IMU."""
+        return self.accel_vibration > 0.0 or self.gyro_vibration > 0.0
+
+    @property
+    def believed_accel_sigma(self) -> float:
+        """Standard deviation of a sample that the filter takes for white [m/s^2].
+
+        It counts the vibration at the rotor speeds of hovering, which those of gentle flight hardly
+        leave: a thrust 10 % larger vibrates 10 % more.
+        """
+        return math.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
+
+    @property
+    def believed_gyro_sigma(self) -> float:
+        """Likewise of the gyro [rad/s]."""
+        return math.hypot(self.gyro_noise_density / math.sqrt(self.dt), self.gyro_vibration)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +135,10 @@ class GnssParams(Checked):
     """(3,) standard deviation east, north, up [m]; laboratory (RTK)"""
     baseline_sigma: float = 0.05
     """standard deviation of the baseline's direction [rad]; laboratory"""
+    heading_error_sigma: float = 0.0
+    """standard deviation of an error that the baseline has in common with all others of its
+    episode: a turn about the body z axis, as unequal antennas, their mounting, or a compass among
+    iron cause it [rad]"""
     velocity_sigma: float | None = None
     """standard deviation of the velocity by Doppler shifts, per axis [m/s]; None: not measured, as
     in the laboratory"""
@@ -96,6 +158,7 @@ class GnssParams(Checked):
 
     def __post_init__(self) -> None:
         self._check(check.number, "latency", least=0.0)
+        self._check(check.number, "heading_error_sigma", least=0.0, most=1.0)
         self._check(check.positive, "rate", "baseline_sigma", "drift_tau")
         self._check(check.phase, "phase")
         if self.velocity_sigma is not None:
@@ -141,6 +204,26 @@ class GnssParams(Checked):
         """Whether positions have a slow error."""
         return any(self.drift_sigma_I)
 
+    @property
+    def first_baseline_sigma(self) -> float:
+        """Standard deviation of the direction of one baseline [rad]."""
+        return math.hypot(self.baseline_sigma, self.heading_error_sigma)
+
+    @property
+    def believed_baseline_sigma(self) -> float:
+        """Standard deviation of the direction of a baseline that the filter takes for white [rad].
+
+        Averages of white noise shrink, a constant error stays. It is counted so often as there are
+        measurements in `HEADING_MEMORY`: the heading is then hardly better known after that time
+        than after the first baseline, unless something else tells it.
+        """
+        count = max(self.rate * HEADING_MEMORY, 1.0)
+        return math.hypot(self.baseline_sigma, math.sqrt(count) * self.heading_error_sigma)
+
+
+HEADING_MEMORY = 60.0
+"""For how long of a flight a filter takes the constant error of a baseline for new [s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraParams(Checked):
@@ -168,9 +251,21 @@ class CameraParams(Checked):
     latency: float = 0.0
     """from when an image is taken to when its features reach the filter, with its time stamp, in
     whole ticks; at most MAX_UNDER_WAY periods [s]"""
+    max_range: float = math.inf
+    """distance beyond which a feature is too small to be found [m]"""
+    exposure: float = 0.0
+    """time over which an image is exposed: turning at w smears a feature over `focal_length w
+    exposure` pixels, in which it is found anywhere; the filter knows how fast it turns [s]"""
+    ground_hides: bool = False
+    """whether the ground (`WorldParams.ground_height`) hides features below it, and all of them
+    from a camera below it"""
 
     def __post_init__(self) -> None:
         self._check(check.number, "latency", least=0.0)
+        self._check(check.number, "exposure", least=0.0, most=1.0)
+        check.flag("CameraParams.ground_hides", self.ground_hides)
+        if self.max_range != math.inf:
+            self._check(check.positive, "max_range")
         self._check(check.phase, "phase")
         self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
         self._check(check.vector, "position_B", "attitude", length=3)
@@ -187,6 +282,16 @@ class CameraParams(Checked):
                 f"CameraParams.features_I must hold at most {MAX_FEATURES} features, "
                 f"got {len(self.features_I)}"
             )
+
+    @property
+    def limited(self) -> bool:
+        """Whether range, blur or ground limit what is seen."""
+        return self.max_range < math.inf or self.exposure > 0.0 or self.ground_hides
+
+    @property
+    def blur(self) -> float:
+        """Standard deviation of a place in a smear, per body rate [pixels/(rad/s)]."""
+        return self.focal_length * self.exposure / math.sqrt(12.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,6 +484,29 @@ class SensorSuite(Checked):
         return self.replace(  # type: ignore[no-any-return]
             imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params
         )
+
+    def simplified(self) -> "SensorSuite":
+        """A copy whose measurements arrive at once, with white noise, bias and drift alone.
+
+        To tell what latency, vibration, misalignment, constant heading errors, blur, range and
+        ground do to a flight. White noise stays as it is.
+        """
+        gnss, camera = self.gnss, self.camera
+        if gnss is not None:
+            gnss = gnss.replace(latency=0.0, heading_error_sigma=0.0)
+        if camera is not None:
+            camera = camera.replace(
+                latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False
+            )
+        imu = self.imu.replace(
+            accel_scale_sigma=0.0,
+            gyro_scale_sigma=0.0,
+            accel_misalignment_sigma=0.0,
+            gyro_misalignment_sigma=0.0,
+            accel_vibration=0.0,
+            gyro_vibration=0.0,
+        )
+        return self.replace(imu=imu, gnss=gnss, camera=camera)  # type: ignore[no-any-return]
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """A copy whose white noise is `factor` times as large, as a filter of this suite knows."""

@@ -4,6 +4,7 @@ from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
     DELAY_SLOTS,
     FAULT_KINDS,
+    MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_GATES,
@@ -31,6 +32,11 @@ _FAULT_FIELDS = (
 _DRAW_FIELDS = (
     # parameters
     Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
+)
+_ACTION_FIELDS = (
+    # actions under way
+    Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first"),
+    Field("delayed_action", (4,), "-", "the action that the vehicle carries out"),
 )
 _CORE_FIELDS = (
     # what every tick reads and writes: the truth, clocks, the random stream
@@ -129,6 +135,12 @@ _FILTER_FIELDS = (
     Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
     Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
 )
+_ERROR_FIELDS = (
+    # errors of sensors that last an episode
+    Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
+    Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
+    Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
+)
 _WATCH_FIELDS = (
     # the innovations of the last measurements, one by one: position, baseline, velocity, features
     Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
@@ -167,8 +179,10 @@ _DRIFT_FIELDS = (
 PARTS = (
     ("faults", _FAULT_FIELDS),
     ("draws", _DRAW_FIELDS),
+    ("actions", _ACTION_FIELDS),
     ("core", _CORE_FIELDS),
     ("filter", _FILTER_FIELDS),
+    ("errors", _ERROR_FIELDS),
     ("watch", _WATCH_FIELDS),
     ("late", _LATE_FIELDS),
     ("drift", _DRIFT_FIELDS),

@@ -22,6 +22,7 @@ SETTINGS_FIELDS = (
     Field("source", (), "-", "what the controller sees, see Source", "i8"),
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
     Field("control", (), "-", "what the action means, see Control", "i8"),
+    Field("action_delays", (), "steps", "the longest delay of an action, rounded up; 0: none", "i8"),
     Field("task", (), "-", "see Task", "i8"),
     Field("harmonics", (), "-", "terms of the reference's series in use", "i8"),
     Field("layout", (), "-", "of the observation, see Layout", "i8"),
@@ -55,6 +56,13 @@ SETTINGS_FIELDS = (
     Field("gnss_delay", (), "ticks", "until a GNSS measurement reaches the filter", "i8"),
     Field("camera_delay", (), "ticks", "until an image reaches the filter", "i8"),
     Field("rewinds", (), "0 or 1", "whether the filter goes back to time stamps", "i8"),
+    # what sensors do wrong
+    Field("imu_errs", (), "0 or 1", "whether the IMU has errors of scale or alignment", "i8"),
+    Field("imu_vibrates", (), "0 or 1", "whether the rotors' vibration reaches the IMU", "i8"),
+    Field("heading_errs", (), "0 or 1", "whether baselines have a constant error", "i8"),
+    Field("camera_limited", (), "0 or 1", "whether range, blur or ground limit what is seen", "i8"),
+    Field("camera_blurs", (), "0 or 1", "whether images are blurred", "i8"),
+    Field("ground_hides", (), "0 or 1", "whether the ground hides features", "i8"),
     # the world, and what is drawn
     Field("air", (), "0 or 1", "whether the air does more than in a calm world", "i8"),
     Field("gusts", (), "0 or 1", "whether there are gusts", "i8"),

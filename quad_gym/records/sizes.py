@@ -15,6 +15,8 @@ MAX_UNDER_WAY = 2
 """Longest latency of a sensor, in its periods: as many measurements can be in transit."""
 DELAY_SLOTS = MAX_UNDER_WAY + 1
 """Measurements that wait: at a latency of MAX_UNDER_WAY periods one is taken as another arrives."""
+MAX_ACTION_DELAY = 10
+"""Longest delay of an action, in control steps."""
 MAX_BLOCKS = 3 + MAX_FEATURES
 """Blocks of the stacked measurement: antenna position, baseline, velocity, features."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS

@@ -85,7 +85,7 @@ def test_each_correction_has_its_share():
 def test_errors_of_prediction_alone_are_as_claimed(kind):
     """10,000 runs of IMU alone: the covariance within 5 % of its diagonal."""
     runs = 10_000
-    sensors = quad_gym.sensor_suite("rtk")
+    sensors = quad_gym.sensor_suite("rtk").simplified()
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
     batch = FlightBatch(
         runs,

@@ -37,6 +37,7 @@ class Stage(IntEnum):
     """The stages, by their places in the table of addresses."""
 
     CONTROL = 0
+    DELAY_ACTION = auto()
     SUPPLY = auto()
     MOVE = auto()
     MOVE_IN_AIR = auto()
@@ -45,6 +46,10 @@ class Stage(IntEnum):
     DRIFT_BIASES = auto()
     AVERAGE_IMU = auto()
     SAMPLE = auto()
+    BEGIN_IMPERFECT = auto()
+    DISTURB_IMU = auto()
+    TURN_BASELINE = auto()
+    LIMIT_CAMERA = auto()
     BEGIN_FAULTS = auto()
     ADVANCE_FAULTS = auto()
     MEET_ROTORS = auto()
@@ -103,6 +108,14 @@ def _corrupts(s: Any) -> bool:
 
 def _late(s: Any) -> bool:
     return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
+
+
+def _imu_disturbed(s: Any) -> bool:
+    return bool(s["run_filter"] and s["imu_errs"] + s["imu_vibrates"] > 0)
+
+
+def _lasting(s: Any) -> bool:
+    return bool(s["run_filter"] and s["imu_errs"] + s["heading_errs"] > 0)
 
 
 def _rewinds(s: Any) -> bool:
@@ -167,6 +180,17 @@ SOURCES = {
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
     Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),
+    Stage.BEGIN_IMPERFECT: Source("sensors.imperfect", "begin_imperfect_stage", _lasting),
+    Stage.DISTURB_IMU: Source("sensors.imperfect", "disturb_imu_stage", _imu_disturbed),
+    Stage.TURN_BASELINE: Source(
+        "sensors.imperfect", "turn_baseline_stage", lambda s: _filter(s) and s["heading_errs"] > 0
+    ),
+    Stage.LIMIT_CAMERA: Source(
+        "sensors.imperfect", "limit_camera_stage", lambda s: _filter(s) and s["camera_limited"] > 0
+    ),
+    Stage.DELAY_ACTION: Source(
+        "vehicle.delay", "delay_action_stage", lambda s: s["action_delays"] > 0
+    ),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
 }
@@ -188,6 +212,8 @@ def used_parts(settings: Any) -> frozenset[str]:
         "faults": _faults(settings),
         "draws": _drawn(settings),
         "filter": _filter(settings),
+        "actions": bool(settings["action_delays"] > 0),
+        "errors": _lasting(settings),
         "watch": _filter(settings) and bool(watches),
         "late": _late(settings),
         "drift": _with_drift(settings),

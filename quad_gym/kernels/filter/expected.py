@@ -3,6 +3,8 @@
 See `update.py` for the triples, and `predict.py` for the form of the unscented transform.
 """
 
+import math
+
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import E, R, V
@@ -72,7 +74,7 @@ def compare_center(flight, p, work, feature_count, use_position, use_baseline, u
         set_triple(h, k, has, u_I)
         measured = apply(R_IG, load3(flight.gnss_baseline))
         set_triple(z, k, has, scale(1.0 / norm(measured), measured))
-        variance = p.baseline_sigma * p.baseline_sigma
+        variance = p.baseline_noise * p.baseline_noise
         _set_noise(Rz, k, has, direction_noise(u_I, variance, p.direction_floor))
         k += 3
     if use_velocity:
@@ -87,6 +89,8 @@ def compare_center(flight, p, work, feature_count, use_position, use_baseline, u
         noise = add_to_diagonal((nothing, nothing, nothing), variance)
         _set_noise(Rz, k, has, noise)
         k += 3
+    w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
+    pixel_sigma = math.sqrt(p.pixel_sigma * p.pixel_sigma + p.blur * p.blur * dot(w_B, w_B))
     for i in range(feature_count):
         has = _has_feature(flight, i)
         if any_of(has):
@@ -104,7 +108,7 @@ def compare_center(flight, p, work, feature_count, use_position, use_baseline, u
             length = norm(ray_C)
             u_B = apply_transposed(R_CB, scale(1.0 / length, ray_C))
             set_triple(z, k, has, u_B)
-            sigma = p.pixel_sigma * pixel / length
+            sigma = pixel_sigma * pixel / length
             predicted = scale(work.inverse_distance[i], to_feature)
             u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
             noise = direction_noise(u_B, sigma * sigma, p.direction_floor)

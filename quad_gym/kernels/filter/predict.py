@@ -176,7 +176,7 @@ def _turned_angles(L, j, full, half, dt):
 @kernel
 def _add_gyro_noise(P, p, R_BI, f_B, half):
     """Add the gyro's white noise to P; half of the angle by which it errs turns the force."""
-    dt, sigma = p.dt, p.gyro_sigma
+    dt, sigma = p.dt, p.gyro_noise
     zero = 0.0 * dt
     axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
     for axis in axes:
@@ -223,9 +223,9 @@ def _sum_moments(flight, p, work, mean_a, mean_e, form):
     dt = p.dt
     half_dt2 = 0.5 * dt * dt
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
-    accel_variance = p.accel_sigma * p.accel_sigma
+    accel_variance = p.accel_noise * p.accel_noise
     extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
-    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
+    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_noise) * (dt * p.gyro_noise)
 
     for i in range(0, 9, 3):
         store_block(P, i, i, sum_of_squares(F, i, 15))
