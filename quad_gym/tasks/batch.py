@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.starts import checked_mask, checked_start
+from quad_gym.batch.starts import checked_mask
 from quad_gym.params import checks as check
 from quad_gym.records import WIDTH, Autoreset, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.endings import endings
 from quad_gym.tasks.memory import ReadableBatch
+from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import METHODS, Task, TaskError, label
 from quad_gym.tasks.view import View
@@ -21,11 +22,8 @@ from quad_gym.tasks.view import View
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Truths = NDArray[np.bool_]
-Start = dict[str, Any]
 
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
-_STARTS: dict[str, tuple[int, ...]] = {"position": (3,), "velocity": (3,), "yaw": ()}
-"""What `reset` may return, with the shapes of its rows."""
 _TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
 
 
@@ -153,7 +151,7 @@ class TaskBatch(ReadableBatch):
     def _after_step(self, shipped: Singles, began: Truths, returns: Floats) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
         self.view.step_over()
-        self.began, self.began_some = began, np.count_nonzero(began) > 0
+        self.began, self.began_some = began, bool(np.count_nonzero(began))
         if self.began_some:
             shipped = self._begin(began, {}, shipped)
         if "update" in self.methods:
@@ -165,9 +163,9 @@ class TaskBatch(ReadableBatch):
             self.view.own_shipped.read()
         self._write(judged)
         if self._same_step:
-            over = self.judged_over
-            if np.count_nonzero(over):
-                over = over.any(axis=0)
+            ends = self.judged_over
+            if np.count_nonzero(ends):
+                over = ends[0] | ends[1]
                 self._finals[over] = observations[over]
                 shipped = self._begin(over, {}, super().reset(mask=over))
                 observations[over] = self._observed(shipped)[over]
@@ -185,7 +183,9 @@ class TaskBatch(ReadableBatch):
         with self._writing(chosen, _RESET_DRAWS) as rng:
             start = answers.ask(self.custom, "reset", self.view, rng)
         if start is not None:
-            shipped = self._begin_again(chosen, self._checked_start(start, chosen, given))
+            shipped = self._begin_again(
+                chosen, starts(self.custom, start, chosen, given, self.task)
+            )
         return shipped
 
     def _begin_again(self, chosen: Truths, start: Start) -> Singles:
@@ -198,35 +198,6 @@ class TaskBatch(ReadableBatch):
         shipped = super().reset(mask=chosen, **start)
         self.view.forget()
         return shipped
-
-    def _checked_start(self, start: Any, chosen: Truths, given: Start) -> Start:
-        """Start values of a task's reset, beside those that a caller has given."""
-        task = self.custom
-        if not isinstance(start, Mapping) or not set(start) <= set(_STARTS):
-            raise TaskError(
-                f"{label(task)}.reset must return None or start values by name, of "
-                f"{', '.join(_STARTS)}; got {start!r}"
-            )
-        found = dict(given)
-        for name, value in start.items():
-            values = answers.numbers(task, "reset", value, name)
-            shape = (self.count, *_STARTS[name])
-            if values.shape not in (shape, _STARTS[name]):
-                raise TaskError(
-                    f"{label(task)}.reset must return shape {shape} for {name!r}, "
-                    f"got {values.shape}"
-                )
-            rows = np.zeros(shape)
-            rows[chosen] = np.broadcast_to(values, shape)[chosen]
-            sound = np.isfinite(rows).reshape(self.count, -1).all(axis=1)
-            answers.require(sound, task, "reset", rows, f"finite numbers for {name!r}")
-            if given.get(name) is None:
-                found[name] = rows
-        try:
-            checked_start(self.count, **found, task=self.task)
-        except ValueError as error:
-            raise TaskError(f"{label(task)}.reset returned a wrong start: {error}") from None
-        return found
 
     # ---- judging ------------------------------------------------------------------------------
 
@@ -319,7 +290,7 @@ class TaskBatch(ReadableBatch):
         return joined
 
     def _require_finite(self, found: Mapping[str, NDArray[Any]], ours: Singles) -> None:
-        """Refuse what `observe` returned if it is not finite; of flights that are no more, clear it."""
+        """Refuse what is not finite; of flights that are no more, make it finite."""
         for name, values in found.items():
             sound = np.isfinite(values).all(axis=1)
             if not sound.all():
