@@ -7,7 +7,7 @@ compiled or loaded from their cache, when the first environment is made.
 from typing import Any
 
 from quad_gym import faults
-from quad_gym.envs import IDS, make_sb3_vec_env, register_all
+from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.distributions import LogUniform, Normal, Uniform
@@ -48,7 +48,12 @@ _LAZY = {
     "QuadVectorEnv": "quad_gym.envs.vector",
     "ExtendedKalmanFilter": "quad_gym.estimation",
     "UnscentedKalmanFilter": "quad_gym.estimation",
+    "Observed": "quad_gym.tasks",
+    "Task": "quad_gym.tasks",
+    "TaskError": "quad_gym.tasks",
+    "View": "quad_gym.tasks.view",
     "observation_layout": "quad_gym.envs.spaces",
+    "rewards": "quad_gym.tasks",
 }
 
 __all__ = [
@@ -75,6 +80,7 @@ __all__ = [
     "faults",
     "make_sb3_vec_env",
     "pd_gains",
+    "register_task",
     "sensor_suite",
     "vehicle_params",
     "world_params",

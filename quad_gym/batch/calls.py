@@ -50,10 +50,11 @@ class Calls:
         self._memory[1][Call.OBSERVATIONS] = observations
         self._words[:, Call.OBSERVATIONS] = _address(observations)
 
-    @property
-    def words(self) -> NDArray[np.int64]:
-        """(len(Call),) of the thread that the batch is called by."""
-        return self._rows[0]
+    def show_into(self, shown: NDArray[np.float64]) -> None:
+        """Let the next step or reset write what is shown here."""
+        self._memory[1][Call.SHOWN] = shown
+        self._words[:, Call.SHOWN] = _address(shown)
+        self._words[:, Call.SHOWN_PITCH] = shown.strides[0]
 
     def __call__(self, board: NDArray[np.int64], number: int, command: int, serving: bool) -> bool:
         """Fly blocks that a board has, as the thread of this number; see `fly`."""

@@ -20,6 +20,7 @@ from quad_gym.records import (
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
     SETTINGS,
+    SHOWN_SIZE,
     WIDTH,
     WORK_BLOCK,
     Autoreset,
@@ -30,7 +31,7 @@ from quad_gym.records import (
 )
 
 _IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
-_JUDGE, _OBSERVE = int(Stage.JUDGE), int(Stage.OBSERVE)
+_JUDGE, _OBSERVE, _SHOW = int(Stage.JUDGE), int(Stage.OBSERVE), int(Stage.SHOW)
 _REWARD = int(Result.REWARD)
 _TERMINATED = int(Result.TERMINATED)
 _TRUNCATED = int(Result.TRUNCATED)
@@ -52,6 +53,7 @@ _SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
 _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
 _RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
+_SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
 
 _CORE = offset_of(FLIGHT_BLOCK, "r")
 _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
@@ -135,6 +137,15 @@ def _write_results(call, flight, index):
 
 
 @kernel
+def _show(call, index, flight, world, model, settings, work, stages):
+    """Show the present instant to a task of a user's own."""
+    call_stage(stages, _SHOW, flight, world, model, settings, work, 0)
+    here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
+    for k in range(SHOWN_SIZE):
+        store_lanes(here + k * pitch, work.observation[k])
+
+
+@kernel
 def _fetch_ahead(call, index, settings, left):
     """Ask for a tick's share of the next block's memory, which is far away in large batches."""
     ticks, line = settings.ticks_per_step, 8 * WIDTH
@@ -197,6 +208,8 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
     if observing:
         _observe(call, flight, true, believed, settings, work, stages)
         _write_rows(call, call[_OBSERVATIONS], index, work, flight.tick >= 0.0)
+    if settings.shown:
+        _show(call, index, flight, true, believed, settings, work, stages)
 
 
 _WORDS = types.Array(types.int64, 1, "C")

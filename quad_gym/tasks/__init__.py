@@ -3,4 +3,4 @@
 from quad_gym.tasks import rewards
 from quad_gym.tasks.task import Observed, Task, TaskError, resolve_task
 
-__all__ = ["Observed", "Task", "TaskError", "rewards", "resolve_task"]
+__all__ = ["Observed", "Task", "TaskError", "resolve_task", "rewards"]

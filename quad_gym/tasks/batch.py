@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.starts import checked_mask, checked_start
+from quad_gym.batch.starts import checked_mask
 from quad_gym.params import checks as check
-from quad_gym.records import SHOWN_SIZE, WIDTH, Autoreset, Result
+from quad_gym.records import WIDTH, Autoreset, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.endings import endings
 from quad_gym.tasks.memory import ReadableBatch
+from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import METHODS, Task, TaskError, label
 from quad_gym.tasks.view import View
@@ -21,12 +22,16 @@ from quad_gym.tasks.view import View
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Truths = NDArray[np.bool_]
-Start = dict[str, Any]
 
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
-_STARTS: dict[str, tuple[int, ...]] = {"position": (3,), "velocity": (3,), "yaw": ()}
-"""What `reset` may return, with the shapes of its rows."""
 _TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
+
+
+class Before(NamedTuple):
+    """What flights were like before a step."""
+
+    position_error: Floats
+    gates_passed: Floats
 
 
 class Part(NamedTuple):
@@ -84,7 +89,9 @@ class TaskBatch(ReadableBatch):
         self._nobody = np.zeros(self.count, bool)
         self._failed = self._nobody.copy()
         self.began, self.began_some = self._nobody, False
-        self.before = np.zeros((SHOWN_SIZE, self.count))
+        self.before = Before(np.zeros(self.count), np.zeros(self.count))
+        bounds = [(part.low, part.high) for part in self._parts.values() for _ in range(part.size)]
+        self._own_low, self._own_high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
         self._finals = np.zeros((self.count, self._size_of_observation()), np.float32)
         self._view: View | None = None
 
@@ -131,7 +138,8 @@ class TaskBatch(ReadableBatch):
             )
         if not self._begun:
             self._require_begun()
-        self.before, returns = self.shown, self.columns("episode_return")
+        self.before = Before(self.columns("position_error"), self.columns("gate_next"))
+        returns = self.columns("episode_return")
         began = self.columns("needs_reset") > 0.0 if self._in_kernel else self._nobody
         shipped = super().step(actions)
         try:
@@ -142,9 +150,8 @@ class TaskBatch(ReadableBatch):
 
     def _after_step(self, shipped: Singles, began: Truths, returns: Floats) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
-        self.show_anew()
         self.view.step_over()
-        self.began, self.began_some = began, bool(began.any())
+        self.began, self.began_some = began, bool(np.count_nonzero(began))
         if self.began_some:
             shipped = self._begin(began, {}, shipped)
         if "update" in self.methods:
@@ -156,9 +163,9 @@ class TaskBatch(ReadableBatch):
             self.view.own_shipped.read()
         self._write(judged)
         if self._same_step:
-            over = self.judged_over
-            if np.count_nonzero(over):
-                over = over.any(axis=0)
+            ends = self.judged_over
+            if np.count_nonzero(ends):
+                over = ends[0] | ends[1]
                 self._finals[over] = observations[over]
                 shipped = self._begin(over, {}, super().reset(mask=over))
                 observations[over] = self._observed(shipped)[over]
@@ -168,7 +175,6 @@ class TaskBatch(ReadableBatch):
 
     def _begin(self, chosen: Truths, given: Start, shipped: Singles) -> Singles:
         """Ask the task about episodes that the kernels have begun; return what these observe."""
-        self.show_anew()
         self.began, self.began_some = chosen, True
         self._state.begin(chosen)
         self.view.begin(chosen)
@@ -177,7 +183,9 @@ class TaskBatch(ReadableBatch):
         with self._writing(chosen, _RESET_DRAWS) as rng:
             start = answers.ask(self.custom, "reset", self.view, rng)
         if start is not None:
-            shipped = self._begin_again(chosen, self._checked_start(start, chosen, given))
+            shipped = self._begin_again(
+                chosen, starts(self.custom, start, chosen, given, self.task)
+            )
         return shipped
 
     def _begin_again(self, chosen: Truths, start: Start) -> Singles:
@@ -188,38 +196,8 @@ class TaskBatch(ReadableBatch):
         self._blocks["instant"][again] -= np.uint64(1)
         self._blocks["episode"][again] -= 1.0
         shipped = super().reset(mask=chosen, **start)
-        self.show_anew()
         self.view.forget()
         return shipped
-
-    def _checked_start(self, start: Any, chosen: Truths, given: Start) -> Start:
-        """Start values of a task's reset, beside those that a caller has given."""
-        task = self.custom
-        if not isinstance(start, Mapping) or not set(start) <= set(_STARTS):
-            raise TaskError(
-                f"{label(task)}.reset must return None or start values by name, of "
-                f"{', '.join(_STARTS)}; got {start!r}"
-            )
-        found = dict(given)
-        for name, value in start.items():
-            values = answers.numbers(task, "reset", value, name)
-            shape = (self.count, *_STARTS[name])
-            if values.shape not in (shape, _STARTS[name]):
-                raise TaskError(
-                    f"{label(task)}.reset must return shape {shape} for {name!r}, "
-                    f"got {values.shape}"
-                )
-            rows = np.zeros(shape)
-            rows[chosen] = np.broadcast_to(values, shape)[chosen]
-            sound = np.isfinite(rows).reshape(self.count, -1).all(axis=1)
-            answers.require(sound, task, "reset", rows, f"finite numbers for {name!r}")
-            if given.get(name) is None:
-                found[name] = rows
-        try:
-            checked_start(self.count, **found, task=self.task)
-        except ValueError as error:
-            raise TaskError(f"{label(task)}.reset returned a wrong start: {error}") from None
-        return found
 
     # ---- judging ------------------------------------------------------------------------------
 
@@ -298,23 +276,27 @@ class TaskBatch(ReadableBatch):
         found = self.ask_parts()
         if found.keys() != self._parts.keys():
             self._refuse_parts(found)
-        own = []
-        for name, part in self._parts.items():
-            values = found[name]
-            if values.shape[1] != part.size:
-                self._refuse_parts(found)
-            flat = values.ravel()
-            if not np.isfinite(np.dot(flat, flat)):
-                sound = np.isfinite(values).all(axis=1)
+        if any(found[name].shape[1] != part.size for name, part in self._parts.items()):
+            self._refuse_parts(found)
+        own = [found[name] for name in self._parts]
+        kept, rest = shipped[:, self._kept], shipped[:, self._split :]
+        parts = [*([kept] if kept.shape[1] else []), *own, *([rest] if rest.shape[1] else [])]
+        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        ours = joined[:, kept.shape[1] : joined.shape[1] - rest.shape[1]]
+        flat = joined.ravel()
+        if not np.isfinite(np.dot(flat, flat)):
+            self._require_finite(found, ours)
+        np.clip(ours, self._own_low, self._own_high, out=ours)
+        return joined
+
+    def _require_finite(self, found: Mapping[str, NDArray[Any]], ours: Singles) -> None:
+        """Refuse what is not finite; of flights that are no more, make it finite."""
+        for name, values in found.items():
+            sound = np.isfinite(values).all(axis=1)
+            if not sound.all():
                 sound |= ~self.finite(~sound)
                 answers.require(sound, self.custom, "observe", values, f"finite {name!r}")
-                values = np.nan_to_num(values, nan=part.low)
-            own.append(np.minimum(np.maximum(values, part.low), part.high))
-        if self._split == shipped.shape[1] and self.custom.replaces_observation:
-            joined = own
-        else:
-            joined = [shipped[:, self._kept], *own, shipped[:, self._split :]]
-        return np.concatenate(joined, axis=1, dtype=np.float32, casting="same_kind")
+        np.nan_to_num(ours, copy=False)
 
     def _refuse_parts(self, found: Mapping[str, NDArray[Any]]) -> None:
         sizes = {name: part.shape[1] for name, part in found.items()}
@@ -367,12 +349,11 @@ class TaskBatch(ReadableBatch):
         if len(self._state):
             self._state.read_from(snapshot["state"])
         self._failed = self._nobody.copy()
-        self.show_anew()
         self._view = None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads and the view, which a copy makes anew."""
-        return super().__getstate__() | {"_view": None, "_shown": None}
+        return super().__getstate__() | {"_view": None}
 
     # ---- calling the task ---------------------------------------------------------------------
 

@@ -92,7 +92,8 @@ class FlightRandom:
     ) -> NDArray[np.float64]:
         """Normal numbers (Box and Muller); see `random` for `size`."""
         radius = np.sqrt(-2.0 * np.log(1.0 - self.random(size)))
-        return np.asarray(loc + scale * (radius * np.cos(2.0 * np.pi * self.random(size))))
+        mean, sigma = np.asarray(loc, np.float64), np.asarray(scale, np.float64)
+        return np.asarray(mean + sigma * (radius * np.cos(2.0 * np.pi * self.random(size))))
 
     def integers(
         self, low: int, high: int | None = None, size: int | tuple[int, ...] | None = None

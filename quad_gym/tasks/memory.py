@@ -5,32 +5,48 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.task.show import show
-from quad_gym.records import SHOWN_SIZE, WIDTH
+from quad_gym.kernels.compiling import Stage
+from quad_gym.records import SHOWN_SIZE, WIDTH, Command
 
 Floats = NDArray[np.float64]
+
+_GAP = 8
+"""Numbers between two rows of what is shown: a line of the cache."""
 
 
 class ReadableBatch(FlightBatch):
     """A `FlightBatch` with what the views of a task read, as new arrays of all flights."""
 
-    _shown: Floats | None = None
+    def __init__(self, count: int, **keywords: Any) -> None:
+        super().__init__(count, **keywords)
+        self._settings["shown"] = True
+        self._stages |= {Stage.SHOW}
+        self._shown = self._new_shown()
 
-    def show_anew(self) -> None:
-        """Take notice that the flights have gone on."""
-        self._shown = None
+    def _new_shown(self) -> Floats:
+        # rows that lie a power of two apart would share a few lines of the cache
+        return np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
+
+    def _run(self, command: Command) -> NDArray[np.float32]:
+        self._shown = self._new_shown()
+        if self._crew is not None:
+            self._crew.gather()  # nobody may still write to the memory that goes
+            self._calls.show_into(self._shown)
+        observations = super()._run(command)
+        self._shown.flags.writeable = False
+        return observations
+
+    def _calls_of_threads(self) -> Calls:
+        calls = super()._calls_of_threads()
+        calls.show_into(self._shown)
+        return calls
 
     @property
     def shown(self) -> Floats:
-        """(SHOWN_SIZE, n) the numbers of `quad_gym.records.SHOWN` at the present instant."""
-        if self._shown is None:
-            shown = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH))
-            calls = getattr(self, "_calls", None) or self._calls_of_threads()
-            show(calls.words, shown)
-            self._shown = shown[:, : self.count]
-            self._shown.flags.writeable = False
-        return self._shown
+        """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only."""
+        return self._shown[:, : self.count]
 
     def columns(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (..., n)."""

@@ -23,9 +23,12 @@ class State:
     """
 
     __slots__ = ("_arrays", "_start")
+    _arrays: dict[str, NDArray[Any]]
+    _start: dict[str, NDArray[Any]]
 
     def __init__(self, count: int, start: Mapping[str, ArrayLike]) -> None:
-        arrays, first = {}, {}
+        arrays: dict[str, NDArray[Any]] = {}
+        first: dict[str, NDArray[Any]] = {}
         for name, value in start.items():
             if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
                 raise ValueError(f"state must hold values by name, got {name!r}")
@@ -42,7 +45,7 @@ class State:
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name[0] == "_" or name not in self._arrays:
             raise AttributeError(f"the task declares no state {name!r}: add it to `state`")
-        return self._arrays[name]  # type: ignore[no-any-return]
+        return self._arrays[name]
 
     def __setattr__(self, name: str, value: Any) -> None:
         self.__getattr__(name)[:] = value

@@ -26,7 +26,7 @@ class View(Group):
 
     Arrays have one row per flight, are made when they are first read, and cannot be written to.
     `quad_gym.tasks.fields.VIEW_FIELDS` lists them all with shapes, units and frames. They are in
-    groups: `truth`, `estimate` (of the filter), `seen` (what the controller goes by), `measured` and
+    groups: `truth`, `estimate` (of the filter), `seen` (what the controller goes by), `measured`,
     `shipped` (what the id's task says). `view.position` is short for `view.truth.position`, as are
     the other states. `view.state` holds what the task keeps.
     """
@@ -219,7 +219,7 @@ class View(Group):
     @Lazy
     def gate_passed(self) -> Truths:
         """(n,) whether this step passed a gate."""
-        return (self.gates_passed > self._flights.before[_GATE_NEXT]) & ~self._flights.began
+        return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
 
     @property
     def features(self) -> Floats:

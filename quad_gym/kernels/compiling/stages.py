@@ -71,6 +71,7 @@ class Stage(IntEnum):
     LOOK = auto()
     JUDGE = auto()
     OBSERVE = auto()
+    SHOW = auto()
     PREDICT_WITH_DRIFT = auto()
     UPDATE_WITH_DRIFT = auto()
     LATE_UPDATE_WITH_DRIFT = auto()
@@ -155,6 +156,7 @@ SOURCES = {
     Stage.MOVE_IN_AIR: Source("vehicle.air", "move_in_air_stage", _air),
     Stage.ALIGN: Source("filter.align", "align_stage", _filter),
     Stage.OBSERVE: Source("task.observation", "observe_stage", _always),
+    Stage.SHOW: Source("task.show", "show_stage", lambda s: bool(s["shown"])),
     Stage.ADVANCE_FAULTS: Source("sensors.faults", "advance_faults_stage", _faults),
     Stage.BEGIN_FAULTS: Source("sensors.faults", "begin_faults_stage", _faults),
     Stage.CONTROL: Source("vehicle.control", "control_stage", _always),

@@ -1,27 +1,11 @@
 """What a task of a user's own is shown of flights, for the views of `quad_gym.tasks`."""
 
-from numba import types
-
-from quad_gym.kernels.compiling import entry, kernel
+from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3, load4, load33
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.simd.addresses import lanes_at, record_at
+from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.task.observation import previewed, put_relative
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import (
-    FLIGHT_BLOCK,
-    PARAMS_BLOCK,
-    SETTINGS,
-    SHOWN_SIZE,
-    WIDTH,
-    WORK_BLOCK,
-    Call,
-)
-
-_BLOCKS, _PITCH = int(Call.BLOCKS), int(Call.PITCH)
-_MODEL, _SETTINGS, _WORK = int(Call.MODEL), int(Call.SETTINGS), int(Call.WORK)
-_flight_at, _params_at, _work_at = map(lanes_at, (FLIGHT_BLOCK, PARAMS_BLOCK, WORK_BLOCK))
-_settings_at, _plain_work_at = record_at(SETTINGS), record_at(WORK_BLOCK)
 
 
 @kernel
@@ -69,22 +53,7 @@ def _show(flight, p, settings, row):
     row[k + 1] = flight.gate_next
 
 
-_WORDS, _FLOATS = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")
-
-
-@entry(signature=types.none(_WORDS, _FLOATS))
-def show(call, shown):
-    """Show all flights of a batch at the present instant.
-
-    Args:
-        call: (len(Call),) of a thread, as for `fly`; the field `observation` of its workspace is
-            written.
-        shown: (SHOWN_SIZE, n_blocks WIDTH), written: the rows of `quad_gym.records.SHOWN`.
-    """
-    p, settings, work = _params_at(call[_MODEL]), _settings_at(call[_SETTINGS]), call[_WORK]
-    row, plain = _work_at(work).observation, _plain_work_at(work).observation
-    for index in range(shown.shape[1] // WIDTH):
-        _show(_flight_at(call[_BLOCKS] + index * call[_PITCH]), p, settings, row)
-        for k in range(SHOWN_SIZE):
-            for lane in range(WIDTH):
-                shown[k, index * WIDTH + lane] = plain[k, lane]
+@stage
+def show_stage(flight, world, model, settings, work, stages, flag):
+    """Fill the workspace's observation with what is shown."""
+    _show(lanes_of(flight), lanes_of(model), settings, lanes_of(work).observation)
