@@ -19,6 +19,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
+    "extensions.docstrings",
     "extensions.environment_pages",
     "extensions.mathml",
 ]
@@ -64,6 +65,7 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
 }
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"quad_gym {version}"
 html_static_path = ["_static"]

@@ -51,7 +51,9 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def _field_docs(kind: type) -> dict[str, str]:
     """What is said below each field of a dataclass."""
     found = ModuleAnalyzer.for_module(kind.__module__).find_attr_docs()
-    docs = {name: " ".join(lines).strip() for (of, name), lines in found.items() if of == kind.__name__}
+    docs = {
+        name: " ".join(lines).strip() for (of, name), lines in found.items() if of == kind.__name__
+    }
     for field in dataclasses.fields(kind):
         if field.name not in docs:
             raise ExtensionError(f"{kind.__name__}.{field.name} has no docstring")
@@ -139,8 +141,11 @@ def _keywords_page() -> str:
     }
     looks = inspect.signature(rendering_of).parameters
     defaults |= {"max_episode_steps": None, "render_mode": None}
-    defaults |= {name: looks[name].default for name in looks if name.startswith("render_")
-                 and name != "render_mode"}
+    defaults |= {
+        name: looks[name].default
+        for name in looks
+        if name.startswith("render_") and name != "render_mode"
+    }
     rows = [(f"`{name}`", _value(value), said[name]) for name, value in defaults.items()]
     return (
         "# Keywords of every environment\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
@@ -169,7 +174,8 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
     parts = [
         f"# {name}\n\n`{env_id}`\n",
         f"- **Reference**: {reference}\n- **Start**: {start}\n- **Time limit**: {limit}\n",
-        f'```python\nimport gymnasium\n\nimport quad_gym\n\nenv = gymnasium.make("{env_id}")\n```\n',
+        "```python\nimport gymnasium\n\nimport quad_gym\n\n"
+        f'env = gymnasium.make("{env_id}")\n```\n',
         "Reward, start, endings and `info` below are those of the specification that all "
         "environments share, `help(quad_gym.QuadEnv)`.\n",
         f"## Observation\n\n{_table(head, observation)}",
@@ -233,7 +239,8 @@ def pages() -> dict[str, str]:
     """All pages by their names."""
     sections, docs = _sections(), _field_docs(quad_gym.TaskParams)
     found = {
-        f"environments/{kind}": _environment_page(env_id, sections, docs) for env_id, kind in quad_gym.IDS.items()
+        f"environments/{kind}": _environment_page(env_id, sections, docs)
+        for env_id, kind in quad_gym.IDS.items()
     }
     return found | {
         "observations": _observations_page(),
