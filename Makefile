@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark wheel clean
+.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
@@ -20,6 +20,10 @@ $(VENV)/.trainer: $(VENV)/.user
 
 $(VENV)/.developer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render,pandas,rerun,dev]"
+	touch $@
+
+$(VENV)/.writer: $(VENV)/.user
+	$(INSTALL) ".[train,plot,docs]"
 	touch $@
 
 demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each, and compare: some minutes
@@ -57,6 +61,9 @@ lint: setup  ## style, types and import rules
 benchmark: setup  ## steps per second of every face and the cost of each part
 	$(BIN)/quad-gym benchmark --output results/benchmark
 
+docs: $(VENV)/.writer  ## the site in docs/_build/html/index.html; runs the tutorials, some minutes
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
 wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they hold
 	rm -rf dist
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine check-wheel-contents
@@ -65,4 +72,4 @@ wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they ho
 	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
-	rm -rf $(VENV) build dist results .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis

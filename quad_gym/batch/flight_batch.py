@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch.calls import Calls
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
-from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
+from quad_gym.faults.presets import FaultsGiven, faults_of
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.faults import pack_faults
@@ -35,7 +36,6 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
     COLUMNS,
-    FLIGHT_BLOCK,
     MAX_ACTION_DELAY,
     RESULTS,
     WIDTH,
@@ -47,18 +47,16 @@ from quad_gym.records import (
     Layout,
     Source,
     aligned_zeros,
-    field_of_flights,
     room_of,
 )
 
 _NO_BOUNDS = np.zeros(0)
-_UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
 """Fields that are NaN at first, all others are zero."""
 _WORTH_NO_COPY = 1 << 16
 """Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
 
 
-class FlightBatch:
+class FlightBatch(FlightMemory):
     """N flights of one configuration, advanced together by compiled kernels.
 
     A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does
@@ -230,28 +228,15 @@ class FlightBatch:
             )
         self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
-        self._room = room_of(used_parts(self._settings[0]))
-        self._blocks = aligned_zeros(-(-self.count // WIDTH), self._room.dtype)
-        lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
-        self._blocks["idle"] = lanes >= self.count
-        self._blocks["needs_reset"] = 1.0
-        for name in _UNKNOWN:
-            if self._room.holds(name):
-                self._blocks[name] = np.nan
-        self._undrawn = draws.low  # as it stays where nothing is drawn
-        if self._room.holds("drawn"):
-            self._blocks["drawn"] = draws.low[:, np.newaxis]
+        self._allocate(room_of(used_parts(self._settings[0])), draws.low)
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         padded = len(self._blocks) * WIDTH
         self._actions = np.zeros((padded, 4))
         self._resets = np.zeros(self.count, np.uint8)
-        self._begun = False
         self._observations = np.zeros((self.count, self._low.size), np.float32)
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
         self._results = np.zeros((len(RESULTS), padded))
         self._crew: Crew | None = None
-
-    # ---- flying -------------------------------------------------------------------------------
 
     def reset(
         self,
@@ -406,40 +391,6 @@ class FlightBatch:
                 self._blocks["fault_from"][:, fault.kind] = tick
             self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
 
-    # ---- reading ------------------------------------------------------------------------------
-
-    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """One field, such as "r" or "b_a_hat", or one drawn parameter, as a new array (n, ...).
-
-        Args:
-            name: The field; or what is drawn for every episode, such as "mass".
-            flights: Whose, by their numbers; None: all flights'.
-
-        Raises:
-            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
-        """
-        if name in self.randomization.names:
-            values = self.drawn()[name]
-            return values if flights is None else values[flights]
-        if name not in (FLIGHT_BLOCK.names or ()):
-            drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
-            raise ValueError(
-                f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
-                f"got {name!r}"
-            )
-        if not self._room.holds(name):
-            return self._unused(name, self.count if flights is None else len(flights))
-        if flights is None:
-            return field_of_flights(self._blocks, name, self.count)
-        return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
-
-    def _unused(self, name: str, count: int) -> NDArray[Any]:
-        """A field that flights of this configuration do not use, and have no room for."""
-        if name == "drawn":
-            return np.tile(self._undrawn, (count, 1))
-        base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
-        return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
-
     @property
     def results(self) -> NDArray[np.float64]:
         """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
@@ -448,44 +399,3 @@ class FlightBatch:
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
         return self._results[RESULTS.index(name), : self.count].copy()
-
-    def drawn(self) -> dict[str, NDArray[np.float64]]:
-        """What the present episodes have drawn, by name: (count,) or (count, components)."""
-        found = {}
-        for name in self.randomization.names:
-            values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
-            values = values.reshape(-1, values.shape[-1])[: self.count].copy()
-            found[name] = values[:, 0] if values.shape[1] == 1 else values
-        return found
-
-    def active_faults(self) -> dict[str, NDArray[np.bool_]]:
-        """Which of the faults that can come are there now, by name: (count,) each."""
-        return named_faults(self.faults, self.read("faults"))
-
-    def covariance(self) -> NDArray[np.float64]:
-        """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
-        factor = self.read("L")
-        return factor @ factor.transpose(0, 2, 1)
-
-    # ---- keeping ------------------------------------------------------------------------------
-
-    def snapshot(self) -> NDArray[Any]:
-        """A copy of all flights; `restore` brings them back to this instant bit for bit."""
-        return self._blocks.copy()
-
-    def restore(self, snapshot: NDArray[Any]) -> None:
-        """Bring all flights back to a snapshot of this batch, or of one of the same size.
-
-        Raises:
-            ValueError: If the snapshot is of another size or kind.
-        """
-        fits = (
-            isinstance(snapshot, np.ndarray)
-            and snapshot.dtype == self._blocks.dtype
-            and snapshot.shape == self._blocks.shape
-            and np.array_equal(snapshot["idle"], self._blocks["idle"])
-        )
-        if not fits:
-            raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
-        self._blocks[:] = snapshot
-        self._begun = False  # it may have been taken before a reset

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import portable
-from quad_gym.params.sensors import LEAST_DRIFT, GnssParams, SensorSuite
+from quad_gym.params.gnss import LEAST_DRIFT, GnssParams
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import WARM_DRAWS, WARM_DRIFT_DRAWS, Autoreset, Control, Source

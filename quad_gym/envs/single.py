@@ -167,9 +167,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
         faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as "gnss_outage" or
             "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
-        radius, period, height, start, pad, reward_per, randomize, duration, out_of_bounds, ground, end_when_lost,
-            max_tilt, max_speed, max_acceleration, gate_count, gate_radius, preview: The task; see
-            `quad_gym.TaskParams`.
+        keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize, duration,
+            out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration, gate_count,
+            gate_radius, preview; see `quad_gym.TaskParams`.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.
         render_size: Width and height of a frame [pixels].

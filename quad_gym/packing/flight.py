@@ -13,7 +13,9 @@ from quad_gym.params import portable
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.sensors import LEAST_DRIFT, ImuParams, SensorSuite, delay_ticks
+from quad_gym.params.gnss import LEAST_DRIFT
+from quad_gym.params.imu import ImuParams
+from quad_gym.params.sensors import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams

@@ -29,15 +29,11 @@ import math
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.sensors import (
-    CameraParams,
-    GnssParams,
-    ImuParams,
-    NoisyObservationParams,
-    PlacementParams,
-    SensorSuite,
-)
+from quad_gym.params.gnss import GnssParams
+from quad_gym.params.imu import ImuParams
+from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0

@@ -14,11 +14,11 @@ from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.factors import cholesky33, lower33, solve_right33
 from quad_gym.kernels.maths.linalg import (
     add33,
     apply,
     apply_transposed,
-    cholesky33,
     dot,
     keep3,
     keep33,
@@ -26,14 +26,12 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load33,
     load_block,
-    lower33,
     multiply,
     outer,
     scale,
     scale33,
     select3,
     select33,
-    solve_right33,
     sub,
     transpose,
     unit_or,

@@ -24,9 +24,9 @@ from quad_gym.kernels.filter.preintegration import (
     take_columns,
     take_mean,
 )
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add_outer,
-    cholesky,
     keep3,
     keep33,
     load3,

@@ -31,6 +31,7 @@ from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.maths.elementary import is_finite
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add,
     add33,
@@ -38,7 +39,6 @@ from quad_gym.kernels.maths.linalg import (
     add_to_diagonal,
     apply,
     apply_transposed,
-    cholesky,
     cross,
     keep3,
     keep33,

@@ -25,11 +25,11 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.drift import add_to_drift, keep_drift
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add33,
     add_outer,
     add_to_diagonal,
-    cholesky,
     load3,
     load33,
     load_block,

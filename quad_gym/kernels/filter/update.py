@@ -19,11 +19,11 @@ from quad_gym.kernels.filter.expected import compare_center, measure_sigma_point
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
 from quad_gym.kernels.filter.recovery import raise_doubts
 from quad_gym.kernels.maths.elementary import is_finite
+from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
     add,
     add_outer,
     add_to_diagonal,
-    cholesky,
     keep3,
     keep33,
     load3,
@@ -32,8 +32,6 @@ from quad_gym.kernels.maths.linalg import (
     multiply,
     scale,
     scale33,
-    solve_left_vector,
-    solve_right,
     store_block,
     sum_of_outers,
     sum_of_outers_of_rows,

@@ -10,9 +10,9 @@ slow error of GNSS positions, that is not zero any more, and goes with its error
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.drift import keep_drift
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     apply,
-    cholesky,
     keep3,
     keep33,
     load3,

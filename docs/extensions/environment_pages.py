@@ -1,0 +1,268 @@
+"""Pages on environments and sensor suites, written from the code before Sphinx reads its sources.
+
+Tables of observations come from `observation_layout`, those of keywords from the fields of
+`TaskParams` and the signature behind the environments, their words from docstrings. What is said of
+a keyword or of a part of an observation that the code has and the docstring lacks is an error.
+"""
+
+import dataclasses
+import inspect
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import docstring_parser
+from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
+from sphinx.pycode import ModuleAnalyzer
+
+import quad_gym
+from quad_gym.envs.configuration import (
+    ONE_TASK_KEYWORDS,
+    TASK_DEFAULTS,
+    TASK_KEYWORDS,
+    Flights,
+)
+from quad_gym.envs.rendered import rendering_of
+from quad_gym.envs.spaces import ObservationField
+from quad_gym.flights.record import COLUMNS, FEATURES
+from quad_gym.params.suites import SUITES
+from quad_gym.records import FLIGHT_FIELDS
+
+FOLDER = "generated"
+"""Where the pages go, inside the sources of the site; Git ignores it."""
+
+
+def _sections() -> dict[str, str]:
+    """The sections of the specification, `QuadEnv`'s docstring, by their headings."""
+    text = (inspect.getdoc(quad_gym.QuadEnv) or "").split("\nArgs:\n")[0]
+    _, *parts = re.split(r"^## (.+)$", text, flags=re.MULTILINE)
+    return dict(zip(parts[::2], (part.strip() for part in parts[1::2]), strict=True))
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+    return "\n".join([line(head), line(["---"] * len(head)), *map(line, rows)]) + "\n"
+
+
+def _field_docs(kind: type) -> dict[str, str]:
+    """What is said below each field of a dataclass."""
+    found = ModuleAnalyzer.for_module(kind.__module__).find_attr_docs()
+    docs = {
+        name: " ".join(lines).strip() for (of, name), lines in found.items() if of == kind.__name__
+    }
+    for field in dataclasses.fields(kind):
+        if field.name not in docs:
+            raise ExtensionError(f"{kind.__name__}.{field.name} has no docstring")
+    return docs
+
+
+def _digits(value: float) -> str:
+    return f"{value:.10g}" if abs(value) >= 1e3 else f"{value:.4g}"
+
+
+def _value(value: Any) -> str:
+    """A default value as it would be typed, in few digits."""
+    if isinstance(value, tuple) and all(isinstance(part, float) for part in value):
+        return "`(" + ", ".join(map(_digits, value)) + ")`"
+    if isinstance(value, float):
+        return f"`{_digits(value)}`"
+    if isinstance(value, str):
+        return f'`"{value}"`'
+    if isinstance(value, tuple) and value:
+        return f"{len(value)} of them"
+    return f"`{value!r}`"
+
+
+def _range(field: ObservationField) -> str:
+    return f"{field.low:g} to {field.high:g}"
+
+
+def _observation_rows(
+    table: Iterable[ObservationField], meanings: dict[str, str] | None = None
+) -> list[tuple[str, ...]]:
+    rows = []
+    for field in table:
+        said = () if meanings is None else (meanings[field.name],)
+        where = f"{field.slice.start}:{field.slice.stop}"
+        rows.append((where, f"`{field.name}`", *said, field.unit, field.frame, _range(field)))
+    return rows
+
+
+def _meanings(section: str) -> dict[str, str]:
+    """The column "meaning" of the specification's table of an observation, by name."""
+    rows = re.findall(r"^\| *(\d+:\d+) *\| *(\w+) *\|([^|]*)\|", section, flags=re.MULTILINE)
+    for (where, name, _), field in zip(rows, quad_gym.observation_layout(), strict=True):
+        if (where, name) != (f"{field.slice.start}:{field.slice.stop}", field.name):
+            raise ExtensionError(f"the specification has {where} {name}, the code {field}")
+    return {name: meaning.strip() for _, name, meaning in rows}
+
+
+HEAD = ("slice", "name", "unit", "frame", "bounds")
+
+
+def _observations_page() -> str:
+    layouts = {
+        'Relative, the default (`layout="relative"`)': {},
+        'Absolute (`layout="absolute"`)': {"layout": "absolute"},
+        'Raw measurements (`observation="sensors"`), two features': {"observation": "sensors"},
+        "Relative, with the filter's standard deviations (`include_covariance=True`)": {
+            "include_covariance": True
+        },
+        "Relative, with the truth for a critic (`privileged=True`)": {"privileged": True},
+    }
+    text = "# Observations\n\nWhat `quad_gym.observation_layout` says of the observations. I: "
+    text += "inertial (east, north, up), B: body, C: image. Observations are held within their "
+    text += "bounds.\n"
+    for title, options in layouts.items():
+        rows = _observation_rows(quad_gym.observation_layout(**options))
+        text += f"\n## {title}\n\n{_table(HEAD, rows)}"
+    return text
+
+
+def _keywords_page() -> str:
+    """Keywords of all environments, from the signature behind them and the specification."""
+    parsed = docstring_parser.parse(
+        inspect.getdoc(quad_gym.QuadEnv) or "", docstring_parser.DocstringStyle.GOOGLE
+    )
+    said = {p.arg_name: " ".join((p.description or "").split()) for p in parsed.params}
+    said |= {
+        "threads": "Threads of a vector environment; None: as many as there are cores.",
+        "render_flights": "Which flights of a vector environment are rendered.",
+    }
+    parameters = inspect.signature(Flights._build).parameters.values()
+    defaults = {
+        p.name: p.default
+        for p in parameters
+        if p.kind is p.KEYWORD_ONLY and p.default is not p.empty
+    }
+    looks = inspect.signature(rendering_of).parameters
+    defaults |= {"max_episode_steps": None, "render_mode": None}
+    defaults |= {
+        name: looks[name].default
+        for name in looks
+        if name.startswith("render_") and name != "render_mode"
+    }
+    rows = [(f"`{name}`", _value(value), said[name]) for name, value in defaults.items()]
+    return (
+        "# Keywords of every environment\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
+        "`quad_gym.make_sb3_vec_env`, besides those of the task, which the page of each "
+        "environment lists.\n\n" + _table(("keyword", "default", "meaning"), rows)
+    )
+
+
+def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str]) -> str:
+    kind = quad_gym.IDS[env_id]
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", env_id.split("/")[1].removesuffix("-v0"))
+    row = re.search(rf"^\| `{re.escape(env_id)}` \|(.+)\|$", sections["Description"], re.MULTILINE)
+    if row is None:
+        raise ExtensionError(f"the table of environments lacks {env_id}")
+    reference, start, limit = (cell.strip() for cell in row[1].split("|"))
+    defaults = TASK_DEFAULTS[kind]
+    rows = [
+        (f"`{key}`", _value(getattr(defaults, key)), docs[key])
+        for key in TASK_KEYWORDS
+        if ONE_TASK_KEYWORDS.get(key, kind) == kind
+    ]
+    observation = _observation_rows(
+        quad_gym.observation_layout(), _meanings(sections["Observation space"])
+    )
+    head = ("slice", "name", "meaning", "unit", "frame", "bounds")
+    parts = [
+        f"# {name}\n\n`{env_id}`\n",
+        f"- **Reference**: {reference}\n- **Start**: {start}\n- **Time limit**: {limit}\n",
+        "```python\nimport gymnasium\n\nimport quad_gym\n\n"
+        f'env = gymnasium.make("{env_id}")\n```\n',
+        "Reward, start, endings and `info` below are those of the specification that all "
+        "environments share, `help(quad_gym.QuadEnv)`.\n",
+        f"## Observation\n\n{_table(head, observation)}",
+        "The other layouts are under [Observations](../observations.md).\n",
+        f"## Action\n\n{sections['Action space']}\n",
+        f"## Keywords of the task\n\n{_table(('keyword', 'default here', 'meaning'), rows)}",
+        "All others are under [Keywords of every environment](../keywords.md).\n",
+        f"## Reward\n\n{sections['Reward']}\n",
+        f"## Start\n\n{sections['Start']}\n",
+        f"## Endings\n\n{sections['Episode end']}\n",
+        f"## Info\n\n{sections['Info']}\n",
+    ]
+    return "\n".join(parts)
+
+
+def _suites_page() -> str:
+    """The numbers of every suite side by side."""
+    suites = {name: quad_gym.sensor_suite(name) for name in SUITES}
+    text = "# Sensor suites in numbers\n\nThe fields of `quad_gym.SensorSuite`. Where they come "
+    text += "from is written beside them, in `quad_gym/params/`.\n"
+    for part, kind in {
+        "imu": quad_gym.ImuParams,
+        "gnss": quad_gym.GnssParams,
+        "camera": quad_gym.CameraParams,
+        "placement": quad_gym.PlacementParams,
+        "estimator": quad_gym.FilterParams,
+        "noisy": quad_gym.NoisyObservationParams,
+    }.items():
+        rows = []
+        for field in dataclasses.fields(kind):
+            of = (getattr(suite, part) for suite in suites.values())
+            values = ["-" if p is None else _value(getattr(p, field.name)) for p in of]
+            rows.append((f"`{field.name}`", *values))
+        text += f"\n## `{part}`: {kind.__name__}\n\n{_table(('', *suites), rows)}"
+    return text
+
+
+def _fields_page() -> str:
+    """What a flight's record and a recorded flight hold."""
+    fields = [(f"`{f.name}`", str(f.shape), f.unit, f.meaning) for f in FLIGHT_FIELDS]
+    columns = [
+        (
+            f"`{c.name}`",
+            "(" + ", ".join("features" if n == FEATURES else str(n) for n in c.shape) + ")",
+            c.unit,
+            c.frame,
+            c.meaning,
+        )
+        for c in COLUMNS
+    ]
+    return (
+        "# Fields of flights\n\n## Columns of a recorded flight\n\nWhat `quad_gym.Flight` holds, "
+        "a row for each control step.\n\n"
+        + _table(("column", "shape of a row", "unit", "frame", "meaning"), columns)
+        + "\n## Fields of a flight's record\n\nWhat `FlightBatch.read` returns by name, with the "
+        "flights as a first axis.\n\n" + _table(("field", "shape", "unit", "meaning"), fields)
+    )
+
+
+def pages() -> dict[str, str]:
+    """All pages by their names."""
+    sections, docs = _sections(), _field_docs(quad_gym.TaskParams)
+    found = {
+        f"environments/{kind}": _environment_page(env_id, sections, docs)
+        for env_id, kind in quad_gym.IDS.items()
+    }
+    return found | {
+        "observations": _observations_page(),
+        "keywords": _keywords_page(),
+        "suites": _suites_page(),
+        "fields": _fields_page(),
+    }
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write the pages that are not there as they should be, and remove others."""
+    folder = Path(app.srcdir) / FOLDER
+    (folder / "environments").mkdir(parents=True, exist_ok=True)
+    wanted = {folder / f"{name}.md": text for name, text in pages().items()}
+    for file in set(folder.rglob("*.md")) - set(wanted):
+        file.unlink()
+    for file, text in wanted.items():
+        if not file.exists() or file.read_text(encoding="utf-8") != text:
+            file.write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Write the pages when a build begins."""
+    app.connect("builder-inited", write_pages, priority=100)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

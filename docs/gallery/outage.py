@@ -1,0 +1,95 @@
+"""
+Watch the filter lose and find itself
+=====================================
+
+GNSS fails for some seconds. A good filter knows how wrong it is; a filter that has been deceived
+finds out late, and has to recover.
+"""
+
+import gymnasium
+import matplotlib.pyplot as plt
+import numpy as np
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym.faults import AccelBiasStep, GnssOutage
+
+FLIGHTS, SECONDS = 200, 16
+
+
+def fly(*faults):
+    """Error, claimed deviation and share of lost filters over time, over all flights."""
+    envs = gymnasium.make_vec(
+        "QuadGym/Hover-v0",
+        num_envs=FLIGHTS,
+        sensors="rtk",
+        camera=False,
+        duration=float(SECONDS),
+        out_of_bounds=1e3,
+        faults=faults,
+    )
+    policy = PDPolicy(envs, gains="tuned")
+    batch = envs.unwrapped.flights.batch
+    observation, _ = envs.reset(seed=0)
+    errors, claimed, lost = [], [], []
+    for _ in range(50 * SECONDS - 1):
+        action, _ = policy.predict(observation)
+        observation, _, _, _, info = envs.step(action)
+        errors.append((batch.read("r") - batch.read("r_hat"))[:, 0])
+        claimed.append(np.sqrt(batch.covariance()[:, 0, 0]))
+        lost.append(info["filter_lost"].mean())
+    return np.array(errors), np.array(claimed), np.array(lost)
+
+
+# %%
+# Without GNSS, the covariance grows
+# ----------------------------------
+#
+# From 4 s to 8 s there are no fixes, and this vehicle has no camera. The filter goes on with the
+# IMU alone. Its error grows, and so does the deviation that it claims: three times that deviation
+# contains nearly all of the 200 flights.
+
+outage = GnssOutage(start=4.0, duration=4.0)
+errors, claimed, lost = fly(outage)
+time = np.arange(1, len(errors) + 1) / 50
+
+figure, axes = plt.subplots()
+axes.axvspan(4, 8, color="0.9", label="no GNSS")
+axes.plot(time, errors, color="C0", alpha=0.08, linewidth=0.8)
+for sign in (-3, 3):
+    axes.plot(time, sign * claimed.mean(axis=1), color="C1", label="3 sigma" if sign > 0 else None)
+axes.set(xlabel="time [s]", ylabel="error of the position, east [m]", title="An outage")
+axes.legend(loc="upper left")
+
+inside = (np.abs(errors) < 3 * claimed).mean()
+print(f"within 3 sigma: {100 * inside:.1f} % of all errors; lost filters: {100 * lost.max():.0f} %")
+
+# %%
+# Deceived during the outage
+# --------------------------
+#
+# Now the accelerometer's bias steps by 0.5 m/s² while there is no GNSS: the true bias changes,
+# and nothing tells the filter. Its error grows far beyond what it claims. When fixes return, they
+# contradict the estimate so much that the gate rejects them. After ten rejections in a row the
+# filter doubts itself, inflates its covariance, and takes the next fix. ``info["filter_lost"]``
+# tells when a filter knows that its covariance does not explain what it measures.
+
+step = AccelBiasStep(start=5.0, duration=float("inf"), size=(0.5, 0.5))
+errors, claimed, lost = fly(outage, step)
+
+figure, (above, below) = plt.subplots(2, 1, sharex=True, height_ratios=(2, 1), figsize=(7, 5))
+for axes in (above, below):
+    axes.axvspan(4, 8, color="0.9")
+above.plot(time, np.sqrt((errors**2).mean(axis=1)), color="C0", label="error (root mean square)")
+above.plot(time, np.sqrt((claimed**2).mean(axis=1)), color="C1", label="deviation that is claimed")
+above.set(ylabel="east [m]", title="An outage, and a bias step within it")
+above.legend()
+below.fill_between(time, 100 * lost, color="C3", alpha=0.5)
+below.set(xlabel="time [s]", ylabel="lost filters [%]", ylim=(0, 105))
+
+print(f"lost filters: at most {100 * lost.max():.0f} %, at the end {100 * lost[-1]:.0f} %")
+
+# %%
+# ``end_when_lost=True`` truncates an episode when its filter is lost. See
+# :doc:`/sensors-and-filter` for the thresholds, and :doc:`/filter-equations` for what is
+# inflated.

@@ -1,0 +1,186 @@
+"""The documentation keeps its promises: its programs run, its commands parse, what it names exists.
+
+Python blocks of a page run in order, in one namespace. A comment on the line above a block changes
+how it is run; on the page nobody sees it:
+
+    <!-- test: skip, REASON -->           not at all
+    <!-- test: replace OLD by NEW -->     with another text, such as fewer steps of a training
+    <!-- test: slow, REASON -->           only with the slow tests, and so its whole page
+"""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import quad_gym
+from quad_gym.commands.main import COMMANDS
+from quad_gym.commands.options import parse
+
+ROOT = Path(__file__).parents[2]
+PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+COMMAND_MODULES = sorted((ROOT / "quad_gym" / "commands").rglob("*.py"))
+
+BLOCK = re.compile(
+    r"(?P<notes>(?:^[ ]*<!-- test: [^\n]* -->\n)*)^(?P<indent>[ ]*)```(?P<language>\w+)\n"
+    r"(?P<text>.*?)^(?P=indent)```$",
+    re.MULTILINE | re.DOTALL,
+)
+NOTE = re.compile(r"<!-- test: (skip|slow|replace)(?:, | )(.+?) -->")
+REPLACEMENT = re.compile(r"(.+) by (.+)")
+
+
+def blocks(page, *languages):
+    """(line, text, notes) of the blocks of a page in some languages."""
+    text = page.read_text(encoding="utf-8")
+    for found in BLOCK.finditer(text):
+        if found["language"] in languages:
+            line = text.count("\n", 0, found.start("text")) + 1
+            yield line, found["text"], NOTE.findall(found["notes"])
+
+
+def programs():
+    """Pages with Python blocks."""
+    for page in PAGES:
+        notes = [kind for _, _, found in blocks(page, "python") for kind, _ in found]
+        marks = [pytest.mark.slow] if "slow" in notes else []
+        if any(True for _ in blocks(page, "python")):
+            yield pytest.param(page, marks=marks, id=page.name)
+
+
+def as_run(line, text, notes):
+    """The text of a block as its notes want it, after as many lines as are above it; None: skip."""
+    for kind, what in notes:
+        if kind == "skip":
+            return None
+        if kind == "replace":
+            old, new = REPLACEMENT.fullmatch(what).groups()
+            assert old in text, f"line {line} has no {old} to replace"
+            text = text.replace(old, new)
+    return "\n" * (line - 1) + text
+
+
+@pytest.mark.parametrize("page", list(programs()))
+def test_programs_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # windows without a screen
+    namespace = {"__name__": "__documentation__"}
+    for line, text, notes in blocks(page, "python"):
+        program = as_run(line, text, notes)
+        if program is not None:
+            exec(compile(program, str(page), "exec"), namespace)
+
+
+def test_every_note_is_understood():
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        used = [note for *_, notes in blocks(page, "python") for note in notes]
+        assert text.count("<!-- test:") == len(used), page
+        for kind, what in used:
+            assert kind != "replace" or REPLACEMENT.fullmatch(what), what
+
+
+def commands_of(text):
+    """Command lines `quad-gym ...` in a shell block, a Makefile or a docstring.
+
+    Docstrings explain them behind three spaces.
+    """
+    text = text.replace("\\\n", " ")
+    for found in re.finditer(r"^\s*(?:[$@] ?)?(?:\$\(BIN\)/)?quad-gym +(.*)$", text, re.MULTILINE):
+        yield re.split(r" {3,}", found[1])[0]
+
+
+def command_lines():
+    """All of them, with the file that they are in."""
+    for page in PAGES:
+        for _, text, _ in blocks(page, "sh", "console"):
+            yield from ((page, words) for words in commands_of(text))
+        prose = BLOCK.sub("", page.read_text(encoding="utf-8"))
+        yield from ((page, " ".join(w.split())) for w in re.findall(r"`quad-gym ([^`]+)`", prose))
+    for file in (*COMMAND_MODULES, *sorted((ROOT / "docs" / "gallery").glob("*.py"))):
+        text = file.read_text(encoding="utf-8").replace("\n#", "\n ")
+        yield from ((file, words) for words in commands_of(text))
+    makefile = ROOT / "Makefile"
+    yield from ((makefile, w) for w in commands_of(makefile.read_text(encoding="utf-8")))
+
+
+LINES = sorted({(file.relative_to(ROOT).as_posix(), words) for file, words in command_lines()})
+
+
+def test_command_lines_are_found():
+    found = {file for file, _ in LINES}
+    assert {"README.md", "Makefile", "docs/training.md", "quad_gym/commands/fly.py"} <= found
+
+
+def exit_code(module, options):
+    """What parsing the options of a command ends with; --help ends with 0."""
+    try:
+        parse(importlib.import_module(f"quad_gym.commands.{module}").Args, options)
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+@pytest.mark.parametrize(("file", "words"), LINES)
+def test_command_lines_parse(file, words):
+    command, *options = shlex.split(words, comments=True)
+    assert command in COMMANDS
+    name = "benchmark.main" if command == "benchmark" else command
+    assert exit_code(name, options) == 0, f"{file}: quad-gym {words}"
+
+
+def test_files_that_pages_name_exist():
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":
+            continue
+        for path in re.findall(
+            r"`((?:quad_gym|baselines|tests|scripts)/[\w/.]*)`", page.read_text()
+        ):
+            assert (ROOT / path).exists(), f"{page.name} names {path}"
+
+
+def test_functions_that_the_equations_name_exist():
+    text = " ".join((ROOT / "docs" / "filter-equations.md").read_text(encoding="utf-8").split())
+    found = re.findall(r"((?:`\w+`(?:, | and )?)+) in `(quad_gym/[\w/]+\.py)`", text)
+    assert len(found) > 15
+    for names, path in found:
+        source = (ROOT / path).read_text(encoding="utf-8")
+        for name in re.findall(r"`(\w+)`", names):
+            assert f"def {name}(" in source, f"{path} has no {name}"
+
+
+def in_interface():
+    """Names in the pages of the interface: of objects, and of modules with all their members."""
+    text = "\n".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs" / "api").glob("*.md"))
+    modules = set(re.findall(r"automodule:: ([\w.]+)", text))
+    objects = set(re.findall(r"auto(?:class|function|data):: ([\w.]+)", text))
+    return {name.rpartition(".")[2] for name in objects} | {
+        name
+        for module in map(importlib.import_module, modules)
+        for name, value in vars(module).items()
+        if getattr(value, "__module__", None) == module.__name__
+    }, modules
+
+
+def test_every_public_name_is_in_the_interface():
+    names, modules = in_interface()
+    public = {*quad_gym.__all__, *quad_gym._LAZY} - {"__version__", "faults"}
+    assert public <= names, sorted(public - names)
+    assert "PDPolicy" in names
+    files = {m.stem for m in (ROOT / "quad_gym" / "analysis").glob("*.py")} - {"__init__"}
+    wanted = {f"quad_gym.analysis.{name}" for name in files} | {
+        f"quad_gym.{name}"
+        for name in (
+            "estimation",
+            "evaluation",
+            "faults",
+            "frames",
+            "rendering",
+            "rotations",
+            "sensors",
+            "vehicle",
+        )
+    }
+    assert wanted <= modules, sorted(wanted - modules)
