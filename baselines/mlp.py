@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +80,7 @@ class MlpPolicy:
             x = _ACTIVATIONS[activation](x @ W.T + b)
         return np.clip(x, -1.0, 1.0).astype(np.float32), None
 
-    def save(self, file: Path) -> None:
+    def save(self, file: Path | IO[bytes]) -> None:
         """Write the policy and its record to one file."""
         layers: dict[str, Any] = {f"W{i}": W for i, W in enumerate(self.weights)}
         layers |= {f"b{i}": b for i, b in enumerate(self.biases)}

@@ -31,6 +31,10 @@ class _Seen(NamedTuple):
 
 
 _RELATIVE_FIELDS = _Seen._fields[:-1]
+_ABSOLUTE_FIELDS = (
+    *("position", "velocity", "R_BI", "body_rates", "reference_position", "reference_velocity"),
+    *("reference_heading", "reference_acceleration"),
+)
 
 
 def _require_plain_observations(env: Any) -> None:
@@ -95,6 +99,12 @@ class PDPolicy:
         _require_plain_observations(env)
         if flights.observation == "sensors":
             raise ValueError('env must observe a state: observation="sensors" holds none')
+        needed = _ABSOLUTE_FIELDS if flights.layout == "absolute" else _RELATIVE_FIELDS
+        missing = sorted(set(needed) - {field.name for field in flights.table})
+        if missing:
+            raise ValueError(
+                f"env must observe {missing[0]}: its task replaces the observation that ships"
+            )
         if flights.action == "velocity" and flights.layout != "absolute":
             raise ValueError(
                 'env must have layout="absolute" for action="velocity", as the relative layout '

@@ -116,7 +116,7 @@ def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, An
     if record.exists():
         _require_agreement(file, json.loads(record.read_text(encoding="utf-8")), env)
     try:
-        from baselines.plans import algorithm_class
+        from baselines.models import algorithm_class
     except ImportError as error:
         raise ImportError(
             f'{file} needs Stable-Baselines3: pip install "quad-gym[train]"'

@@ -1,4 +1,4 @@
-"""Training with Stable-Baselines3: from a plan to a folder with everything about the run.
+"""Training: from a plan to a folder with everything about the run.
 
 The folder holds
 
@@ -6,8 +6,10 @@ The folder holds
   Stable-Baselines3 loads them; `last.zip` also holds what resuming needs: the flights, the random
   number generators, the counters (and `replay_*.pickle` beside it, for algorithms with a replay
   buffer);
+- or, from the compiled engine, `last.npz` and `best.npz` of the same kind, as `MlpPolicy` loads
+  them;
 - `training.json`: the plan, versions, seeds, wall time; `evaluations.csv`: errors while training;
-- TensorBoard's files.
+- TensorBoard's files, from Stable-Baselines3.
 
 A run that is resumed goes on exactly where the last evaluation left it.
 """
@@ -17,11 +19,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
-from baselines.checkpoints import Keeper, RunError, has_checkpoint, load_model
-from baselines.mlp import mlp_of
-from baselines.plans import Plan, algorithm_class, description, make_model
+from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint
+from baselines.mlp import MlpPolicy, mlp_of
+from baselines.plans import Plan, description
 from baselines.policies import interface_of
 from quad_gym.analysis.reports import versions, write_json
 from quad_gym.batch.threads import resolve_threads
@@ -40,11 +40,8 @@ class Training:
     """whether all steps were done"""
     best: dict[str, float]
     """of the best evaluation"""
-
-    @property
-    def best_policy(self) -> Path:
-        """The policy at the best evaluation."""
-        return self.folder / "best.zip"
+    best_policy: Path
+    """the policy at the best evaluation"""
 
 
 def train(
@@ -58,7 +55,7 @@ def train(
         plan: What to train.
         folder: Where the run is kept; made if missing.
         resume: Go on from the folder's last checkpoint; without one, begin.
-        tensorboard: Whether to write TensorBoard's files.
+        tensorboard: Whether Stable-Baselines3 is to write TensorBoard's files.
         quiet: Whether to leave out the progress bar.
 
     Returns:
@@ -82,29 +79,25 @@ def train(
             )
         if before["finished"]:
             return Training(
-                folder, before["steps"], before["training_seconds"], True, before["best"]
+                folder,
+                before["steps"],
+                before["training_seconds"],
+                True,
+                before["best"],
+                best_file(plan, folder),
             )
-    threads = resolve_threads(plan.threads)
-    torch.set_num_threads(1)  # networks this small gain nothing from more
-    env, judge = plan.make_flights(), plan.make_judge()
-    model = make_model(plan, env, folder / "tensorboard" if tensorboard else None)
-    keeper = Keeper(plan, folder, judge, quiet=quiet)
-    resuming = has_checkpoint(folder)
-    if resuming:
-        model = load_model(folder, model, env, keeper)
-    else:
+    judge = plan.make_judge()
+    if not has_checkpoint(folder):
         begun = {"plan": described, "interface": interface_of(judge), "finished": False}
         write_json(folder / "training.json", begun)
-    steps = plan.recipe.steps - model.num_timesteps
-    with keeper:
-        if steps > 0:
-            model.learn(
-                steps,
-                callback=keeper,
-                reset_num_timesteps=not resuming,
-                tb_log_name="run",
-            )
-        keeper.finish(model)
+    if plan.engine == "compiled":
+        from baselines.compiled_ppo.run import run as run_compiled
+
+        keeper: RunKeeper = run_compiled(plan, folder, judge, quiet=quiet)
+    else:
+        from baselines.checkpoints import run
+
+        keeper = run(plan, folder, judge, tensorboard=tensorboard, quiet=quiet)
     record = {
         "plan": described,
         "interface": interface_of(judge),
@@ -114,14 +107,15 @@ def train(
         "steps_per_second": keeper.steps / max(keeper.seconds, 1e-9),
         "best": keeper.best,
         "last": keeper.last,
-        "threads": threads,
+        "threads": resolve_threads(plan.threads),
         "ended": time.strftime("%Y-%m-%d %H:%M:%S"),
         "versions": versions("numpy", "numba", "torch", "stable_baselines3", "sb3_contrib"),
     }
     write_json(folder / "training.json", record)
     judge.close()
-    env.close()
-    return Training(folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best)
+    return Training(
+        folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best, best_file(plan, folder)
+    )
 
 
 def export(training: Training, file: Path) -> None:
@@ -131,7 +125,13 @@ def export(training: Training, file: Path) -> None:
         ValueError: If the policy is no plain network.
     """
     record = json.loads((training.folder / "training.json").read_text(encoding="utf-8"))
-    kind = algorithm_class(record["plan"]["recipe"]["algorithm"])
-    model = kind.load(training.best_policy, device="cpu")
+    if training.best_policy.suffix == ".npz":
+        policy = MlpPolicy.load(training.best_policy)
+        policy.record = record
+    else:
+        from baselines.models import algorithm_class
+
+        kind = algorithm_class(record["plan"]["recipe"]["algorithm"])
+        policy = mlp_of(kind.load(training.best_policy, device="cpu"), record)
     file.parent.mkdir(parents=True, exist_ok=True)
-    mlp_of(model, record).save(file)
+    policy.save(file)

@@ -7,20 +7,16 @@ compiled or loaded from their cache, when the first environment is made.
 from typing import Any
 
 from quad_gym import faults
-from quad_gym.envs import IDS, make_sb3_vec_env, register_all
+from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
+from quad_gym.params.camera import CameraParams
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.distributions import LogUniform, Normal, Uniform
 from quad_gym.params.filter import FilterParams
+from quad_gym.params.gnss import GnssParams
+from quad_gym.params.imu import ImuParams
 from quad_gym.params.randomization import Randomization
-from quad_gym.params.sensors import (
-    CameraParams,
-    GnssParams,
-    ImuParams,
-    NoisyObservationParams,
-    PlacementParams,
-    SensorSuite,
-)
+from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
@@ -48,7 +44,12 @@ _LAZY = {
     "QuadVectorEnv": "quad_gym.envs.vector",
     "ExtendedKalmanFilter": "quad_gym.estimation",
     "UnscentedKalmanFilter": "quad_gym.estimation",
+    "Observed": "quad_gym.tasks",
+    "Task": "quad_gym.tasks",
+    "TaskError": "quad_gym.tasks",
+    "View": "quad_gym.tasks.view",
     "observation_layout": "quad_gym.envs.spaces",
+    "rewards": "quad_gym.tasks",
 }
 
 __all__ = [
@@ -75,6 +76,7 @@ __all__ = [
     "faults",
     "make_sb3_vec_env",
     "pd_gains",
+    "register_task",
     "sensor_suite",
     "vehicle_params",
     "world_params",

@@ -55,9 +55,9 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
 
 
 @functools.cache
-def _prepare() -> None:
+def _prepare(drifts: bool) -> None:
     """Compile what a filter calls, side by side, unless this process has it."""
-    prepare(single.FILTER)
+    prepare(single.DRIFT_FILTER if drifts else single.FILTER)
 
 
 def _require_relative(position_G: NDArray[np.float64]) -> None:
@@ -178,7 +178,7 @@ class _KalmanFilter:
 
     def _start(self, x_I: NDArray[np.float64]) -> None:
         """Start from the fix in the record, with clocks at zero and nothing remembered."""
-        _prepare()
+        _prepare(self.sensors.drifts)
         self._flight["tick"], self._flight["w_before"] = 0.0, np.nan
         self._flight["rejected_in_row"] = self._flight["reopened"] = 0.0
         single.ukf_initialize(self._flight, self._params, x_I)
@@ -236,7 +236,8 @@ class _KalmanFilter:
             f["feature_valid"][0, : self._features] = seen
             f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
         before = self.status
-        single.ukf_update(f, self._params, self._work, self._features, self._form)
+        run = single.drift_update if self.sensors.drifts else single.ukf_update
+        run(f, self._params, self._work, self._features, self._form)
         self._warn_of_news(before)
 
     def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
@@ -262,7 +263,8 @@ class _KalmanFilter:
         self._flight["w_before"] = self._flight["w_meas"] if known else rates
         self._flight["w_meas"] = rates
         before = self.status
-        single.ukf_predict(self._flight, self._params, self._work, self._form)
+        run = single.drift_predict if self.sensors.drifts else single.ukf_predict
+        run(self._flight, self._params, self._work, self._form)
         self._warn_of_news(before)
 
     # ---- the estimate -------------------------------------------------------------------------
@@ -296,6 +298,20 @@ class _KalmanFilter:
     def covariance(self) -> NDArray[np.float64]:
         """(15, 15) covariance of the errors, in the order r, v, e, b_a, b_g."""
         L = self._read("L")
+        return L @ L.T
+
+    @property
+    def gnss_drift(self) -> NDArray[np.float64]:
+        """(3,) estimated slow error of GNSS positions in I [m], zero for suites without one.
+
+        It is zero at the start: positions count from where the receiver has the vehicle then.
+        """
+        return self._read("gnss_drift_hat")
+
+    @property
+    def gnss_drift_covariance(self) -> NDArray[np.float64]:
+        """(3, 3) covariance of its error [m^2]."""
+        L = self._read("L_drift")
         return L @ L.T
 
     @property

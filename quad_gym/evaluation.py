@@ -7,10 +7,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs import keywords_of
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params import checks as check
+
+NO_CRASHES = ["last_gate", "task"]
+"""Endings of terminated episodes that are no crashes; what a task's own ending is, it knows."""
 
 
 class Policy(Protocol):
@@ -118,7 +121,7 @@ def roll_out(
             late_steps += flying
         over = flying & (terminated | truncated)
         ending[over] = info["ending"][over]
-        crashed |= over & terminated & (info["ending"] != "last_gate")
+        crashed |= over & terminated & ~np.isin(info["ending"], NO_CRASHES)
         gates[over] = info["gates_passed"][over]
         flying &= ~over
         if watch is not None:
@@ -162,7 +165,7 @@ def evaluate(
 
     Args:
         policy: Acts on batches of observations.
-        env_id: One of `quad_gym.IDS`.
+        env_id: One of `quad_gym.IDS`, or of `quad_gym.register_task`.
         episodes: How many.
         seed: Of the first episode; episode i has seed + i.
         watch: Called at the start and after every step, such as `recording.Tracer.add`.
@@ -174,8 +177,7 @@ def evaluate(
     Raises:
         ValueError: If an argument is invalid.
     """
-    if env_id not in quad_gym.IDS:
-        raise ValueError(f"env_id must be one of {', '.join(quad_gym.IDS)}, got {env_id!r}")
+    keywords_of(env_id)
     count = check.whole("episodes", episodes)
     env = gymnasium.make_vec(env_id, num_envs=count, **keywords)
     return roll_out(policy, env, seed=seed, watch=watch)

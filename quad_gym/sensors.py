@@ -8,7 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.kernels import single
 from quad_gym.packing.flight import params_record
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import CameraParams, GnssParams, ImuParams, SensorSuite
+from quad_gym.params.camera import CameraParams
+from quad_gym.params.gnss import GnssParams
+from quad_gym.params.imu import ImuParams
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import FLIGHT
 from quad_gym.rotations import dcm_to_quaternion
@@ -47,7 +50,7 @@ class GnssReceiver(_Sensor):
     def __init__(self, params: GnssParams, rng: np.random.Generator) -> None:
         imu = ImuParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
-        self._drifts = any(params.drift_sigma_I)
+        self._drifts = params.drifts
 
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike

@@ -21,7 +21,7 @@ class Rewinding:
 
     def _state(self):
         f = self.plain
-        return tuple(part.copy() for part in (f.r, f.v, f.R, f.b_a, f.b_g, f.P))
+        return tuple(part.copy() for part in (f.r, f.v, f.R, f.b_a, f.b_g, f.d, f.P))
 
     def predict(self, gyro, accel):
         """Carry the filter over a tick."""
@@ -38,7 +38,7 @@ class Rewinding:
         """Take a measurement into account that was taken at a tick not after the present one."""
         self._measured[taken_at].append(measurement)
         f = self.plain
-        f.r, f.v, f.R, f.b_a, f.b_g, f.P = (part.copy() for part in self._states[taken_at])
+        f.r, f.v, f.R, f.b_a, f.b_g, f.d, f.P = (part.copy() for part in self._states[taken_at])
         for tick in range(taken_at, self.tick + 1):
             for known in self._measured[tick]:
                 f.update(**known)

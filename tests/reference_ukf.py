@@ -7,8 +7,9 @@ filter computes in as many digits as the decimal context has. In float64 it is t
 filter that speeds are compared with.
 
 State (r, v, e, b_a, b_g) with R_BI = R(e) Rbar_BI and e = 0 after each step. Prediction noise
-(v_g, v_g2, v_a, v_a2). `PlainEKF` differentiates the same models numerically, which is as good as
-exact in that many digits.
+(v_g, v_g2, v_a, v_a2). Where GNSS positions drift, the slow error d is part of the state, after
+b_g, and its driving noise part of the noise, at the end. `PlainEKF` differentiates the same models
+numerically, which is as good as exact in that many digits.
 """
 
 from decimal import Decimal
@@ -168,6 +169,8 @@ class PlainUKF:
         self.l_p = array(gnss.primary_antenna_B)
         self.l_b = array(gnss.secondary_antenna_B) - self.l_p
         self.R_position = eye * array(gnss.position_sigma_I) ** 2
+        self.drifts, self.states = any(gnss.drift_sigma_I), 18 if any(gnss.drift_sigma_I) else 15
+        self.d = self.zeros[: self.states - 15]
         self.baseline_variance = number(gnss.baseline_sigma) ** 2
         self.features = array(np.zeros((0, 3)))
         if sensors.camera is not None:
@@ -184,6 +187,11 @@ class PlainUKF:
         Q_a = number(imu.accel_noise_density) ** 2 / self.dt * eye
         Q_g = number(imu.gyro_noise_density) ** 2 / self.dt * eye
         self.Q = block_diagonal(Q_g, drive["gyro"], Q_a, drive["accel"])
+        if self.drifts:
+            self.zeros = array_of(number, np.zeros(15))
+            self.decay["drift"] = np.exp(-self.dt / number(gnss.drift_tau))
+            variance = array(gnss.drift_sigma_I) ** 2 * (1 - self.decay["drift"] ** 2)
+            self.Q = block_diagonal(self.Q, eye_of(number) * variance)
 
     def _array(self, values):
         return array_of(self.number, values)
@@ -204,15 +212,16 @@ class PlainUKF:
 
     def _inject(self, x, P):
         self.r, self.v, e, self.b_a, self.b_g = x[:3], x[3:6], x[6:9], x[9:12], x[12:15]
+        self.d = x[15:]
         self.R = rotation_312(e) @ self.R
         self.P = (P + P.T) / 2
         if self.sensors.estimator.covariance_reset == "turn":
-            turn = eye_of(self.number, 15)
+            turn = eye_of(self.number, self.states)
             turn[6:9, 6:9] = inverse33(euler_rate_matrix(e[np.newaxis])[0])
             self.P = turn @ self.P @ turn.T
 
     def _state(self):
-        return np.concatenate([self.r, self.v, self.zeros[:3], self.b_a, self.b_g])
+        return np.concatenate([self.r, self.v, self.zeros[:3], self.b_a, self.b_g, self.d])
 
     # ---- the cycle ----
 
@@ -231,6 +240,9 @@ class PlainUKF:
             self.number(imu.accel_bias_sigma) ** 2 * eye,
             self.number(imu.gyro_bias_sigma) ** 2 * eye,
         )
+        self.d = self.zeros[: self.states - 15]
+        if self.drifts:  # known to be zero, but for what a factor needs
+            self.P = block_diagonal(self.P, self.number(1e-30) * eye)
 
     def predict(self, gyro, accel):
         w_B, f_B = self._array(gyro), self._array(accel)
@@ -251,8 +263,10 @@ class PlainUKF:
         return mean, (w_cov * deviations.T) @ deviations
 
     def _process(self, points, w_B, f_B):
-        """(n, 15) states after a tick, of (n, 27) states with noise before it."""
-        r, v, e, b_a, b_g, v_g, v_g2, v_a, v_a2 = np.split(points, 9, axis=1)
+        """(n, 15 or 18) states after a tick, of states with noise before it."""
+        r, v, e, b_a, b_g = np.split(points[:, :15], 5, axis=1)
+        noise = points[:, self.states :]
+        v_g, v_g2, v_a, v_a2 = np.split(noise[:, :12], 4, axis=1)
         dt, R_BI = self.dt, rotation_312(e) @ self.R
         force = f_B - b_a - v_a
         if self.sensors.estimator.integration == "midpoint":
@@ -264,6 +278,7 @@ class PlainUKF:
             rate = (euler_rate_matrix(e) @ (w_B - b_g - v_g)[:, :, np.newaxis])[:, :, 0]
             e_after = e + dt * rate
         a_I = (force[:, np.newaxis] @ R_BI)[:, 0] - self.g_I
+        drift = [self.decay["drift"] * points[:, 15:18] + noise[:, 12:]] if self.drifts else []
         return np.concatenate(
             [
                 r + v * dt + a_I * dt**2 / 2,
@@ -271,6 +286,7 @@ class PlainUKF:
                 e_after,
                 self.decay["accel"] * b_a + v_a2,
                 self.decay["gyro"] * b_g + v_g2,
+                *drift,
             ],
             axis=1,
         )
@@ -280,10 +296,10 @@ class PlainUKF:
         if gnss_position_G is not None:
             measured.append(self.R_IG @ self._array(gnss_position_G))
             noises.append(self.R_position)
-            models.append(lambda r, R: r + self.l_p @ R)
+            models.append(lambda r, R, d: r + self.l_p @ R + d)
         if gnss_baseline_G is not None:
             measured.append(unit(self.R_IG @ self._array(gnss_baseline_G)))
-            models.append(lambda r, R: unit(self.l_b @ R))
+            models.append(lambda r, R, d: unit(self.l_b @ R))
             noises.append(self._direction_noise(unit(self.R.T @ self.l_b), self.baseline_variance))
         for X_I, pixel in zip(self.features, [] if pixels is None else pixels, strict=False):
             if np.isfinite(pixel).all():
@@ -295,15 +311,17 @@ class PlainUKF:
     def _predicted(self, models, points):
         """What is measured at states (n, 15 and more), (n, n_z)."""
         r, R_BI = points[:, :3], rotation_312(points[:, 6:9]) @ self.R
-        return np.concatenate([model(r, R_BI) for model in models], axis=1)
+        d = points[:, 15:18] if self.drifts else 0 * r
+        return np.concatenate([model(r, R_BI, d) for model in models], axis=1)
 
     def _condition(self, z, noise, models):
         x0 = np.concatenate([self._state(), self._array(np.zeros(len(z)))])
         points, w_mean, w_cov = self._sigma_points(x0, block_diagonal(self.P, noise))
-        Z = self._predicted(models, points) + points[:, 15:]
+        Z = self._predicted(models, points) + points[:, self.states :]
         z_mean = w_mean @ Z
-        x_mean = w_mean @ points[:, :15]
-        dX, dZ = points[:, :15] - x_mean, Z - z_mean
+        states = points[:, : self.states]
+        x_mean = w_mean @ states
+        dX, dZ = states - x_mean, Z - z_mean
         P_zz, P_xz = (w_cov * dZ.T) @ dZ, (w_cov * dX.T) @ dZ
         self.innovation, self.innovation_covariance, self.prediction = z - z_mean, P_zz, Z[0]
         K = solve_positive_definite(P_zz, np.ascontiguousarray(P_xz.T)).T
@@ -314,14 +332,14 @@ class PlainUKF:
         size, focal = self.number(camera.pixel_size), self.number(camera.focal_length)
         v = size * self._array([pixel[0], pixel[1], focal])
 
-        def direction(r, R):
+        def direction(r, R, d):
             to_feature = X_I - r - self.l_c @ R
             return unit((R @ to_feature[..., np.newaxis])[..., 0] @ self.R_CB.T)
 
         variance = (self.number(camera.pixel_sigma) * size) ** 2 / (v @ v)
         across = unit(v)
         if self.sensors.estimator.feature_noise_across != "measured":
-            across = direction(self.r, self.R)
+            across = direction(self.r, self.R, self.d)
         noise = self._direction_noise(across, variance)
         if self.sensors.estimator.feature_noise_across == "projected":
             projector = eye_of(self.number) - np.outer(across, across)
@@ -341,7 +359,8 @@ class PlainUKF:
     R_BI = property(lambda self: self.R)
     accel_bias = property(lambda self: self.b_a)
     gyro_bias = property(lambda self: self.b_g)
-    covariance = property(lambda self: self.P)
+    covariance = property(lambda self: self.P[:15, :15])
+    gnss_drift = property(lambda self: self.d)
 
 
 class PlainEKF(PlainUKF):

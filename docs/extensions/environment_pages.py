@@ -195,7 +195,7 @@ def _suites_page() -> str:
     """The numbers of every suite side by side."""
     suites = {name: quad_gym.sensor_suite(name) for name in SUITES}
     text = "# Sensor suites in numbers\n\nThe fields of `quad_gym.SensorSuite`. Where they come "
-    text += "from is written beside them, in `quad_gym/params/sensors.py` and `suites.py`.\n"
+    text += "from is written beside them, in `quad_gym/params/`.\n"
     for part, kind in {
         "imu": quad_gym.ImuParams,
         "gnss": quad_gym.GnssParams,

@@ -1,5 +1,6 @@
 """`FlightBatch`: many flights of one configuration, flown together."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,15 +8,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.calls import Calls
+from quad_gym.batch.memory import FlightMemory
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
-from quad_gym.batch.threads import Crew, Fly, resolve_threads
+from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
-from quad_gym.faults.presets import FaultsGiven, faults_of, named_faults
-from quad_gym.kernels.batch import fly
+from quad_gym.faults.presets import FaultsGiven, faults_of
 from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import needed_stages
+from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.faults import pack_faults
-from quad_gym.packing.flight import pack_latency, params_block, params_record, settings_record
+from quad_gym.packing.flight import (
+    pack_imperfections,
+    pack_latency,
+    params_block,
+    params_record,
+    settings_record,
+)
 from quad_gym.packing.world import pack_options
 from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
@@ -28,23 +36,27 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
     COLUMNS,
-    FLIGHT_BLOCK,
+    MAX_ACTION_DELAY,
     RESULTS,
     WIDTH,
     WORK_BLOCK,
     Autoreset,
+    Call,
     Command,
     Control,
     Layout,
     Source,
     aligned_zeros,
-    field_of_flights,
+    room_of,
 )
 
 _NO_BOUNDS = np.zeros(0)
+"""Fields that are NaN at first, all others are zero."""
+_WORTH_NO_COPY = 1 << 16
+"""Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
 
 
-class FlightBatch:
+class FlightBatch(FlightMemory):
     """N flights of one configuration, advanced together by compiled kernels.
 
     A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does
@@ -62,6 +74,8 @@ class FlightBatch:
         control: What an action means; `Control.PD` flies by itself.
         control_rate: Actions per second, a whole division of the IMU rate [Hz].
         substeps: Runge-Kutta steps in a tick.
+        action_delay: How much later than commanded an action is carried out, at most
+            MAX_ACTION_DELAY, in whole ticks [control steps]. Before, a vehicle hovers.
         layout: What an observation holds.
         include_covariance: Whether an observation holds the filter's standard deviations.
         privileged: Whether an observation ends with the truth.
@@ -99,6 +113,7 @@ class FlightBatch:
         control: Control = Control.PD,
         control_rate: float | None = None,
         substeps: int = 1,
+        action_delay: float = 0.0,
         layout: Layout = Layout.RELATIVE,
         include_covariance: bool = False,
         privileged: bool = False,
@@ -159,10 +174,19 @@ class FlightBatch:
         if run_filter:
             self.sensors.require_filter()
 
-        draws = DrawingTable(self.randomization, true_vehicle, true_sensors, self.world)
+        self.action_delay = check.number(
+            "action_delay", action_delay, least=0.0, most=float(MAX_ACTION_DELAY)
+        )
+        draws = DrawingTable(
+            self.randomization, true_vehicle, true_sensors, self.world, self.action_delay
+        )
+        longest_delay = math.ceil(draws.high[COLUMNS["action_delay"]][0])
+        if longest_delay > 0 and self.control is Control.PD:
+            raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
+        true["action_delay"] = self.action_delay
         self._model, self._world = params_block(model), params_block(true)
         self._own = [self._world.copy() for _ in range(self.threads)]
         self._settings = settings_record(
@@ -179,7 +203,7 @@ class FlightBatch:
             innovations=innovations,
             lever_drawn=self.randomization.known
             and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
-            gnss_drifts=true_sensors.gnss is not None and any(true_sensors.gnss.drift_sigma_I),
+            gnss_drifts=true_sensors.drifts,
         )
         pack_options(
             self._settings[0],
@@ -188,12 +212,15 @@ class FlightBatch:
             known=self.randomization.known,
             limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
         )
+        self._settings["action_delays"] = longest_delay
         pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
         pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors.estimator)
+        pack_imperfections(self._settings[0], true_sensors)
         if run_filter and filter_start == "warm":
             pack_warm_start(
                 self._settings[0],
                 FlightBatch,
+                true_sensors,
                 vehicle=self.vehicle,
                 sensors=self.sensors,
                 task=self.task,
@@ -201,23 +228,15 @@ class FlightBatch:
             )
         self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
-        self._blocks = aligned_zeros(-(-self.count // WIDTH), FLIGHT_BLOCK)
-        lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
-        self._blocks["idle"] = lanes >= self.count
-        self._blocks["needs_reset"] = 1.0
-        for name in ("start_given", "innovation", "innovation_sigma", "block_nis"):
-            self._blocks[name] = np.nan
-        self._blocks["drawn"] = draws.low[:, np.newaxis]  # as it stays where nothing is drawn
+        self._allocate(room_of(used_parts(self._settings[0])), draws.low)
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
-        self._actions = np.zeros((self.count, 4))
+        padded = len(self._blocks) * WIDTH
+        self._actions = np.zeros((padded, 4))
         self._resets = np.zeros(self.count, np.uint8)
-        self._begun = False
-        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
-        self._results = np.zeros((len(RESULTS), self.count))
         self._observations = np.zeros((self.count, self._low.size), np.float32)
+        self.final_observations = np.zeros((self.count, self._low.size), np.float32)
+        self._results = np.zeros((len(RESULTS), padded))
         self._crew: Crew | None = None
-
-    # ---- flying -------------------------------------------------------------------------------
 
     def reset(
         self,
@@ -280,7 +299,7 @@ class FlightBatch:
         """
         if not self._begun:
             self._require_begun()
-        self._actions[:] = self.read("action") if actions is None else actions
+        self._actions[: self.count] = self.read("action") if actions is None else actions
         return self._run(Command.STEP)
 
     def _require_begun(self) -> None:
@@ -294,43 +313,43 @@ class FlightBatch:
         self._begun = True
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        table = linked_table(self._stages)
         if self._crew is None or self._crew.process != os.getpid():
-            self._crew = Crew(self._ranges(table), len(self._blocks), self.threads)
+            self._calls = self._calls_of_threads()
+            self._crew = Crew(self._calls, len(self._blocks), self.threads)
+        self._crew.gather()
+        if self._observations.nbytes < _WORTH_NO_COPY:
+            self._crew.run(int(command))
+            return self._observations.copy()
+        self._observations = np.empty_like(self._observations)
+        self._calls.observe_into(self._observations)
         self._crew.run(int(command))
-        return self._observations.copy()
+        return self._observations
 
-    def _ranges(self, table: NDArray[Any]) -> Fly:
-        """What flies a range of blocks; it knows the arrays, not the batch, which may go."""
-        own, work = self._own, self._work
-        blocks, resets, world = self._blocks, self._resets, self._world
-        model = (self._model, self._settings)
-        after = (table, self._actions, self._low, self._high)
-        written = (self._observations, self.final_observations, self._results)
-
-        def fly_range(
-            number: int, first: int, last: int, words: NDArray[np.int64], serving: int
-        ) -> None:
-            fly(
-                blocks,
-                first,
-                last,
-                resets,
-                world,
-                own[number],
-                *model,
-                work[number],
-                *after,
-                *written,
-                words,
-                serving,
-            )
-
-        return fly_range
+    def _calls_of_threads(self) -> Calls:
+        """What the threads call the compiled code with."""
+        shared = {
+            Call.RESETS: self._resets,
+            Call.WORLD: self._world,
+            Call.MODEL: self._model,
+            Call.SETTINGS: self._settings,
+            Call.STAGES: linked_table(self._stages),
+            Call.ACTIONS: self._actions,
+            Call.LOW: self._low,
+            Call.HIGH: self._high,
+            Call.OBSERVATIONS: self._observations,
+            Call.FINAL_OBSERVATIONS: self.final_observations,
+            Call.RESULTS: self._results,
+        }
+        numbers = {
+            Call.COUNT: self.count,
+            Call.SIZE: self._low.size,
+            Call.RESULT_PITCH: self._results.strides[0],
+        }
+        return Calls(self._blocks, self._room, shared, numbers, self._own, self._work)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""
-        return self.__dict__ | {"_crew": None}
+        return self.__dict__ | {"_crew": None, "_calls": None}
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: never."""
@@ -372,77 +391,11 @@ class FlightBatch:
                 self._blocks["fault_from"][:, fault.kind] = tick
             self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
 
-    # ---- reading ------------------------------------------------------------------------------
-
-    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """One field, such as "r" or "b_a_hat", or one drawn parameter, as a new array (n, ...).
-
-        Args:
-            name: The field; or what is drawn for every episode, such as "mass".
-            flights: Whose, by their numbers; None: all flights'.
-
-        Raises:
-            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
-        """
-        if name in self.randomization.names:
-            values = self.drawn()[name]
-            return values if flights is None else values[flights]
-        if name not in (FLIGHT_BLOCK.names or ()):
-            drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
-            raise ValueError(
-                f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
-                f"got {name!r}"
-            )
-        if flights is None:
-            return field_of_flights(self._blocks, name, self.count)
-        return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
-
     @property
     def results(self) -> NDArray[np.float64]:
         """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
-        return self._results.T
+        return self._results[:, : self.count].T
 
     def result(self, name: str) -> NDArray[np.float64]:
         """One column of `RESULTS` of the last step, as a new array (count,)."""
-        return self._results[RESULTS.index(name)].copy()
-
-    def drawn(self) -> dict[str, NDArray[np.float64]]:
-        """What the present episodes have drawn, by name: (count,) or (count, components)."""
-        found = {}
-        for name in self.randomization.names:
-            values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
-            values = values.reshape(-1, values.shape[-1])[: self.count].copy()
-            found[name] = values[:, 0] if values.shape[1] == 1 else values
-        return found
-
-    def active_faults(self) -> dict[str, NDArray[np.bool_]]:
-        """Which of the faults that can come are there now, by name: (count,) each."""
-        return named_faults(self.faults, self.read("faults"))
-
-    def covariance(self) -> NDArray[np.float64]:
-        """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
-        factor = self.read("L")
-        return factor @ factor.transpose(0, 2, 1)
-
-    # ---- keeping ------------------------------------------------------------------------------
-
-    def snapshot(self) -> NDArray[Any]:
-        """A copy of all flights; `restore` brings them back to this instant bit for bit."""
-        return self._blocks.copy()
-
-    def restore(self, snapshot: NDArray[Any]) -> None:
-        """Bring all flights back to a snapshot of this batch, or of one of the same size.
-
-        Raises:
-            ValueError: If the snapshot is of another size or kind.
-        """
-        fits = (
-            isinstance(snapshot, np.ndarray)
-            and snapshot.dtype == FLIGHT_BLOCK
-            and snapshot.shape == self._blocks.shape
-            and np.array_equal(snapshot["idle"], self._blocks["idle"])
-        )
-        if not fits:
-            raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
-        self._blocks[:] = snapshot
-        self._begun = False  # it may have been taken before a reset
+        return self._results[RESULTS.index(name), : self.count].copy()

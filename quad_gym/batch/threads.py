@@ -14,12 +14,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels import mailbox
+from quad_gym.kernels import board
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.params import checks as check
 
 MIN_BLOCKS_PER_THREAD = 4
 """Fewer blocks than this are not worth a hand-over to another thread."""
+
+CHUNKS_OF_RANGE = 16
+"""Times that a thread comes for blocks of its range: each time costs some tens of nanoseconds."""
 
 MAX_THREADS = 1024
 """More than this is a mistake: each thread has memory of its own."""
@@ -36,42 +39,41 @@ def resolve_threads(threads: int | None) -> int:
     return check.whole("threads", threads, most=MAX_THREADS)
 
 
-Fly = Callable[[int, int, int, NDArray[np.int64], int], None]
-"""Flies a range: its number, first block, last block, mailbox, and whether to serve that."""
+Fly = Callable[[NDArray[np.int64], int, int, bool], bool]
+"""Flies blocks that a board has: board, number of the thread, command, whether it serves."""
+
+POSTED_BEFORE = -1
+"""In place of a command: nothing new, wait for what was posted before."""
 
 
 class Crew:
-    """Helper threads of one batch, each of which flies a range of its blocks.
+    """The threads that fly the blocks of one batch: the calling one, and helpers.
 
     A helper lives in compiled code while steps follow each other fast, and sleeps otherwise; see
-    `kernels/mailbox.py`. It ends with the crew.
+    `kernels/board.py`. It ends with the crew. A single thread needs no crew, but has its board.
 
     Args:
-        fly: Flies a range: once with serving 0, and with 1 until its mailbox stays empty.
+        fly: Flies blocks, see `Fly`.
         blocks: How many blocks there are.
-        threads: The most ranges to cut; the first is the calling thread's.
+        threads: The most threads to fly them.
     """
 
     def __init__(self, fly: Fly, blocks: int, threads: int) -> None:
         parts = max(1, min(threads, blocks // MIN_BLOCKS_PER_THREAD))
-        cuts = [blocks * part // parts for part in range(parts + 1)]
         self.process = os.getpid()
-        self._fly, self._own = fly, (0, cuts[0], cuts[1])
-        self._mailboxes = np.zeros((parts - 1, mailbox.WORDS), np.int64)
-        self._words = np.zeros(mailbox.WORDS, np.int64)
-        self._alarms = [threading.Semaphore(0) for _ in range(parts - 1)]
+        self._fly = fly
+        self._board = board_of(blocks, parts)
+        places = board.RANGES + board.WORDS_OF_RANGE * np.arange(1, parts) + board.PRESENT
+        self._alarms = [(int(place), threading.Semaphore(0)) for place in places]
         self._errors: list[BaseException] = []
         self._flying = False
-        for i in range(parts - 1):
-            part = (i + 1, cuts[i + 1], cuts[i + 2])
-            shared = (self._mailboxes[i], self._alarms[i], self._errors)
-            threading.Thread(
-                target=_help, args=(fly, *part, *shared), name="quad_gym", daemon=True
-            ).start()
-        weakref.finalize(self, _dismiss, self._mailboxes, self._alarms)
+        for number, alarm in enumerate(self._alarms, 1):
+            shared = (fly, self._board, number, *alarm, self._errors)
+            threading.Thread(target=_help, args=shared, name="quad_gym", daemon=True).start()
+        weakref.finalize(self, _dismiss, self._board, self._alarms)
 
     def run(self, command: int) -> None:
-        """Fly all ranges, the first of them in the calling thread.
+        """Fly all blocks.
 
         Raises:
             RuntimeError: If another thread is flying this batch at the same time.
@@ -80,55 +82,71 @@ class Crew:
             raise RuntimeError("a batch can be flown by one thread at a time")
         self._flying = True
         try:
-            self._words[mailbox.COMMAND] = command
-            if len(self._mailboxes):
-                self._wait()  # for what an interrupted step may have left
-                if mailbox.post(self._mailboxes, command):
-                    self._wake()
-            self._fly(*self._own, self._words, 0)
-            if len(self._mailboxes):
+            if not self._fly(self._board, 0, command, False):
                 self._wait()
+        except Exception as error:
+            self._errors.append(error)  # its blocks will never be finished
+            raise
         finally:
             self._flying = False
 
+    def gather(self) -> None:
+        """Wait for what an interrupted step may have left, and wake the helpers that sleep."""
+        if not self._alarms:
+            return
+        words = self._board
+        if words[board.FINISHED] != words[board.LAST - board.WORDS_OF_RANGE]:
+            self._wait()
+        for place, alarm in self._alarms:
+            if words[place] == 0:
+                words[place] = 1
+                alarm.release()
+
     def _wait(self) -> None:
-        """Wait until all helpers are done."""
-        while not mailbox.wait(self._mailboxes):
+        """Wait until all blocks are finished."""
+        while True:
             if self._errors:
-                raise self._errors.pop()
+                raise self._errors[-1]
+            if self._fly(self._board, 0, POSTED_BEFORE, False):
+                return
             time.sleep(0.0)
 
-    def _wake(self) -> None:
-        """Wake the helpers that sleep."""
-        for words, alarm in zip(self._mailboxes, self._alarms, strict=True):
-            if words[mailbox.PRESENT] == 0:
-                alarm.release()
+
+def board_of(blocks: int, parts: int) -> NDArray[np.int64]:
+    """A board with the blocks cut into ranges, and nothing posted."""
+    words = np.zeros(board.RANGES + parts * board.WORDS_OF_RANGE, np.int64)
+    ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
+    cuts = [blocks * part // parts for part in range(parts + 1)]
+    ranges[:, board.FIRST], ranges[:, board.LAST] = cuts[:-1], cuts[1:]
+    ranges[:, board.NEXT] = cuts[1:]
+    words[board.FINISHED] = blocks
+    words[board.CHUNK] = 1 + blocks // (CHUNKS_OF_RANGE * parts) if parts > 1 else blocks
+    return words
 
 
 def _help(
     fly: Fly,
-    number: int,
-    first: int,
-    last: int,
     words: NDArray[np.int64],
+    number: int,
+    place: int,
     alarm: threading.Semaphore,
     errors: list[BaseException],
 ) -> None:
-    """What a helper thread does: sleep until it is woken, then serve its mailbox."""
+    """What a helper thread does: sleep until it is woken, then serve the board."""
     while True:
         alarm.acquire()
-        if words[mailbox.STOP]:
+        if words[board.STOP]:
             return
-        words[mailbox.PRESENT] = 1
+        words[place] = 1
         try:
-            fly(number, first, last, words, 1)
+            fly(words, number, POSTED_BEFORE, True)
         except BaseException as error:
             errors.append(error)
             return
 
 
-def _dismiss(mailboxes: NDArray[np.int64], alarms: list[threading.Semaphore]) -> None:
+def _dismiss(words: NDArray[np.int64], alarms: list[tuple[int, threading.Semaphore]]) -> None:
     """End the helpers of a crew that nobody needs any more."""
-    mailboxes[:, mailbox.STOP] = 1
-    for alarm in alarms:
+    words[board.STOP] = 1
+    for _, alarm in alarms:
         alarm.release()

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import portable
-from quad_gym.params.sensors import ImuParams, SensorSuite
+from quad_gym.params.gnss import LEAST_DRIFT, GnssParams
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import WARM_DRAWS, Autoreset, Control, Source
+from quad_gym.records import WARM_DRAWS, WARM_DRIFT_DRAWS, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 FILTER_STARTS = ("cold", "warm")
@@ -38,18 +39,25 @@ it is wrong by its square over two. Overconfidence alone is no reason to refuse 
 Floats = NDArray[np.float64]
 
 
-def pack_warm_start(settings: Any, make: Callable[..., Any], **configuration: Any) -> None:
+def pack_warm_start(
+    settings: Any, make: Callable[..., Any], true_sensors: SensorSuite, **configuration: Any
+) -> None:
     """Fill the settings' fields of a warm start.
 
     Args:
         settings: One SETTINGS record.
         make: Makes a batch of flights, called as `FlightBatch`.
+        true_sensors: The sensors as they are.
         configuration: Arguments of `converged_covariance`.
     """
-    P = converged_covariance(make, **configuration)
-    W = root_with_biases(P, configuration["sensors"].imu)
+    P, sensors = converged_covariance(make, **configuration), configuration["sensors"]
+    W = root_with_truth(P, sensors)
     settings["warm"] = True
-    settings["warm_root"], settings["warm_covariance"] = W, portable.product(W, W.T)
+    states, draws = W.shape
+    settings["warm_root"][:states, :draws] = W
+    settings["warm_covariance"][:states, :states] = portable.product(W, W.T)
+    if true_sensors.gnss is not None:
+        settings["warm_drift_sigma"] = drift_sigma(true_sensors.gnss)
 
 
 @functools.lru_cache(maxsize=64)
@@ -71,7 +79,8 @@ def converged_covariance(
         substeps: Runge-Kutta steps in a tick.
 
     Returns:
-        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east.
+        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east; (18,
+        18) with the slow error d of GNSS positions last, if the filter estimates that.
 
     Raises:
         ValueError: If a filter fails on the way, or is lost at its end, as one that has nothing to
@@ -109,9 +118,10 @@ def converged_covariance(
             f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
             "filter its heading, such as a level baseline or the mark of `placement`?"
         )
-    mean = np.zeros((15, 15))
-    for q, L in zip(batch.read("q"), batch.read("L"), strict=True):
-        root = portable.product(_turned_east(q).T, L)
+    states = 18 if sensors.drifts else 15
+    mean = np.zeros((states, states))
+    for q, L in zip(batch.read("q"), _factors(batch), strict=True):
+        root = portable.product(_turned_east(q).T[:states, :states], L[:states, :states])
         mean += portable.product(root, root.T) / FLIGHTS
     return mean
 
@@ -122,35 +132,58 @@ def _attitude_errors(batch: Any) -> Floats:
     return dcm_to_euler(quaternion_to_dcm(batch.read("q")) @ R_hat.transpose(0, 2, 1))
 
 
+def _factors(batch: Any) -> Floats:
+    """(n, 18, 18) factors of the joint covariances."""
+    factors = np.zeros((batch.count, 18, 18))
+    factors[:, :15, :15], factors[:, 15:] = batch.read("L"), batch.read("L_drift")
+    return factors
+
+
 def _turned_east(q: Floats) -> Floats:
-    """(15, 15) turn of positions and velocities in I from a vehicle that looks east to this one."""
+    """(18, 18) turn of what is in I from a vehicle that looks east to this one."""
     w, x, y, z = map(float, q)
     forward = (w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z))
     c, s = (component / portable.norm(forward) for component in forward)
-    turn = np.eye(15)
-    for block in (slice(0, 3), slice(3, 6)):
+    turn = np.eye(18)
+    for block in (slice(0, 3), slice(3, 6), slice(15, 18)):
         turn[block, block] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
     return turn
 
 
-def root_with_biases(P: Floats, imu: ImuParams) -> Floats:
-    """W with W W^T = P, whose last six columns belong to the true biases.
+def drift_sigma(gnss: GnssParams) -> Floats:
+    """(3,) deviation of the slow error of GNSS positions `WARM_UP` after it was zero [m]."""
+    decay = math.exp(-2.0 * WARM_UP / gnss.drift_tau)
+    return np.array(gnss.drift_sigma_I) * math.sqrt(1.0 - decay)
 
-    A filter that started from the stationary distribution of the biases, of covariance S, has an
-    estimate that is independent of its error, so that cov(error, bias) = P_b, the columns of P for
-    the biases. Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals.
+
+def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
+    """W with W W^T = P, some of whose columns belong to the true biases and the true slow error.
+
+    A filter that started from the distribution of the biases, of covariance S, has an estimate that
+    is independent of its error, so that cov(error, bias) = P_b, the columns of P for the biases.
+    Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals. Likewise the slow
+    error of GNSS positions.
 
     Args:
-        P: (15, 15) covariance, whose share of the biases is not larger than S.
-        imu: Says what S is.
+        P: (15, 15) or (18, 18) covariance, whose share of biases and slow error is not larger than
+            S.
+        sensors: As the filter believes them to be; say what S is.
 
     Returns:
-        (15, WARM_DRAWS).
+        (15, WARM_DRAWS), with the columns of the biases last; or (18, WARM_DRAWS +
+        WARM_DRIFT_DRAWS), with three more, and those of the slow error, behind these.
     """
+    imu = sensors.imu
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
-    with_biases = P[:, 9:] / sigma
-    # what the biases do not explain; where they explain everything, rounding leaves some of it
-    rest = portable.lower_root(P - portable.product(with_biases, with_biases.T), np.diag(P))
-    W = np.zeros((15, WARM_DRAWS))
-    W[:, :15], W[:, 15:] = rest, with_biases
+    if len(P) == 15:
+        W = np.zeros((15, WARM_DRAWS))
+    else:
+        assert sensors.gnss is not None
+        sigma = np.concatenate([sigma, np.maximum(drift_sigma(sensors.gnss), LEAST_DRIFT)])
+        W = np.zeros((18, WARM_DRAWS + WARM_DRIFT_DRAWS))
+    with_truth = P[:, 9:] / sigma
+    # what the truth does not explain; where it explains everything, rounding leaves some of it
+    rest = portable.lower_root(P - portable.product(with_truth, with_truth.T), np.diag(P))
+    W[:, :15], W[:, 15:21] = rest[:, :15], with_truth[:, :6]
+    W[:, 21 : 21 + len(P) - 15], W[:, 24:] = rest[:, 15:], with_truth[:, 6:]
     return W

@@ -91,7 +91,8 @@ def configure(args: Args) -> Setting:
     from baselines.recipes import recipe
 
     try:
-        from baselines.plans import Plan, make_model
+        from baselines.models import make_model
+        from baselines.plans import Plan
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     plots.require_matplotlib()

@@ -5,7 +5,7 @@
 
 The hyper-parameters are those of baselines/recipes.py for the task and the algorithm. While
 training, the policy is evaluated on the task itself, by its true position error, and kept: last.zip
-and best.zip, which Stable-Baselines3 loads and quad-gym evaluate flies, with training.json
+and best.zip (.npz with --engine compiled), which quad-gym evaluate flies, with training.json
 (everything needed to repeat the run), evaluations.csv, and TensorBoard's files. A run that was
 stopped, by Ctrl-C or otherwise, goes on with --resume, exactly where its last evaluation left it.
 """
@@ -27,6 +27,8 @@ class Args:
     env_id: EnvId = "QuadGym/Circle-v0"
     algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
     """how to learn"""
+    engine: Literal["sb3", "compiled"] = "sb3"
+    """what trains: Stable-Baselines3, or the compiled PPO, some times faster and without torch"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=rtk camera=false"""
     steps: int | None = None
@@ -40,7 +42,8 @@ class Args:
     seed shares and quad-gym evaluate does not fly"""
 
     output: Path | None = None
-    """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED"""
+    """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; compiled_ppo is the
+    ALGORITHM of the compiled engine"""
     resume: bool = False
     """go on with the run in the folder"""
     evaluations: int = 20
@@ -50,7 +53,7 @@ class Args:
     threads: int | None = None
     """threads of the flights; if not given, one per core; no result depends on them"""
     tensorboard: bool = True
-    """write files for TensorBoard"""
+    """let Stable-Baselines3 write files for TensorBoard"""
     progress: bool = True
     """show a progress bar"""
     export: Path | None = None
@@ -65,13 +68,10 @@ def configure(args: Args) -> tuple[Any, Path]:
         OSError: If nothing can be written to the folder.
         ImportError: If Stable-Baselines3 is missing.
     """
+    from baselines.plans import Plan
     from baselines.recipes import recipe
     from quad_gym.analysis.reports import require_writable
 
-    try:
-        from baselines.plans import Plan, make_model
-    except ImportError as error:
-        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     chosen = recipe(args.env_id, args.algorithm)
     given = {"steps": args.steps, "n_envs": args.n_envs}
     chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})
@@ -82,13 +82,15 @@ def configure(args: Args) -> tuple[Any, Path]:
         recipe=chosen,
         seed=args.seed,
         threads=args.threads,
+        engine=args.engine,
         evaluations=args.evaluations,
         episodes=args.episodes,
     )
-    make_model(plan, plan.make_flights())
+    _require_model(plan)
     plan.make_judge().close()
     task = IDS[args.env_id]
-    folder = args.output or Path("results/train") / task / f"{args.algorithm}_seed_{args.seed}"
+    name = "compiled_ppo" if args.engine == "compiled" else args.algorithm
+    folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
     require_writable("--output", folder)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
@@ -97,12 +99,26 @@ def configure(args: Args) -> tuple[Any, Path]:
     return plan, folder
 
 
+def _require_model(plan: Any) -> None:
+    """Make the untrained model once, which checks what the plan says of it."""
+    if plan.engine == "compiled":
+        from baselines.compiled_ppo.run import make_compiled
+
+        make_compiled(plan).env.close()
+        return
+    try:
+        from baselines.models import make_model
+    except ImportError as error:
+        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
+    make_model(plan, plan.make_flights())
+
+
 def main(args: Args) -> None:
     """Train."""
     from_start = time.perf_counter()
     with usage_errors():
         plan, folder = configure(args)
-    from baselines.checkpoints import RunError
+    from baselines.keeping import RunError
     from baselines.training import export, train
 
     print(

@@ -9,21 +9,61 @@ from quad_gym.params.task import TASKS
 
 if TYPE_CHECKING:
     from quad_gym.envs.sb3 import QuadVecEnv
+    from quad_gym.tasks import Task
 
 IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in TASKS}
 """The registered environments and their tasks."""
+
+_ENTRY_POINTS = {
+    "entry_point": "quad_gym.envs.single:QuadEnv",
+    "vector_entry_point": "quad_gym.envs.vector:QuadVectorEnv",
+}
 
 
 def register_all() -> None:
     """Make the ids known to Gymnasium, once."""
     for env_id, task in IDS.items():
         if env_id not in registry:
-            register(
-                env_id,
-                entry_point="quad_gym.envs.single:QuadEnv",
-                vector_entry_point="quad_gym.envs.vector:QuadVectorEnv",
-                kwargs={"task": task},
-            )
+            register(env_id, **_ENTRY_POINTS, kwargs={"task": task})  # type: ignore[arg-type]
+
+
+def register_task(
+    env_id: str,
+    custom: "Task | type[Task] | str",
+    base: str = "QuadGym/Circle-v0",
+    **keywords: Any,
+) -> None:
+    """Register an environment with a task of one's own, for all three interfaces.
+
+    Args:
+        env_id: A new id, such as "Mine/Chase-v0".
+        custom: The task, see `quad_gym.Task`.
+        base: The id over which it is laid.
+        keywords: Those of `QuadEnv`, as defaults.
+
+    Raises:
+        ValueError: If the id is one of `IDS`, or `base` is none of them.
+    """
+    check.choice("base", base, tuple(IDS))
+    if env_id in IDS:
+        raise ValueError(f"env_id must be a new one, got {env_id!r}")
+    kwargs = {"task": IDS[base], "custom": custom, **keywords}
+    register(env_id, **_ENTRY_POINTS, kwargs=kwargs)  # type: ignore[arg-type]
+
+
+def keywords_of(env_id: str) -> dict[str, Any]:
+    """The keywords of an id, "task" among them: of one of `IDS`, or of `register_task`.
+
+    Raises:
+        ValueError: If there is no such id.
+    """
+    name = env_id.removeprefix("quad_gym:") if isinstance(env_id, str) else env_id
+    spec = registry.get(name) if isinstance(name, str) else None
+    if spec is None or spec.entry_point != _ENTRY_POINTS["entry_point"]:
+        raise ValueError(
+            f"env_id must be one of {', '.join(IDS)}, or of register_task, got {env_id!r}"
+        )
+    return dict(spec.kwargs)
 
 
 def make_sb3_vec_env(
@@ -32,7 +72,7 @@ def make_sb3_vec_env(
     """N flights of an id as a Stable-Baselines3 vector environment.
 
     Args:
-        env_id: One of `IDS`, with or without the prefix "quad_gym:".
+        env_id: One of `IDS`, with or without the prefix "quad_gym:", or of `register_task`.
         n_envs: Number of flights.
         seed: Seeds flight i with seed + i at the first reset.
         keywords: Those of `QuadEnv`, and `threads`.
@@ -44,9 +84,7 @@ def make_sb3_vec_env(
         ValueError: If the id or a keyword is unknown, or a value is invalid.
         ImportError: If Stable-Baselines3 is not installed.
     """
-    name = env_id.removeprefix("quad_gym:") if isinstance(env_id, str) else env_id
-    if not isinstance(name, str) or name not in IDS:
-        raise ValueError(f"env_id must be one of {', '.join(IDS)}, got {env_id!r}")
+    given = keywords_of(env_id) | keywords
     check.seed("seed", seed)
     try:
         from quad_gym.envs.sb3 import QuadVecEnv
@@ -54,7 +92,7 @@ def make_sb3_vec_env(
         raise ImportError(
             'make_sb3_vec_env needs Stable-Baselines3: pip install "quad-gym[train]"'
         ) from error
-    env = QuadVecEnv(n_envs, IDS[name], **keywords)
+    env = QuadVecEnv(n_envs, **given)
     if seed is not None:
         env.seed(seed)
     return env

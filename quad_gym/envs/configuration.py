@@ -3,7 +3,8 @@
 import inspect
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,9 @@ from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import RESULTS, Autoreset, Ending, Layout
+
+if TYPE_CHECKING:
+    from quad_gym.tasks import Task
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
     "hover": TaskParams(kind="hover", start="hover"),
@@ -123,6 +127,7 @@ class Flights:
         estimator: str | None = None,
         filter_start: str = "cold",
         control_rate: float = CONTROL_RATE,
+        action_delay: float = 0.0,
         imu_rate: float | None = None,
         gnss_rate: float | None = None,
         camera_rate: float | None = None,
@@ -134,6 +139,7 @@ class Flights:
         world: WorldParams | str = "calm",
         randomization: Randomization | Mapping[str, Given] | None = None,
         faults: FaultsGiven = None,
+        custom: "Task | type[Task] | str | None" = None,
     ) -> None:
         check.choice("observation", observation, tuple(OBSERVATIONS))
         check.choice("action", action, tuple(ACTIONS))
@@ -180,13 +186,12 @@ class Flights:
             gnss_velocity=suite.gnss is not None and suite.gnss.velocity_sigma is not None,
             drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
-        self.space = observation_space(self.table)
-        self._split = policy_size(self.table) if privileged else None
+        bounds = layout_bounds(self.table)
         self.observation, self.action, self.layout = observation, action, layout
         self.control_rate = check.positive("control_rate", control_rate)
         check_limit(self.task, self.control_rate, "control_rate")
-        self.batch = FlightBatch(
-            count,
+        make = partial(
+            FlightBatch,
             vehicle=vehicle,
             sensors=suite,
             actions=actions,
@@ -195,20 +200,26 @@ class Flights:
             control=ACTIONS[action],
             control_rate=control_rate,
             substeps=substeps,
+            action_delay=action_delay,
             layout=Layout.SENSORS if observation == "sensors" else LAYOUTS[layout],
             include_covariance=include_covariance,
             privileged=privileged,
-            bounds=layout_bounds(self.table),
-            autoreset=autoreset,
+            bounds=bounds,
             filter_start=filter_start,
             innovations=innovations,
-            threads=threads,
             true_vehicle=true_vehicle,
             true_sensors=true_sensors,
             world=place,
             randomization=drawn,
             faults=befall,
         )
+        if custom is not None:
+            from quad_gym.envs.custom import with_task
+
+            make, self.table = with_task(custom, make, self.table)
+        self.space = observation_space(self.table)
+        self._split = policy_size(self.table) if privileged else None
+        self.batch = make(count, autoreset=autoreset, threads=threads)
 
     def start(self, options: dict[str, Any] | None) -> dict[str, Any]:
         """The start values in the options of a reset, checked before anything changes.
@@ -269,13 +280,13 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
     """Whether actions need neither a check nor clipping; NaN and infinity are not within bounds."""
-    return (
-        isinstance(actions, np.ndarray)
-        and actions.dtype.kind == "f"
-        and actions.shape == shape
-        and bool(actions.max() <= 1.0)
-        and bool(actions.min() >= -1.0)
-    )
+    if not (
+        isinstance(actions, np.ndarray) and actions.dtype.kind == "f" and actions.shape == shape
+    ):
+        return False
+    if actions.ndim == 1:  # a few numbers are sooner looked at than handed to NumPy
+        return all(-1.0 <= number <= 1.0 for number in actions.tolist())
+    return bool(actions.max() <= 1.0 and actions.min() >= -1.0)
 
 
 def named_options(options: Any) -> dict[str, Any]:

@@ -22,6 +22,15 @@ from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
 
+_REWARD, _TERMINATED, _TRUNCATED = COLUMN["reward"], COLUMN["terminated"], COLUMN["truncated"]
+_POSITION_ERROR, _ESTIMATION_ERROR = COLUMN["position_error"], COLUMN["estimation_error"]
+_ENDING, _FILTER_STATUS = COLUMN["ending"], COLUMN["filter_status"]
+_FILTER_LOST, _GATES_PASSED, _FAULTS = (
+    COLUMN["filter_lost"],
+    COLUMN["gates_passed"],
+    COLUMN["faults"],
+)
+
 
 class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     """A quadrotor that is controlled on estimated state.
@@ -143,6 +152,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
             no GNSS; "warm": it has been running for 10 s before the episode and has converged.
         control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
+        action_delay: How much later than commanded the vehicle carries out an action, in control
+            steps (whole ticks), at most 10; 0 by default. Until the first action arrives it carries
+            out zeros, which hover. `last_action` in the observation is the commanded one.
         imu_rate: In place of the suite's [Hz].
         gnss_rate: In place of the suite's [Hz].
         camera_rate: In place of the suite's [Hz].
@@ -260,26 +272,23 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         batch = self.flights.batch
         observations = batch.step(numbers)
         row = batch.results[0].tolist()
-        terminated, truncated = row[COLUMN["terminated"]] > 0.0, row[COLUMN["truncated"]] > 0.0
+        terminated, truncated = row[_TERMINATED] > 0.0, row[_TRUNCATED] > 0.0
         self._over = terminated or truncated
         if self.rendering is not None:
             self.rendering.observe()
-        return (
-            self.flights.split(observations[0]),
-            row[COLUMN["reward"]],
-            terminated,
-            truncated,
-            {
-                "position_error": row[COLUMN["position_error"]],
-                "estimation_error": row[COLUMN["estimation_error"]],
-                "ending": ENDINGS[int(row[COLUMN["ending"]])],
-                "filter_status": int(row[COLUMN["filter_status"]]),
-                "filter_lost": row[COLUMN["filter_lost"]] > 0.0,
-                "gates_passed": int(row[COLUMN["gates_passed"]]),
-                **drawn_info(batch.drawn(), 0),
-                **info_of_flight(flight_info(batch, batch.results[:, COLUMN["faults"]]), 0),
-            },
-        )
+        info = {
+            "position_error": row[_POSITION_ERROR],
+            "estimation_error": row[_ESTIMATION_ERROR],
+            "ending": ENDINGS[int(row[_ENDING])],
+            "filter_status": int(row[_FILTER_STATUS]),
+            "filter_lost": row[_FILTER_LOST] > 0.0,
+            "gates_passed": int(row[_GATES_PASSED]),
+        }
+        if batch.randomization.names:
+            info |= drawn_info(batch.drawn(), 0)
+        if batch.faults or batch.innovations:
+            info |= info_of_flight(flight_info(batch, batch.results[:, _FAULTS]), 0)
+        return self.flights.split(observations[0]), row[_REWARD], terminated, truncated, info
 
     def render(self) -> Any:
         """What `render_mode` asks for.

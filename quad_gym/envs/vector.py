@@ -29,7 +29,7 @@ _MODES = {
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
 _ENDING_NAMES = np.array(ENDINGS, dtype=object)
-_NOBODY = np.zeros(0, np.intp)
+_TERMINATED, _TRUNCATED = COLUMN["terminated"], COLUMN["truncated"]
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
@@ -173,21 +173,15 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
                 "reset it before step()"
             )
         batch = self.flights.batch
-        next_step = self.autoreset_mode == AutoresetMode.NEXT_STEP
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
-        began = np.flatnonzero(self._over) if next_step else _NOBODY
         flown_with = batch.drawn() if same_step else {}
         observations = batch.step(numbers)
         results = batch.results
-        terminated, truncated = (
-            results[:, COLUMN["terminated"]] > 0.0,
-            results[:, COLUMN["truncated"]] > 0.0,
-        )
+        terminated, truncated = results[:, _TERMINATED] > 0.0, results[:, _TRUNCATED] > 0.0
         self._over = terminated | truncated
         if self.rendering is not None:
             self.rendering.observe()
         infos = self._step_infos(results)
-        self._replace_by_start(infos, began)
         infos = _masked(infos, self._everyone)
         if same_step and self._over.any():
             infos = self._with_finals(infos, flown_with)
@@ -237,7 +231,11 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "filter_lost": results[:, COLUMN["filter_lost"]] > 0.0,
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
         }
-        infos |= self._drawn() | flight_info(self.flights.batch, results[:, COLUMN["faults"]])
+        batch = self.flights.batch
+        if batch.randomization.names:
+            infos["drawn"] = batch.drawn()
+        if batch.faults or batch.innovations:
+            infos |= flight_info(batch, results[:, COLUMN["faults"]])
         ended = np.flatnonzero(self._over)
         if ended.size:  # rare: looking up a name for every flight would cost more than the rest
             infos["ending"][ended] = _ENDING_NAMES[results[ended, COLUMN["ending"]].astype(np.intp)]
@@ -245,8 +243,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
         """Describe the new episode instead, of the flights where one began."""
-        if not began.size:
-            return
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.read(name, began)
         infos["filter_lost"][began] = self.flights.batch.read("lost", began) > 0.0

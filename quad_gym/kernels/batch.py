@@ -1,29 +1,37 @@
-"""The one entry that flies: a step, or a reset, of a range of blocks."""
+"""The one entry that flies: a step, or a reset, of the blocks of a batch."""
 
-import numpy as np
 from numba import types
-from numba.np.numpy_support import from_dtype
 
+from quad_gym.kernels.board import COMMAND, FINISHED, TICKET, comes, finished, post, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.flight import begin_episode, tick
-from quad_gym.kernels.mailbox import COMMAND, DONE, next_ticket
-from quad_gym.kernels.simd.atomics import read_shared, write_shared
-from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.kernels.simd.addresses import (
+    array_at,
+    lanes_at,
+    prefetch,
+    record_at,
+    store_lanes,
+    store_tile,
+)
+from quad_gym.kernels.simd.atomics import add_shared, read_shared
+from quad_gym.kernels.simd.lanes import all_of, any_of, select
 from quad_gym.records import (
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
     SETTINGS,
+    SHOWN_SIZE,
     WIDTH,
     WORK_BLOCK,
     Autoreset,
+    Call,
     Command,
     Result,
+    offset_of,
 )
 
 _IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
-_JUDGE, _OBSERVE = int(Stage.JUDGE), int(Stage.OBSERVE)
+_JUDGE, _OBSERVE, _SHOW = int(Stage.JUDGE), int(Stage.OBSERVE), int(Stage.SHOW)
 _REWARD = int(Result.REWARD)
 _TERMINATED = int(Result.TERMINATED)
 _TRUNCATED = int(Result.TRUNCATED)
@@ -38,54 +46,117 @@ _GATES_PASSED = int(Result.GATES_PASSED)
 _FAULTS = int(Result.FAULTS)
 _FILTER_LOST = int(Result.FILTER_LOST)
 
+_BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
+_RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
+_WORLD, _OWN, _MODEL = int(Call.WORLD), int(Call.OWN), int(Call.MODEL)
+_SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
+_SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
+_OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
+_RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
+_SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
+
+_CORE = offset_of(FLIGHT_BLOCK, "r")
+_TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
+"""Bytes of what every step needs, which come first in a record's core."""
+
+_flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
+_params_at = lanes_at(PARAMS_BLOCK)
+_work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
+_settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
+_floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
+
 
 @kernel
-def _write_rows(source, low, high, out, block, begins):
-    """Copy observations from lanes to the rows of an array, held within the space's bounds."""
-    first = block * WIDTH
-    for lane in range(min(WIDTH, out.shape[0] - first)):
-        if begins[lane] > 0.0:
-            row = out[first + lane]
-            for k in range(out.shape[1]):
-                value = source[k, lane]
-                value = value if value > low[k] else low[k]  # also where it is NaN
-                row[k] = value if value < high[k] else high[k]
+def _observe(call, flight, world, model, settings, work, stages):
+    """Observe the present instant, within the space's bounds."""
+    call_stage(stages, _OBSERVE, flight, world, model, settings, work, 0)
+    size = call[_SIZE]
+    low, high, row = _floats_at(call[_LOW], size), _floats_at(call[_HIGH], size), work.observation
+    for k in range(size):
+        value = row[k]
+        value = select(value > low[k], value, low[k])  # also where it is NaN
+        row[k] = select(value < high[k], value, high[k])
 
 
 @kernel
-def _load_actions(block, actions, index):
+def _write_rows(call, address, index, work, chosen):
+    """Copy observations from lanes to the rows of an array, where `chosen`."""
+    size, first = call[_SIZE], index * WIDTH
+    pitch = 4 * size
+    address = address + first * pitch
+    if all_of(chosen) and first + WIDTH <= call[_COUNT] and size >= WIDTH:
+        for k in range(0, size - WIDTH, WIDTH):
+            store_tile(address + 4 * k, pitch, work.observation, k)
+        k = size - WIDTH
+        store_tile(address + 4 * k, pitch, work.observation, k)
+    else:
+        work.begins = select(chosen, 1.0, 0.0)
+        plain = _plain_work_at(call[_WORK])
+        for lane in range(min(WIDTH, call[_COUNT] - first)):
+            if plain.begins[lane] > 0.0:
+                row = _singles_at(address + lane * pitch, size)
+                for k in range(size):
+                    row[k] = plain.observation[k, lane]
+
+
+@kernel
+def _load_actions(call, flight, index):
     """Make the caller's actions the present ones, and the present ones the last."""
-    first = index * WIDTH
+    block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
+    rows = _floats_at(call[_ACTIONS] + index * (32 * WIDTH), 4 * WIDTH)
+    for i in range(4):
+        flight.last_action[i] = flight.action[i]
     for i in range(4):
         for lane in range(WIDTH):
-            block.last_action[i, lane] = block.action[i, lane]
-            known = first + lane < actions.shape[0]
-            block.action[i, lane] = actions[first + lane, i] if known else 0.0
+            block.action[i, lane] = rows[4 * lane + i]
 
 
 @kernel
-def _write_results(block, results, index):
-    """What the caller wants to know of a step, before a new episode overwrites it."""
-    first = index * WIDTH
-    for lane in range(min(WIDTH, results.shape[1] - first)):
-        flight = first + lane
-        results[_REWARD, flight] = block.reward[lane]
-        results[_TERMINATED, flight] = block.terminated[lane]
-        results[_TRUNCATED, flight] = block.truncated[lane]
-        results[_ENDING, flight] = block.ending[lane]
-        results[_POSITION_ERROR, flight] = block.position_error[lane]
-        results[_ESTIMATION_ERROR, flight] = block.estimation_error[lane]
-        results[_FILTER_STATUS, flight] = block.filter_status[lane]
-        results[_EPISODE_STEPS, flight] = block.step[lane]
-        results[_EPISODE_RETURN, flight] = block.episode_return[lane]
-        results[_EPISODE_ERROR_SUM, flight] = block.episode_error[lane]
-        results[_GATES_PASSED, flight] = block.gate_next[lane]
-        results[_FAULTS, flight] = block.faults[lane]
-        results[_FILTER_LOST, flight] = block.lost[lane]
+def _write_results(call, flight, index):
+    """What the caller wants to know of a step.
+
+    Where an episode begins in the same step as one ends it is that of the end, else of the start.
+    """
+    here, pitch = call[_RESULTS] + index * (8 * WIDTH), call[_RESULT_PITCH]
+    store_lanes(here + _REWARD * pitch, flight.reward)
+    store_lanes(here + _TERMINATED * pitch, flight.terminated)
+    store_lanes(here + _TRUNCATED * pitch, flight.truncated)
+    store_lanes(here + _ENDING * pitch, flight.ending)
+    store_lanes(here + _POSITION_ERROR * pitch, flight.position_error)
+    store_lanes(here + _ESTIMATION_ERROR * pitch, flight.estimation_error)
+    store_lanes(here + _EPISODE_STEPS * pitch, flight.step)
+    store_lanes(here + _EPISODE_RETURN * pitch, flight.episode_return)
+    store_lanes(here + _EPISODE_ERROR_SUM * pitch, flight.episode_error)
+    store_lanes(here + _GATES_PASSED * pitch, flight.gate_next)
+    store_lanes(here + _FAULTS * pitch, flight.faults)
+    store_lanes(here + _FILTER_LOST * pitch, flight.lost)
+    block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
+    status = _floats_at(here + _FILTER_STATUS * pitch, WIDTH)
+    for lane in range(WIDTH):
+        status[lane] = block.filter_status[lane]
 
 
 @kernel
-def _fly_step(flight, world, model, settings, work, stages):
+def _show(call, index, flight, world, model, settings, work, stages):
+    """Show the present instant to a task of a user's own."""
+    call_stage(stages, _SHOW, flight, world, model, settings, work, 0)
+    here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
+    for k in range(SHOWN_SIZE):
+        store_lanes(here + k * pitch, work.observation[k])
+
+
+@kernel
+def _fetch_ahead(call, index, settings, left):
+    """Ask for a tick's share of the next block's memory, which is far away in large batches."""
+    ticks, line = settings.ticks_per_step, 8 * WIDTH
+    share = (_TICKED // line + ticks) // ticks * line
+    begin = call[_BLOCKS] + (index + 1) * call[_PITCH] + _CORE + left * share
+    for k in range(0, share, line):
+        prefetch(begin + k)
+
+
+@kernel
+def _fly_step(call, index, flight, world, model, settings, work, stages):
     """Fly a control period and judge it; return which lanes begin and which ended an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
     flight.position_fresh = 0.0
@@ -93,8 +164,9 @@ def _fly_step(flight, world, model, settings, work, stages):
     for i in range(settings.feature_count):
         flight.feature_fresh[i] = 0.0
     instant = flight.instant
-    for _ in range(settings.ticks_per_step):
-        tick(flight, world, model, settings, work, stages)
+    for left in range(settings.ticks_per_step - 1, -1, -1):
+        _fetch_ahead(call, index, settings, left)
+        tick(flight, world, model, settings, work, stages, left == 0)
     # a step that begins an episode draws nothing before it
     flight.instant = select(resetting, instant, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)
@@ -105,117 +177,77 @@ def _fly_step(flight, world, model, settings, work, stages):
     return resetting | (done & (same_step | (flight.idle > 0.0))), done
 
 
-def _array(kind, dimensions=1):
-    return types.Array(from_dtype(np.dtype(kind)), dimensions, "C")
+@kernel
+def _fly_block(call, index, command, nominal, true, believed, settings, work, stages):
+    """Step or reset the flights of one block."""
+    flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+    observing, written = call[_SIZE] > 0, False
+    if settings.randomized:
+        call_stage(stages, _IMPOSE, flight, true, nominal, settings, work, 0)
+    if settings.faults:
+        call_stage(stages, _MEET_ROTORS, flight, true, believed, settings, work, 0)
+    if command == Command.RESET:
+        resets, plain = _bytes_at(call[_RESETS], call[_COUNT]), _plain_work_at(call[_WORK])
+        for lane in range(WIDTH):
+            known = index * WIDTH + lane < call[_COUNT]
+            plain.begins[lane] = resets[index * WIDTH + lane] if known else 1.0
+        begins = work.begins > 0.0
+    else:
+        _load_actions(call, flight, index)
+        begins, done = _fly_step(call, index, flight, true, believed, settings, work, stages)
+        if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
+            _write_results(call, flight, index)  # of the episodes that end
+            written = True
+        if observing and any_of(begins & done):
+            _observe(call, flight, true, believed, settings, work, stages)
+            _write_rows(call, call[_FINALS], index, work, begins & done)
+    if any_of(begins):
+        begin_episode(flight, nominal, true, believed, settings, work, stages, begins)
+    if command != Command.RESET and not written:
+        _write_results(call, flight, index)
+    if observing:
+        _observe(call, flight, true, believed, settings, work, stages)
+        _write_rows(call, call[_OBSERVATIONS], index, work, flight.tick >= 0.0)
+    if settings.shown:
+        _show(call, index, flight, true, believed, settings, work, stages)
 
 
-_ARGUMENTS = (
-    _array(FLIGHT_BLOCK),
-    types.int64,
-    types.int64,
-    _array(np.uint8),
-    _array(PARAMS_BLOCK),
-    _array(PARAMS_BLOCK),
-    _array(PARAMS_BLOCK),
-    _array(SETTINGS),
-    _array(WORK_BLOCK),
-    _array(STAGE_TABLE),
-    _array(np.float64, 2),
-    _array(np.float64),
-    _array(np.float64),
-    _array(np.float32, 2),
-    _array(np.float32, 2),
-    _array(np.float64, 2),
-    _array(np.int64),
-    types.int64,
-)
+_WORDS = types.Array(types.int64, 1, "C")
 
 
-@entry(signature=types.none(*_ARGUMENTS))
-def fly(
-    blocks,
-    first_block,
-    last_block,
-    resets,
-    world,
-    own,
-    model,
-    settings,
-    work,
-    stage_table,
-    actions,
-    low,
-    high,
-    observations,
-    final_observations,
-    results,
-    mailbox,
-    serving,
-):
-    """Step or reset the flights of a range of blocks: once, or whenever a mailbox says so.
+@entry(signature=types.boolean(_WORDS, _WORDS, types.int64, types.int64, types.boolean))
+def fly(call, board, number, command, serving):
+    """Step or reset the flights of a batch, together with the other threads at a board.
 
     Args:
-        blocks: (n_blocks,) FLIGHT_BLOCK.
-        first_block, last_block: The range, without its end.
-        resets: (n,) uint8; for RESET, which flights begin an episode.
-        world: (1,) PARAMS_BLOCK: parameters as they are.
-        own: (1,) PARAMS_BLOCK, used by no other thread: a copy of `world`, where the parameters of
-            the flights at hand are put together if they draw some, or if their rotors can fail.
-        model: (1,) PARAMS_BLOCK: parameters as the filter and the controller believe them.
-        settings: (1,) SETTINGS.
-        work: (1,) WORK_BLOCK, used by no other thread.
-        stage_table: (1,) STAGE_TABLE, which has the stages that the settings need.
-        actions: (n, 4); for STEP.
-        low, high: (n_observation,) bounds of the observation space.
-        observations: (n, n_observation), written; with no columns nothing is observed.
-        final_observations: Likewise, written where one episode ends and the next begins in this
-            step.
-        results: (len(RESULTS), n), written in a STEP: a row for each of `quad_gym.records.RESULTS`.
-        mailbox: (WORDS,) of the thread that calls, see `mailbox.py`; has the `Command`.
-        serving: 0: fly once; 1: fly the commands of the mailbox until it stays empty.
+        call: (len(Call),) of this thread; its memory lasts as long as the call does.
+        board: See `board.py`.
+        number: Of this thread; the one that posts steps is 0.
+        command: A `Command` to post, unless serving; a negative one posts nothing and waits for
+            what was posted before.
+        serving: Whether to fly what others post, until nothing comes for a while.
+
+    Returns:
+        Whether all blocks are finished; where not, another thread still flies.
     """
-    scratch, todo, nominal = lanes_of(work[0]), settings[0], lanes_of(world[0])
-    stages = stage_table[0]
-    differ = todo.randomized > 0 or todo.faults > 0
-    true = lanes_of(own[0]) if differ else nominal
-    believed = true if todo.known else lanes_of(model[0])
-    observing = observations.shape[1] > 0
+    settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
+    stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
+    differ = settings.randomized > 0 or settings.faults > 0
+    true = _params_at(call[_OWN] if differ else call[_WORLD])
+    believed = true if settings.known else _params_at(call[_MODEL])
+    if not serving and command >= 0:
+        post(board, command)
     while True:  # once, where nobody serves
-        ticket = 0
-        if serving:
-            ticket = next_ticket(mailbox)
-            if ticket == 0:
-                return
-        command = read_shared(mailbox, COMMAND)
-        for index in range(first_block, last_block):
-            block, flight = blocks[index], lanes_of(blocks[index])
-            if todo.randomized:
-                call_stage(stages, _IMPOSE, flight, true, nominal, todo, scratch, 0)
-            if todo.faults:
-                call_stage(stages, _MEET_ROTORS, flight, true, believed, todo, scratch, 0)
-            if command == Command.RESET:
-                for lane in range(WIDTH):
-                    known = index * WIDTH + lane < resets.shape[0]
-                    work[0].begins[lane] = resets[index * WIDTH + lane] if known else 1.0
-                begins = scratch.begins > 0.0
-            else:
-                _load_actions(block, actions, index)
-                begins, done = _fly_step(flight, true, believed, todo, scratch, stages)
-                _write_results(block, results, index)
-                if observing:
-                    call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
-                    scratch.begins = select(begins & done, 1.0, 0.0)
-                    _write_rows(
-                        work[0].observation, low, high, final_observations, index, work[0].begins
-                    )
-            beginning = any_of(begins)
-            if beginning:
-                begin_episode(flight, nominal, true, believed, todo, scratch, stages, begins)
-            if observing:
-                if beginning or command == Command.RESET:
-                    call_stage(stages, _OBSERVE, flight, true, believed, todo, scratch, 0)
-                scratch.begins = select(flight.tick >= 0.0, 1.0, 0.0)
-                _write_rows(work[0].observation, low, high, observations, index, work[0].begins)
+        seen = read_shared(board, TICKET)
+        while True:
+            first, last = take(board, number)
+            if first == last:
+                break
+            posted = read_shared(board, COMMAND)
+            for index in range(first, last):
+                _fly_block(call, index, posted, nominal, true, believed, settings, work, stages)
+            add_shared(board, FINISHED, last - first)
         if not serving:
-            return
-        write_shared(mailbox, DONE, ticket)
+            return finished(board)
+        if not comes(board, number, seen):
+            return True

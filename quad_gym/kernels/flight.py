@@ -15,6 +15,8 @@ from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Start, Supply
 
+_DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
+_DELAY_ACTION = int(Stage.DELAY_ACTION)
 _CONTROL, _SUPPLY = int(Stage.CONTROL), int(Stage.SUPPLY)
 _MOVE, _MOVE_IN_AIR = int(Stage.MOVE), int(Stage.MOVE_IN_AIR)
 _REST_ON_PAD = int(Stage.REST_ON_PAD)
@@ -23,6 +25,10 @@ _PREDICT, _INCREMENT, _UPDATE = int(Stage.PREDICT), int(Stage.INCREMENT), int(St
 _DRIFT_BIASES, _ADVANCE_FAULTS = int(Stage.DRIFT_BIASES), int(Stage.ADVANCE_FAULTS)
 _SET_ASIDE, _SAMPLE, _LOOK = int(Stage.SET_ASIDE), int(Stage.SAMPLE), int(Stage.LOOK)
 _EXCHANGE, _LATE_UPDATE = int(Stage.EXCHANGE), int(Stage.LATE_UPDATE)
+_PREDICT_WITH_DRIFT = int(Stage.PREDICT_WITH_DRIFT)
+_UPDATE_WITH_DRIFT = int(Stage.UPDATE_WITH_DRIFT)
+_WARM_WITH_DRIFT = int(Stage.WARM_WITH_DRIFT)
+_LATE_UPDATE_WITH_DRIFT = int(Stage.LATE_UPDATE_WITH_DRIFT)
 _ALIGN, _WARM = int(Stage.ALIGN), int(Stage.WARM)
 _DRAW, _IMPOSE, _BEGIN = int(Stage.DRAW), int(Stage.IMPOSE), int(Stage.BEGIN)
 _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
@@ -32,7 +38,7 @@ _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
 
 
 @kernel
-def sense(flight, world, model, settings, work, stages, mask, starting):
+def sense(flight, world, model, settings, work, stages, mask, starting, within):
     """Measure at the present instant, update the filter and look, where `mask`.
 
     Args:
@@ -44,6 +50,7 @@ def sense(flight, world, model, settings, work, stages, mask, starting):
         stages: Table of stages.
         mask: Which lanes.
         starting: 1 at the first instant of their episode, else 0.
+        within: 1 within a control period, where an action's inner loop alone looks, else 0.
     """
     work.mask = select(mask, 1.0, 0.0)
     if settings.run_filter:
@@ -54,16 +61,19 @@ def sense(flight, world, model, settings, work, stages, mask, starting):
         if starting:
             call_stage(stages, _ALIGN, flight, world, model, settings, work, 0)
             if settings.warm:
-                call_stage(stages, _WARM, flight, world, model, settings, work, 0)
+                warm = _WARM_WITH_DRIFT if settings.estimates_drift else _WARM
+                call_stage(stages, warm, flight, world, model, settings, work, 0)
         if late:
             call_stage(stages, _EXCHANGE, flight, world, model, settings, work, starting)
         if late and settings.rewinds and not starting:
-            call_stage(stages, _LATE_UPDATE, flight, world, model, settings, work, 0)
+            late_update = _LATE_UPDATE_WITH_DRIFT if settings.estimates_drift else _LATE_UPDATE
+            call_stage(stages, late_update, flight, world, model, settings, work, 0)
             work.mask = select(mask, 1.0, 0.0)
         else:
             features = settings.feature_count
-            call_stage(stages, _UPDATE, flight, world, model, settings, work, features)
-    call_stage(stages, _LOOK, flight, world, model, settings, work, 0)
+            update = _UPDATE_WITH_DRIFT if settings.estimates_drift else _UPDATE
+            call_stage(stages, update, flight, world, model, settings, work, features)
+    call_stage(stages, _LOOK, flight, world, model, settings, work, within)
 
 
 @kernel
@@ -78,10 +88,12 @@ def _store_start(flight, work):
 
 
 @kernel
-def tick(flight, world, model, settings, work, stages):
-    """Fly one tick."""
+def tick(flight, world, model, settings, work, stages, last):
+    """Fly one tick; `last`: whether it is the last one of a control period."""
     everyone = flight.tick >= 0.0
     work.mask = 1.0
+    if settings.action_delays > 0:
+        call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 0)
     call_stage(stages, _CONTROL, flight, world, model, settings, work, 0)
     if settings.supply != Supply.NOMINAL:
         call_stage(stages, _SUPPLY, flight, world, model, settings, work, 0)
@@ -98,16 +110,19 @@ def tick(flight, world, model, settings, work, stages):
     if settings.run_filter:
         if settings.imu_averages:
             call_stage(stages, _AVERAGE_IMU, flight, world, model, settings, work, 0)
+            if settings.imu_errs + settings.imu_vibrates > 0:
+                call_stage(stages, _DISTURB_IMU, flight, world, model, settings, work, 0)
             if settings.faults:
                 call_stage(stages, _SATURATE_IMU, flight, world, model, settings, work, 0)
-        call_stage(stages, _PREDICT, flight, world, model, settings, work, 0)
+        predict = _PREDICT_WITH_DRIFT if settings.estimates_drift else _PREDICT
+        call_stage(stages, predict, flight, world, model, settings, work, 0)
         if settings.gnss_delay + settings.camera_delay > 0:
             call_stage(stages, _INCREMENT, flight, world, model, settings, work, 0)
         call_stage(stages, _DRIFT_BIASES, flight, world, model, settings, work, 0)
     flight.tick = flight.tick + 1.0
     if settings.faults:
         call_stage(stages, _ADVANCE_FAULTS, flight, world, model, settings, work, 0)
-    sense(flight, world, model, settings, work, stages, everyone, 0)
+    sense(flight, world, model, settings, work, stages, everyone, 0, 0 if last else 1)
 
 
 @kernel
@@ -125,14 +140,18 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.randomized:
         call_stage(stages, _DRAW, flight, world, nominal, settings, work, 0)
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
+    if settings.action_delays > 0:
+        call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
     if settings.gnss_delay + settings.camera_delay > 0:
         call_stage(stages, _BEGIN_LATE, flight, world, model, settings, work, 0)
     call_stage(stages, _BEGIN, flight, world, model, settings, work, 0)
+    if settings.run_filter and settings.imu_errs + settings.heading_errs > 0:
+        call_stage(stages, _BEGIN_IMPERFECT, flight, world, model, settings, work, 0)
     if settings.air:
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:
         call_stage(stages, _BEGIN_FAULTS, flight, world, model, settings, work, 0)
-    sense(flight, world, model, settings, work, stages, mask, 1)
+    sense(flight, world, model, settings, work, stages, mask, 1, 0)
     r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     error = norm(sub(r_ref, load3(flight.r)))
     flight.position_error = select(mask, error, flight.position_error)

@@ -8,6 +8,7 @@ from quad_gym.kernels.compiling import call_stage, entry
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.predict import predict
 from quad_gym.kernels.filter.update import update
+from quad_gym.kernels.simd.addresses import lanes_at
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.records import (
     FLIGHT,
@@ -19,20 +20,23 @@ from quad_gym.records import (
     WORK_BLOCK,
 )
 
+_flight_at = lanes_at(FLIGHT_BLOCK)
 
-def _run_stage(blocks, number, world, model, settings, work, table, flag):
+
+def _run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
     """Run a stage once for every block.
 
     Args:
-        blocks: (n_blocks,) FLIGHT_BLOCK.
+        address, pitch: Of the first block, as of `Call`; bytes from one block to the next.
+        count: How many blocks there are.
         number: A `Stage`.
         world, model, settings, work, table: As for `fly`.
         flag: What the stage is called with.
     """
     true, believed = lanes_of(world[0]), lanes_of(model[0])
     scratch = lanes_of(work[0])
-    for index in range(len(blocks)):
-        flight = lanes_of(blocks[index])
+    for index in range(count):
+        flight = _flight_at(address + index * pitch)
         scratch.mask = 1.0
         call_stage(table[0], number, flight, true, believed, settings[0], scratch, flag)
 
@@ -44,7 +48,9 @@ def _array(dtype):
 run_stage = entry(
     _run_stage,
     types.none(
-        _array(FLIGHT_BLOCK),
+        types.int64,
+        types.int64,
+        types.int64,
         types.int64,
         *map(_array, (PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)),
         types.int64,

@@ -10,6 +10,7 @@ from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling import entry
 from quad_gym.kernels.filter.align import initialize
+from quad_gym.kernels.filter.drift import begin_drift
 from quad_gym.kernels.filter.predict import predict
 from quad_gym.kernels.filter.update import update
 from quad_gym.kernels.filter.wahba import wahba
@@ -37,8 +38,13 @@ from quad_gym.records import FLIGHT, PARAMS, SETTINGS, WORK
 
 FILTER = tuple(f"{__name__}:{name}" for name in ("ukf_update", "ukf_predict", "ukf_initialize"))
 """Names of the entries of a filter, the longest to compile first."""
+DRIFT_FILTER = tuple(
+    f"{__name__}:{name}" for name in ("drift_update", "drift_predict", "ukf_initialize")
+)
+"""Those of a filter that estimates the slow error of GNSS positions."""
 SINGLE = (
     *FILTER,
+    *DRIFT_FILTER[:2],
     *(
         f"{__name__}:{name}"
         for name in (
@@ -74,6 +80,7 @@ def _entry(*arguments, returns=types.none):
 def ukf_initialize(flights, params, x_I):
     """Start the filter of flights[0] from its first fix; x_I is (3,), zero if it is not known."""
     initialize(flights[0], params[0], True, load3(x_I))
+    begin_drift(flights[0], True)
 
 
 @_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64)
@@ -86,6 +93,18 @@ def ukf_update(flights, params, work, feature_count, form):
 def ukf_predict(flights, params, work, form):
     """Carry the filter of flights[0] over one tick."""
     predict(flights[0], params[0], work[0], form)
+
+
+@_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64)
+def drift_update(flights, params, work, feature_count, form):
+    """As `ukf_update`, of a filter that estimates the slow error of GNSS positions."""
+    update(flights[0], params[0], work[0], feature_count, True, form, flights[0].L_drift)
+
+
+@_entry(_FLIGHT, _PARAMS, _WORK, types.int64)
+def drift_predict(flights, params, work, form):
+    """As `ukf_predict`, likewise."""
+    predict(flights[0], params[0], work[0], form, flights[0].L_drift)
 
 
 @_entry(_FLIGHT, _PARAMS)
@@ -109,7 +128,7 @@ def sense_gnss(flights, params):
 @_entry(_FLIGHT, _PARAMS)
 def step_gnss_drift(flights, params):
     """Step the slow position error of flights[0] to the next measurement."""
-    drift_gnss(flights[0], params[0], True)
+    drift_gnss(flights[0], params[0], True, 1.0)
 
 
 @_entry(_FLIGHT, _PARAMS, types.int64)

@@ -13,7 +13,9 @@ from quad_gym.params import portable
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.sensors import ImuParams, SensorSuite, delay_ticks
+from quad_gym.params.gnss import LEAST_DRIFT
+from quad_gym.params.imu import ImuParams
+from quad_gym.params.sensors import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
@@ -77,7 +79,12 @@ def params_record(
     p["dt"], p["imu_lever_arm"] = imu.dt, imu.lever_arm_B
     p["accel_sigma"] = imu.accel_noise_density / math.sqrt(imu.dt)
     p["gyro_sigma"] = imu.gyro_noise_density / math.sqrt(imu.dt)
+    p["accel_noise"], p["gyro_noise"] = imu.believed_accel_sigma, imu.believed_gyro_sigma
+    hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
     for sensor in ("accel", "gyro"):
+        p[f"{sensor}_scale_sigma"] = getattr(imu, f"{sensor}_scale_sigma")
+        p[f"{sensor}_misalignment_sigma"] = getattr(imu, f"{sensor}_misalignment_sigma")
+        p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / hover_speed**2
         sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
         p[f"{sensor}_bias_sigma"] = sigma
         p[f"{sensor}_bias_decay"] = math.exp(-imu.dt / tau)
@@ -88,15 +95,22 @@ def params_record(
         p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
         p["baseline_length"] = portable.norm(gnss.baseline_B)
         p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
-        p["position_sigma"], p["velocity_sigma"] = gnss.believed_sigma_I, gnss.velocity_sigma or 0.0
+        p["heading_error_sigma"] = gnss.heading_error_sigma
+        p["first_baseline_sigma"] = gnss.first_baseline_sigma
+        p["baseline_noise"] = gnss.believed_baseline_sigma
+        p["velocity_sigma"] = gnss.velocity_sigma or 0.0
         period = 1.0 / (gnss.rate * gnss.drift_tau)
         p["drift_decay"] = math.exp(-period)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
+        period = imu.dt / gnss.drift_tau
+        p["drift_tick_decay"] = math.exp(-period)
+        believed = np.maximum(gnss.drift_sigma_I, LEAST_DRIFT)
+        p["drift_tick_drive"] = believed * math.sqrt(-math.expm1(-2.0 * period))
     else:  # the place of the start, as if its center and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
         p["gnss_sigma"] = sensors.placement.position_sigma
-        p["position_sigma"] = sensors.placement.position_sigma
         p["baseline_sigma"] = sensors.placement.heading_sigma
+        p["first_baseline_sigma"] = p["baseline_noise"] = sensors.placement.heading_sigma
 
     p["heading_sigma"] = sensors.placement.heading_sigma
 
@@ -106,6 +120,7 @@ def params_record(
         p["pixel_size"], p["focal_length"] = camera.pixel_size, camera.focal_length
         p["half_image"] = np.array(camera.image_size) / 2
         p["pixel_sigma"] = camera.pixel_sigma
+        p["max_range"], p["blur"] = camera.max_range, camera.blur
         p["features"][: len(camera.features_I)] = camera.features_I
 
     p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
@@ -194,6 +209,17 @@ def pack_latency(
     settings["rewinds"] = believes.late_measurements == "rewind"
 
 
+def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
+    """Fill the settings' fields of what sensors as they are (`measures`) do wrong."""
+    imu, gnss, camera = measures.imu, measures.gnss, measures.camera
+    settings["imu_errs"], settings["imu_vibrates"] = imu.errs, imu.vibrates
+    settings["heading_errs"] = gnss is not None and gnss.heading_error_sigma > 0.0
+    if camera is not None:
+        settings["camera_limited"] = camera.limited
+        settings["camera_blurs"] = camera.exposure > 0.0
+        settings["ground_hides"] = camera.ground_hides
+
+
 def params_block(record: NDArray[Any]) -> NDArray[Any]:
     """A scalar parameter record repeated for the eight flights of a block, shape (1,)."""
     block = aligned_zeros(1, PARAMS_BLOCK)
@@ -228,7 +254,7 @@ def settings_record(
         s["gnss_ticks"] = clocks.ticks_between("gnss")
         s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
         s["gnss_phase"] = _phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
-    s["gnss_drifts"] = gnss_drifts
+    s["gnss_drifts"], s["estimates_drift"] = gnss_drifts, sensors.drifts
     s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
     if sensors.camera is not None:
         s["camera_ticks"] = clocks.ticks_between("camera")

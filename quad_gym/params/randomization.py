@@ -112,6 +112,7 @@ class DrawingTable:
         vehicle: The vehicle without draws.
         sensors: The sensors without draws.
         world: The world without draws.
+        action_delay: Likewise [control steps].
 
     Raises:
         ValueError: If a range holds invalid values, such as a vehicle too heavy to
@@ -124,11 +125,13 @@ class DrawingTable:
         vehicle: VehicleParams,
         sensors: SensorSuite,
         world: WorldParams,
+        action_delay: float = 0.0,
     ) -> None:
         self.names = randomization.names
         self.kind = np.zeros(DRAWN_SIZE, np.int64)
         self.a, self.b, self.c, self.d = np.zeros((4, DRAWN_SIZE))
         nominal = nominal_values(vehicle, sensors, world)
+        nominal[COLUMNS["action_delay"]] = action_delay
         self.low, self.high = nominal.copy(), nominal.copy()
         self.center, self.spread = np.zeros(DRAWN_SIZE), np.ones(DRAWN_SIZE)
         for drawable in DRAWABLES:

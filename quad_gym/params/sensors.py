@@ -1,197 +1,20 @@
-"""Sensors: frozen parameters with the source of every number.
+"""A sensor suite: IMU, GNSS, camera, and the filter that fuses them.
 
-As in `params`: SI units, body frame B with x forward and z up along the thrust; the laboratory's
-numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Austin).
+As everywhere in `params`: SI units, body frame B with x forward and z up along the thrust; the
+laboratory's numbers from the Aerial Robotics course (ASE 479W, The University of Texas at Austin).
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.camera import CameraParams
+from quad_gym.params.checks import Checked
 from quad_gym.params.filter import FilterParams
-from quad_gym.records import MAX_FEATURES, MAX_UNDER_WAY
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImuParams(Checked):
-    """Accelerometer and gyro: white noise, Gauss-Markov biases (report equations 4, 6, 7)."""
-
-    rate: float = 200.0
-    """[Hz]; one sample is one tick of the simulation; report section 4"""
-    lever_arm_B: Vector = (0.0, 0.0, 0.0)
-    """(3,) position of the accelerometer in B [m]; report section 2.3"""
-    samples: str = "instant"
-    """what the filter predicts a tick with: "instant", a sample of the motion at its start
-    (report); or "average", the mean over it, as real IMUs deliver delta angles and delta
-    velocities, corrected for coning and sculling. The inner loops read the gyro at the present
-    instant either way, with the noise of the last sample: a mean lags by half a tick, which a
-    tight rate loop does not bear."""
-    accel_noise_density: float = 9.8e-3 * 0.1
-    """[m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
-    gyro_noise_density: float = math.radians(0.05)
-    """[rad/s/sqrt(Hz)]; laboratory: 0.05 deg/s/sqrt(Hz)"""
-    accel_bias_sigma: float = 9.8e-3 * 100.0
-    """stationary standard deviation [m/s^2]; laboratory: 100 milli-g"""
-    gyro_bias_sigma: float = math.radians(100.0) / 3600.0
-    """stationary standard deviation [rad/s]; laboratory: 100 deg/h"""
-    accel_bias_tau: float = 100.0
-    """correlation time [s]; laboratory"""
-    gyro_bias_tau: float = 100.0
-    """correlation time [s]; laboratory"""
-
-    def __post_init__(self) -> None:
-        self._check(check.positive, "rate", least=1.0, most=1e6)
-        self._check(check.positive, "accel_bias_tau", "gyro_bias_tau")
-        self._check(check.positive, "accel_noise_density", "gyro_noise_density")
-        self._check(check.positive, "accel_bias_sigma", "gyro_bias_sigma")
-        self._check(check.vector, "lever_arm_B", length=3)
-        self._check(check.choice, "samples", choices=("instant", "average"))
-
-    @property
-    def dt(self) -> float:
-        """The tick: time between two samples [s]."""
-        return 1.0 / self.rate
-
-
-@dataclass(frozen=True, kw_only=True)
-class GnssParams(Checked):
-    """Two GNSS antennas: position of the primary one, and the baseline to the secondary one."""
-
-    rate: float = 200.0
-    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
-    primary_antenna_B: Vector = (0.1013, -0.0004, 0.0472)
-    """(3,) in B [m]; laboratory vehicle"""
-    secondary_antenna_B: Vector = (-0.0887, -0.0004, 0.0472)
-    """(3,) in B [m]; laboratory vehicle"""
-    reference_antenna_G: Vector = (-742080.456, -5462030.875, 3198338.956)
-    """(3,) origin of the east-north-up frame I, in ECEF [m]; laboratory"""
-    position_sigma_I: Vector = (0.006, 0.006, 0.012)
-    """(3,) standard deviation east, north, up [m]; laboratory (RTK)"""
-    baseline_sigma: float = 0.05
-    """standard deviation of the baseline's direction [rad]; laboratory"""
-    velocity_sigma: float | None = None
-    """standard deviation of the velocity by Doppler shifts, per axis [m/s]; None: not measured, as
-    in the laboratory"""
-    phase: float | None = 0.0
-    """when the first measurement after the start comes, as a share of the period in [0, 1), in
-    whole ticks; None: at random in each episode"""
-    drift_sigma_I: Vector = (0.0, 0.0, 0.0)
-    """(3,) slow position error east, north, up, beside the white one: stationary standard deviation
-    of a first-order Gauss-Markov process that is zero at the start of an episode, for positions are
-    relative to the place of the start [m]"""
-    drift_tau: float = 60.0
-    """its correlation time [s]"""
-    latency: float = 0.0
-    """from when a measurement is taken to when it reaches the filter, with its time stamp, in whole
-    ticks; at most MAX_UNDER_WAY periods [s]. Receivers take about 0.1 s: the autopilot PX4 assumes
-    0.11 s (parameter EKF2_GPS_DELAY)"""
-
-    def __post_init__(self) -> None:
-        self._check(check.number, "latency", least=0.0)
-        self._check(check.positive, "rate", "baseline_sigma", "drift_tau")
-        self._check(check.phase, "phase")
-        if self.velocity_sigma is not None:
-            self._check(check.positive, "velocity_sigma")
-        self._check(check.vector, "drift_sigma_I", length=3)
-        if min(self.drift_sigma_I) < 0.0:
-            raise ValueError(
-                f"GnssParams.drift_sigma_I must be at least 0, got {self.drift_sigma_I}"
-            )
-        self._check(
-            check.vector,
-            "primary_antenna_B",
-            "secondary_antenna_B",
-            "reference_antenna_G",
-            "position_sigma_I",
-            length=3,
-        )
-        if min(self.position_sigma_I) <= 0.0:
-            raise ValueError(
-                f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
-            )
-        for name in ("primary_antenna_B", "secondary_antenna_B"):
-            if np.abs(getattr(self, name)).max() > 100.0:
-                raise ValueError(
-                    f"GnssParams.{name} must be on the vehicle, within 100 m, got "
-                    f"{getattr(self, name)}"
-                )
-        if np.linalg.norm(self.baseline_B) < 1e-3:
-            raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
-        if np.linalg.norm(self.reference_antenna_G) < 1e6:
-            raise ValueError(
-                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF meters, "
-                f"got {self.reference_antenna_G}"
-            )
-
-    @property
-    def baseline_B(self) -> np.ndarray:
-        """(3,) from the primary to the secondary antenna, in B [m]."""
-        return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
-
-    @property
-    def believed_sigma_I(self) -> np.ndarray:
-        """(3,) standard deviation of a position that the filter takes for white [m].
-
-        The slow error is counted as white noise of the same spectral density at frequency zero,
-        `sigma^2 (1 + a) / (1 - a)` with `a = exp(-1 / (rate tau))`. That is its sum over time as a
-        filter that averages for longer than tau meets it; for any shorter memory it is more than
-        there is, so that the filter errs on the side of doubt (R. G. Brown and P. Y. C. Hwang,
-        Introduction to Random Signals and Applied Kalman Filtering, on colored measurement noise).
-        """
-        a = math.exp(-1.0 / (self.rate * self.drift_tau))
-        slow = np.square(self.drift_sigma_I) * (1.0 + a) / (1.0 - a)
-        return np.sqrt(np.square(self.position_sigma_I) + slow)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraParams(Checked):
-    """A pinhole camera that sees known features."""
-
-    rate: float = 200.0
-    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
-    position_B: Vector = (0.1159, -0.0004, -0.0435)
-    """(3,) projection center in B [m]; laboratory vehicle"""
-    attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
-    """(3,) Euler angles of R_CB, camera z along the optical axis [rad]; laboratory"""
-    pixel_size: float = 2e-6
-    """[m]; laboratory"""
-    focal_length: float = 1657.72
-    """[pixels]; laboratory"""
-    image_size: Vector = (3840.0, 2160.0)
-    """(2,) width and height, with the origin of coordinates at the center [pixels]; laboratory"""
-    pixel_sigma: float = 20.0
-    """standard deviation per axis [pixels]; laboratory"""
-    features_I: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
-    """(n, 3) known points in I, at most MAX_FEATURES [m]; laboratory"""
-    phase: float | None = 0.0
-    """when the first image after the start comes, as a share of the period in [0, 1), in whole
-    ticks; None: at random in each episode"""
-    latency: float = 0.0
-    """from when an image is taken to when its features reach the filter, with its time stamp, in
-    whole ticks; at most MAX_UNDER_WAY periods [s]"""
-
-    def __post_init__(self) -> None:
-        self._check(check.number, "latency", least=0.0)
-        self._check(check.phase, "phase")
-        self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
-        self._check(check.vector, "position_B", "attitude", length=3)
-        self._check(check.vector, "image_size", length=2)
-        if min(self.image_size) <= 0.0:
-            raise ValueError(
-                f"CameraParams.image_size must be greater than 0, got {self.image_size}"
-            )
-        if np.size(self.features_I) == 0:
-            raise ValueError("CameraParams.features_I must hold at least one feature, got none")
-        self._check(check.matrix, "features_I", rows=None, columns=3)
-        if len(self.features_I) > MAX_FEATURES:
-            raise ValueError(
-                f"CameraParams.features_I must hold at most {MAX_FEATURES} features, "
-                f"got {len(self.features_I)}"
-            )
+from quad_gym.params.gnss import GnssParams
+from quad_gym.params.imu import ImuParams
+from quad_gym.records import MAX_UNDER_WAY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,6 +102,11 @@ class SensorSuite(Checked):
             delay_ticks(
                 "CameraParams.latency", self.camera.latency, self.camera.rate, self.imu.rate
             )
+
+    @property
+    def drifts(self) -> bool:
+        """Whether GNSS positions have a slow error, so that a filter estimates it."""
+        return self.gnss is not None and self.gnss.drifts
 
     def require_filter(self) -> None:
         """Refuse a suite whose filter mistakes the samples of the IMU, or would overflow.
@@ -379,6 +207,29 @@ class SensorSuite(Checked):
         return self.replace(  # type: ignore[no-any-return]
             imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params
         )
+
+    def simplified(self) -> "SensorSuite":
+        """A copy whose measurements arrive at once, with white noise, bias and drift alone.
+
+        To tell what latency, vibration, misalignment, constant heading errors, blur, range and
+        ground do to a flight. White noise stays as it is.
+        """
+        gnss, camera = self.gnss, self.camera
+        if gnss is not None:
+            gnss = gnss.replace(latency=0.0, heading_error_sigma=0.0)
+        if camera is not None:
+            camera = camera.replace(
+                latency=0.0, max_range=math.inf, exposure=0.0, ground_hides=False
+            )
+        imu = self.imu.replace(
+            accel_scale_sigma=0.0,
+            gyro_scale_sigma=0.0,
+            accel_misalignment_sigma=0.0,
+            gyro_misalignment_sigma=0.0,
+            accel_vibration=0.0,
+            gyro_vibration=0.0,
+        )
+        return self.replace(imu=imu, gnss=gnss, camera=camera)  # type: ignore[no-any-return]
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """A copy whose white noise is `factor` times as large, as a filter of this suite knows."""

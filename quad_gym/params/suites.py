@@ -5,12 +5,18 @@
 | `standard` | as `lab` | as `lab` | as `lab`, but samples are means over the tick |
 | `lab` | RTK, two antennas, every tick | every tick, two points at the origin | the report's |
 | `rtk` | RTK, two antennas, 10 Hz | 25 Hz, twelve markers on the ground | industrial MEMS |
-| `consumer` | single frequency, slowly drifting, and a compass, 10 Hz | none | cheap MEMS |
+| `consumer` | single frequency, and a compass, 10 Hz; its drift is a state | none | cheap MEMS |
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 
 The IMU runs at 200 Hz, so that cameras of 30 Hz run at 25 Hz, a whole division of it. Outside `lab`
 the phases of GNSS and camera are drawn anew in each episode, the fix that starts the filter is
 counted once, and a gate of false alarm 1e-4 guards the filter.
+
+`rtk`, `consumer` and `indoor` also do what real sensors do beside noise and bias: measurements
+arrive late, accelerometer axes are not quite orthogonal, rotors shake the IMU, headings have a
+constant error, the camera blurs and does not see far. Gyros have no error of scale or alignment by
+default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
+place (docs/sensors-and-filter.md says what it does).
 
 The noise of `observation="noisy"` is the size of each suite's own errors. Outside `lab` it is the
 root mean square error per axis of what control on the estimate sees from 20 s to 30 s after the
@@ -23,18 +29,23 @@ import math
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.sensors import (
-    CameraParams,
-    GnssParams,
-    ImuParams,
-    NoisyObservationParams,
-    PlacementParams,
-    SensorSuite,
-)
+from quad_gym.params.gnss import GnssParams
+from quad_gym.params.imu import ImuParams
+from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
+
+_GNSS_LATENCY = 0.1
+"""[s]; PX4 assumes 0.11 s (EKF2_GPS_DELAY)"""
+_CAMERA_LATENCY = 0.04
+"""[s]; exposure, transfer and search for markers; typical of small computers, 30 to 60 ms"""
+_EXPOSURE = 0.003
+"""[s]; daylight, or a well-lit hall; our judgment"""
+_MARKER_RANGE = 13.0
+"""[m]; there a marker of 0.2 m subtends 25 pixels of the laboratory's camera; our judgment"""
 
 FIELD_FILTER = FilterParams(
     integration="midpoint",
@@ -65,28 +76,42 @@ RTK = SensorSuite(
         # Trans. Instrumentation and Measurement 57(1), 2008
         gyro_bias_tau=300.0,
         accel_bias_tau=300.0,
+        # what its factory calibration leaves, 0.1 % and 0.03 deg; our judgment
+        accel_scale_sigma=0.001,
+        accel_misalignment_sigma=0.0005,
+        # balanced rotors, an isolated IMU, and its filters; our judgment
+        accel_vibration=0.05,
+        gyro_vibration=0.002,
     ),
     gnss=GnssParams(
+        latency=_GNSS_LATENCY,
         rate=10.0,  # u-blox ZED-F9P data sheet: RTK up to 20 Hz, moving base up to 10 Hz
         # the same: 0.01 m + 1 ppm CEP, so sigma = 0.0085 m an axis at short range, twice that up
         position_sigma_I=(0.0085, 0.0085, 0.017),
         # the same: heading 0.4 deg with antennas 1 m apart, so 7 mm, on the laboratory's 0.19 m
         baseline_sigma=math.radians(0.4) / 0.19,
+        # antennas' phase centers are unequal by some millimeters that depend on the direction of
+        # satellites and hardly change in a flight, and mounted to a degree or so; our judgment
+        heading_error_sigma=math.radians(0.5),
         velocity_sigma=0.05,  # the same
         phase=None,
     ),
     camera=CameraParams(
         rate=25.0,
         # markers are found within a pixel (S. Garrido-Jurado and others, Pattern Recognition 47(6),
-        # 2014); an exposure of 1 ms at 1 rad/s smears 1.7 pixels, a calibration leaves one or two
-        pixel_sigma=3.0,
+        # 2014), a calibration of lens and mounting leaves one or two; our judgment
+        pixel_sigma=2.5,
+        latency=_CAMERA_LATENCY,
+        exposure=_EXPOSURE,
+        max_range=_MARKER_RANGE,
+        ground_hides=True,
         # three rows of four markers on the ground of the flying field
         features_I=tuple((x, y, 0.0) for x in (-4.5, -1.5, 1.5, 4.5) for y in (-3.0, 0.0, 3.0)),
         phase=None,
     ),
     estimator=FIELD_FILTER,
     noisy=NoisyObservationParams(
-        position=0.0012, velocity=0.002, attitude=0.00018, body_rates=0.002
+        position=0.00135, velocity=0.0032, attitude=0.00021, body_rates=0.0028
     ),  # measured, see above
 )
 """A survey vehicle: real-time kinematic GNSS with two antennas, and markers on the ground."""
@@ -103,8 +128,16 @@ CONSUMER = SensorSuite(
         gyro_bias_sigma=math.radians(0.1),
         gyro_bias_tau=300.0,
         accel_bias_tau=300.0,
+        # the same data sheet: scale +-0.5 %, taken for two sigma, and cross-axis sensitivity +-2 %,
+        # of which a calibration in six orientations leaves a quarter; our judgment
+        accel_scale_sigma=0.0025,
+        accel_misalignment_sigma=0.005,
+        # rotors that nobody has balanced, an IMU on foam; our judgment
+        accel_vibration=0.2,
+        gyro_vibration=0.01,
     ),
     gnss=GnssParams(
+        latency=_GNSS_LATENCY,
         rate=10.0,  # u-blox MAX-M10S data sheet: 10 Hz with four constellations
         # fixes scatter by decimeters from one to the next; our judgment
         position_sigma_I=(0.2, 0.2, 0.4),
@@ -114,17 +147,19 @@ CONSUMER = SensorSuite(
         drift_sigma_I=(0.6, 0.6, 1.0),
         drift_tau=60.0,
         velocity_sigma=0.05,  # the same data sheet: velocity accuracy 0.05 m/s
-        # one antenna has no baseline. Yaw comes from a compass: 5 deg among motors and iron. It is
-        # modeled as the direction of the body x axis, here the line between the two "antennas"
+        # one antenna has no baseline. Yaw comes from a compass: some 2 deg of noise, and 4 deg that
+        # iron and a calibration leave for a whole flight; our judgment. It is modeled as the
+        # direction of the body x axis, here the line between the two "antennas"
         primary_antenna_B=(0.0, 0.0, 0.0472),
         secondary_antenna_B=(0.1, 0.0, 0.0472),
-        baseline_sigma=math.radians(5.0),
+        baseline_sigma=math.radians(2.0),
+        heading_error_sigma=math.radians(4.0),
         phase=None,
     ),
     camera=None,
-    estimator=FIELD_FILTER,
+    estimator=FIELD_FILTER,  # with the slow error among its states
     noisy=NoisyObservationParams(
-        position=0.28, velocity=0.02, attitude=0.0061, body_rates=0.004
+        position=0.125, velocity=0.024, attitude=0.021, body_rates=0.011
     ),  # measured, see above
 )
 """A hobby vehicle: one single-frequency receiver, a compass, a cheap IMU, no camera."""
@@ -152,19 +187,29 @@ INDOOR = SensorSuite(
         gyro_bias_sigma=math.radians(0.05),
         gyro_bias_tau=300.0,
         accel_bias_tau=300.0,
+        # typical of consumer MEMS, of the order of the ICM-20948's; our judgment
+        accel_scale_sigma=0.0025,
+        accel_misalignment_sigma=0.005,
+        # the IMU withstands vibration well; our judgment
+        accel_vibration=0.1,
+        gyro_vibration=0.005,
     ),
     gnss=None,
     placement=PlacementParams(position_sigma=0.05, heading_sigma=0.05),
     camera=CameraParams(
         rate=25.0,
         attitude=(math.radians(90.0), 0.0, math.radians(90.0)),  # looking level ahead
-        pixel_sigma=3.0,  # as in `rtk`
+        pixel_sigma=2.5,  # as in `rtk`, like what follows
+        latency=_CAMERA_LATENCY,
+        exposure=_EXPOSURE,
+        max_range=_MARKER_RANGE,
+        ground_hides=True,
         features_I=_on_walls(distance=8.0, low=0.5, high=3.0),  # a hall of 16 m by 16 m
         phase=None,
     ),
     estimator=FIELD_FILTER,
     noisy=NoisyObservationParams(
-        position=0.0066, velocity=0.0103, attitude=0.00046, body_rates=0.0035
+        position=0.0077, velocity=0.0128, attitude=0.00056, body_rates=0.0061
     ),  # measured, see above
 )
 """A hall without GNSS: the camera sees markers on the walls wherever it looks."""

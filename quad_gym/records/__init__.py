@@ -3,6 +3,9 @@
 As a flight is nothing but its record, snapshot, restore, pickling and copying are array copies.
 """
 
+from quad_gym.records.call import (
+    Call,
+)
 from quad_gym.records.draws import (
     COLUMNS,
     DRAWABLES,
@@ -30,6 +33,7 @@ from quad_gym.records.enums import (
 )
 from quad_gym.records.flight import (
     FLIGHT_FIELDS,
+    PARTS,
 )
 from quad_gym.records.layout import (
     FLIGHT,
@@ -39,9 +43,12 @@ from quad_gym.records.layout import (
     SETTINGS,
     WORK,
     WORK_BLOCK,
+    Room,
     aligned_zeros,
     block_dtype,
     field_of_flights,
+    offset_of,
+    room_of,
     scalar_dtype,
 )
 from quad_gym.records.params import (
@@ -54,12 +61,18 @@ from quad_gym.records.results import (
 from quad_gym.records.settings import (
     SETTINGS_FIELDS,
 )
+from quad_gym.records.shown import (
+    SHOWN,
+    SHOWN_SHAPES,
+    SHOWN_SIZE,
+)
 from quad_gym.records.sizes import (
     BASELINE_BLOCK,
     DELAY_SLOTS,
     FAULT_KINDS,
     FEATURE_BLOCKS,
     FREEDOMS,
+    MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_GATES,
@@ -71,11 +84,13 @@ from quad_gym.records.sizes import (
     SENSOR_GROUPS,
     VELOCITY_BLOCK,
     WARM_DRAWS,
+    WARM_DRIFT_DRAWS,
     WIDTH,
     Field,
 )
 from quad_gym.records.streams import (
     DRAW_BIAS,
+    DRAW_BLUR,
     DRAW_COURSE,
     DRAW_DRIFT,
     DRAW_FAULTS,
@@ -85,8 +100,10 @@ from quad_gym.records.streams import (
     DRAW_GNSS,
     DRAW_GROUND,
     DRAW_GUST,
+    DRAW_HEADING,
     DRAW_HIDDEN,
     DRAW_IMU,
+    DRAW_IMU_ERRORS,
     DRAW_MARK,
     DRAW_NOISY,
     DRAW_PARAMETERS,
@@ -95,7 +112,9 @@ from quad_gym.records.streams import (
     DRAW_SERIES,
     DRAW_START,
     DRAW_VELOCITY,
+    DRAW_VIBRATION,
     DRAW_WARM,
+    DRAW_WARM_DRIFT,
     DRAWS_OF_FAULT,
 )
 from quad_gym.records.work import (
@@ -110,6 +129,7 @@ __all__ = [
     "DRAWN_SIZE",
     "DRAWS_OF_FAULT",
     "DRAW_BIAS",
+    "DRAW_BLUR",
     "DRAW_COURSE",
     "DRAW_DRIFT",
     "DRAW_FAULTS",
@@ -119,8 +139,10 @@ __all__ = [
     "DRAW_GNSS",
     "DRAW_GROUND",
     "DRAW_GUST",
+    "DRAW_HEADING",
     "DRAW_HIDDEN",
     "DRAW_IMU",
+    "DRAW_IMU_ERRORS",
     "DRAW_MARK",
     "DRAW_NOISY",
     "DRAW_PARAMETERS",
@@ -129,7 +151,9 @@ __all__ = [
     "DRAW_SERIES",
     "DRAW_START",
     "DRAW_VELOCITY",
+    "DRAW_VIBRATION",
     "DRAW_WARM",
+    "DRAW_WARM_DRIFT",
     "FAULT_KINDS",
     "FEATURE_BLOCKS",
     "FIXED",
@@ -138,6 +162,7 @@ __all__ = [
     "FLIGHT_FIELDS",
     "FREEDOMS",
     "LOG_UNIFORM",
+    "MAX_ACTION_DELAY",
     "MAX_BLOCKS",
     "MAX_FEATURES",
     "MAX_GATES",
@@ -149,19 +174,25 @@ __all__ = [
     "PARAMS",
     "PARAMS_BLOCK",
     "PARAMS_FIELDS",
+    "PARTS",
     "POSITION_BLOCK",
     "RESULTS",
     "SENSOR_GROUPS",
     "SETTINGS",
     "SETTINGS_FIELDS",
+    "SHOWN",
+    "SHOWN_SHAPES",
+    "SHOWN_SIZE",
     "UNIFORM",
     "VELOCITY_BLOCK",
     "WARM_DRAWS",
+    "WARM_DRIFT_DRAWS",
     "WIDTH",
     "WORK",
     "WORK_BLOCK",
     "WORK_FIELDS",
     "Autoreset",
+    "Call",
     "Command",
     "Control",
     "Drawable",
@@ -173,6 +204,7 @@ __all__ = [
     "Gate",
     "Layout",
     "Result",
+    "Room",
     "Source",
     "Start",
     "Supply",
@@ -180,5 +212,7 @@ __all__ = [
     "aligned_zeros",
     "block_dtype",
     "field_of_flights",
+    "offset_of",
+    "room_of",
     "scalar_dtype",
 ]

@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+from quad_gym.records.sizes import MAX_ACTION_DELAY
+
 FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3
 """How a parameter is drawn."""
 
@@ -70,6 +72,8 @@ DRAWABLES = (
     Drawable("start_roll", 1, "rad", "added to the start's roll"),
     Drawable("start_pitch", 1, "rad", "added to the start's pitch"),
     Drawable("start_yaw", 1, "rad", "added to the start's yaw"),
+    # what actions meet
+    Drawable("action_delay", 1, "steps", "of actions, in control steps", 0.0, most=MAX_ACTION_DELAY),
 )
 # fmt: on
 """Every parameter that can be drawn; the columns of a flight's field `drawn`, in this order."""

@@ -115,6 +115,8 @@ class Ending(IntEnum):
     LAST_GATE = 5
     FILTER_FAILED = 6
     FILTER_LOST = 7
+    TASK = 8
+    """a user's task says so, see `quad_gym.Task`"""
 
 
 class Command(IntEnum):

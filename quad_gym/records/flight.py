@@ -4,6 +4,7 @@ from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
     DELAY_SLOTS,
     FAULT_KINDS,
+    MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_GATES,
@@ -13,108 +14,8 @@ from quad_gym.records.sizes import (
 )
 
 # fmt: off
-FLIGHT_FIELDS = (
-    # the truth
-    Field("r", (3,), "m", "position r_I of the center of mass"),
-    Field("v", (3,), "m/s", "velocity v_I"),
-    Field("q", (4,), "-", "attitude, unit quaternion (w, x, y, z), body to inertial"),
-    Field("w", (3,), "rad/s", "body rates w_B"),
-    Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
-    Field("voltages", (4,), "V", "motor voltages over the present tick"),
-    Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
-    Field("disturbance", (3,), "N", "external force d_I on the body"),
-    Field("b_a", (3,), "m/s^2", "accelerometer bias"),
-    Field("b_g", (3,), "rad/s", "gyro bias"),
-    Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
-    # the world
-    Field("wind", (3,), "m/s", "velocity of the air in I"),
-    Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),
-    Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
-    Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
-    Field("charge", (), "-", "charge of the battery, 1: full"),
-    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
-    # the last measurements
-    Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
-    Field("w_before", (3,), "rad/s", "w_meas one sample before"),
-    Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
-    Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
-    Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
-    Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
-    Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
-    Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
-    Field("position_valid", (), "0 or 1", "whether gnss_position was measured at the present instant"),
-    Field("baseline_valid", (), "0 or 1", "whether gnss_baseline was measured at the present instant"),
-    Field("velocity_valid", (), "0 or 1", "whether gnss_velocity was measured at the present instant"),
-    Field("feature_valid", (MAX_FEATURES,), "0 or 1", "whether the camera saw a feature at the present instant"),
-    Field("position_fresh", (), "0 or 1", "whether gnss_position was measured since the last step"),
-    Field("baseline_fresh", (), "0 or 1", "whether gnss_baseline was measured since the last step"),
-    Field("feature_fresh", (MAX_FEATURES,), "0 or 1", "whether a feature was seen since the last step"),
-    # the filter
-    Field("r_hat", (3,), "m", "estimated position in I"),
-    Field("v_hat", (3,), "m/s", "estimated velocity in I"),
-    Field("R_hat", (3, 3), "-", "estimated attitude R_BI"),
-    Field("b_a_hat", (3,), "m/s^2", "estimated accelerometer bias"),
-    Field("b_g_hat", (3,), "rad/s", "estimated gyro bias"),
-    Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
-    Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
-    Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
-    Field("update_failures", (), "-", "updates that failed since the filter's start"),
-    Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
-    Field("nis_dimension", (), "-", "measurements in the last update"),
-    # the innovations of the last measurements, one by one: position, baseline, velocity, features (if asked for)
-    Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
-    Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
-    Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
-    Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
-    Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
-    Field("rejected_in_row", (4,), "-", "positions, baselines, velocities, images wholly rejected since the last accepted one"),
-    Field("reopened", (4,), "-", "times that the gate of each of these was reopened in this episode"),
-    Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
-    Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
-    Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
-    Field("doubt_tick", (), "ticks", "when the filter last doubted itself"),
-    Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
-    Field("lost", (), "0 or 1", "whether the covariance does not explain the last innovations"),
-    # what the controller sees
-    Field("r_seen", (3,), "m", "position in I from the controller's source"),
-    Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),
-    Field("R_seen", (3, 3), "-", "attitude R_BI from the controller's source"),
-    Field("w_seen", (3,), "rad/s", "body rates in B from the controller's source"),
-    # clocks: whole numbers
-    Field("tick", (), "ticks", "since the start of the episode"),
-    Field("gnss_wait", (), "ticks", "until GNSS measures next"),
-    Field("camera_wait", (), "ticks", "until the camera measures next"),
-    # the random stream
-    Field("key", (2,), "-", "key of the stream", "u8"),
-    Field("instant", (), "-", "instants drawn so far", "u8"),
-    # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
-    Field("ref_omega", (), "rad/s", "fundamental frequency w"),
-    Field("ref_center", (3,), "m", "constant term c in I"),
-    Field("ref_cos", (MAX_HARMONICS, 3), "m", "cosine coefficients a_k in I"),
-    Field("ref_sin", (MAX_HARMONICS, 3), "m", "sine coefficients b_k in I"),
-    Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
-    Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
-    # the course of gates
-    Field("gates", (MAX_GATES, 3), "m", "gate centers in I"),
-    Field("gate_next", (), "-", "gates passed so far"),
-    # the task
-    Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
-    Field("action", (4,), "-", "the present action, in [-1, 1]"),
-    Field("last_action", (4,), "-", "the action before it"),
-    Field("idle", (), "0 or 1", "a lane that only pads the last block"),
-    Field("step", (), "steps", "control steps since the start of the episode"),
-    Field("episode", (), "-", "episodes begun since seeding"),
-    Field("needs_reset", (), "0 or 1", "the episode is over; the next step begins a new one"),
-    Field("reward", (), "-", "of the last step"),
-    Field("terminated", (), "0 or 1", "the last step ended the episode by a crash or at the goal"),
-    Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit or a failed filter"),
-    Field("ending", (), "-", "why the episode ended, see Ending"),
-    Field("position_error", (), "m", "distance of the true position from the reference"),
-    Field("estimation_error", (), "m", "distance of the seen from the true position"),
-    Field("episode_return", (), "-", "sum of rewards in this episode"),
-    Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
+_FAULT_FIELDS = (
     # what goes wrong
-    Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
     Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
     Field("fault_count", (FAULT_KINDS,), "-", "times that a fault has come in this episode"),
     Field("fault_from", (FAULT_KINDS,), "ticks", "since the start of the episode, when it comes (next)"),
@@ -127,6 +28,128 @@ FLIGHT_FIELDS = (
     Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "whether an occlusion hides a feature"),
     Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
     Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
+)
+_DRAW_FIELDS = (
+    # parameters
+    Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
+)
+_ACTION_FIELDS = (
+    # actions under way
+    Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first"),
+    Field("delayed_action", (4,), "-", "the action that the vehicle carries out"),
+)
+_CORE_FIELDS = (
+    # what every tick reads and writes: the truth, clocks, the random stream
+    Field("r", (3,), "m", "position r_I of the center of mass"),
+    Field("v", (3,), "m/s", "velocity v_I"),
+    Field("q", (4,), "-", "attitude, unit quaternion (w, x, y, z), body to inertial"),
+    Field("w", (3,), "rad/s", "body rates w_B"),
+    Field("rotor_speeds", (4,), "rad/s", "rotor speeds"),
+    Field("voltages", (4,), "V", "motor voltages over the present tick"),
+    Field("on_pad", (), "0 or 1", "whether the launch pad carries the vehicle"),
+    Field("disturbance", (3,), "N", "external force d_I on the body"),
+    Field("tick", (), "ticks", "since the start of the episode"),
+    Field("instant", (), "-", "instants drawn so far", "u8"),
+    Field("key", (2,), "-", "key of the stream", "u8"),
+    Field("action", (4,), "-", "the present action, in [-1, 1]"),
+    Field("last_action", (4,), "-", "the action before it"),
+    # what the controller sees
+    Field("w_seen", (3,), "rad/s", "body rates in B from the controller's source"),
+    Field("R_seen", (3, 3), "-", "attitude R_BI from the controller's source"),
+    Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),
+    Field("r_seen", (3,), "m", "position in I from the controller's source"),
+    # what every step reads and writes: the task
+    Field("needs_reset", (), "0 or 1", "the episode is over; the next step begins a new one"),
+    Field("idle", (), "0 or 1", "a lane that only pads the last block"),
+    Field("step", (), "steps", "control steps since the start of the episode"),
+    Field("gate_next", (), "-", "gates passed so far"),
+    Field("reward", (), "-", "of the last step"),
+    Field("terminated", (), "0 or 1", "the last step ended the episode by a crash or at the goal"),
+    Field("truncated", (), "0 or 1", "the last step ended the episode by its time limit or a failed filter"),
+    Field("ending", (), "-", "why the episode ended, see Ending"),
+    Field("position_error", (), "m", "distance of the true position from the reference"),
+    Field("estimation_error", (), "m", "distance of the seen from the true position"),
+    Field("episode_return", (), "-", "sum of rewards in this episode"),
+    Field("episode_error", (), "m", "sum over steps of the position error in this episode"),
+    Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
+    Field("lost", (), "0 or 1", "whether the covariance does not explain the last innovations"),
+    Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
+    Field("position_fresh", (), "0 or 1", "whether gnss_position was measured since the last step"),
+    Field("baseline_fresh", (), "0 or 1", "whether gnss_baseline was measured since the last step"),
+    # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
+    Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
+    Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
+    Field("ref_omega", (), "rad/s", "fundamental frequency w"),
+    Field("ref_center", (3,), "m", "constant term c in I"),
+    Field("ref_cos", (MAX_HARMONICS, 3), "m", "cosine coefficients a_k in I"),
+    Field("ref_sin", (MAX_HARMONICS, 3), "m", "sine coefficients b_k in I"),
+    # the course of gates
+    Field("gates", (MAX_GATES, 3), "m", "gate centers in I"),
+    # episodes
+    Field("episode", (), "-", "episodes begun since seeding"),
+    Field("start_given", (7,), "mixed", "position, velocity in I and yaw to start the next episode with; NaN: drawn"),
+    # the air
+    Field("wind", (3,), "m/s", "velocity of the air in I"),
+    Field("air_force", (3,), "N", "force of the air in I, less thrust and disc drag"),
+    Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
+    Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),
+    Field("charge", (), "-", "charge of the battery, 1: full"),
+    # what the sensors are made of
+    Field("b_a", (3,), "m/s^2", "accelerometer bias"),
+    Field("b_g", (3,), "rad/s", "gyro bias"),
+    Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
+    Field("gnss_wait", (), "ticks", "until GNSS measures next"),
+    Field("camera_wait", (), "ticks", "until the camera measures next"),
+    Field("feature_fresh", (MAX_FEATURES,), "0 or 1", "whether a feature was seen since the last step"),
+)
+_FILTER_FIELDS = (
+    # the last measurements
+    Field("w_meas", (3,), "rad/s", "body rates in B that the gyro reads at the present instant"),
+    Field("w_before", (3,), "rad/s", "w_meas one sample before"),
+    Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
+    Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
+    Field("position_valid", (), "0 or 1", "whether gnss_position was measured at the present instant"),
+    Field("baseline_valid", (), "0 or 1", "whether gnss_baseline was measured at the present instant"),
+    Field("velocity_valid", (), "0 or 1", "whether gnss_velocity was measured at the present instant"),
+    Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
+    Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
+    Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
+    Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
+    Field("feature_valid", (MAX_FEATURES,), "0 or 1", "whether the camera saw a feature at the present instant"),
+    # the filter
+    Field("r_hat", (3,), "m", "estimated position in I"),
+    Field("v_hat", (3,), "m/s", "estimated velocity in I"),
+    Field("R_hat", (3, 3), "-", "estimated attitude R_BI"),
+    Field("b_a_hat", (3,), "m/s^2", "estimated accelerometer bias"),
+    Field("b_g_hat", (3,), "rad/s", "estimated gyro bias"),
+    Field("prediction_failures", (), "-", "predictions that failed since the filter's start"),
+    Field("update_failures", (), "-", "updates that failed since the filter's start"),
+    Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
+    Field("nis_dimension", (), "-", "measurements in the last update"),
+    Field("rejected_in_row", (4,), "-", "positions, baselines, velocities, images wholly rejected since the last accepted one"),
+    Field("reopened", (4,), "-", "times that the gate of each of these was reopened in this episode"),
+    Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
+    Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
+    Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
+    Field("doubt_tick", (), "ticks", "when the filter last doubted itself"),
+    Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
+    Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
+)
+_ERROR_FIELDS = (
+    # errors of sensors that last an episode
+    Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
+    Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
+    Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
+)
+_WATCH_FIELDS = (
+    # the innovations of the last measurements, one by one: position, baseline, velocity, features
+    Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
+    Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
+    Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
+    Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
+    Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
+)
+_LATE_FIELDS = (
     # what the IMU has summed up since the start of the episode, biases and gravity included
     Field("imu_turn", (3, 3), "-", "C, from the body frame of the start to the present one"),
     Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
@@ -147,4 +170,25 @@ FLIGHT_FIELDS = (
     Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
     Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
 )
+_DRIFT_FIELDS = (
+    # the slow error of GNSS positions, where the filter estimates it
+    Field("gnss_drift_hat", (3,), "m", "estimated slow error d in I"),
+    Field("L_drift", (3, 18), "mixed", "rows of d below L in the factor of the joint covariance"),
+)
 # fmt: on
+PARTS = (
+    ("faults", _FAULT_FIELDS),
+    ("draws", _DRAW_FIELDS),
+    ("actions", _ACTION_FIELDS),
+    ("core", _CORE_FIELDS),
+    ("filter", _FILTER_FIELDS),
+    ("errors", _ERROR_FIELDS),
+    ("watch", _WATCH_FIELDS),
+    ("late", _LATE_FIELDS),
+    ("drift", _DRIFT_FIELDS),
+)
+"""The parts of a record, in the order in which they lie in memory. All flights have the core; what
+a batch uses beside it is best close to it, as the memory of a flight has no gaps: see `Room`."""
+
+FLIGHT_FIELDS = tuple(field for _, fields in PARTS for field in fields)
+"""Every field, in the order of the parts."""

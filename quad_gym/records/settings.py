@@ -1,7 +1,7 @@
 """What a batch does, the same for all its flights."""
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import FAULT_KINDS, WARM_DRAWS, Field
+from quad_gym.records.sizes import FAULT_KINDS, WARM_DRAWS, WARM_DRIFT_DRAWS, Field
 
 # fmt: off
 SETTINGS_FIELDS = (
@@ -13,6 +13,7 @@ SETTINGS_FIELDS = (
     Field("camera_phase", (), "ticks", "from the start to the first image; -1: at random", "i8"),
     Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
     Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),
+    Field("estimates_drift", (), "0 or 1", "whether the filter has this slow error among its states", "i8"),
     Field("reuse_first_fix", (), "0 or 1", "whether the fix that starts the filter is its first measurement, too", "i8"),
     Field("warm", (), "0 or 1", "whether the filter has converged before an episode begins", "i8"),
     Field("feature_count", (), "-", "features in use", "i8"),
@@ -21,11 +22,13 @@ SETTINGS_FIELDS = (
     Field("source", (), "-", "what the controller sees, see Source", "i8"),
     Field("run_filter", (), "0 or 1", "whether sensors and filter run", "i8"),
     Field("control", (), "-", "what the action means, see Control", "i8"),
+    Field("action_delays", (), "steps", "the longest delay of an action, rounded up; 0: none", "i8"),
     Field("task", (), "-", "see Task", "i8"),
     Field("harmonics", (), "-", "terms of the reference's series in use", "i8"),
     Field("layout", (), "-", "of the observation, see Layout", "i8"),
     Field("include_covariance", (), "0 or 1", "whether the observation holds standard deviations", "i8"),
     Field("privileged", (), "0 or 1", "whether the observation ends with the truth", "i8"),
+    Field("shown", (), "0 or 1", "whether flights are shown to a task of a user's own", "i8"),
     Field("autoreset", (), "-", "see Autoreset", "i8"),
     Field("start", (), "-", "how episodes begin, see Start", "i8"),
     Field("pad", (), "0 or 1", "whether a launch pad carries vehicles that start on the ground", "i8"),
@@ -46,12 +49,20 @@ SETTINGS_FIELDS = (
     Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
     Field("start_velocity_variance", (3,), "m^2/s^2", "mean square of what is drawn on top of the start's velocity"),
     Field("start_tilt_variance", (3,), "rad^2", "likewise of roll and pitch, then 0"),
-    Field("warm_covariance", (15, 15), "mixed", "of a converged filter whose vehicle looks east"),
-    Field("warm_root", (15, WARM_DRAWS), "mixed", "W with W W^T = warm_covariance; the last six columns: of the true biases"),
+    Field("warm_covariance", (18, 18), "mixed", "of a converged filter whose vehicle looks east; the last three: of the slow error, if it has that"),
+    Field("warm_root", (18, WARM_DRAWS + WARM_DRIFT_DRAWS), "mixed", "W with W W^T = warm_covariance; six columns from the 16th on: of the true biases; the last three: of the true slow error"),
+    Field("warm_drift_sigma", (3,), "m", "of the true slow error after the filter's convergence"),
     # late measurements
     Field("gnss_delay", (), "ticks", "until a GNSS measurement reaches the filter", "i8"),
     Field("camera_delay", (), "ticks", "until an image reaches the filter", "i8"),
     Field("rewinds", (), "0 or 1", "whether the filter goes back to time stamps", "i8"),
+    # what sensors do wrong
+    Field("imu_errs", (), "0 or 1", "whether the IMU has errors of scale or alignment", "i8"),
+    Field("imu_vibrates", (), "0 or 1", "whether the rotors' vibration reaches the IMU", "i8"),
+    Field("heading_errs", (), "0 or 1", "whether baselines have a constant error", "i8"),
+    Field("camera_limited", (), "0 or 1", "whether range, blur or ground limit what is seen", "i8"),
+    Field("camera_blurs", (), "0 or 1", "whether images are blurred", "i8"),
+    Field("ground_hides", (), "0 or 1", "whether the ground hides features", "i8"),
     # the world, and what is drawn
     Field("air", (), "0 or 1", "whether the air does more than in a calm world", "i8"),
     Field("gusts", (), "0 or 1", "whether there are gusts", "i8"),

@@ -15,6 +15,8 @@ MAX_UNDER_WAY = 2
 """Longest latency of a sensor, in its periods: as many measurements can be in transit."""
 DELAY_SLOTS = MAX_UNDER_WAY + 1
 """Measurements that wait: at a latency of MAX_UNDER_WAY periods one is taken as another arrives."""
+MAX_ACTION_DELAY = 10
+"""Longest delay of an action, in control steps."""
 MAX_BLOCKS = 3 + MAX_FEATURES
 """Blocks of the stacked measurement: antenna position, baseline, velocity, features."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS
@@ -29,6 +31,8 @@ MAX_OBSERVATION = 256
 """Numbers that an observation can hold."""
 WARM_DRAWS = 21
 """Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""
+WARM_DRIFT_DRAWS = 6
+"""More of them, for the slow error of GNSS positions: three, and three that make the true one."""
 FAULT_KINDS = len(FaultKind)
 """Number of kinds of faults."""
 

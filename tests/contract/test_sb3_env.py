@@ -72,7 +72,7 @@ def test_an_episode_ends_with_its_return_its_length_its_time_and_its_error():
 
 
 def test_a_crash_is_not_reported_as_truncation():
-    env = make(2, "QuadGym/Circle-v0")
+    env = make(2, "QuadGym/Circle-v0", pad=False)
     env.reset()
     for _ in range(60):
         _, _, dones, infos = env.step(np.tile([-1.0, 0, 0, 0], (2, 1)))

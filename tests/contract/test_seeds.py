@@ -74,7 +74,8 @@ def test_trainings_fly_their_own_flights_and_are_judged_on_others():
     """The algorithm seeds its environment too, which must not bring other flights in."""
     pytest.importorskip("stable_baselines3")
     from baselines.checkpoints import Keeper
-    from baselines.plans import Plan, make_model
+    from baselines.models import make_model
+    from baselines.plans import Plan
     from baselines.recipes import recipe
 
     flown = []

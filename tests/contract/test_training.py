@@ -19,7 +19,8 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
-from baselines.plans import Plan, algorithm_class, make_model  # noqa: E402
+from baselines.models import algorithm_class, make_model  # noqa: E402
+from baselines.plans import Plan  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
 from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
 from baselines.training import train  # noqa: E402

@@ -40,22 +40,13 @@ def assert_consistent(findings, parts):
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-@pytest.mark.parametrize("suite", ["rtk", "indoor"])
+@pytest.mark.parametrize("suite", ["rtk", "consumer", "indoor"])
 def test_a_suite_is_consistent_from_its_first_instant_on(suite, kind, start):
     """NEES of state and blocks and NIS of all sensors in their bands, innovations white."""
     sensors = quad_gym.sensor_suite(suite)
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
     findings = flown(sensors, filter_start=start)
     assert_consistent(findings, findings.nees | findings.nis)
-
-
-@pytest.mark.slow
-def test_errors_with_a_consumer_receiver_are_as_claimed():
-    """Its position drifts, which the filter takes for much white noise: the NIS of it is small."""
-    findings = flown("consumer")
-    assert all(part.consistent for part in findings.nees.values())
-    assert findings.nis["velocity"].consistent
-    assert findings.nis["position"].overall < 0.1
 
 
 @pytest.mark.slow
@@ -94,7 +85,7 @@ def test_each_correction_has_its_share():
 def test_errors_of_prediction_alone_are_as_claimed(kind):
     """10,000 runs of IMU alone: the covariance within 5 % of its diagonal."""
     runs = 10_000
-    sensors = quad_gym.sensor_suite("rtk")
+    sensors = quad_gym.sensor_suite("rtk").simplified()
     sensors = sensors.replace(estimator=sensors.estimator.replace(kind=kind))
     batch = FlightBatch(
         runs,

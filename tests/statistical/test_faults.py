@@ -18,7 +18,7 @@ from quad_gym.records import POSITION_BLOCK, Gate, Source
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.unit.alarms import ALARM, alarm_score
 
-LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk")
+LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
 COUNT = 1000
 BEFORE, OUTAGE, RETURN = 15.0, 60.0, 3.0
 MOTION = slice(0, 6)
@@ -192,7 +192,7 @@ SUITES = {
     "lab": GATED_LAB,
     "rtk": RTK,
     "rtk, no camera": RTK.replace(camera=None),
-    "consumer": quad_gym.sensor_suite("consumer"),
+    "consumer": quad_gym.sensor_suite("consumer").simplified(),
 }
 
 

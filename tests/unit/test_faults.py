@@ -33,7 +33,7 @@ from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import fly
 from tests.unit.alarms import ALARM, alarm_score
 
-LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk")
+LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
 DT = LAB.imu.dt
 BLIND = LAB.replace(camera=None)
 R_IG = ecef_to_enu(LAB.gnss.reference_antenna_G)
@@ -198,7 +198,7 @@ def test_a_ramp_grows_with_time_and_a_jump_stays():
 
 
 def test_an_occlusion_hides_the_same_share_of_features_as_long_as_it_stays():
-    suite = quad_gym.sensor_suite("indoor").with_rates(camera=200.0)
+    suite = quad_gym.sensor_suite("indoor").simplified().with_rates(camera=200.0)
     calm, faulty = both(suite, CameraOcclusion(start=0.1, duration=0.1, share=0.4), count=300)
     for tick in range(1, 51):
         calm.step()
@@ -215,7 +215,7 @@ def test_an_occlusion_hides_the_same_share_of_features_as_long_as_it_stays():
 
 @pytest.mark.parametrize("how", ["swap", "copy"])
 def test_wrong_associations_take_one_seen_feature_for_another(how):
-    suite = quad_gym.sensor_suite("indoor").with_rates(camera=200.0)
+    suite = quad_gym.sensor_suite("indoor").simplified().with_rates(camera=200.0)
     calm, faulty = both(suite, WrongAssociations(share=0.3, how=how), count=100)
     images = changed = 0
     places = []
@@ -390,7 +390,10 @@ def test_the_gate_rejects_most_outliers_and_says_so():
         (lambda: faults_of(3, LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([3], LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([GnssOutage(), "gnss_outage"], LAB), "one of a kind, got two Gnss"),
-        (lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor")), "needs GNSS"),
+        (
+            lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor").simplified()),
+            "needs GNSS",
+        ),
         (lambda: faults_of(CameraOcclusion(), BLIND), "needs a camera"),
         (
             lambda: faults_of(

@@ -10,7 +10,7 @@ from quad_gym.sensors import Camera
 from tests.field_flights import fly, state_errors
 from tests.unit.alarms import ALARM
 
-INDOOR = quad_gym.sensor_suite("indoor")
+INDOOR = quad_gym.sensor_suite("indoor").simplified()
 
 
 def with_gradual(above, kind="ukf"):

@@ -180,9 +180,7 @@ def test_a_lane_gates_for_itself():
     ],
     ids=["lab", "watched", "gated", "ekf"],
 )
-@pytest.mark.parametrize(
-    "field", ["gnss_position", "gnss_baseline", "pixels", "position_sigma", "L"]
-)
+@pytest.mark.parametrize("field", ["gnss_position", "gnss_baseline", "pixels", "gnss_sigma", "L"])
 def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, sensors, form):
     """Not finite, or singular: the flight keeps its estimate and says so; others do not notice."""
     filters, free = LaneFilter(sensors), LaneFilter(sensors)
@@ -191,8 +189,8 @@ def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, s
         for lane in range(EIGHT):
             lanes.measure(lane, RECORDING, 0)
         lanes.initialize()
-    if field == "position_sigma":  # neither prior nor measurement have any noise: singular
-        filters.put_params(2, position_sigma=0.0)
+    if field == "gnss_sigma":  # neither prior nor measurement have any noise: singular
+        filters.put_params(2, gnss_sigma=0.0)
         filters.put(2, L=0.0)
     elif field == "L":
         factor = filters.get("L")[2]
@@ -216,7 +214,7 @@ def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, s
 
 
 def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
-    suite = quad_gym.sensor_suite("consumer")
+    suite = quad_gym.sensor_suite("consumer").simplified()
     suite = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=0.01))
     batch = fly(suite, 400, task="hover")
     steps(batch, 5.0)  # until the start's larger uncertainty is over
@@ -256,7 +254,7 @@ def shifted(batch, **changes):
 @pytest.mark.parametrize("name", ["rtk", "consumer"])
 def test_a_jump_does_not_lock_the_filter_out_for_ever(name):
     suite = quad_gym.sensor_suite(name)
-    if name == "consumer":  # one that trusts its fixes, or the jump is within its doubts
+    if name == "consumer":  # with a slow error a jump of the vehicle looks like one of the receiver
         suite = suite.replace(gnss=suite.gnss.replace(drift_sigma_I=(0.0, 0.0, 0.0)))
     batch = fly(suite.replace(camera=None), 200, task="hover")
     steps(batch, 5.0)
@@ -272,7 +270,7 @@ def test_a_jump_does_not_lock_the_filter_out_for_ever(name):
 
 
 def test_a_wrong_heading_does_not_lock_the_baseline_out_for_ever():
-    suite = quad_gym.sensor_suite("rtk").replace(camera=None)
+    suite = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
     batch = fly(suite, 200, task="hover")
     steps(batch, 5.0)
     c, s = np.cos(0.7), np.sin(0.7)

@@ -11,7 +11,10 @@ from tests.field_flights import fly, measured_now, nees, steps
 from tests.reference_late import Rewinding
 from tests.reference_ukf import PlainEKF, PlainUKF
 
-RTK, INDOOR = quad_gym.sensor_suite("rtk"), quad_gym.sensor_suite("indoor")
+RTK, INDOOR = (
+    quad_gym.sensor_suite("rtk").simplified(),
+    quad_gym.sensor_suite("indoor").simplified(),
+)
 DT = RTK.imu.dt
 ESTIMATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
 

@@ -14,7 +14,7 @@ from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, PositionJump, RotorLoss
 from quad_gym.records import Source
 
-LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk")
+LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
 VEHICLE = quad_gym.vehicle_params("lab")
 
 

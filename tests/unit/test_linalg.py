@@ -7,15 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quad_gym.kernels.maths import linalg
-from quad_gym.kernels.maths.linalg import (
-    cholesky,
-    load3,
-    load33,
-    solve_left_vector,
-    solve_right,
-    store3,
-    store33,
-)
+from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
+from quad_gym.kernels.maths.linalg import load3, load33, store3, store33
 from tests.unit.compiled import Compiled
 
 LARGEST, ROWS = 18, 9

@@ -125,7 +125,8 @@ def test_a_reset_without_seeds_goes_on_with_the_stream():
 
 
 def test_a_batch_flies_on_the_motors_it_is_told():
-    batch = new_batch(2, control=Control.MOTOR, source=Source.TRUTH)
+    task = TaskParams(duration=0, pad=False)
+    batch = new_batch(2, control=Control.MOTOR, source=Source.TRUTH, task=task)
     batch.reset(seeds=[1, 1])
     for _ in range(20):
         batch.step(np.array([[-1.0] * 4, [1.0] * 4]))

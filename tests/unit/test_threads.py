@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, Crew
-from quad_gym.kernels import mailbox
+from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
+from quad_gym.kernels import board
 from quad_gym.records import WIDTH, Control, Source
 
 COUNT = 3 * MIN_BLOCKS_PER_THREAD * WIDTH + 3
@@ -106,43 +106,74 @@ def crew_of(fly):
     return Crew(fly, 2 * MIN_BLOCKS_PER_THREAD, 2)
 
 
+def post(words):
+    """What a caller does first in compiled code: post a step, of which nothing is finished."""
+    words[board.FINISHED] = 0
+    words[board.TICKET] += 1
+
+
+def finish(words):
+    words[board.FINISHED] = 2 * MIN_BLOCKS_PER_THREAD
+
+
 def test_what_goes_wrong_in_a_helper_is_raised():
-    def fly(number, first, last, words, serving):
+    def fly(words, number, command, serving):
         if serving:
             raise MemoryError("no more")
-
-    with pytest.raises(MemoryError, match="no more"):
-        crew_of(fly).run(0)
-
-
-def test_after_an_interrupted_step_the_next_one_is_flown_by_all():
-    flown_by, interrupts = [], [True]
-
-    def fly(number, first, last, words, serving):
-        if serving:
-            time.sleep(0.05)
-            while words[mailbox.TICKET] != words[mailbox.DONE]:
-                flown_by.append(number)
-                words[mailbox.DONE] = words[mailbox.TICKET]
-            words[mailbox.PRESENT] = 0
-        elif interrupts and interrupts.pop():
-            raise KeyboardInterrupt
-        else:
-            flown_by.append(number)
+        if command != POSTED_BEFORE:
+            post(words)
+        return False  # some blocks are the helper's
 
     crew = crew_of(fly)
+    crew.gather()
+    for _ in range(2):  # it has no helper from then on
+        with pytest.raises(MemoryError, match="no more"):
+            crew.run(0)
+
+
+def test_after_an_interrupted_step_the_next_one_waits_for_what_it_left():
+    seen = []
+
+    def fly(words, number, command, serving):
+        if serving:
+            time.sleep(0.05)
+            finish(words)
+            seen.append("helper")
+            words[board.RANGES + board.WORDS_OF_RANGE + board.PRESENT] = 0
+        elif not seen:
+            post(words)
+            raise KeyboardInterrupt
+        else:
+            seen.append(command)
+        return bool(seen)
+
+    crew = crew_of(fly)
+    crew.gather()
     with pytest.raises(KeyboardInterrupt):
-        crew.run(0)
-    crew.run(0)
-    assert sorted(flown_by) == [0, 1, 1]
+        crew.run(7)
+    while not seen:
+        time.sleep(0.01)
+    crew.gather()
+    crew.run(8)
+    assert [what for what in seen if what != "helper"] == [8]
+
+
+@pytest.mark.parametrize("blocks", [1, 7, 64, 1000])
+@pytest.mark.parametrize("parts", [1, 2, 5])
+def test_the_ranges_of_a_board_hold_every_block_once(blocks, parts):
+    words = board_of(blocks, parts)
+    ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
+    flown = [i for row in ranges for i in range(row[board.FIRST], row[board.LAST])]
+    assert flown == list(range(blocks))
+    assert words[board.FINISHED] == blocks  # nothing is posted
+    assert 1 <= words[board.CHUNK] <= blocks
 
 
 def test_a_batch_is_flown_by_one_thread_at_a_time():
     crew = None
 
-    def fly(number, first, last, words, serving):
-        if not serving:
-            crew.run(0)
+    def fly(words, number, command, serving):
+        crew.run(0)
 
     crew = Crew(fly, 1, 1)
     with pytest.raises(RuntimeError, match="one thread at a time"):

@@ -16,6 +16,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import SUITES
+from quad_gym.records import Control
 
 LAB = quad_gym.sensor_suite("lab")
 OFF = "everything off"
@@ -43,6 +44,11 @@ def arriving_late(name: str, gnss: float, camera: float) -> dict[str, Any]:
     return {"sensors": suite.replace(gnss=gnss_late, camera=camera_late)}
 
 
+def lab_sensor(part: str, **changes: Any) -> dict[str, Any]:
+    """The laboratory's suite with one sensor changed, as a keyword of a batch."""
+    return {"sensors": LAB.replace(**{part: getattr(LAB, part).replace(**changes)})}
+
+
 OPTIONS: dict[str, dict[str, Any]] = {
     OFF: {},
     "extended Kalman filter": filter_form(kind="ekf"),
@@ -59,6 +65,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "innovations kept": {"innovations": True},
     "gate": filter_form(gate_false_alarm=1e-4),
     "measurements 10 ms late": arriving_late("lab", gnss=0.01, camera=0.01),
+    "thrust and rates, commanded": {"control": Control.CTBR},
+    "thrust and rates, commanded and late": {"control": Control.CTBR, "action_delay": 1.0},
+    "IMU errs in scale and alignment": lab_sensor(
+        "imu", accel_scale_sigma=0.002, accel_misalignment_sigma=0.002
+    ),
+    "IMU vibrates": lab_sensor("imu", accel_vibration=0.1, gyro_vibration=0.005),
+    "constant heading error": lab_sensor("gnss", heading_error_sigma=0.01),
+    "camera's range, blur and ground": lab_sensor(
+        "camera", max_range=13.0, exposure=0.003, ground_hides=True
+    ),
     "wind and rotor drag": in_a_world(wind_I=(4.0, 0.0, 0.0), linear_drag_B=(0.4, 0.3, 0.0)),
     "gusts": in_a_world(gust_wind_speed=4.0),
     "ground effect": in_a_world(ground_effect=True),
@@ -69,7 +85,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "randomization": {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
     },
     **{f"suite {name}": {"sensors": name} for name in SUITES if name != "lab"},
-    "suite rtk, GNSS 110 ms and camera 60 ms late": arriving_late("rtk", gnss=0.11, camera=0.06),
+    **{
+        f"suite {name}, simplified": {"sensors": quad_gym.sensor_suite(name).simplified()}
+        for name in ("rtk", "consumer", "indoor")
+    },
+    "suite rtk, prompt": arriving_late("rtk", gnss=0.0, camera=0.0),
 }
 """What is switched on, as keywords of `FlightBatch`; without a suite, it is the laboratory's."""
 

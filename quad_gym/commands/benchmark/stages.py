@@ -52,13 +52,22 @@ class Staged:
     """
 
     def __init__(self, batch: FlightBatch, stage: Stage, flag: int = 0) -> None:
-        self._stage, self._flag = int(stage), flag
+        self._stage, self._flag, self._skipped = int(stage), flag, batch._room.skipped
         self._others = (batch._world, batch._model, batch._settings, batch._work[0])
         self._table = linked_table(needed_stages(batch._settings[0]) | {stage})
 
     def __call__(self, blocks: NDArray[Any]) -> None:
         """Run the stage once for every block."""
-        run_stage(blocks, self._stage, *self._others, self._table, self._flag)
+        begin = blocks.ctypes.data - self._skipped
+        run_stage(
+            begin,
+            blocks.strides[0],
+            len(blocks),
+            self._stage,
+            *self._others,
+            self._table,
+            self._flag,
+        )
 
 
 def flag_of(stage: Stage, batch: FlightBatch) -> int:

@@ -10,7 +10,6 @@ from quad_gym.kernels.compiling.stages import SIGNATURE, SOURCES, STAGE_TABLE, S
 from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
 
 FLY = "quad_gym.kernels.batch:fly"
-HAND_OVER = ("quad_gym.kernels.mailbox:post", "quad_gym.kernels.mailbox:wait")
 _table: NDArray[Any] = np.zeros(1, STAGE_TABLE)
 _linked: set[Stage] = set()
 _lock = threading.Lock()
@@ -25,7 +24,7 @@ def name_of(stage: Stage) -> str:
 def names_of(needed: frozenset[Stage]) -> list[str]:
     """The compiled functions that flights through these stages take, the longest first."""
     ordered = [name_of(stage) for stage in SOURCES if stage in needed]
-    return [*ordered[:2], FLY, *ordered[2:], *HAND_OVER]
+    return [*ordered[:2], FLY, *ordered[2:]]
 
 
 def linked_table(needed: frozenset[Stage]) -> NDArray[Any]:

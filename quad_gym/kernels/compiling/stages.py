@@ -22,13 +22,22 @@ from numba.extending import intrinsic
 from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
-from quad_gym.records import FLIGHT_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, Start, Supply
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    PARAMS_BLOCK,
+    SETTINGS,
+    WORK_BLOCK,
+    FilterForm,
+    Start,
+    Supply,
+)
 
 
 class Stage(IntEnum):
     """The stages, by their places in the table of addresses."""
 
     CONTROL = 0
+    DELAY_ACTION = auto()
     SUPPLY = auto()
     MOVE = auto()
     MOVE_IN_AIR = auto()
@@ -37,6 +46,10 @@ class Stage(IntEnum):
     DRIFT_BIASES = auto()
     AVERAGE_IMU = auto()
     SAMPLE = auto()
+    BEGIN_IMPERFECT = auto()
+    DISTURB_IMU = auto()
+    TURN_BASELINE = auto()
+    LIMIT_CAMERA = auto()
     BEGIN_FAULTS = auto()
     ADVANCE_FAULTS = auto()
     MEET_ROTORS = auto()
@@ -58,6 +71,11 @@ class Stage(IntEnum):
     LOOK = auto()
     JUDGE = auto()
     OBSERVE = auto()
+    SHOW = auto()
+    PREDICT_WITH_DRIFT = auto()
+    UPDATE_WITH_DRIFT = auto()
+    LATE_UPDATE_WITH_DRIFT = auto()
+    WARM_WITH_DRIFT = auto()
 
 
 class Source(NamedTuple):
@@ -92,6 +110,26 @@ def _late(s: Any) -> bool:
     return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
 
 
+def _imu_disturbed(s: Any) -> bool:
+    return bool(s["run_filter"] and s["imu_errs"] + s["imu_vibrates"] > 0)
+
+
+def _lasting(s: Any) -> bool:
+    return bool(s["run_filter"] and s["imu_errs"] + s["heading_errs"] > 0)
+
+
+def _rewinds(s: Any) -> bool:
+    return bool(_late(s) and s["rewinds"] > 0)
+
+
+def _with_drift(s: Any) -> bool:
+    return bool(s["run_filter"] and s["estimates_drift"])
+
+
+def _without_drift(s: Any) -> bool:
+    return bool(s["run_filter"] and not s["estimates_drift"])
+
+
 def _pad(s: Any) -> bool:
     return bool(s["pad"] and s["start"] != Start.HOVER)
 
@@ -101,10 +139,15 @@ def _drawn(s: Any) -> bool:
 
 
 SOURCES = {
-    Stage.UPDATE: Source("filter.update", "update_stage", _filter),
-    Stage.PREDICT: Source("filter.predict", "predict_stage", _filter),
+    Stage.UPDATE_WITH_DRIFT: Source("filter.update", "update_with_drift_stage", _with_drift),
+    Stage.UPDATE: Source("filter.update", "update_stage", _without_drift),
+    Stage.PREDICT_WITH_DRIFT: Source("filter.predict", "predict_with_drift_stage", _with_drift),
+    Stage.PREDICT: Source("filter.predict", "predict_stage", _without_drift),
+    Stage.LATE_UPDATE_WITH_DRIFT: Source(
+        "filter.late", "late_update_with_drift_stage", lambda s: _with_drift(s) and _rewinds(s)
+    ),
     Stage.LATE_UPDATE: Source(
-        "filter.late", "late_update_stage", lambda s: _late(s) and s["rewinds"] > 0
+        "filter.late", "late_update_stage", lambda s: _without_drift(s) and _rewinds(s)
     ),
     Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
     Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
@@ -113,12 +156,16 @@ SOURCES = {
     Stage.MOVE_IN_AIR: Source("vehicle.air", "move_in_air_stage", _air),
     Stage.ALIGN: Source("filter.align", "align_stage", _filter),
     Stage.OBSERVE: Source("task.observation", "observe_stage", _always),
+    Stage.SHOW: Source("task.show", "show_stage", lambda s: bool(s["shown"])),
     Stage.ADVANCE_FAULTS: Source("sensors.faults", "advance_faults_stage", _faults),
     Stage.BEGIN_FAULTS: Source("sensors.faults", "begin_faults_stage", _faults),
     Stage.CONTROL: Source("vehicle.control", "control_stage", _always),
     Stage.MOVE: Source("vehicle.dynamics", "move_stage", lambda s: not _air(s)),
     Stage.BEGIN_IN_AIR: Source("vehicle.air", "begin_in_air_stage", _air),
-    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _filter(s) and s["warm"] > 0),
+    Stage.WARM_WITH_DRIFT: Source(
+        "filter.warm", "warm_with_drift_stage", lambda s: _with_drift(s) and s["warm"] > 0
+    ),
+    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_drift(s) and s["warm"] > 0),
     Stage.AVERAGE_IMU: Source(
         "sensors.measure", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
     ),
@@ -133,6 +180,17 @@ SOURCES = {
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.late", "begin_late_stage", _late),
     Stage.SET_ASIDE: Source("filter.late", "set_aside_stage", _late),
+    Stage.BEGIN_IMPERFECT: Source("sensors.imperfect", "begin_imperfect_stage", _lasting),
+    Stage.DISTURB_IMU: Source("sensors.imperfect", "disturb_imu_stage", _imu_disturbed),
+    Stage.TURN_BASELINE: Source(
+        "sensors.imperfect", "turn_baseline_stage", lambda s: _filter(s) and s["heading_errs"] > 0
+    ),
+    Stage.LIMIT_CAMERA: Source(
+        "sensors.imperfect", "limit_camera_stage", lambda s: _filter(s) and s["camera_limited"] > 0
+    ),
+    Stage.DELAY_ACTION: Source(
+        "vehicle.delay", "delay_action_stage", lambda s: s["action_delays"] > 0
+    ),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
 }
@@ -145,6 +203,22 @@ STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
 def needed_stages(settings: Any) -> frozenset[Stage]:
     """The stages that a batch of these settings (a SETTINGS record) flies through."""
     return frozenset(stage for stage, source in SOURCES.items() if source.needed(settings))
+
+
+def used_parts(settings: Any) -> frozenset[str]:
+    """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
+    watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
+    uses = {
+        "faults": _faults(settings),
+        "draws": _drawn(settings),
+        "filter": _filter(settings),
+        "actions": bool(settings["action_delays"] > 0),
+        "errors": _lasting(settings),
+        "watch": _filter(settings) and bool(watches),
+        "late": _late(settings),
+        "drift": _with_drift(settings),
+    }
+    return frozenset(name for name, used in uses.items() if used)
 
 
 _DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)

@@ -8,16 +8,17 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.drift import begin_drift
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.factors import cholesky33, lower33, solve_right33
 from quad_gym.kernels.maths.linalg import (
     add33,
     apply,
     apply_transposed,
-    cholesky33,
     dot,
     keep3,
     keep33,
@@ -25,14 +26,12 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load33,
     load_block,
-    lower33,
     multiply,
     outer,
     scale,
     scale33,
     select3,
     select33,
-    solve_right33,
     sub,
     transpose,
     unit_or,
@@ -103,7 +102,7 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
         tilt_variance: Of roll and pitch, likewise [rad^2]; the third counts nothing.
     """
     inflation = math.sqrt(p.initial_scale)
-    attitude = inflation * p.baseline_sigma
+    attitude = inflation * p.first_baseline_sigma
     baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
     level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])
     heading = minimum(attitude / maximum(level_share, 1e-9), _NO_HEADING)
@@ -174,6 +173,8 @@ def known_velocity(flight, settings):
 def align_stage(flight, world, model, settings, work, stages, flag):
     """Start the filter from its first fix."""
     flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
+    if settings.estimates_drift:
+        begin_drift(flying, mask)
     if (settings.form & _WATCH) != 0:
         forget_innovations(flying, settings.feature_count, mask)
     x_I = look_along_mark(flying, lanes_of(world))

@@ -53,17 +53,19 @@ def _put(row, k, has, values):
 
 
 @kernel
-def measure_columns(flight, p, work, n, feature_count, use_position, use_baseline, use_velocity):
+def measure_columns(
+    flight, p, work, n, feature_count, use_position, use_baseline, use_velocity, last
+):
     """Fill work.A with the derivatives of the measurement along the nine columns of L that matter.
 
-    Column j of L is row 8 - j; work.E becomes zero. Reads work.X_B, work.inverse_distance and
+    Column j of L is row `last - j`; work.E becomes zero. Reads work.X_B, work.inverse_distance and
     work.h, the measurement predicted at the center.
     """
     L = flight.L
     R_BI = load33(flight.R_hat)
     antenna, unit_baseline = load3(p.antenna), scale(1.0 / p.baseline_length, load3(p.baseline))
     for j in range(9):
-        A, S = work.A[8 - j], work.E[8 - j]
+        A, S = work.A[last - j], work.E[8 - j]
         d, dr = load_column3(L, E, j), load_column3(L, R, j)
         for k in range(n):
             S[k] = 0.0 * dr[0]

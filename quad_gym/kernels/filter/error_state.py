@@ -25,8 +25,9 @@ from quad_gym.kernels.maths.linalg import (
     transpose,
 )
 
-R, V, E, BA, BG = 0, 3, 6, 9, 12
-"""First rows of position, velocity, attitude error, accelerometer and gyro bias in the state."""
+R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
+"""First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
+of the slow error of GNSS positions where the filter has that, see `drift.py`."""
 
 
 @kernel
@@ -53,30 +54,34 @@ def turn_covariance(P, T):
 
 
 @kernel
-def turn_factor(L9, T):
+def turn_factor(L9, T, rows, columns):
     """Turn the factor of a covariance likewise and make it lower triangular again.
 
     Args:
-        L9: (15, 9) the factor's first nine columns, last first; its rows of e are multiplied by T,
-            which fills the three places above the diagonal that Givens rotations of columns clear.
+        L9: (rows, columns) the factor's first columns, last first; its rows of e are multiplied by
+            T, which fills the three places above the diagonal that Givens rotations of columns
+            clear.
         T: As of `reset_matrix`.
+        rows: States.
+        columns: At least the nine up to the error angles.
     """
-    for j in range(9):
+    first = columns - 9
+    for j in range(first, columns):
         turned = apply(T, load_column3(L9, E, j))
         for i in range(3):
             L9[E + i, j] = turned[i]
-    _clear(L9, E, 2, 1)
-    _clear(L9, E, 2, 0)
-    _clear(L9, E + 1, 1, 0)
+    _clear(L9, E, first + 2, first + 1, rows)
+    _clear(L9, E, first + 2, first, rows)
+    _clear(L9, E + 1, first + 1, first, rows)
 
 
 @kernel
-def _clear(L9, row, kept, cleared):
+def _clear(L9, row, kept, cleared, rows):
     """Rotate two columns so that `cleared` vanishes at `row`; above it both are zero."""
     x, y = L9[row, kept], L9[row, cleared]
     inverse = 1.0 / math.sqrt(x * x + y * y)
     c, s = inverse * x, inverse * y
-    for i in range(row, 15):
+    for i in range(row, rows):
         a, b = L9[i, kept], L9[i, cleared]
         L9[i, kept] = c * a + s * b
         L9[i, cleared] = c * b - s * a

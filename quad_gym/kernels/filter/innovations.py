@@ -57,10 +57,10 @@ _GATE = int(FilterForm.GATE)
 
 
 @kernel
-def _covariance(p, work, k):
+def _covariance(p, work, k, columns):
     """S of the block that begins at row k of the stacked measurement."""
     S = add33(
-        sum_of_outers_of_rows(work.A, work.A, k, k, 9),
+        sum_of_outers_of_rows(work.A, work.A, k, k, columns),
         sum_of_outers_of_rows(work.E, work.E, k, k, 9),
     )
     mu = (work.mu[k], work.mu[k + 1], work.mu[k + 2])
@@ -114,11 +114,12 @@ def _keep_block(flight, s, has, nu, sigma, nis, rejected, unsure):
 
 
 @kernel
-def _mask_block(work, k, rejected):
+def _mask_block(work, k, rejected, columns):
     """Leave the block at row k out of the update, where `rejected`."""
     for i in range(k, k + 3):
-        for j in range(9):
+        for j in range(columns):
             work.A[j, i] = select(rejected, 0.0, work.A[j, i])
+        for j in range(9):
             work.E[j, i] = select(rejected, 0.0, work.E[j, i])
         work.mu[i] = select(rejected, 0.0, work.mu[i])
         work.z[i] = select(rejected, 0.0, work.z[i])
@@ -143,9 +144,9 @@ def _decide(flight, s, has, wanting, again, decision):
 
 
 @kernel
-def _judge_triple(flight, p, work, k, s, has, again, gating):
+def _judge_triple(flight, p, work, k, s, has, again, gating, columns):
     """Keep the innovation of a position or velocity; return where it is rejected, and its NIS."""
-    S = _covariance(p, work, k)
+    S = _covariance(p, work, k, columns)
     nu = (work.z[k], work.z[k + 1], work.z[k + 2])
     nis = _nis_of_triple(S, nu)
     rejected = _decide(flight, s, has, (nis > p.gate_position) & gating, again, _REJECTED)
@@ -158,13 +159,13 @@ def _judge_triple(flight, p, work, k, s, has, again, gating):
 
 
 @kernel
-def _judge_direction(flight, p, work, k, s, has, again, gating, most):
+def _judge_direction(flight, p, work, k, s, has, again, gating, columns, most):
     """Keep the innovation of a direction; return where it is rejected, and where too uncertain.
 
     Besides, its innovation in deviations, and its NIS. Too uncertain is one whose predicted
     variances add up to more than `most`.
     """
-    S = _covariance(p, work, k)
+    S = _covariance(p, work, k, columns)
     u = (work.h[k], work.h[k + 1], work.h[k + 2])
     nu, S2 = _across(u, S, (work.z[k], work.z[k + 1], work.z[k + 2]))
     nis = _nis_of_direction(S2, nu)
@@ -181,7 +182,17 @@ def _judge_direction(flight, p, work, k, s, has, again, gating, most):
 
 @kernel
 def judge_innovations(
-    flight, p, work, feature_count, use_position, use_baseline, use_velocity, form, mask, again
+    flight,
+    p,
+    work,
+    feature_count,
+    use_position,
+    use_baseline,
+    use_velocity,
+    form,
+    mask,
+    again,
+    columns,
 ):
     """Keep the innovations of the present measurements and mask those beyond the gate.
 
@@ -196,6 +207,7 @@ def judge_innovations(
         form: A `FilterForm`.
         mask: Which lanes.
         again: Which lanes take a later step of measurements that they have met before.
+        columns: Rows of work.A in use.
 
     Returns:
         How many measurements were masked in each lane.
@@ -208,35 +220,39 @@ def judge_innovations(
     k = 0
     if use_position:
         has = mask & (flight.position_valid > 0.0)
-        rejected, nis = _judge_triple(flight, p, work, k, POSITION_BLOCK, has, again, gating)
+        rejected, nis = _judge_triple(
+            flight, p, work, k, POSITION_BLOCK, has, again, gating, columns
+        )
         # a fix that is rejected while the camera fits tells of GNSS, not of the filter
         counts = select(has & logical_not(rejected & trusted), 1.0, 0.0)
         total, freedoms = total + counts * nis, freedoms + 3.0 * counts
         if gating:
-            _mask_block(work, k, rejected)
+            _mask_block(work, k, rejected, columns)
             _count_in_row(flight, POSITION_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
         k += 3
     if use_baseline:
         has = mask & (flight.baseline_valid > 0.0)
         rejected, _, scaled, nis = _judge_direction(
-            flight, p, work, k, BASELINE_BLOCK, has, again, gating, np.inf
+            flight, p, work, k, BASELINE_BLOCK, has, again, gating, columns, np.inf
         )
         first = has & logical_not(again)
         follow_drift(flight, BASELINE_BLOCK, first, scaled[0], scaled[1], zero)
         counts = select(has & logical_not(rejected & trusted), 1.0, 0.0)
         total, freedoms = total + counts * nis, freedoms + 2.0 * counts
         if gating:
-            _mask_block(work, k, rejected)
+            _mask_block(work, k, rejected, columns)
             _count_in_row(flight, BASELINE_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
         k += 3
     if use_velocity:
         has = mask & (flight.velocity_valid > 0.0)
-        rejected, nis = _judge_triple(flight, p, work, k, VELOCITY_BLOCK, has, again, gating)
+        rejected, nis = _judge_triple(
+            flight, p, work, k, VELOCITY_BLOCK, has, again, gating, columns
+        )
         total, freedoms = total + nis, freedoms + select(has, 3.0, 0.0)
         if gating:
-            _mask_block(work, k, rejected)
+            _mask_block(work, k, rejected, columns)
             _count_in_row(flight, VELOCITY_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
         k += 3
@@ -246,7 +262,7 @@ def judge_innovations(
             has = mask & (flight.feature_valid[i] > 0.0)
             s = FEATURE_BLOCKS + i
             rejected, unsure, scaled, nis = _judge_direction(
-                flight, p, work, k, s, has, again, gating, p.gate_uncertainty
+                flight, p, work, k, s, has, again, gating, columns, p.gate_uncertainty
             )
             total = total + nis
             freedoms = freedoms + select(has & logical_not(unsure), 2.0, 0.0)
@@ -255,7 +271,7 @@ def judge_innovations(
             side = side + counts * clip(scaled[0], -LARGEST, LARGEST)
             up = up + counts * clip(scaled[1], -LARGEST, LARGEST)
             if gating:
-                _mask_block(work, k, rejected | unsure)
+                _mask_block(work, k, rejected | unsure, columns)
                 left_out = left_out + select(rejected | unsure, 3.0, 0.0)
                 seen = seen + select(has & logical_not(unsure), 1.0, 0.0)
                 refused = refused + select(rejected, 1.0, 0.0)

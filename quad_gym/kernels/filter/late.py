@@ -15,6 +15,7 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.filter.drift import carry_drift, decay_over, keep_drift
 from quad_gym.kernels.filter.preintegration import (
     NOISE,
     add_increment,
@@ -23,9 +24,9 @@ from quad_gym.kernels.filter.preintegration import (
     take_columns,
     take_mean,
 )
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add_outer,
-    cholesky,
     keep3,
     keep33,
     load3,
@@ -44,7 +45,7 @@ from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import DELAY_SLOTS, FilterStatus
 
 _GNSS, _CAMERA, _PRESENT = 0, 1, 2
-_UPDATE = int(Stage.UPDATE)
+_UPDATE, _UPDATE_WITH_DRIFT = int(Stage.UPDATE), int(Stage.UPDATE_WITH_DRIFT)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -186,7 +187,7 @@ def exchange(flight, work, settings, mask, starting):
 
 
 @kernel
-def _keep_estimate(flight, work):
+def _keep_estimate(flight, work, drift):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
     store3(work.kept_r, load3(flight.r_hat))
     store3(work.kept_v, load3(flight.v_hat))
@@ -198,6 +199,11 @@ def _keep_estimate(flight, work):
     for i in range(15):
         for j in range(i + 1):
             work.kept_L[i, j] = flight.L[i, j]
+    if drift is not None:
+        store3(work.kept_drift, load3(flight.gnss_drift_hat))
+        for i in range(3):
+            for j in range(18):
+                work.kept_L_drift[i, j] = drift[i, j]
 
 
 @kernel
@@ -223,7 +229,7 @@ def _find_stamp(flight, p, work, sensor, delay, arrived):
 
 
 @kernel
-def _factor_columns(flight, work, noise):
+def _factor_columns(flight, p, work, noise, drift, decay, back):
     """L of the covariance of work.columns, whose noise counts `noise` times; its least pivot."""
     M, P = work.columns, work.P
     for i in range(0, 15, 3):
@@ -232,7 +238,11 @@ def _factor_columns(flight, work, noise):
             for k in range(NOISE, NOISE + 6):
                 block = add_outer(block, scale(noise, load_column3(M, i, k)), load_column3(M, j, k))
             store_block(P, i, j, block)
-    pivot = cholesky(P, 15, work.inverse_diagonal)
+    states = 15
+    if drift is not None:
+        states = 18
+        carry_drift(drift, p, work, noise, decay, back)
+    pivot = cholesky(P, states, work.inverse_diagonal)
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = P[i, j]
@@ -249,10 +259,18 @@ def _load_factor(flight, work):
 
 
 @kernel
-def _carry(flight, p, work, back):
+def _carry(flight, p, work, back, ticks, drift):
     """Take the estimate to the time stamp of what arrives, or from there to the present.
 
     Where more noise than uncertainty would be left out on the way back, the noise is left in.
+
+    Args:
+        flight: Record.
+        p: Parameters as the filter believes them.
+        work: Workspace.
+        back: Whether it goes back.
+        ticks: How far.
+        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
 
     Returns:
         Where the covariance stays positive definite.
@@ -262,19 +280,26 @@ def _carry(flight, p, work, back):
     put_noise(p, work, R_s, dR, dv)
     take_columns(work, R_s, dR, dv, dr, back)
     noise, sign = work.since_noise, -1.0 if back else 1.0
+    decay = 1.0 + 0.0 * p.dt
+    if drift is not None:
+        decay = select(work.since_time > 0.0, decay_over(p, ticks), 1.0)
     good = noise > 0.0
     for _ in range(2):
-        good = _factor_columns(flight, work, sign * noise) > 0.0
+        good = _factor_columns(flight, p, work, sign * noise, drift, decay, back) > 0.0
         if not any_of(logical_not(good)):
             break
         if back:
             noise = select(good, noise, 0.0)
     work.since_noise = noise
+    if drift is not None:
+        d = load3(flight.gnss_drift_hat)
+        d = scale(1.0 / decay, d) if back else scale(decay, d)
+        keep_drift(flight, drift, work, noise == noise, d)
     return good
 
 
 @kernel
-def _restore_estimate(flight, work, arrived, good):
+def _restore_estimate(flight, work, arrived, good, drift):
     """Undo what has happened but where something arrived and all went well."""
     old = logical_not(arrived & good)
     keep3(flight.r_hat, old, load3(work.kept_r))
@@ -285,6 +310,11 @@ def _restore_estimate(flight, work, arrived, good):
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(old, work.kept_L[i, j], flight.L[i, j])
+    if drift is not None:
+        keep3(flight.gnss_drift_hat, old, load3(work.kept_drift))
+        for i in range(3):
+            for j in range(18):
+                drift[i, j] = select(old, work.kept_L_drift[i, j], drift[i, j])
     store3(flight.w_meas, load3(work.kept_rates))
     failed = arrived & old
     status = flight.filter_status
@@ -305,7 +335,7 @@ def _count_arrived(flight, settings, sensor):
 
 
 @kernel
-def update_in_turn(flight, p, work, settings, stages, mask):
+def update_in_turn(flight, p, work, settings, stages, mask, drift=None):
     """Update with what has arrived, where `mask`: late fixes, late images, then what is fresh.
 
     Args:
@@ -315,6 +345,7 @@ def update_in_turn(flight, p, work, settings, stages, mask):
         settings: Which sensors are late.
         stages: Has the update.
         mask: Which lanes.
+        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
     """
     late_gnss, late_camera = settings.gnss_delay > 0, settings.camera_delay > 0
     flags = (flight.position_valid, flight.baseline_valid, flight.velocity_valid)
@@ -329,24 +360,25 @@ def update_in_turn(flight, p, work, settings, stages, mask):
         flight.baseline_valid = share * flags[1]
         flight.velocity_valid = share * flags[2]
         features = settings.feature_count if images else 0
+        delay = settings.gnss_delay if turn == _GNSS else settings.camera_delay
         arrived = mask
         if late:
             arrived = mask & (_count_arrived(flight, settings, turn) > 0.0)
             if not any_of(arrived):
                 continue
-            _keep_estimate(flight, work)
-            delay = settings.gnss_delay if turn == _GNSS else settings.camera_delay
+            _keep_estimate(flight, work, drift)
             _find_stamp(flight, p, work, turn, delay, arrived)
         good = arrived
         for leg in range(2 if late else 1):  # loops, so that there is one copy of what is in them
             if late:
-                good = good & _carry(flight, p, work, leg == 0)
+                good = good & _carry(flight, p, work, leg == 0, delay, drift)
             if leg == 0:
                 work.mask = select(good, 1.0, 0.0)
-                call_stage(stages, _UPDATE, flight, p, p, settings, work, features)
+                update = _UPDATE if drift is None else _UPDATE_WITH_DRIFT
+                call_stage(stages, update, flight, p, p, settings, work, features)
         if late:
             good = good & (flight.update_failures == work.kept_failures)
-            _restore_estimate(flight, work, arrived, good)
+            _restore_estimate(flight, work, arrived, good, drift)
     flight.position_valid, flight.baseline_valid, flight.velocity_valid = flags
 
 
@@ -383,3 +415,11 @@ def late_update_stage(flight, world, model, settings, work, stages, flag):
     """Update with what has arrived, late or fresh."""
     scratch = lanes_of(work)
     update_in_turn(lanes_of(flight), lanes_of(model), scratch, settings, stages, scratch.mask > 0.0)
+
+
+@stage
+def late_update_with_drift_stage(flight, world, model, settings, work, stages, flag):
+    """The same by a filter that estimates the slow error of GNSS positions."""
+    flying, scratch = lanes_of(flight), lanes_of(work)
+    mask, drift = scratch.mask > 0.0, flying.L_drift
+    update_in_turn(flying, lanes_of(model), scratch, settings, stages, mask, drift)

@@ -26,10 +26,12 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.drift import keep_drift, predict_drift, turn_drift
 from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.maths.elementary import is_finite
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add,
     add33,
@@ -37,7 +39,6 @@ from quad_gym.kernels.maths.linalg import (
     add_to_diagonal,
     apply,
     apply_transposed,
-    cholesky,
     cross,
     keep3,
     keep33,
@@ -98,7 +99,7 @@ def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
 
 
 @kernel
-def _propagate_columns(flight, p, work, f_B, w_B, half, form):
+def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
     """Fill work.F and work.S with the propagated pairs; return their mean less the center's.
 
     Position and velocity share the half-sums of the acceleration, so that S has these, and those of
@@ -112,7 +113,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form):
     dt = p.dt
     half_dt, half_dt2 = 0.5 * dt, 0.5 * dt * dt
     midpoint, extended = (form & _MIDPOINT) != 0, (form & _EKF) != 0
-    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 27.0)
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + augmented)
     inverse_c = 1.0 / c
     zero = 0.0 * c
     nothing = (zero, zero, zero)
@@ -175,7 +176,7 @@ def _turned_angles(L, j, full, half, dt):
 @kernel
 def _add_gyro_noise(P, p, R_BI, f_B, half):
     """Add the gyro's white noise to P; half of the angle by which it errs turns the force."""
-    dt, sigma = p.dt, p.gyro_sigma
+    dt, sigma = p.dt, p.gyro_noise
     zero = 0.0 * dt
     axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
     for axis in axes:
@@ -222,9 +223,9 @@ def _sum_moments(flight, p, work, mean_a, mean_e, form):
     dt = p.dt
     half_dt2 = 0.5 * dt * dt
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
-    accel_variance = p.accel_sigma * p.accel_sigma
+    accel_variance = p.accel_noise * p.accel_noise
     extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
-    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_sigma) * (dt * p.gyro_sigma)
+    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_noise) * (dt * p.gyro_noise)
 
     for i in range(0, 9, 3):
         store_block(P, i, i, sum_of_squares(F, i, 15))
@@ -254,7 +255,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, form):
 
 
 @kernel
-def predict(flight, p, work, form=0):
+def predict(flight, p, work, form=0, drift=None):
     """Carry the estimate over one tick with its IMU sample.
 
     The report's form, with the sample as of the tick's start:
@@ -277,6 +278,7 @@ def predict(flight, p, work, form=0):
         p: Parameters as the filter believes them.
         work: Workspace.
         form: A `FilterForm`.
+        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
     """
     dt = p.dt
     midpoint = (form & _MIDPOINT) != 0
@@ -288,8 +290,12 @@ def predict(flight, p, work, form=0):
         half = vector_to_dcm(scale(0.5 * dt, w_B))
     if (form & LEVER_ARM) != 0:
         f_B = sub(f_B, lever_force(flight, p, form, half))
-    mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form)
+    states = 15 if drift is None else 18
+    augmented = 27.0 if drift is None else 33.0  # with the noise
+    mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented)
     _sum_moments(flight, p, work, mean_a, mean_e, form)
+    if drift is not None:
+        predict_drift(flight, drift, p, work)
     turn = add(scale(dt, w_B), mean_e)
     if midpoint:
         _add_gyro_noise(work.P, p, R_BI, f_B, half)
@@ -298,7 +304,9 @@ def predict(flight, p, work, form=0):
         R_pred = multiply(euler_to_dcm(turn), R_BI)
         if (form & _TURN) != 0:
             turn_covariance(work.P, reset_matrix(turn))
-    ok = cholesky(work.P, 15, work.inverse_diagonal) > 0.0
+            if drift is not None:
+                turn_drift(work.P, reset_matrix(turn))
+    ok = cholesky(work.P, states, work.inverse_diagonal) > 0.0
 
     a_I = apply_transposed(R_BI, f_B)
     a_I = add((a_I[0], a_I[1], a_I[2] - p.gravity), mean_a)
@@ -315,6 +323,9 @@ def predict(flight, p, work, form=0):
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
+    if drift is not None:
+        d = scale(p.drift_tick_decay, load3(flight.gnss_drift_hat))
+        keep_drift(flight, drift, work, ok, d)
     flight.filter_status = select(
         ok, flight.filter_status, flight.filter_status | _PREDICTION_FAILED
     )
@@ -325,3 +336,10 @@ def predict(flight, p, work, form=0):
 def predict_stage(flight, world, model, settings, work, stages, flag):
     """Carry the estimate over a tick."""
     predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form)
+
+
+@stage
+def predict_with_drift_stage(flight, world, model, settings, work, stages, flag):
+    """The same by a filter that estimates the slow error of GNSS positions."""
+    flying = lanes_of(flight)
+    predict(flying, lanes_of(model), lanes_of(work), settings.form, flying.L_drift)

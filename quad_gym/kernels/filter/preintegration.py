@@ -148,7 +148,7 @@ def put_noise(p, work, R_s, dR, dv):
     """
     M, T = work.columns, work.since_time
     root = math.sqrt(p.dt * T)
-    a, g = root * p.accel_sigma, root * p.gyro_sigma
+    a, g = root * p.accel_noise, root * p.gyro_noise
     zero = 0.0 * T
     for k in range(6):
         for i in range(15):

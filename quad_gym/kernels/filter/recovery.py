@@ -22,13 +22,14 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.drift import add_to_drift, keep_drift
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add33,
     add_outer,
     add_to_diagonal,
-    cholesky,
     load3,
     load33,
     load_block,
@@ -173,8 +174,8 @@ def _doubt_features(flight, p, feature_count, camera):
 
 
 @kernel
-def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask):
-    """P + D, with D of all five parts of the state, where `mask`; return where it failed.
+def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, drift, D_d):
+    """P + D, with D of all parts of the state, where `mask`; return where it failed.
 
     There the covariance stays as it was.
     """
@@ -187,10 +188,16 @@ def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask):
     store_block(P, E, E, add33(load_block(P, E, E), D_e))
     store_block(P, BA, BA, add_to_diagonal(load_block(P, BA, BA), D_a))
     store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), D_g))
-    ok = mask & (cholesky(P, 15, work.inverse_diagonal) > 0.0)
+    states = 15
+    if drift is not None:
+        states = 18
+        add_to_drift(flight, drift, P, D_d)
+    ok = mask & (cholesky(P, states, work.inverse_diagonal) > 0.0)
     for i in range(15):
         for j in range(i + 1):
             L[i, j] = select(ok, P[i, j], L[i, j])
+    if drift is not None:
+        keep_drift(flight, drift, work, ok, load3(flight.gnss_drift_hat))
     return mask & logical_not(ok)
 
 
@@ -206,7 +213,7 @@ def _variance_of(flight, row):
 
 
 @kernel
-def raise_doubts(flight, p, work, feature_count, mask):
+def raise_doubts(flight, p, work, feature_count, mask, drift):
     """Inflate the covariance of what may be wrong, where the filter is, and `mask`.
 
     Args:
@@ -215,6 +222,7 @@ def raise_doubts(flight, p, work, feature_count, mask):
         work: Workspace.
         feature_count: Features in use.
         mask: Which lanes.
+        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
     """
     row, patience = flight.rejected_in_row, p.gate_patience
     free = logical_not(camera_fits(flight, p))
@@ -230,6 +238,7 @@ def raise_doubts(flight, p, work, feature_count, mask):
         return
     nu = flight.innovation
     D_r, D_v = _squares(nu[POSITION_BLOCK], position), _squares(nu[VELOCITY_BLOCK], velocity)
+    D_d = D_r  # fixes that are off may be so by their slow error
     D_e, turned = _doubt_attitude(flight, baseline)
     angle, offset = _doubt_features(flight, p, feature_count, camera)
     D_e, D_r = add_to_diagonal(D_e, angle), add_to_diagonal(D_r, offset)
@@ -251,7 +260,7 @@ def raise_doubts(flight, p, work, feature_count, mask):
     D_a = D_a + select(drifting, minimum(more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
     D_g = D_g + select(drifting, minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS), 0.0)
 
-    failed = _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, doubtful)
+    failed = _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, doubtful, drift, D_d)
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)

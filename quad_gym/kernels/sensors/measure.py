@@ -8,7 +8,7 @@ tests.
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.elementary import exp, log, sin_cos
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
@@ -134,12 +134,17 @@ def noisy_baseline(r_b, normals, sigma_b, floor, length):
 
 
 @kernel
-def drift_gnss(flight, p, mask):
-    """Step the slow error of GNSS positions from one measurement to the next, where `mask`."""
+def drift_gnss(flight, p, mask, share):
+    """Step the slow error of GNSS positions from one measurement to the next, where `mask`.
+
+    The first measurement comes a `share` of the period after the start.
+    """
     n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
-    d, s = load3(flight.gnss_drift), load3(p.drift_drive)
-    drive = (s[0] * n[0], s[1] * n[1], s[2] * n[2])
-    keep3(flight.gnss_drift, mask, add(scale(p.drift_decay, d), drive))
+    d, s, whole = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_decay
+    decay = exp(share * log(whole))
+    root = math.sqrt((1.0 - decay) * (1.0 + decay) / ((1.0 - whole) * (1.0 + whole)))
+    drive = (root * s[0] * n[0], root * s[1] * n[1], root * s[2] * n[2])
+    keep3(flight.gnss_drift, mask, add(scale(decay, d), drive))
 
 
 @kernel

@@ -1,6 +1,7 @@
 """Which sensors measure at the present instant, and when they measure next."""
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.linalg import keep3, load3
 from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.measure import (
@@ -13,6 +14,8 @@ from quad_gym.kernels.sensors.measure import (
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 
+_DISTURB_IMU, _TURN_BASELINE = int(Stage.DISTURB_IMU), int(Stage.TURN_BASELINE)
+_LIMIT_CAMERA = int(Stage.LIMIT_CAMERA)
 _SATURATE_IMU = int(Stage.SATURATE_IMU)
 _CORRUPT_GNSS, _CORRUPT_FEATURES = int(Stage.CORRUPT_GNSS), int(Stage.CORRUPT_FEATURES)
 
@@ -21,10 +24,12 @@ _CORRUPT_GNSS, _CORRUPT_FEATURES = int(Stage.CORRUPT_GNSS), int(Stage.CORRUPT_FE
 def _sample_imu(flight, world, settings, work, stages, mask, starting):
     """Sample the IMU, where `mask`."""
     measure_imu(flight, world, mask)
+    work.mask = select(mask, 1.0, 0.0)
+    if settings.imu_errs + settings.imu_vibrates > 0:
+        call_stage(stages, _DISTURB_IMU, flight, world, world, settings, work, 0)
     if starting:
         keep3(flight.w_before, mask, load3(flight.w_meas))
     if settings.faults:
-        work.mask = select(mask, 1.0, 0.0)
         call_stage(stages, _SATURATE_IMU, flight, world, world, settings, work, 0)
 
 
@@ -33,7 +38,8 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
     """Measure by GNSS where it is due, and the place of the start for the filter to start from."""
     due = mask & (flight.gnss_wait <= 0.0) & (settings.gnss_ticks > 0)
     if settings.gnss_drifts > 0 and not starting and any_of(due):
-        drift_gnss(flight, world, due)
+        share = minimum(flight.tick / settings.gnss_ticks, 1.0)
+        drift_gnss(flight, world, due, share)
     measured = mask if starting else due
     paired = measured
     sound = starting and not settings.warm  # the fix that starts the filter
@@ -41,6 +47,9 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
         measured, paired = gnss_heard(flight, settings, due)
     if any_of(measured):
         measure_gnss(flight, world, measured)
+        if settings.heading_errs:
+            work.mask = select(measured, 1.0, 0.0)
+            call_stage(stages, _TURN_BASELINE, flight, world, world, settings, work, 0)
         if settings.faults and not sound:
             work.mask = select(measured, 1.0, 0.0)
             call_stage(stages, _CORRUPT_GNSS, flight, world, world, settings, work, 0)
@@ -71,6 +80,9 @@ def _sample_camera(flight, world, settings, work, stages, mask):
         flight.feature_valid[i] = select(mask, 0.0, flight.feature_valid[i])
     if any_of(due):
         measure_features(flight, world, settings.feature_count, due)
+        if settings.camera_limited:
+            work.mask = select(due, 1.0, 0.0)
+            call_stage(stages, _LIMIT_CAMERA, flight, world, world, settings, work, 0)
         if settings.faults:
             work.mask = select(due, 1.0, 0.0)
             call_stage(stages, _CORRUPT_FEATURES, flight, world, world, settings, work, 0)

@@ -41,6 +41,18 @@ def write_shared(typing_context, words, index, value):  # type: ignore[no-untype
 
 
 @intrinsic
+def add_shared(typing_context, words, index, number):  # type: ignore[no-untyped-def]
+    """Add to `words[index]` (int64) in one go; returns what was there before."""
+
+    def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        pointer = _pointer(context, builder, signature, args)
+        word = context.cast(builder, args[2], signature.args[2], types.int64)
+        return builder.atomic_rmw("add", pointer, word, "seq_cst")
+
+    return types.int64(words, index, number), lower
+
+
+@intrinsic
 def pause(typing_context):  # type: ignore[no-untyped-def]
     """Tell the processor that this thread waits for another."""
 

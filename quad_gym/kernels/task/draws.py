@@ -44,6 +44,7 @@ _PIXEL_SIGMA, _LEVER_ARM = COLUMNS["pixel_sigma"].start, COLUMNS["lever_arm_B"].
 _PRIMARY, _SECONDARY = COLUMNS["primary_antenna_B"].start, COLUMNS["secondary_antenna_B"].start
 _CAMERA, _CAMERA_ROTATION = COLUMNS["camera_position_B"].start, COLUMNS["camera_rotation"].start
 _FOCAL_LENGTH = COLUMNS["focal_length"].start
+_ACTION_DELAY = COLUMNS["action_delay"].start
 
 
 @kernel
@@ -155,6 +156,7 @@ def _impose_body(flight, nominal, own, settings):
         own.rotors[i, 2] = nominal.rotors[i, 2] - z
 
     own.kF, own.kN = kF, kN
+    own.action_delay = _value(flight, settings, _ACTION_DELAY, nominal.action_delay)
     own.motor_tau = _value(flight, settings, _TAU, nominal.motor_tau)
     gain = _value(flight, settings, _GAIN, nominal.motor_gain)
     full = _value(flight, settings, _VOLTAGE, nominal.max_voltage)
@@ -186,13 +188,21 @@ def _impose_world(flight, nominal, own, settings):
 
 
 @kernel
+def _all_noise(drawn, white, all_of_it):
+    """A drawn white noise with what the filter takes for white, too."""
+    return math.sqrt(drawn * drawn + (all_of_it - white) * (all_of_it + white))
+
+
+@kernel
 def _impose_noise(flight, nominal, own, settings):
     """White noise, and biases with the decay and drive that follow."""
     root = math.sqrt(nominal.dt)
     if settings.draw_kind[_ACCEL_NOISE] != FIXED:
         own.accel_sigma = flight.drawn[_ACCEL_NOISE] / root
+        own.accel_noise = _all_noise(own.accel_sigma, nominal.accel_sigma, nominal.accel_noise)
     if settings.draw_kind[_GYRO_NOISE] != FIXED:
         own.gyro_sigma = flight.drawn[_GYRO_NOISE] / root
+        own.gyro_noise = _all_noise(own.gyro_sigma, nominal.gyro_sigma, nominal.gyro_noise)
     own.accel_bias_sigma = _value(flight, settings, _ACCEL_BIAS, nominal.accel_bias_sigma)
     own.gyro_bias_sigma = _value(flight, settings, _GYRO_BIAS, nominal.gyro_bias_sigma)
     if settings.draw_kind[_ACCEL_TAU] != FIXED:
@@ -207,11 +217,13 @@ def _impose_noise(flight, nominal, own, settings):
         own.gyro_bias_drive = own.gyro_bias_sigma * math.sqrt((1.0 - g) * (1.0 + g))
     for i in range(3):
         if settings.draw_kind[_POSITION_SIGMA + i] != FIXED:
-            white, all_of_it = nominal.gnss_sigma[i], nominal.position_sigma[i]
-            slow = (all_of_it - white) * (all_of_it + white)  # taken for white by the filter, too
             own.gnss_sigma[i] = flight.drawn[_POSITION_SIGMA + i]
-            own.position_sigma[i] = math.sqrt(own.gnss_sigma[i] * own.gnss_sigma[i] + slow)
-    own.baseline_sigma = _value(flight, settings, _BASELINE_SIGMA, nominal.baseline_sigma)
+    if settings.draw_kind[_BASELINE_SIGMA] != FIXED:
+        white, own.baseline_sigma = nominal.baseline_sigma, flight.drawn[_BASELINE_SIGMA]
+        own.baseline_noise = _all_noise(own.baseline_sigma, white, nominal.baseline_noise)
+        own.first_baseline_sigma = _all_noise(
+            own.baseline_sigma, white, nominal.first_baseline_sigma
+        )
     own.pixel_sigma = _value(flight, settings, _PIXEL_SIGMA, nominal.pixel_sigma)
 
 
@@ -239,6 +251,8 @@ def _impose_mounting(flight, nominal, own, settings):
         e = (flight.drawn[k], flight.drawn[k + 1], flight.drawn[k + 2])
         store33(own.R_CB, multiply(euler_to_dcm(e), load33(nominal.R_CB)))
     own.focal_length = _value(flight, settings, _FOCAL_LENGTH, nominal.focal_length)
+    if settings.draw_kind[_FOCAL_LENGTH] != FIXED:
+        own.blur = nominal.blur * (own.focal_length / nominal.focal_length)
 
 
 @kernel

@@ -11,13 +11,14 @@ from quad_gym.kernels.maths.linalg import (
     multiply,
     norm,
     scale,
+    store3,
     sub,
 )
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import DRAW_NOISY, Source
+from quad_gym.records import DRAW_NOISY, Control, Source
 
 
 @kernel
@@ -45,7 +46,27 @@ def look(flight, model, settings, mask):
     flight.estimation_error = select(mask, error, flight.estimation_error)
 
 
+@kernel
+def look_within(flight, model, settings):
+    """As `look`, at an instant within a control period: what the inner loop of an action reads."""
+    control, source = settings.control, settings.source
+    if control != Control.MOTOR and control != Control.WRENCH:
+        w_B = load3(flight.w)
+        if source == Source.ESTIMATE:
+            w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
+        elif source == Source.SENSORS:
+            w_B = load3(flight.w_meas)
+        elif source == Source.NOISY:
+            _, n_w = six_normals(stream_of(flight), DRAW_NOISY + 3)
+            w_B = add(w_B, scale(model.noisy_sigma[3], n_w))
+        store3(flight.w_seen, w_B)
+
+
 @stage
 def look_stage(flight, world, model, settings, work, stages, flag):
-    """Set what the controller sees."""
-    look(lanes_of(flight), lanes_of(model), settings, lanes_of(work).mask > 0.0)
+    """Set what the controller sees; `flag`: whether the instant is within a control period."""
+    flying, believed = lanes_of(flight), lanes_of(model)
+    if flag and settings.control <= Control.CTBR:
+        look_within(flying, believed, settings)
+    else:
+        look(flying, believed, settings, lanes_of(work).mask > 0.0)

@@ -31,7 +31,7 @@ def _upcoming_gate(flight, ahead):
 
 
 @kernel
-def _preview(flight, p, settings, i):
+def previewed(flight, p, settings, i):
     """The reference a little later: in time, or on a course the gates after the next."""
     if settings.task == Task.WAYPOINTS:
         return _upcoming_gate(flight, 1.0 + i)
@@ -40,17 +40,17 @@ def _preview(flight, p, settings, i):
 
 
 @kernel
-def _put_relative(flight, p, settings, row, r, v, R_BI, w_B):
-    """Errors, directions and rates in the body frame."""
+def put_relative(flight, p, settings, row, k, r, v, R_BI, w_B):
+    """Write errors, directions and rates in the body frame from `k` on; return the next place."""
     r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-    k = _put3(row, 0, apply(R_BI, sub(r_ref, r)))
+    k = _put3(row, k, apply(R_BI, sub(r_ref, r)))
     k = _put3(row, k, apply(R_BI, sub(v_ref, v)))
     k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
     k = _put3(row, k, apply(R_BI, x_ref))
     k = _put3(row, k, w_B)
     k = _put3(row, k, apply(R_BI, a_ref))
     for i in range(2):
-        k = _put3(row, k, apply(R_BI, sub(_preview(flight, p, settings, i), r_ref)))
+        k = _put3(row, k, apply(R_BI, sub(previewed(flight, p, settings, i), r_ref)))
     return k
 
 
@@ -63,7 +63,7 @@ def _put_reference(flight, p, settings, row, k):
     k = _put3(row, k, a_ref)
     k = _put3(row, k, x_ref)
     for i in range(2):
-        k = _put3(row, k, _preview(flight, p, settings, i))
+        k = _put3(row, k, previewed(flight, p, settings, i))
     return k
 
 
@@ -159,11 +159,12 @@ def observe(flight, p, settings, row):
     elif settings.layout == Layout.ABSOLUTE:
         k = _put_absolute(flight, p, settings, row)
     else:
-        k = _put_relative(
+        k = put_relative(
             flight,
             p,
             settings,
             row,
+            0,
             load3(flight.r_seen),
             load3(flight.v_seen),
             load33(flight.R_seen),

@@ -13,9 +13,11 @@ from quad_gym.records import MAX_HARMONICS
 @kernel
 def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
     """r*(t) in I [m]."""
-    s1, c1 = sin_cos(flight.ref_omega * t)
-    s, c = s1, c1
     x, y, z = load3(flight.ref_center)
+    s1, c1 = 0.0 * x, 0.0 * x
+    if harmonics > 0:
+        s1, c1 = sin_cos(flight.ref_omega * t)
+    s, c = s1, c1
     for k in range(harmonics):
         a, b = flight.ref_cos[k], flight.ref_sin[k]
         x, y, z = x + a[0] * c + b[0] * s, y + a[1] * c + b[1] * s, z + a[2] * c + b[2] * s
@@ -42,10 +44,12 @@ def evaluate_reference(flight, t, harmonics=MAX_HARMONICS):
     `harmonics`: how many terms of the series there are; the others are zero.
     """
     omega = flight.ref_omega
-    s1, c1 = sin_cos(omega * t)
-    s, c = s1, c1
     x, y, z = load3(flight.ref_center)
     zero = 0.0 * x
+    s1, c1 = zero, zero
+    if harmonics > 0:
+        s1, c1 = sin_cos(omega * t)
+    s, c = s1, c1
     vx, vy, vz, ax, ay, az = zero, zero, zero, zero, zero, zero
     rate = omega
     for k in range(harmonics):

@@ -125,16 +125,16 @@ def tilt_rates(z_wanted_I, R_BI, yaw_rate, p):
 
 
 @kernel
-def act(flight, p, mode, reference):
+def act(flight, a, p, mode, reference):
     """Set the motor voltages of the coming tick.
 
     Args:
-        flight: Record; reads the action and what the controller sees, sets voltages.
+        flight: Record; reads what the controller sees, sets voltages.
+        a: (4,) the action, in [-1, 1].
         p: Nominal parameters.
         mode: What the action means, a `Control`.
         reference: (r*, v*, a*, x*) in I, for `Control.PD`.
     """
-    a = load4(flight.action)
     R_BI, w_B = load33(flight.R_seen), load3(flight.w_seen)
     weight = p.mass * p.gravity
     thrust = weight * (1.0 + a[0])
@@ -191,4 +191,7 @@ def control_stage(flight, world, model, settings, work, stages, flag):
     reference = (nothing, nothing, nothing, nothing)
     if settings.control == Control.PD:
         reference = evaluate_reference(flying, flying.tick * believed.dt, settings.harmonics)
-    act(flying, believed, settings.control, reference)
+    action = load4(flying.action)
+    if settings.action_delays > 0:
+        action = load4(flying.delayed_action)
+    act(flying, action, believed, settings.control, reference)

@@ -1,0 +1,279 @@
+"""Compiled parts of PPO: networks forward and backward, the loss, and Adam.
+
+A network is a table with a row for each layer, and a part of one vector of float32 parameters:
+weights (outputs, inputs) of each layer, then its biases. `flipped` holds the weights transposed,
+so that every product of matrices is one that BLAS does fast. Samples are taken TILE at a time: what
+a tile needs stays in the first caches, and BLAS does not divide products this small among threads.
+
+All kernels are in this file, as the cache of compiled code follows imports of `quad_gym` alone.
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.board import FINISHED, TICKET, comes, finished, post, take
+from quad_gym.kernels.compiling import entry, kernel, routine
+from quad_gym.kernels.simd.atomics import add_shared, read_shared
+
+TILE = 64
+"""Samples that go through the networks together."""
+
+INPUTS, OUTPUTS, WEIGHTS, BIASES, STORED = range(5)
+"""Columns of a table of layers: sizes, where the layer's numbers begin in the vector of parameters,
+and the sum of the outputs of the layers below."""
+
+ACTIVATIONS = RELU, TANH, ELU = range(3)
+
+BETAS, EPSILON = (0.9, 0.999), 1e-5
+"""Of Adam: torch's, and Stable-Baselines3's for PPO."""
+
+SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction")
+"""What `differentiate` adds up over the samples of a minibatch."""
+
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_FRESH, _EPSILON = tuple(np.float32(1.0 - beta) for beta in BETAS), np.float32(EPSILON)
+_LOG_TAU = np.float32(math.log(2.0 * math.pi))
+
+
+@kernel
+def _weights(vector, row, first, second):
+    """A layer's part of a vector of weights, as a matrix of row[first] by row[second]."""
+    begin, size = row[WEIGHTS], row[INPUTS] * row[OUTPUTS]
+    return vector[begin : begin + size].reshape((row[first], row[second]))
+
+
+@kernel
+def _stored(outputs, row, rows):
+    """What a layer gives for `rows` samples: (rows, its outputs)."""
+    first = TILE * row[STORED]
+    return outputs[first : first + rows * row[OUTPUTS]].reshape((rows, row[OUTPUTS]))
+
+
+@routine
+def _activate(y, activation):
+    """Replace y by its activation."""
+    v = y.reshape(-1)
+    if activation == RELU:
+        for i in range(v.size):
+            v[i] = max(v[i], _ZERO)
+    elif activation == TANH:
+        for i in range(v.size):
+            v[i] = math.tanh(v[i])
+    else:
+        for i in range(v.size):
+            v[i] = v[i] if v[i] > _ZERO else math.expm1(v[i])
+
+
+@routine
+def _through_activation(delta, y, activation):
+    """Multiply delta by the derivative of the activation where its value is y."""
+    d, v = delta.reshape(-1), y.reshape(-1)
+    if activation == RELU:
+        for i in range(v.size):
+            d[i] = d[i] if v[i] > _ZERO else _ZERO
+    elif activation == TANH:
+        for i in range(v.size):
+            d[i] *= _ONE - v[i] * v[i]
+    else:
+        for i in range(v.size):
+            d[i] *= _ONE if v[i] > _ZERO else v[i] + _ONE
+
+
+@routine
+def _forward(x, table, model, outputs):
+    """Run samples x (rows, inputs) through a network; `outputs` keeps what every layer gives."""
+    params, flipped, _, _, activation = model
+    h = x
+    for layer in range(len(table)):
+        row = table[layer]
+        y = _stored(outputs, row, len(x))
+        np.dot(h, _weights(flipped, row, INPUTS, OUTPUTS), y)
+        b = params[row[BIASES] : row[BIASES] + row[OUTPUTS]]
+        for i in range(len(x)):
+            for j in range(b.size):
+                y[i, j] += b[j]
+        if layer < len(table) - 1:
+            _activate(y, activation)
+        h = y
+    return h
+
+
+@routine
+def _backward(x, table, model, room, gradient):
+    """Add a tile's gradient; deltas[0] begins with the loss's with respect to the output."""
+    params, _, _, _, activation = model
+    _, outputs, deltas, product = room
+    rows = len(x)
+    for layer in range(len(table) - 1, -1, -1):
+        row, side = table[layer], (len(table) - 1 - layer) % 2
+        below = _stored(outputs, table[layer - 1], rows) if layer > 0 else x
+        d = deltas[side, : rows * row[OUTPUTS]].reshape((rows, row[OUTPUTS]))
+        change = product[: row[INPUTS] * row[OUTPUTS]]
+        np.dot(d.T, below, change.reshape((row[OUTPUTS], row[INPUTS])))
+        W = gradient[row[WEIGHTS] : row[WEIGHTS] + change.size]
+        for i in range(change.size):
+            W[i] += change[i]
+        b = gradient[row[BIASES] : row[BIASES] + row[OUTPUTS]]
+        for i in range(rows):
+            for j in range(b.size):
+                b[j] += d[i, j]
+        if layer > 0:
+            before = deltas[1 - side, : rows * row[INPUTS]].reshape((rows, row[INPUTS]))
+            np.dot(d, _weights(params, row, OUTPUTS, INPUTS), before)
+            _through_activation(before, below, activation)
+
+
+@routine
+def _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, d_log_std, sums):
+    """The policy's loss of a tile, and its gradient with respect to means and log_std.
+
+    L = -min(r A, clip(r, 1 - c, 1 + c) A) - k H, where r is the ratio of an action's probabilities
+    now and when it was taken, A its advantage and H the entropy (Schulman et al. 2017, eqs. 7, 9).
+    """
+    _, actions, log_probs, _ = samples
+    clip, entropy_weight = np.float32(recipe[0]), np.float32(recipe[1])
+    precision = np.exp(-log_std)
+    for i in range(len(chosen)):
+        log_prob, action = _ZERO, actions[chosen[i]]
+        for j in range(log_std.size):
+            z = (action[j] - mean[i, j]) * precision[j]
+            log_prob -= _HALF * (z * z + _LOG_TAU) + log_std[j]
+        change = log_prob - log_probs[chosen[i]]
+        ratio, advantage = math.exp(change), advantages[i]
+        gain = ratio * advantage
+        held = min(max(ratio, _ONE - clip), _ONE + clip) * advantage
+        slope = -gain * share if gain <= held else _ZERO
+        for j in range(log_std.size):
+            z = (action[j] - mean[i, j]) * precision[j]
+            d[i, j] = slope * z * precision[j]
+            d_log_std[j] += slope * (z * z - _ONE) - entropy_weight * share
+        sums[0] -= min(gain, held)
+        sums[2] += ratio - _ONE - change
+        sums[3] += abs(ratio - _ONE) > clip
+
+
+@routine
+def _differentiate_tile(chosen, advantages, share, model, samples, recipe, room, gradient, sums):
+    """Add the gradient of the loss of a tile; each sample's loss counts as `share`."""
+    params, _, actor, critic, _ = model
+    observations, _, _, returns = samples
+    inputs, outputs, deltas, _ = room
+    x = inputs[: len(chosen)]
+    for i in range(len(chosen)):
+        sample = chosen[i]
+        for j in range(x.shape[1]):
+            x[i, j] = observations[sample, j]
+    mean = _forward(x, actor, model, outputs)
+    first = actor[-1, BIASES] + actor[-1, OUTPUTS]
+    log_std = params[first : first + mean.shape[1]]
+    slope = gradient[first : first + mean.shape[1]]
+    d = deltas[0, : mean.size].reshape(mean.shape)
+    _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, slope, sums)
+    _backward(x, actor, model, room, gradient)
+    value = _forward(x, critic, model, outputs)
+    for i in range(len(chosen)):
+        error = value[i, 0] - returns[chosen[i]]
+        deltas[0, i] = np.float32(2.0 * recipe[2]) * share * error
+        sums[1] += error * error
+    _backward(x, critic, model, room, gradient)
+
+
+@routine
+def _differentiate_part(part, minibatch, model, samples, recipe, rooms, written):
+    """The gradient of one part of a minibatch, and its SUMS."""
+    span, order, advantages = minibatch
+    inputs, outputs, deltas, product = rooms
+    gradient, sums = written[0][part], written[1][part]
+    room = (inputs[part], outputs[part], deltas[part], product[part])
+    count, parts = span[1] - span[0], len(inputs)
+    share = _ONE / np.float32(count)
+    gradient[:] = _ZERO
+    sums[:] = 0.0
+    end = span[0] + count * (part + 1) // parts
+    for a in range(span[0] + count * part // parts, end, TILE):
+        b = min(a + TILE, end)
+        tile = (order[a:b], advantages[a:b], share)
+        _differentiate_tile(*tile, model, samples, recipe, room, gradient, sums)
+
+
+@entry
+def differentiate(
+    board, number, command, serving, minibatch, model, samples, recipe, rooms, written
+):
+    """The gradient of the loss of a minibatch, in parts that threads share at a board.
+
+    Args:
+        board: See `quad_gym.kernels.board`; its blocks are the parts.
+        number: Of this thread; the one that posts is 0.
+        command: 0 to post a minibatch; negative to wait for the one that was posted before.
+        serving: Whether to work on what others post, until nothing comes for a while.
+        minibatch: (2,) where it begins and ends in the order of this epoch; that order (n,); the
+            advantages (n,) in that order, normalized.
+        model: Parameters (p,), flipped weights (p,), tables of actor and critic, activation.
+        samples: Observations (n, o), actions (n, a), log probabilities (n,), returns (n,).
+        recipe: (3,) clip range, weights of the entropy and of the value function's error.
+        rooms: For each part: inputs (TILE, o), outputs, deltas (2, ...), a product of matrices.
+        written: Of each part: its gradient (p,) and SUMS (4,).
+
+    Returns:
+        Whether all parts are finished; where not, another thread is still at work.
+    """
+    if not serving and command >= 0:
+        post(board, command)
+    while True:  # once, where nobody serves
+        seen = read_shared(board, TICKET)
+        while True:
+            first, last = take(board, number)
+            if first == last:
+                break
+            for part in range(first, last):
+                _differentiate_part(part, minibatch, model, samples, recipe, rooms, written)
+            add_shared(board, FINISHED, last - first)
+        if not serving:
+            return finished(board)
+        if not comes(board, number, seen):
+            return True
+
+
+@entry
+def descend(gradients, params, moments, rate, max_norm, corrections):
+    """One step of Adam (Kingma and Ba 2015) along the sum of the parts' gradients (parts, p).
+
+    A sum longer than max_norm is shortened to it. `corrections` are 1 - beta^t of both moments.
+    Changes params (p,) and moments (2, p); returns the norm of the sum.
+    """
+    g, m, v = gradients[0], moments[0], moments[1]
+    for part in range(1, len(gradients)):
+        more = gradients[part]
+        for i in range(g.size):
+            g[i] += more[i]
+    norm = math.sqrt(np.dot(g, g))
+    shortened = np.float32(min(1.0, max_norm / (norm + 1e-6)))
+    length, root = np.float32(rate / corrections[0]), np.float32(math.sqrt(corrections[1]))
+    for i in range(g.size):
+        q = g[i] * shortened
+        m[i] += _FRESH[0] * (q - m[i])
+        v[i] += _FRESH[1] * (q * q - v[i])
+        params[i] -= length * m[i] / (math.sqrt(v[i]) / root + _EPSILON)
+    return norm
+
+
+@entry
+def flip(model):
+    """Keep the flipped weights in step with the parameters."""
+    params, flipped, actor, critic, _ = model
+    for table in (actor, critic):
+        for layer in range(len(table)):
+            W = _weights(params, table[layer], OUTPUTS, INPUTS)
+            _weights(flipped, table[layer], INPUTS, OUTPUTS)[:] = W.T
+
+
+@entry
+def evaluate(x, model, outputs, means, values):
+    """What both networks say of observations x (n, o): means (n, a) and values (n,), written."""
+    _, _, actor, critic, _ = model
+    for a in range(0, len(x), TILE):
+        b = min(a + TILE, len(x))
+        means[a:b] = _forward(x[a:b], actor, model, outputs)
+        values[a:b] = _forward(x[a:b], critic, model, outputs)[:, 0]

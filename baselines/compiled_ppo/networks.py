@@ -1,0 +1,84 @@
+"""Actor and critic in one vector of parameters: where each layer lies, and its first values."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baselines.compiled_ppo.kernels import INPUTS, OUTPUTS, STORED, TILE
+from baselines.mlp import MlpPolicy
+from baselines.recipes import ACTIVATIONS, Recipe
+
+
+class Networks:
+    """A Gaussian policy and a value function.
+
+    The vector of parameters holds the actor's layers, the logarithms of the policy's standard
+    deviations, and the critic's layers. First values are drawn as Stable-Baselines3 draws them.
+
+    Args:
+        inputs: Numbers in an observation.
+        outputs: Numbers in an action.
+        recipe: Layers, activation and the first standard deviations.
+        rng: Draws the first weights.
+    """
+
+    def __init__(self, inputs: int, outputs: int, recipe: Recipe, rng: np.random.Generator) -> None:
+        self.actor, first = _table((inputs, *recipe.layers, outputs), 0)
+        self.critic, count = _table((inputs, *recipe.critic_layers, 1), first + outputs)
+        self.params = np.zeros(count, np.float32)
+        self.log_std = self.params[first : first + outputs]
+        self.log_std[:] = recipe.policy.get("log_std_init", 0.0)
+        for table, last_gain in ((self.actor, 0.01), (self.critic, 1.0)):
+            for W, _ in self.layers(table)[:-1]:
+                W[:] = np.sqrt(2.0) * _orthogonal(W.shape, rng)
+            W, _ = self.layers(table)[-1]
+            W[:] = last_gain * _orthogonal(W.shape, rng)
+        self._activation = recipe.activation
+        number = ACTIVATIONS.index(recipe.activation)
+        self.model = (self.params, np.zeros_like(self.params), self.actor, self.critic, number)
+
+    def layers(self, table: NDArray[np.int64]) -> list[tuple[Any, Any]]:
+        """Weights (outputs, inputs) and biases (outputs,) of each layer, as views."""
+        return [
+            (self.params[w : w + i * o].reshape(o, i), self.params[b : b + o])
+            for i, o, w, b, _ in table.tolist()
+        ]
+
+    def rooms(self, parts: int) -> tuple[NDArray[np.float32], ...]:
+        """Memory that `kernels.differentiate` computes in."""
+        tables = (self.actor, self.critic)
+        sizes = (
+            (TILE, self.actor[0, INPUTS]),
+            (TILE * max(t[-1, STORED] + t[-1, OUTPUTS] for t in tables),),
+            (2, TILE * max(t[:, OUTPUTS].max() for t in tables)),
+            (max((t[:, INPUTS] * t[:, OUTPUTS]).max() for t in tables),),
+        )
+        return tuple(np.zeros((parts, *size), np.float32) for size in sizes)
+
+    def policy(self, record: Mapping[str, Any]) -> MlpPolicy:
+        """A copy of the actor, which needs NumPy alone."""
+        layers = self.layers(self.actor)
+        activations = [self._activation] * (len(layers) - 1) + ["none"]
+        return MlpPolicy(
+            [W.copy() for W, _ in layers], [b.copy() for _, b in layers], activations, record
+        )
+
+
+def _table(sizes: Sequence[int], first: int) -> tuple[NDArray[np.int64], int]:
+    """The table of a network whose parameters begin at `first`, and where they end."""
+    rows, stored = [], 0
+    for inputs, outputs in pairwise(sizes):
+        rows.append((inputs, outputs, first, first + inputs * outputs, stored))
+        first += (inputs + 1) * outputs
+        stored += outputs
+    return np.array(rows, np.int64), first
+
+
+def _orthogonal(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[Any]:
+    """A random matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014)."""
+    Q, R = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
+    Q *= np.sign(np.diag(R))
+    return Q if shape[0] >= shape[1] else Q.T

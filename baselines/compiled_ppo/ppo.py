@@ -1,0 +1,264 @@
+"""`CompiledPPO`: proximal policy optimization without torch, for vector environments."""
+
+import pickle
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+
+from baselines.compiled_ppo import kernels
+from baselines.compiled_ppo.learner import Learner
+from baselines.compiled_ppo.networks import Networks
+from baselines.mlp import MlpPolicy
+from baselines.recipes import Recipe
+from quad_gym.batch.threads import resolve_threads
+from quad_gym.params import checks as check
+
+PARAMETERS = {
+    "n_steps": 2048,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "normalize_advantage": True,
+    "ent_coef": 0.0,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+}
+"""Parameters of a recipe, with the defaults of Stable-Baselines3."""
+
+_EPISODES = 100
+"""Whose mean return is `training_return`: the latest."""
+
+
+class CompiledPPO:
+    """PPO (Schulman et al. 2017) as `stable_baselines3.PPO` does it, but for the random numbers.
+
+    The same seed gives the same policy bit for bit, with any number of threads.
+
+    Args:
+        env: Its observations are vectors, its actions vectors in [-1, 1], and it begins the next
+            episode in the step that ends one (`autoreset_mode="SameStep"`).
+        recipe: All hyper-parameters.
+        seed: Of the networks, the actions and the order of samples.
+        env_seed: Of the environment; None: `seed`.
+        threads: To learn with; None: as many as there are cores.
+
+    Raises:
+        ValueError: If the environment does not fit, or the recipe asks for what is not there.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        recipe: Recipe,
+        *,
+        seed: int = 0,
+        env_seed: int | None = None,
+        threads: int | None = None,
+    ) -> None:
+        inputs, outputs = _sizes(env)
+        self.parameters = _checked(recipe)
+        self.env, self.recipe, self.num_timesteps = env, recipe, 0
+        self.losses: dict[str, float] = {}
+        self._env_seed = seed if env_seed is None else env_seed
+        self._rng = np.random.default_rng(seed)
+        self.networks = Networks(inputs, outputs, recipe, self._rng)
+        shape = (self.parameters["n_steps"], env.num_envs)
+        self._observations = np.zeros((*shape, inputs), np.float32)
+        self._actions = np.zeros((*shape, outputs), np.float32)
+        self._log_probs, self._rewards, self._values, self._advantages, self._targets = (
+            np.zeros(shape, np.float32) for _ in range(5)
+        )
+        self._ended = np.zeros(shape, bool)
+        samples = (self._observations, self._actions, self._log_probs, self._targets)
+        self.learner = Learner(
+            self.networks,
+            tuple(a.reshape(-1, *a.shape[2:]) for a in samples),  # type: ignore[arg-type]
+            self._advantages.reshape(-1),
+            self.parameters,
+            resolve_threads(threads),
+        )
+        self._outputs = self.networks.rooms(1)[1][0]
+        self._seen: NDArray[np.float32] | None = None
+        self._returns, self._finished = np.zeros(env.num_envs), deque[float](maxlen=_EPISODES)
+
+    def learn(self, steps: int, watch: Callable[["CompiledPPO"], bool] | None = None) -> None:
+        """Train until `steps` environment steps have been made in all.
+
+        Args:
+            steps: Over all flights; the last rollout is completed.
+            watch: Called before every rollout, where nothing is half done; False ends the training.
+        """
+        self.prepare()
+        first, last = self.recipe.learning_rate
+        while self.num_timesteps < steps and (watch is None or watch(self)):
+            self._roll_out()
+            remaining = 1.0 - self.num_timesteps / steps
+            self.losses = self.learner.learn(last + (first - last) * remaining, self._rng)
+
+    def prepare(self) -> None:
+        """Begin the first episodes, and compile what is not compiled yet."""
+        if self._seen is None:
+            self._seen = _floats(self.env.reset(seed=self._env_seed)[0])
+        self._evaluate(self._seen[:1])
+        self.learner.prepare()
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], None]:
+        """Actions for observations (..., n); always deterministic."""
+        return self.policy().predict(observation)
+
+    def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
+        """A copy of the present policy, which needs NumPy alone."""
+        return self.networks.policy(record or {"interface": {}})
+
+    @property
+    def training_return(self) -> float:
+        """Mean return of the latest episodes, not scaled; NaN before the first."""
+        return float(np.mean(self._finished)) if self._finished else float("nan")
+
+    def state(self) -> bytes:
+        """All that a training consists of, the environment included, to go on exactly from."""
+        kept = {name: getattr(self, name) for name in _STATE}
+        arrays = (self.networks.params, self.learner.moments, self.learner.steps)
+        return pickle.dumps((kept, arrays))
+
+    def restore(self, state: bytes) -> None:
+        """Go on from a `state` of the same recipe; unpickling can run code: trust its source."""
+        kept, (params, moments, self.learner.steps) = pickle.loads(state)
+        self.networks.params[:], self.learner.moments[:] = params, moments
+        self.__dict__.update(kept)
+
+    # ---- a rollout ------------------------------------------------------------------------------
+
+    def _roll_out(self) -> None:
+        """Fly `n_steps` steps, and estimate advantages."""
+        actions = self._actions.shape[-1]
+        log_std = self.networks.log_std
+        spread, peak = np.exp(log_std), log_std.sum() + 0.5 * actions * np.log(2.0 * np.pi)
+        assert self._seen is not None
+        for t in range(len(self._actions)):
+            self._observations[t] = self._seen
+            means, self._values[t] = self._evaluate(self._observations[t])
+            noise = self._rng.standard_normal(means.shape, np.float32)
+            self._actions[t] = means + spread * noise
+            self._log_probs[t] = -0.5 * (noise * noise).sum(axis=1) - peak
+            seen, reward, terminated, truncated, info = self.env.step(
+                self._actions[t].clip(-1.0, 1.0)
+            )
+            self._seen = _floats(seen)
+            self._rewards[t] = np.float32(self.recipe.reward_scale) * reward.astype(np.float32)
+            self._ended[t] = terminated | truncated
+            cut = np.flatnonzero(truncated & ~terminated)
+            if cut.size:  # the episode would have gone on, and have earned what the critic says
+                last = _floats(np.stack(info["final_obs"][cut]))
+                self._rewards[t, cut] += self.parameters["gamma"] * self._evaluate(last)[1]
+            self._returns += reward
+            self._finished += self._returns[self._ended[t]].tolist()
+            self._returns[self._ended[t]] = 0.0
+        self.num_timesteps += self._ended.size
+        self._advantages[:] = advantages(
+            self._rewards,
+            self._values,
+            self._ended,
+            self._evaluate(self._seen)[1],
+            self.parameters["gamma"],
+            self.parameters["gae_lambda"],
+        )
+        self._targets[:] = self._advantages + self._values
+
+    def _evaluate(self, x: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Means of actions (n, a) and values (n,) for observations (n, o)."""
+        means = np.empty((len(x), self._actions.shape[-1]), np.float32)
+        values = np.empty(len(x), np.float32)
+        kernels.evaluate(x, self.networks.model, self._outputs, means, values)
+        return means, values
+
+
+_STATE = ("env", "num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
+"""Attributes that a training goes on from, beside what learns."""
+
+
+def advantages(
+    rewards: NDArray[np.float32],
+    values: NDArray[np.float32],
+    ended: NDArray[np.bool_],
+    next_values: NDArray[np.float32],
+    gamma: float,
+    gae_lambda: float,
+) -> NDArray[np.float32]:
+    """Generalized advantage estimation (Schulman et al. 2016, eq. 16).
+
+    A_t = d_t + gamma lambda A_{t+1}, d_t = r_t + gamma V(s_{t+1}) - V(s_t); nothing comes from
+    beyond the end of an episode.
+
+    Args:
+        rewards: (T, n) of steps, with what a truncated episode would still have earned.
+        values: (T, n) that the critic gave the observations before them.
+        ended: (T, n) whether an episode ended with the step.
+        next_values: (n,) of the observations after the last step.
+        gamma: Discount.
+        gae_lambda: From 0 (one step) to 1 (all that was seen).
+
+    Returns:
+        (T, n).
+    """
+    found = np.empty_like(values)
+    ahead = np.zeros_like(next_values)
+    for t in range(len(rewards) - 1, -1, -1):
+        goes_on = np.float32(gamma) * ~ended[t]
+        ahead = rewards[t] + goes_on * (next_values + np.float32(gae_lambda) * ahead) - values[t]
+        found[t], next_values = ahead, values[t]
+    return found
+
+
+def _floats(observations: Any) -> NDArray[np.float32]:
+    return np.ascontiguousarray(observations, np.float32)
+
+
+def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
+    """Numbers in an observation and in an action, if these are what they have to be."""
+    sizes = []
+    for name, space in (
+        ("observations", env.single_observation_space),
+        ("actions", env.single_action_space),
+    ):
+        if not isinstance(space, Box) or len(space.shape) != 1:
+            raise ValueError(f"env must have vectors as {name} for the compiled PPO, got {space}")
+        sizes.append(space.shape[0])
+    if space != Box(-1.0, 1.0, space.shape, space.dtype):  # type: ignore[arg-type]
+        raise ValueError(f"env must have actions in [-1, 1], as RescaleAction makes them: {space}")
+    mode = env.metadata.get("autoreset_mode")
+    if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
+        raise ValueError(f"env must have the autoreset mode SameStep, got {mode}")
+    return sizes[0], sizes[1]
+
+
+def _checked(recipe: Recipe) -> dict[str, Any]:
+    """All parameters of a recipe, if the compiled PPO has what it asks for."""
+    check.choice("algorithm of the compiled engine", recipe.algorithm, ("ppo",))
+    check.keywords(recipe.parameters, tuple(PARAMETERS), "the compiled PPO")
+    check.keywords(recipe.policy, ("log_std_init",), "the policy of the compiled PPO")
+    found = {**PARAMETERS, **recipe.parameters}
+    for name in ("n_steps", "batch_size", "n_epochs"):
+        found[name] = check.whole(name, found[name])
+    for name in ("gamma", "gae_lambda"):
+        check.number(name, found[name], least=0.0, most=1.0)
+    for name in ("clip_range", "max_grad_norm"):
+        check.positive(name, found[name])
+    for name in ("ent_coef", "vf_coef"):
+        check.number(name, found[name], least=0.0)
+    check.flag("normalize_advantage", found["normalize_advantage"])
+    check.number("log_std_init", recipe.policy.get("log_std_init", 0.0))
+    return found

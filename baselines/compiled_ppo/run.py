@@ -1,0 +1,75 @@
+"""Running a plan with the compiled PPO."""
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from baselines.compiled_ppo.ppo import CompiledPPO
+from baselines.keeping import STATE, RunError, RunKeeper, best_file, last_file, replace_file
+from baselines.plans import Plan, description
+from baselines.policies import interface_of
+from baselines.seeds import first_seed
+
+
+class CompiledKeeper(RunKeeper):
+    """Keeps a training with the compiled PPO."""
+
+    def _training_return(self, model: CompiledPPO) -> float:
+        return model.training_return
+
+    def _save(self, model: CompiledPPO, *, best: bool) -> None:
+        content = io.BytesIO()
+        record = {"plan": description(self._plan), "interface": interface_of(self._judge)}
+        model.policy(record).save(content)
+        if best:
+            replace_file(best_file(self._plan, self._folder), content.getvalue())
+        with zipfile.ZipFile(content, "a") as archive:
+            archive.writestr(STATE, pickle.dumps((self.state(), model.state())))
+        replace_file(last_file(self._plan, self._folder), content.getvalue())
+
+
+def make_compiled(plan: Plan) -> CompiledPPO:
+    """The untrained model of a plan, with its flights.
+
+    Raises:
+        ValueError: If the compiled PPO lacks what the plan asks for.
+    """
+    seed = first_seed("training", plan.seed, plan.recipe.n_envs)
+    return CompiledPPO(
+        plan.make_vector_flights(),
+        plan.recipe,
+        seed=plan.seed,
+        env_seed=seed,
+        threads=plan.threads,
+    )
+
+
+def run(
+    plan: Plan, folder: Path, judge: gymnasium.vector.VectorEnv[Any, Any, Any], *, quiet: bool
+) -> CompiledKeeper:
+    """Train, or go on from the folder's checkpoint; see `baselines.training.train`."""
+    model, keeper = make_compiled(plan), CompiledKeeper(plan, folder, judge, quiet=quiet)
+    if (file := last_file(plan, folder)).exists():
+        try:
+            with zipfile.ZipFile(file) as archive:
+                kept, state = pickle.loads(archive.read(STATE))
+        except (zipfile.BadZipFile, KeyError, pickle.UnpicklingError, EOFError) as error:
+            raise RunError(f"the checkpoint in {folder} is damaged: {error}") from None
+        model.restore(state)
+        keeper.restore(kept, model.num_timesteps)
+
+    def watch(model: CompiledPPO) -> bool:
+        keeper.watch(model, model.num_timesteps)
+        return not keeper.stopping
+
+    with keeper:
+        model.prepare()
+        keeper.begin(model.num_timesteps)
+        model.learn(plan.recipe.steps, watch)
+        keeper.finish(model, model.num_timesteps)
+    model.env.close()
+    return keeper

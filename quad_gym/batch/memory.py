@@ -1,0 +1,122 @@
+"""The records of many flights in memory: how they are read, kept and brought back."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.faults import Fault
+from quad_gym.faults.presets import named_faults
+from quad_gym.params.randomization import Randomization
+from quad_gym.records import (
+    COLUMNS,
+    FLIGHT_BLOCK,
+    WIDTH,
+    Room,
+    aligned_zeros,
+    field_of_flights,
+)
+
+_UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
+"""Fields that are NaN until they are measured or given."""
+
+
+class FlightMemory:
+    """The records of `count` flights, in blocks of WIDTH."""
+
+    count: int
+    faults: tuple[Fault, ...]
+    randomization: Randomization
+
+    def _allocate(self, room: Room, undrawn: NDArray[np.float64]) -> None:
+        """Make the records of flights that have never been reset.
+
+        Args:
+            room: Which fields they have.
+            undrawn: What the columns of "drawn" are where nothing is drawn.
+        """
+        self._room, self._undrawn, self._begun = room, undrawn, False
+        self._blocks = aligned_zeros(-(-self.count // WIDTH), room.dtype)
+        lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
+        self._blocks["idle"] = lanes >= self.count
+        self._blocks["needs_reset"] = 1.0
+        for name in _UNKNOWN:
+            if room.holds(name):
+                self._blocks[name] = np.nan
+        if room.holds("drawn"):
+            self._blocks["drawn"] = undrawn[:, np.newaxis]
+
+    # ---- reading ------------------------------------------------------------------------------
+
+    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """One field, such as "r" or "b_a_hat", or one drawn parameter, as a new array (n, ...).
+
+        Args:
+            name: The field; or what is drawn for every episode, such as "mass".
+            flights: Whose, by their numbers; None: all flights'.
+
+        Raises:
+            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
+        """
+        if name in self.randomization.names:
+            values = self.drawn()[name]
+            return values if flights is None else values[flights]
+        if name not in (FLIGHT_BLOCK.names or ()):
+            drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
+            raise ValueError(
+                f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
+                f"got {name!r}"
+            )
+        if not self._room.holds(name):
+            return self._unused(name, self.count if flights is None else len(flights))
+        if flights is None:
+            return field_of_flights(self._blocks, name, self.count)
+        return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
+
+    def _unused(self, name: str, count: int) -> NDArray[Any]:
+        """A field that flights of this configuration do not use, and have no room for."""
+        if name == "drawn":
+            return np.tile(self._undrawn, (count, 1))
+        base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
+        return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
+
+    def drawn(self) -> dict[str, NDArray[np.float64]]:
+        """What the present episodes have drawn, by name: (count,) or (count, components)."""
+        found = {}
+        for name in self.randomization.names:
+            values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
+            values = values.reshape(-1, values.shape[-1])[: self.count].copy()
+            found[name] = values[:, 0] if values.shape[1] == 1 else values
+        return found
+
+    def active_faults(self) -> dict[str, NDArray[np.bool_]]:
+        """Which of the faults that can come are there now, by name: (count,) each."""
+        return named_faults(self.faults, self.read("faults"))
+
+    def covariance(self) -> NDArray[np.float64]:
+        """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
+        factor = self.read("L")
+        return factor @ factor.transpose(0, 2, 1)
+
+    # ---- keeping ------------------------------------------------------------------------------
+
+    def snapshot(self) -> NDArray[Any]:
+        """A copy of all flights; `restore` brings them back to this instant bit for bit."""
+        return self._blocks.copy()
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Bring all flights back to a snapshot of this batch, or of one of the same size.
+
+        Raises:
+            ValueError: If the snapshot is of another size or kind.
+        """
+        fits = (
+            isinstance(snapshot, np.ndarray)
+            and snapshot.dtype == self._blocks.dtype
+            and snapshot.shape == self._blocks.shape
+            and np.array_equal(snapshot["idle"], self._blocks["idle"])
+        )
+        if not fits:
+            raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
+        self._blocks[:] = snapshot
+        self._begun = False  # it may have been taken before a reset

@@ -1,0 +1,59 @@
+"""From the keyword `custom` to flights under a task of a user's own."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.spaces import ObservationField, policy_size
+from quad_gym.tasks.batch import Part, TaskBatch
+from quad_gym.tasks.task import Observed, resolve_task
+
+Table = tuple[ObservationField, ...]
+
+
+def with_task(
+    custom: Any, make: "partial[FlightBatch]", table: Table
+) -> "tuple[partial[FlightBatch], Table]":
+    """What makes the flights, and the table of their observation, under a task of a user's own.
+
+    What `observe` returns is found by asking it once, of a flight of its own.
+
+    Args:
+        custom: See `resolve_task`.
+        make: Makes the flights without it.
+        table: Of their observation.
+
+    Raises:
+        ValueError: If it is no task, or a part of its observation has a shipped name.
+        TaskError: If its `reset` or `observe` fail.
+    """
+    task = resolve_task(custom)
+    split = policy_size(table)
+    under: Callable[..., TaskBatch] = partial(TaskBatch, **make.keywords, custom=task, split=split)
+    if not task.has("observe"):
+        return under, table  # type: ignore[return-value]
+    first = under(1, threads=1)
+    first.reset(keys=np.zeros((1, 2), np.uint64))
+    sizes = {name: part.shape[1] for name, part in first.ask_parts().items()}
+    unknown = sorted(set(task.observes) - set(sizes))
+    if unknown:
+        raise ValueError(f"observes has {unknown[0]!r}, which observe does not return")
+    kept = () if task.replaces_observation else tuple(f for f in table if f.slice.stop <= split)
+    rest = tuple(f for f in table if f.slice.start >= split)
+    taken = {field.name for field in (*kept, *rest)} & set(sizes)
+    if taken:
+        raise ValueError(f"observe must not return {taken.pop()!r}, which is the shipped one's")
+    described = {name: task.observes.get(name, Observed()) for name in sizes}
+    own = [ObservationField(name, slice(0, sizes[name]), *described[name]) for name in sizes]
+    parts = {n: Part(sizes[n], described[n].low, described[n].high) for n in sizes}
+    new, place = [], 0
+    for field in (*kept, *own, *rest):
+        size = field.slice.stop - field.slice.start
+        new.append(field._replace(slice=slice(place, place + size)))
+        place += size
+    if not new:
+        raise ValueError("observe must return something where it replaces the observation")
+    return partial(under, parts=parts), tuple(new)  # type: ignore[return-value]

@@ -1,0 +1,172 @@
+"""What real sensors do beside noise and bias: errors that last an episode, vibration, blur.
+
+Each acts on a measurement that has just been taken and has draws of its own, so that it changes
+nothing else.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    keep3,
+    keep33,
+    load3,
+    load4,
+    load33,
+    norm,
+    scale,
+    sub,
+)
+from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import logical_not, select
+from quad_gym.records import DRAW_BLUR, DRAW_HEADING, DRAW_IMU_ERRORS, DRAW_VIBRATION
+
+HIDDEN_BELOW = 1e-3
+"""A feature on the ground is not below it [m]."""
+
+
+@kernel
+def _errors(on, off, n, m, k):
+    """D of a sensor: scale errors on the diagonal, those of alignment off it."""
+    return (
+        (on * n[0], off * n[1], off * n[2]),
+        (off * m[0], on * m[1], off * m[2]),
+        (off * k[0], off * k[1], on * k[2]),
+    )
+
+
+@kernel
+def draw_imu_errors(flight, p, mask):
+    """Draw the errors of scale and alignment of an episode, where `mask`."""
+    stream = stream_of(flight)
+    a, b = six_normals(stream, DRAW_IMU_ERRORS)
+    c, d = six_normals(stream, DRAW_IMU_ERRORS + 3)
+    e, f = six_normals(stream, DRAW_IMU_ERRORS + 6)
+    accel = _errors(p.accel_scale_sigma, p.accel_misalignment_sigma, a, b, c)
+    gyro = _errors(p.gyro_scale_sigma, p.gyro_misalignment_sigma, d, e, f)
+    keep33(flight.accel_error, mask, accel)
+    keep33(flight.gyro_error, mask, gyro)
+
+
+@kernel
+def err_imu(flight, p, mask):
+    """Add D (f - g e3) and D w to the IMU's sample, where `mask`."""
+    D_a, D_g = load33(flight.accel_error), load33(flight.gyro_error)
+    f, w, w_now = load3(flight.accel), load3(flight.gyro), load3(flight.w_meas)
+    keep3(flight.accel, mask, add(f, apply(D_a, (f[0], f[1], f[2] - p.gravity))))
+    keep3(flight.gyro, mask, add(w, apply(D_g, w)))
+    keep3(flight.w_meas, mask, add(w_now, apply(D_g, w_now)))
+
+
+@kernel
+def vibrate_imu(flight, p, mask):
+    """Add the rotors' vibration to the IMU's sample, where `mask`.
+
+    Each rotor's imbalance shakes with a force that grows with the square of its speed, and the four
+    are independent: a standard deviation of `c sqrt(sum W_i^4 / 4)`.
+    """
+    W = load4(flight.rotor_speeds)
+    a, b, c, d = W[0] * W[0], W[1] * W[1], W[2] * W[2], W[3] * W[3]
+    size = 0.5 * math.sqrt(a * a + b * b + c * c + d * d)
+    n_a, n_g = six_normals(stream_of(flight), DRAW_VIBRATION)
+    shake = scale(p.gyro_vibration * size, n_g)
+    keep3(flight.accel, mask, add(load3(flight.accel), scale(p.accel_vibration * size, n_a)))
+    keep3(flight.gyro, mask, add(load3(flight.gyro), shake))
+    keep3(flight.w_meas, mask, add(load3(flight.w_meas), shake))
+
+
+@kernel
+def draw_heading_error(flight, p, mask):
+    """Draw the constant error of an episode's baselines, where `mask`."""
+    n, _ = normal_pair(stream_of(flight), DRAW_HEADING)
+    flight.heading_error = select(mask, p.heading_error_sigma * n, flight.heading_error)
+
+
+@kernel
+def turn_baseline(flight, p, mask):
+    """Turn a measured baseline about the body z axis by its constant error, where `mask`."""
+    z_G = apply_transposed(load33(p.R_IG), quaternion_to_dcm(load4(flight.q))[2])
+    s, c = sin_cos(flight.heading_error)
+    b = load3(flight.gnss_baseline)
+    along = scale((1.0 - c) * dot(z_G, b), z_G)
+    turned = add(add(scale(c, b), scale(s, cross(z_G, b))), along)
+    keep3(flight.gnss_baseline, mask, turned)
+
+
+@kernel
+def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
+    """Blur the image just taken, and lose what is too far or behind the ground, where `mask`.
+
+    Args:
+        flight: Record, with the image.
+        p: Parameters as they are.
+        blurs: Whether images are blurred.
+        ground_hides: Whether the ground hides features.
+        feature_count: Features in use.
+        mask: Which lanes.
+    """
+    stream = stream_of(flight)
+    camera_I = apply_transposed(quaternion_to_dcm(load4(flight.q)), load3(p.camera))
+    camera_I = add(load3(flight.r), camera_I)
+    # as far as the smear reaches either way, evenly: sqrt(3) standard deviations
+    reach = 1.7320508075688772 * p.blur * norm(load3(flight.w))
+    above = camera_I[2] >= p.ground_height
+    for i in range(feature_count):
+        X_I = load3(p.features[i])
+        lost = norm(sub(X_I, camera_I)) > p.max_range
+        if ground_hides:
+            lost = lost | logical_not(above) | (X_I[2] < p.ground_height - HIDDEN_BELOW)
+        kept = select(lost, 0.0, flight.feature_valid[i])
+        flight.feature_valid[i] = select(mask, kept, flight.feature_valid[i])
+        if blurs:
+            u, v = uniform_pair(stream, DRAW_BLUR + i)
+            seen = mask & (kept > 0.0)
+            for axis in range(2):
+                shift = reach * (2.0 * (u if axis == 0 else v) - 1.0)
+                pixel = flight.pixels[i, axis]
+                flight.pixels[i, axis] = select(seen, pixel + shift, pixel)
+
+
+# ---- stages ----------------------------------------------------------------------------------
+
+
+@stage
+def begin_imperfect_stage(flight, world, model, settings, work, stages, flag):
+    """Draw the errors that last an episode."""
+    flying, true, mask = lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0
+    if settings.imu_errs:
+        draw_imu_errors(flying, true, mask)
+    if settings.heading_errs:
+        draw_heading_error(flying, true, mask)
+
+
+@stage
+def disturb_imu_stage(flight, world, model, settings, work, stages, flag):
+    """Err and vibrate with the IMU's sample."""
+    flying, true, mask = lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0
+    if settings.imu_errs:
+        err_imu(flying, true, mask)
+    if settings.imu_vibrates:
+        vibrate_imu(flying, true, mask)
+
+
+@stage
+def turn_baseline_stage(flight, world, model, settings, work, stages, flag):
+    """Give the baseline just measured its constant error."""
+    turn_baseline(lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0)
+
+
+@stage
+def limit_camera_stage(flight, world, model, settings, work, stages, flag):
+    """Blur the image just taken, and lose what is too far or behind the ground."""
+    mask, count = lanes_of(work).mask > 0.0, settings.feature_count
+    blurs, hides = settings.camera_blurs, settings.ground_hides
+    limit_camera(lanes_of(flight), lanes_of(world), blurs, hides, count, mask)

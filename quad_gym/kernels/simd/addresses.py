@@ -1,0 +1,149 @@
+"""Memory behind addresses: records, arrays and rows, where compiled code is called with addresses.
+
+An address is a word (int64). Whoever hands it over keeps the memory alive.
+"""
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array, populate_array
+from numba.np.numpy_support import from_dtype
+
+from quad_gym.kernels.simd.blocks import LaneRecord
+from quad_gym.kernels.simd.lanes import lanes
+from quad_gym.records import WIDTH
+
+_BYTES = ir.IntType(8).as_pointer()
+_INDEX = ir.IntType(32)
+_SINGLE = ir.FloatType()
+
+
+def record_at(dtype: np.dtype) -> Any:
+    """A function that returns the record of a type at an address."""
+    kind = from_dtype(dtype)
+
+    @intrinsic
+    def at(typing_context, address):  # type: ignore[no-untyped-def]
+        def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            return builder.inttoptr(args[0], context.get_value_type(kind))
+
+        return kind(types.int64), lower
+
+    return at
+
+
+def lanes_at(dtype: np.dtype) -> Any:
+    """A function that returns the lanes of a block of a type at an address."""
+    kind = LaneRecord(from_dtype(dtype))
+
+    @intrinsic
+    def at(typing_context, address):  # type: ignore[no-untyped-def]
+        def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            return builder.inttoptr(args[0], _BYTES)
+
+        return kind(types.int64), lower
+
+    return at
+
+
+def array_at(dtype: Any) -> Any:
+    """A function that returns the array of a type and length at an address."""
+    kind = types.Array(from_dtype(np.dtype(dtype)), 1, "C", aligned=False)
+
+    @intrinsic
+    def at(typing_context, address, length):  # type: ignore[no-untyped-def]
+        def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            element = context.get_data_type(kind.dtype)
+            size = context.get_constant(types.intp, context.get_abi_sizeof(element))
+            array = make_array(kind)(context, builder)
+            populate_array(
+                array,
+                data=builder.inttoptr(args[0], element.as_pointer()),
+                shape=cgutils.pack_array(builder, [args[1]]),
+                strides=cgutils.pack_array(builder, [size]),
+                itemsize=size,
+                meminfo=None,
+                parent=None,
+            )
+            return array._getvalue()
+
+        return kind(types.int64, types.int64), lower
+
+    return at
+
+
+@intrinsic
+def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
+    """Write lanes to an address, one float64 after the other."""
+    if value != lanes:
+        return None
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        builder.store(args[1], builder.inttoptr(args[0], args[1].type.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.none(types.int64, lanes), lower
+
+
+@intrinsic
+def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
+    """Ask for the cache line at an address, which is needed soon; it may be no address at all."""
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        word = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [_BYTES, word, word, word])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [_BYTES], kind)
+        place = builder.inttoptr(args[0], _BYTES)
+        builder.call(function, [place, word(0), word(2), word(1)])  # to read, into the second level
+        return context.get_dummy_value()
+
+    return types.none(types.int64), lower
+
+
+@intrinsic
+def store_tile(typing_context, address, pitch, source, first):  # type: ignore[no-untyped-def]
+    """Write WIDTH numbers of each lane as float32: those of a lane side by side.
+
+    Args:
+        address: Where those of the first lane go.
+        pitch: Bytes from one lane's to the next one's.
+        source: Array of lanes.
+        first: Its first element to write.
+    """
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        begin, pitch, _, first = args
+        array = context.make_array(sig.args[2])(context, builder, args[2])
+        rows = []
+        for k in range(WIDTH):
+            place = builder.add(first, context.get_constant(types.intp, k))
+            pointer = cgutils.get_item_pointer(context, builder, sig.args[2], array, [place])
+            wide = builder.load(pointer, align=8)
+            rows.append(builder.fptrunc(wide, ir.VectorType(_SINGLE, WIDTH)))
+        for lane, row in enumerate(_transposed(builder, rows)):
+            offset = builder.mul(pitch, context.get_constant(types.int64, lane))
+            pointer = builder.inttoptr(builder.add(begin, offset), row.type.as_pointer())
+            builder.store(row, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.none(types.int64, types.int64, source, types.intp), lower
+
+
+def _transposed(builder: ir.IRBuilder, rows: list[Any]) -> list[Any]:
+    """The columns of a square of vectors: blocks off the diagonal change places, at every size."""
+    size = 1
+    while size < WIDTH:
+        # of element k of rows i and i + size: where it comes from, in both rows end to end
+        upper = [k if k & size == 0 else WIDTH + k - size for k in range(WIDTH)]
+        lower = [k + size if k & size == 0 else WIDTH + k for k in range(WIDTH)]
+        masks = [ir.Constant(ir.VectorType(_INDEX, WIDTH), chosen) for chosen in (upper, lower)]
+        for i in range(WIDTH):
+            if i & size == 0:
+                pair = rows[i], rows[i + size]
+                rows[i], rows[i + size] = (builder.shuffle_vector(*pair, m) for m in masks)
+        size *= 2
+    return rows

@@ -1,0 +1,118 @@
+"""GNSS: positions, the baseline between two antennas, velocities, and their errors."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Vector
+
+LEAST_DRIFT = 1e-6
+"""Slow error that a filter assumes in an axis that has none beside one that has [m]: its covariance
+stays regular."""
+
+HEADING_MEMORY = 60.0
+"""For how long of a flight a filter takes the constant error of a baseline for new [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssParams(Checked):
+    """Two GNSS antennas: position of the primary one, and the baseline to the secondary one."""
+
+    rate: float = 200.0
+    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
+    primary_antenna_B: Vector = (0.1013, -0.0004, 0.0472)
+    """(3,) in B [m]; laboratory vehicle"""
+    secondary_antenna_B: Vector = (-0.0887, -0.0004, 0.0472)
+    """(3,) in B [m]; laboratory vehicle"""
+    reference_antenna_G: Vector = (-742080.456, -5462030.875, 3198338.956)
+    """(3,) origin of the east-north-up frame I, in ECEF [m]; laboratory"""
+    position_sigma_I: Vector = (0.006, 0.006, 0.012)
+    """(3,) standard deviation east, north, up [m]; laboratory (RTK)"""
+    baseline_sigma: float = 0.05
+    """standard deviation of the baseline's direction [rad]; laboratory"""
+    heading_error_sigma: float = 0.0
+    """standard deviation of an error that the baseline has in common with all others of its
+    episode: a turn about the body z axis, as unequal antennas, their mounting, or a compass among
+    iron cause it [rad]"""
+    velocity_sigma: float | None = None
+    """standard deviation of the velocity by Doppler shifts, per axis [m/s]; None: not measured, as
+    in the laboratory"""
+    phase: float | None = 0.0
+    """when the first measurement after the start comes, as a share of the period in [0, 1), in
+    whole ticks; None: at random in each episode"""
+    drift_sigma_I: Vector = (0.0, 0.0, 0.0)
+    """(3,) slow position error east, north, up, beside the white one: stationary standard deviation
+    of a first-order Gauss-Markov process that is zero at the start of an episode, for positions are
+    relative to the place of the start [m]"""
+    drift_tau: float = 60.0
+    """its correlation time [s]; the filter estimates the slow error, as three more states"""
+    latency: float = 0.0
+    """from when a measurement is taken to when it reaches the filter, with its time stamp, in whole
+    ticks; at most MAX_UNDER_WAY periods [s]. Receivers take about 0.1 s: the autopilot PX4 assumes
+    0.11 s (parameter EKF2_GPS_DELAY)"""
+
+    def __post_init__(self) -> None:
+        self._check(check.number, "latency", least=0.0)
+        self._check(check.number, "heading_error_sigma", least=0.0, most=1.0)
+        self._check(check.positive, "rate", "baseline_sigma", "drift_tau")
+        self._check(check.phase, "phase")
+        if self.velocity_sigma is not None:
+            self._check(check.positive, "velocity_sigma")
+        self._check(check.vector, "drift_sigma_I", length=3)
+        if min(self.drift_sigma_I) < 0.0:
+            raise ValueError(
+                f"GnssParams.drift_sigma_I must be at least 0, got {self.drift_sigma_I}"
+            )
+        self._check(
+            check.vector,
+            "primary_antenna_B",
+            "secondary_antenna_B",
+            "reference_antenna_G",
+            "position_sigma_I",
+            length=3,
+        )
+        if min(self.position_sigma_I) <= 0.0:
+            raise ValueError(
+                f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
+            )
+        for name in ("primary_antenna_B", "secondary_antenna_B"):
+            if np.abs(getattr(self, name)).max() > 100.0:
+                raise ValueError(
+                    f"GnssParams.{name} must be on the vehicle, within 100 m, got "
+                    f"{getattr(self, name)}"
+                )
+        if np.linalg.norm(self.baseline_B) < 1e-3:
+            raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
+        if np.linalg.norm(self.reference_antenna_G) < 1e6:
+            raise ValueError(
+                "GnssParams.reference_antenna_G must be a place on the Earth in ECEF meters, "
+                f"got {self.reference_antenna_G}"
+            )
+
+    @property
+    def baseline_B(self) -> np.ndarray:
+        """(3,) from the primary to the secondary antenna, in B [m]."""
+        return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
+
+    @property
+    def drifts(self) -> bool:
+        """Whether positions have a slow error."""
+        return any(self.drift_sigma_I)
+
+    @property
+    def first_baseline_sigma(self) -> float:
+        """Standard deviation of the direction of one baseline [rad]."""
+        return math.hypot(self.baseline_sigma, self.heading_error_sigma)
+
+    @property
+    def believed_baseline_sigma(self) -> float:
+        """Standard deviation of the direction of a baseline that the filter takes for white [rad].
+
+        Averages of white noise shrink, a constant error stays. It is counted so often as there are
+        measurements in `HEADING_MEMORY`: the heading is then hardly better known after that time
+        than after the first baseline, unless something else tells it.
+        """
+        count = max(self.rate * HEADING_MEMORY, 1.0)
+        return math.hypot(self.baseline_sigma, math.sqrt(count) * self.heading_error_sigma)

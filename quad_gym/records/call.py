@@ -1,0 +1,49 @@
+"""What the compiled code that flies is called with: words, most of them addresses."""
+
+from enum import IntEnum, auto
+
+
+class Call(IntEnum):
+    """The words of a call, by their place; each thread has its own."""
+
+    BLOCKS = 0
+    """Address of the first block, as if it had all fields; see `Room`."""
+    PITCH = auto()
+    """Bytes from one block to the next."""
+    COUNT = auto()
+    """Flights."""
+    RESETS = auto()
+    """(COUNT,) uint8; for RESET, which flights begin an episode."""
+    WORLD = auto()
+    """PARAMS_BLOCK: parameters as they are."""
+    OWN = auto()
+    """PARAMS_BLOCK of this thread: a copy of WORLD, where the parameters of the flights at hand are
+    put together if they draw some, or if their rotors can fail."""
+    MODEL = auto()
+    """PARAMS_BLOCK: parameters as the filter and the controller believe them."""
+    SETTINGS = auto()
+    """SETTINGS."""
+    WORK = auto()
+    """WORK_BLOCK of this thread."""
+    STAGES = auto()
+    """STAGE_TABLE, which has the stages that the settings need."""
+    ACTIONS = auto()
+    """(blocks WIDTH, 4) float64; for STEP."""
+    SIZE = auto()
+    """Numbers of an observation; 0: nothing is observed."""
+    LOW = auto()
+    """(SIZE,) float64: bounds of the observation space."""
+    HIGH = auto()
+    """(SIZE,) float64, likewise."""
+    OBSERVATIONS = auto()
+    """(COUNT, SIZE) float32, written."""
+    FINAL_OBSERVATIONS = auto()
+    """Likewise, written where one episode ends and the next begins in this step."""
+    RESULTS = auto()
+    """(len(RESULTS), blocks WIDTH) float64, written in a STEP."""
+    RESULT_PITCH = auto()
+    """Bytes from one row of the results to the next."""
+    SHOWN = auto()
+    """(SHOWN_SIZE, blocks WIDTH) float64, written where the settings say that flights are shown."""
+    SHOWN_PITCH = auto()
+    """Bytes from one row of it to the next."""

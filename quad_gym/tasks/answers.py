@@ -1,0 +1,135 @@
+"""What a task's methods return, checked; what is wrong names the method and the flights."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.tasks.task import Task, TaskError, label
+
+Floats = NDArray[np.float64]
+Truths = NDArray[np.bool_]
+
+LARGEST_REWARD = 1e30
+"""A larger one is a mistake; learning algorithms hold rewards in single precision."""
+
+LONE = "observed"
+"""What the table of observations calls an array that `observe` returns without a name."""
+
+
+def ask(task: Task, method: str, *arguments: Any) -> Any:
+    """Call a task's method.
+
+    Raises:
+        TaskError: If it raises anything; that is the cause.
+    """
+    try:
+        return getattr(task, method)(*arguments)
+    except Exception as error:
+        raise TaskError(
+            f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
+        ) from error
+
+
+def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]:
+    """An array of numbers.
+
+    Raises:
+        TaskError: If it is none.
+    """
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError):
+        found = np.array(None)
+    if found.dtype.kind not in "fiub":
+        raise TaskError(
+            f"{label(task)}.{method} must return numbers{_of(name)}, got {_short(value)}"
+        )
+    return found
+
+
+def reward(task: Task, value: Any, count: int) -> Floats:
+    """(n,) rewards; they may still be NaN or infinite.
+
+    Raises:
+        TaskError: If it has another shape, or is no array of numbers.
+    """
+    found = numbers(task, "reward", value)
+    if found.shape != (count,):
+        raise TaskError(
+            f"{label(task)}.reward must return shape ({count},), a number per flight, "
+            f"got {found.shape}"
+        )
+    return found.astype(np.float64)
+
+
+def truths(task: Task, method: str, value: Any, count: int) -> Truths:
+    """(n,) truth values.
+
+    Raises:
+        TaskError: If it is something else.
+    """
+    found = numbers(task, method, value)
+    if found.dtype != bool or found.shape != (count,):
+        raise TaskError(
+            f"{label(task)}.{method} must return booleans of shape ({count},), "
+            f"got {found.dtype} of {found.shape}"
+        )
+    return found
+
+
+def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
+    """What `observe` returns as (n, k) arrays by name, in its order.
+
+    Raises:
+        TaskError: If an array has another shape, or is none of numbers.
+    """
+    named = value if isinstance(value, Mapping) else {LONE: value}
+    found = {}
+    for name, part in named.items():
+        array = numbers(task, "observe", part, str(name))
+        if array.ndim not in (1, 2) or len(array) != count:
+            raise TaskError(
+                f"{label(task)}.observe must return shape ({count},) or ({count}, k)"
+                f"{_of(name)}, got {array.shape}"
+            )
+        found[str(name)] = array[:, np.newaxis] if array.ndim == 1 else array
+    return found
+
+
+def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted: str) -> None:
+    """Refuse values of flights that are not `sound`.
+
+    Args:
+        sound: (n,).
+        task: Whose.
+        method: Which returned them.
+        values: (n, ...), for the message.
+        wanted: What they have to be.
+
+    Raises:
+        TaskError: If there are any.
+    """
+    wrong = np.flatnonzero(~sound)
+    if wrong.size:
+        raise TaskError(
+            f"{label(task)}.{method} must return {wanted}, got {_short(values[wrong[0]])} for "
+            f"{flights_named(wrong)}"
+        )
+
+
+def flights_named(flights: NDArray[np.intp]) -> str:
+    """Which flights, the first of them by number."""
+    first = ", ".join(str(i) for i in flights[:5])
+    more = f" and {len(flights) - 5} more" if len(flights) > 5 else ""
+    return f"flight {first}" if len(flights) == 1 else f"flights {first}{more}"
+
+
+def _of(name: str) -> str:
+    return f" for {name!r}" if name and name != LONE else ""
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,370 @@
+"""`TaskBatch`: flights that a task of a user's own judges, observes and begins."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.batch.starts import checked_mask
+from quad_gym.params import checks as check
+from quad_gym.records import WIDTH, Autoreset, Result
+from quad_gym.tasks import answers
+from quad_gym.tasks.draws import FlightRandom
+from quad_gym.tasks.endings import endings
+from quad_gym.tasks.memory import ReadableBatch
+from quad_gym.tasks.starts import Start, starts
+from quad_gym.tasks.state import State
+from quad_gym.tasks.task import METHODS, Task, TaskError, label
+from quad_gym.tasks.view import View
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Truths = NDArray[np.bool_]
+
+_RESET_DRAWS, _UPDATE_DRAWS = 1, 2
+_TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
+
+
+class Before(NamedTuple):
+    """What flights were like before a step."""
+
+    position_error: Floats
+    gates_passed: Floats
+
+
+class Part(NamedTuple):
+    """One part of what `observe` returns."""
+
+    size: int
+    low: float
+    high: float
+
+
+class TaskBatch(ReadableBatch):
+    """Flights of one configuration under a task of a user's own.
+
+    The kernels fly, judge and observe as ever; then the task's methods replace what they replace.
+    Episodes begin in the kernel where it flies by the next-step mode, and by masked resets
+    otherwise, so that the flights' random streams go on as without a task.
+
+    Args:
+        count: Number of flights.
+        custom: The task.
+        parts: What its `observe` returns, by name; None: it is not asked.
+        split: Where that stands in an observation: after so many shipped numbers.
+        autoreset: When a flight whose episode is over begins the next one.
+        keywords: Those of `FlightBatch`.
+
+    Raises:
+        ValueError: If an argument is invalid.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        custom: Task,
+        parts: Mapping[str, Part] | None = None,
+        split: int = 0,
+        autoreset: Autoreset = Autoreset.DISABLED,
+        **keywords: Any,
+    ) -> None:
+        self._in_kernel = autoreset == Autoreset.NEXT_STEP
+        mode = Autoreset.NEXT_STEP if self._in_kernel else Autoreset.DISABLED
+        super().__init__(count, autoreset=mode, **keywords)
+        self.custom = custom
+        self.methods = frozenset(method for method in METHODS if custom.has(method))
+        self._same_step = autoreset == Autoreset.SAME_STEP
+        self._parts, self._split = dict(parts or {}), split
+        self._observes = parts is not None and "observe" in self.methods
+        self._kept = slice(split, split) if custom.replaces_observation else slice(0, split)
+        self.period = 1.0 / self.clocks.control_rate
+        self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
+        camera = self.sensors.camera
+        self.features = np.array([] if camera is None else camera.features_I).reshape(-1, 3)
+        self.features.flags.writeable = False
+        self._state = State(self.count, custom.state)
+        self._nobody = np.zeros(self.count, bool)
+        self._failed = self._nobody.copy()
+        self.began, self.began_some = self._nobody, False
+        self.before = Before(np.zeros(self.count), np.zeros(self.count))
+        bounds = [(part.low, part.high) for part in self._parts.values() for _ in range(part.size)]
+        self._own_low, self._own_high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
+        self._finals = np.zeros((self.count, self._size_of_observation()), np.float32)
+        self._view: View | None = None
+
+    # ---- flying -------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seeds: Sequence[int | None] | None = None,
+        keys: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        velocity: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
+    ) -> Singles:
+        """Begin new episodes; see `FlightBatch.reset`.
+
+        Raises:
+            ValueError: If the arguments do not fit the number of flights; nothing has changed then.
+            TaskError: If a method of the task fails; the flights need another reset then.
+        """
+        given: Start = {"position": position, "velocity": velocity, "yaw": yaw}
+        chosen = checked_mask(self.count, mask)
+        shipped = super().reset(seeds=seeds, keys=keys, mask=mask, **given)
+        self._failed = self._failed & ~chosen
+        try:
+            return self._observed(self._begin(chosen, given, shipped))
+        except BaseException:
+            self._failed = self._failed | chosen
+            raise
+
+    def step(self, actions: NDArray[Any] | None = None) -> Singles:
+        """Fly one control period; see `FlightBatch.step`.
+
+        Raises:
+            ValueError: If flights have never been reset; it is a RuntimeError, too.
+            TaskError: If a method of the task fails. The step has been flown then, but nothing
+                says what came of it: all flights need a reset.
+        """
+        if np.count_nonzero(self._failed):
+            raise check.NotResetError(
+                f"call reset() before step(): a method of {label(self.custom)} has failed for "
+                f"{answers.flights_named(np.flatnonzero(self._failed))}"
+            )
+        if not self._begun:
+            self._require_begun()
+        self.before = Before(self.columns("position_error"), self.columns("gate_next"))
+        returns = self.columns("episode_return")
+        began = self.columns("needs_reset") > 0.0 if self._in_kernel else self._nobody
+        shipped = super().step(actions)
+        try:
+            return self._after_step(shipped, began, returns)
+        except BaseException:
+            self._failed = ~self._nobody
+            raise
+
+    def _after_step(self, shipped: Singles, began: Truths, returns: Floats) -> Singles:
+        """Ask the task about a step that has been flown; return what is observed."""
+        self.view.step_over()
+        self.began, self.began_some = began, bool(np.count_nonzero(began))
+        if self.began_some:
+            shipped = self._begin(began, {}, shipped)
+        if "update" in self.methods:
+            with self._writing(~began, _UPDATE_DRAWS) as rng:
+                answers.ask(self.custom, "update", self.view, rng)
+        judged = self._judge(returns)
+        observations = self._observed(shipped)
+        if self._observes and self.custom.privileged:
+            self.view.own_shipped.read()
+        self._write(judged)
+        if self._same_step:
+            ends = self.judged_over
+            if np.count_nonzero(ends):
+                over = ends[0] | ends[1]
+                self._finals[over] = observations[over]
+                shipped = self._begin(over, {}, super().reset(mask=over))
+                observations[over] = self._observed(shipped)[over]
+        return observations
+
+    # ---- episodes that begin ------------------------------------------------------------------
+
+    def _begin(self, chosen: Truths, given: Start, shipped: Singles) -> Singles:
+        """Ask the task about episodes that the kernels have begun; return what these observe."""
+        self.began, self.began_some = chosen, True
+        self._state.begin(chosen)
+        self.view.begin(chosen)
+        if "reset" not in self.methods:
+            return shipped
+        with self._writing(chosen, _RESET_DRAWS) as rng:
+            start = answers.ask(self.custom, "reset", self.view, rng)
+        if start is not None:
+            shipped = self._begin_again(
+                chosen, starts(self.custom, start, chosen, given, self.task)
+            )
+        return shipped
+
+    def _begin_again(self, chosen: Truths, start: Start) -> Singles:
+        """Begin the same episodes once more, at other places: their draws are the same."""
+        lanes = np.zeros(len(self._blocks) * WIDTH, bool)
+        lanes[: self.count] = chosen
+        again = lanes.reshape(-1, WIDTH)
+        self._blocks["instant"][again] -= np.uint64(1)
+        self._blocks["episode"][again] -= 1.0
+        shipped = super().reset(mask=chosen, **start)
+        self.view.forget()
+        return shipped
+
+    # ---- judging ------------------------------------------------------------------------------
+
+    def _judge(self, returns: Floats) -> dict[Result, Floats]:
+        """Ask for reward and endings; return what takes the place of the kernels' judgment."""
+        judged: dict[Result, Floats] = {}
+        if "reward" in self.methods:
+            reward = self._rewards()
+            judged[Result.REWARD] = reward
+            judged[Result.EPISODE_RETURN] = returns + reward
+            if self.began_some:
+                judged[Result.REWARD] = np.where(self.began, 0.0, reward)
+                judged[Result.EPISODE_RETURN][self.began] = 0.0
+        if "terminated" in self.methods or "truncated" in self.methods:
+            judged |= endings(self)
+        return judged
+
+    def _rewards(self) -> Floats:
+        """(n,) what the task's reward returns, in the unit of the results."""
+        value = answers.ask(self.custom, "reward", self.view)
+        reward = answers.reward(self.custom, value, self.count)
+        if not float(np.dot(reward, reward)) <= answers.LARGEST_REWARD**2:
+            sound = np.abs(reward) <= answers.LARGEST_REWARD
+            # nobody is asked about a flight that begins, or that is no more
+            sound |= self.began | ~self.finite(~sound)
+            answers.require(sound, self.custom, "reward", reward, "finite rewards")
+            reward = np.where(np.isfinite(reward), reward, 0.0)
+        return reward if self.reward_scale == 1.0 else reward * self.reward_scale
+
+    @property
+    def judged_over(self) -> Truths:
+        """(2, n) whether flights are terminated, and whether they are truncated."""
+        return self._results[_TERMINATED : _TRUNCATED + 1, : self.count] > 0.0
+
+    def _write(self, judged: Mapping[Result, Floats]) -> None:
+        """Let results and records say what the task has judged."""
+        for result, values in judged.items():
+            self._results[result, : self.count] = values
+            self.write(result.name.lower(), values)
+        if Result.ENDING in judged:
+            self.write("needs_reset", judged[Result.TERMINATED] + judged[Result.TRUNCATED])
+        if self.began_some:
+            for name in ("position_error", "estimation_error", "filter_status"):
+                row = self._results[Result[name.upper()], : self.count]
+                row[self.began] = self.columns(name)[self.began]
+
+    # ---- observing ----------------------------------------------------------------------------
+
+    @property
+    def final_observations(self) -> Singles:
+        """(count, n_observation) float32, where one episode has ended and the next begun."""
+        return self._finals
+
+    @final_observations.setter
+    def final_observations(self, value: Singles) -> None:
+        """The kernels' own are never written, as their episodes begin where a step begins."""
+
+    def shipped_observation(self) -> Singles:
+        """(count, k) what the kernels observe, less its privileged part."""
+        return self._observations[:, : self._split]
+
+    def ask_parts(self) -> dict[str, NDArray[Any]]:
+        """What `observe` returns at the present instant, (count, k) each."""
+        view = self.view
+        view.hide(not self.custom.privileged)
+        try:
+            value = answers.ask(self.custom, "observe", view)
+        finally:
+            view.hide(False)
+        return answers.parts(self.custom, value, self.count)
+
+    def _observed(self, shipped: Singles) -> Singles:
+        """The observations that the environment shows: shipped, the task's, privileged ones."""
+        if not self._observes:
+            return shipped
+        found = self.ask_parts()
+        if found.keys() != self._parts.keys():
+            self._refuse_parts(found)
+        if any(found[name].shape[1] != part.size for name, part in self._parts.items()):
+            self._refuse_parts(found)
+        own = [found[name] for name in self._parts]
+        kept, rest = shipped[:, self._kept], shipped[:, self._split :]
+        parts = [*([kept] if kept.shape[1] else []), *own, *([rest] if rest.shape[1] else [])]
+        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        ours = joined[:, kept.shape[1] : joined.shape[1] - rest.shape[1]]
+        flat = joined.ravel()
+        if not np.isfinite(np.dot(flat, flat)):
+            self._require_finite(found, ours)
+        np.clip(ours, self._own_low, self._own_high, out=ours)
+        return joined
+
+    def _require_finite(self, found: Mapping[str, NDArray[Any]], ours: Singles) -> None:
+        """Refuse what is not finite; of flights that are no more, make it finite."""
+        for name, values in found.items():
+            sound = np.isfinite(values).all(axis=1)
+            if not sound.all():
+                sound |= ~self.finite(~sound)
+                answers.require(sound, self.custom, "observe", values, f"finite {name!r}")
+        np.nan_to_num(ours, copy=False)
+
+    def _refuse_parts(self, found: Mapping[str, NDArray[Any]]) -> None:
+        sizes = {name: part.shape[1] for name, part in found.items()}
+        declared = {name: part.size for name, part in self._parts.items()}
+        raise TaskError(
+            f"{label(self.custom)}.observe must return as many numbers as at first, {declared}, "
+            f"got {sizes}"
+        )
+
+    def _size_of_observation(self) -> int:
+        """Numbers of an observation that the environment shows."""
+        kept = len(range(*self._kept.indices(self._low.size))) + self._low.size - self._split
+        own = sum(part.size for part in self._parts.values())
+        return kept + own if self._observes else self._low.size
+
+    # ---- keeping ------------------------------------------------------------------------------
+
+    @property
+    def view(self) -> View:
+        """What the task sees of the flights."""
+        if self._view is None:
+            self._view = View(self, self._state)
+        return self._view
+
+    def snapshot(self) -> NDArray[Any]:
+        """A copy of all flights and of what the task keeps; `restore` brings them back."""
+        flights = super().snapshot()
+        if not len(self._state):
+            return flights
+        kept = np.zeros(len(flights), [("flights", flights.dtype), ("state", self._state.dtype())])
+        kept["flights"] = flights
+        self._state.write_to(kept["state"])
+        return kept
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Bring all flights back to a snapshot of this batch, or of one of the same size.
+
+        Raises:
+            ValueError: If the snapshot is of another size, kind or task.
+        """
+        flights = snapshot
+        if len(self._state):
+            kind = getattr(snapshot, "dtype", None)
+            if getattr(kind, "names", None) != ("flights", "state") or (
+                snapshot["state"].dtype != self._state.dtype()
+            ):
+                raise ValueError(f"snapshot must be that of a batch with {label(self.custom)}")
+            flights = snapshot["flights"]
+        super().restore(flights)
+        if len(self._state):
+            self._state.read_from(snapshot["state"])
+        self._failed = self._nobody.copy()
+        self._view = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the threads and the view, which a copy makes anew."""
+        return super().__getstate__() | {"_view": None}
+
+    # ---- calling the task ---------------------------------------------------------------------
+
+    @contextmanager
+    def _writing(self, chosen: Truths, draws: int) -> Iterator[FlightRandom]:
+        """Let a method change the task's state, of some flights alone."""
+        kept = {} if chosen.all() else self._state.copies()
+        self._state.lock(False)
+        try:
+            yield FlightRandom(self.rows("key"), self.columns("instant"), draws)
+        finally:
+            self._state.lock(True)
+            if kept:
+                self._state.bring_back(kept, ~chosen)

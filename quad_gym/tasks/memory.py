@@ -1,0 +1,93 @@
+"""Flights whose memory a view reads, and a task writes its judgment to."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.batch.calls import Calls
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.kernels.compiling import Stage
+from quad_gym.records import SHOWN_SIZE, WIDTH, Command
+
+Floats = NDArray[np.float64]
+
+_GAP = 8
+"""Numbers between two rows of what is shown: a line of the cache."""
+
+
+class ReadableBatch(FlightBatch):
+    """A `FlightBatch` with what the views of a task read, as new arrays of all flights."""
+
+    def __init__(self, count: int, **keywords: Any) -> None:
+        super().__init__(count, **keywords)
+        self._settings["shown"] = True
+        self._stages |= {Stage.SHOW}
+        self._shown = self._new_shown()
+
+    def _new_shown(self) -> Floats:
+        # rows that lie a power of two apart would share a few lines of the cache
+        return np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
+
+    def _run(self, command: Command) -> NDArray[np.float32]:
+        self._shown = self._new_shown()
+        if self._crew is not None:
+            self._crew.gather()  # nobody may still write to the memory that goes
+            self._calls.show_into(self._shown)
+        observations = super()._run(command)
+        self._shown.flags.writeable = False
+        return observations
+
+    def _calls_of_threads(self) -> Calls:
+        calls = super()._calls_of_threads()
+        calls.show_into(self._shown)
+        return calls
+
+    @property
+    def shown(self) -> Floats:
+        """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only."""
+        return self._shown[:, : self.count]
+
+    def columns(self, name: str) -> NDArray[Any]:
+        """A field of the flights' records as a new array (..., n)."""
+        if name not in (self._blocks.dtype.fields or {}):
+            return np.ascontiguousarray(np.moveaxis(self.read(name), 0, -1))
+        values = self._blocks[name]
+        if values.ndim == 2:
+            return values.flatten()[: self.count]
+        last = values.ndim - 1
+        values = values.transpose(*range(1, last), 0, last).copy()
+        return values.reshape(*values.shape[:-2], -1)[..., : self.count]
+
+    def rows(self, name: str) -> NDArray[Any]:
+        """A field of the flights' records as a new array (n, ...)."""
+        values = self.columns(name)
+        return values.T if values.ndim == 2 else np.ascontiguousarray(np.moveaxis(values, -1, 0))
+
+    def write(self, name: str, values: NDArray[Any]) -> None:
+        """Write a field of the flights' records, (n,)."""
+        field = self._blocks[name]
+        if values.size == field.size:
+            field[:] = values.reshape(field.shape)
+            return
+        lanes = field.flatten()
+        lanes[: self.count] = values
+        field[:] = lanes.reshape(field.shape)
+
+    def gates(self) -> Floats:
+        """(n, gates, 3) of a course in I [m]; none elsewhere."""
+        gates = self.task.gate_count if self.task.kind == "waypoints" else 0
+        return self.rows("gates")[:, :gates]
+
+    def nominal(self) -> dict[str, Any]:
+        """Numbers of the nominal sensors."""
+        names = ("camera", "R_CB", "focal_length", "half_image", "R_IG")
+        return {name: self._world[name][0, ..., 0] for name in names}
+
+    def finite(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(n,) whether the true state of flights is finite; looked at where `chosen`."""
+        finite = np.ones(self.count, bool)
+        flights = np.flatnonzero(chosen)
+        state = np.concatenate([self.read(name, flights) for name in ("r", "v", "q", "w")], axis=1)
+        finite[flights] = np.isfinite(state).all(axis=1)
+        return finite

@@ -1,0 +1,232 @@
+"""`View`: what the methods of a task read of all flights; `fields.py` has it as a table."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.records import SHOWN
+from quad_gym.tasks.groups import Estimate, Measured, Seen, Shipped, Truth
+from quad_gym.tasks.lazy import Group, Lazy, Shown
+from quad_gym.tasks.state import State
+from quad_gym.tasks.task import HiddenTruthError
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.batch import TaskBatch
+
+Floats = NDArray[np.float64]
+Truths = NDArray[np.bool_]
+
+_GATE_NEXT = SHOWN["gate_next"].start
+_GROUPS = ("estimate", "seen", "measured", "state", "own_shipped")
+
+
+class View(Group):
+    """All flights at the end of a step, in the episode that the step belongs to.
+
+    Arrays have one row per flight, are made when they are first read, and cannot be written to.
+    `quad_gym.tasks.fields.VIEW_FIELDS` lists them all with shapes, units and frames. They are in
+    groups: `truth`, `estimate` (of the filter), `seen` (what the controller goes by), `measured`,
+    `shipped` (what the id's task says). `view.position` is short for `view.truth.position`, as are
+    the other states. `view.state` holds what the task keeps.
+    """
+
+    __slots__ = ("_hidden", "_truth")
+
+    estimate: Estimate
+    seen: Seen
+    measured: Measured
+    state: State
+    own_shipped: Shipped
+    """`shipped`, which is never hidden from the batch itself"""
+
+    def __init__(self, flights: "TaskBatch", state: State) -> None:
+        super().__init__(flights)
+        self._hidden = False
+        self._truth = Truth(flights, self)
+        self._keep(state)
+
+    def _keep(self, state: State) -> None:
+        """The groups, which stay while their arrays come and go."""
+        flights = self._flights
+        self.__dict__.update(
+            estimate=Estimate(flights),
+            seen=Seen(flights),
+            measured=Measured(flights),
+            state=state,
+            own_shipped=Shipped(flights),
+        )
+
+    def forget(self) -> None:
+        """Forget what the flights are like; what is said of their step stays."""
+        mine = self.__dict__
+        kept = {name: mine[name] for name in _GROUPS}
+        mine.clear()
+        mine.update(kept)
+        for group in (self._truth, self.estimate, self.seen, self.measured):
+            group.forget()
+
+    def step_over(self) -> None:
+        """Forget all arrays, as a step has been flown."""
+        self.forget()
+        self.own_shipped.forget()
+
+    def begin(self, chosen: Truths) -> None:
+        """Forget what belongs to the last episodes of flights that have begun others."""
+        self.forget()
+        self.own_shipped.begin(chosen)
+
+    def hide(self, hidden: bool) -> None:
+        """Whether the truth is hidden, as from `observe`."""
+        self._hidden = hidden
+
+    # ---- what may be hidden -------------------------------------------------------------------
+
+    def _open(self, name: str) -> None:
+        if self._hidden:
+            raise HiddenTruthError(
+                f"observe cannot read the truth (view.{name}), which no controller knows: read "
+                "view.seen or view.estimate, or set privileged = True in the task"
+            )
+
+    @property
+    def truth(self) -> Truth:
+        """What is so; `observe` reads it only if the task is privileged."""
+        self._open("truth")
+        return self._truth
+
+    @property
+    def shipped(self) -> Shipped:
+        """What the id's task says of the step: it follows from the truth."""
+        self._open("shipped")
+        return self.own_shipped
+
+    @property
+    def position(self) -> Floats:
+        """(n, 3) true position in I [m]."""
+        self._open("position")
+        return self._truth.position
+
+    @property
+    def velocity(self) -> Floats:
+        """(n, 3) true velocity in I [m/s]."""
+        self._open("velocity")
+        return self._truth.velocity
+
+    @property
+    def R_BI(self) -> Floats:
+        """(n, 3, 3) true attitude, v_B = R_BI v_I."""
+        self._open("R_BI")
+        return self._truth.R_BI
+
+    @property
+    def quaternion(self) -> Floats:
+        """(n, 4) true attitude (w, x, y, z), B to I."""
+        self._open("quaternion")
+        return self._truth.quaternion
+
+    @property
+    def body_rates(self) -> Floats:
+        """(n, 3) true body rates [rad/s]."""
+        self._open("body_rates")
+        return self._truth.body_rates
+
+    @property
+    def rotor_speeds(self) -> Floats:
+        """(n, 4) true rotor speeds [rad/s]."""
+        self._open("rotor_speeds")
+        return self._truth.rotor_speeds
+
+    @property
+    def accel_bias(self) -> Floats:
+        """(n, 3) true bias of the accelerometer in B [m/s^2]."""
+        self._open("accel_bias")
+        return self._truth.accel_bias
+
+    @property
+    def gyro_bias(self) -> Floats:
+        """(n, 3) true bias of the gyro [rad/s]."""
+        self._open("gyro_bias")
+        return self._truth.gyro_bias
+
+    @property
+    def position_error(self) -> Floats:
+        """(n,) distance of the true position from the reference [m]."""
+        self._open("position_error")
+        return self._truth.position_error
+
+    @property
+    def estimation_error(self) -> Floats:
+        """(n,) distance of the seen from the true position [m]."""
+        self._open("estimation_error")
+        return self._truth.estimation_error
+
+    # ---- what everybody knows -----------------------------------------------------------------
+
+    @property
+    def count(self) -> int:
+        """How many flights there are, n."""
+        return self._flights.count  # type: ignore[no-any-return]
+
+    @property
+    def period(self) -> float:
+        """Of control, from step to step [s]."""
+        return self._flights.period  # type: ignore[no-any-return]
+
+    time = Shown("time", "(n,) since the start of the episode [s].")
+
+    @Lazy
+    def step(self) -> NDArray[np.int64]:
+        """(n,) steps since the start of the episode."""
+        return self._flights.columns("step").astype(np.int64)
+
+    @Lazy
+    def began(self) -> Truths:
+        """(n,) whether the episode has just begun, and nothing was flown in it."""
+        return self._flights.began.copy()
+
+    action = Shown("action", "(n, 4) action of this step, in [-1, 1].")
+
+    last_action = Shown("last_action", "(n, 4) the one before it.")
+
+    reference_position = Shown(
+        "r_ref", "(n, 3) where the vehicle should be, in I [m]; on a course, the next gate."
+    )
+
+    reference_velocity = Shown("v_ref", "(n, 3) of the reference in I [m/s].")
+
+    reference_acceleration = Shown("a_ref", "(n, 3) of the reference in I [m/s^2].")
+
+    reference_heading = Shown(
+        "x_ref", "(n, 3) horizontal direction that body x is to point in, in I."
+    )
+
+    preview = Shown(
+        "preview",
+        "(n, 2, 3) the reference a little later in I [m]; on a course, the gates after the next.",
+    )
+
+    @Lazy
+    def gates(self) -> Floats:
+        """(n, gates, 3) of a course in I [m], in order; none elsewhere."""
+        return self._flights.gates()
+
+    @Lazy
+    def gates_passed(self) -> NDArray[np.int64]:
+        """(n,) in this episode."""
+        return self._flights.shown[_GATE_NEXT].astype(np.int64)
+
+    @Lazy
+    def gate_passed(self) -> Truths:
+        """(n,) whether this step passed a gate."""
+        return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
+
+    @property
+    def features(self) -> Floats:
+        """(m, 3) markers that the camera sees, in I [m]."""
+        return self._flights.features  # type: ignore[no-any-return]
+
+    @Lazy
+    def observation(self) -> NDArray[np.float32]:
+        """(n, k) the shipped observation, less its privileged part."""
+        return self._flights.shipped_observation().copy()

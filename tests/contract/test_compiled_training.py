@@ -1,0 +1,192 @@
+"""Training with the compiled engine: repeatable, resumable after any death, without torch."""
+
+import json
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from baselines.compiled_ppo import CompiledPPO
+from baselines.keeping import STATE
+from baselines.mlp import MlpPolicy
+from baselines.plans import Plan
+from baselines.policies import load_policy
+from baselines.recipes import recipe
+from baselines.training import export, train
+
+ROOT = Path(__file__).resolve().parents[2]
+CIRCLE = "QuadGym/Circle-v0"
+
+
+def small_plan(**changes):
+    """A training of seconds."""
+    shipped = recipe(CIRCLE)
+    parameters = {**shipped.parameters, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
+    options = {
+        "recipe": shipped.replace(steps=2560, n_envs=16, parameters=parameters),
+        "environment": {"duration": 1.0},
+        "engine": "compiled",
+        "threads": 1,
+        "evaluations": 5,
+        "episodes": 8,
+    }
+    return Plan(**{**options, **changes})
+
+
+def run(plan, folder, **options):
+    return train(plan, folder, quiet=True, **options)
+
+
+def assert_same_policy(first, second):
+    first, second = (MlpPolicy.load(f / "last.npz") for f in (first, second))
+    for a, b in zip(first.weights + first.biases, second.weights + second.biases, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_same_seed_gives_the_same_policy_with_any_number_of_threads(tmp_path):
+    for name, threads in (("a", 1), ("b", 2)):
+        assert run(small_plan(threads=threads), tmp_path / name).finished
+    assert_same_policy(tmp_path / "a", tmp_path / "b")
+
+
+@pytest.mark.parametrize("rollouts", [3, 8])
+def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollouts):
+    plan = small_plan()
+    run(plan, tmp_path / "whole")
+    calls = iter(range(10_000))
+    roll_out = CompiledPPO._roll_out
+
+    def die(self):
+        if next(calls) == rollouts:
+            raise RuntimeError("died")
+        roll_out(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CompiledPPO, "_roll_out", die)
+        with pytest.raises(RuntimeError, match="died"):
+            run(plan, tmp_path / "cut")
+    assert run(plan, tmp_path / "cut", resume=True).finished
+    assert_same_policy(tmp_path / "whole", tmp_path / "cut")
+    rows = [(tmp_path / name / "evaluations.csv").read_text() for name in ("whole", "cut")]
+    timeless = [[line.split(",")[:1] + line.split(",")[2:] for line in r.split()] for r in rows]
+    assert timeless[0] == timeless[1]
+
+
+def test_the_best_policy_flies_by_its_file_and_can_be_exported(tmp_path):
+    done = run(small_plan(), tmp_path / "run")
+    assert done.best_policy == tmp_path / "run" / "best.npz"
+    env = gymnasium.make_vec(CIRCLE, num_envs=2, duration=1.0)
+    policy = load_policy(str(done.best_policy), env)
+    actions = policy.predict(env.reset(seed=0)[0])[0]
+    assert actions.shape == (2, 4)
+    with pytest.raises(ValueError, match="trained with action ctbr"):
+        load_policy(str(done.best_policy), gymnasium.make_vec(CIRCLE, 2, action="motor"))
+    export(done, tmp_path / "out" / "policy.npz")
+    exported = MlpPolicy.load(tmp_path / "out" / "policy.npz")
+    assert exported.record["finished"]
+    np.testing.assert_array_equal(exported.weights[0], policy.weights[0])
+
+
+class SameDraws:
+    """Draws what Stable-Baselines3 draws, from the same generators in the same order."""
+
+    def __init__(self, torch, flights, steps):
+        self.torch, self.flights, self.steps = torch, flights, steps
+        torch.manual_seed(1)
+        np.random.seed(1)  # noqa: NPY002
+
+    def standard_normal(self, shape, dtype):
+        return self.torch.normal(self.torch.zeros(shape), self.torch.ones(shape)).numpy()
+
+    def permutation(self, count):
+        flight, step = divmod(np.random.permutation(count), self.steps)  # noqa: NPY002
+        return step * self.flights + flight
+
+
+def test_with_the_same_draws_a_training_is_that_of_stable_baselines():
+    """Rollouts, episodes that end and are cut off, rewards, epochs, learning rate, all together."""
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("stable_baselines3")
+    from baselines.compiled_ppo.run import make_compiled
+    from baselines.models import make_model
+
+    parameters = {**recipe(CIRCLE).parameters, "n_steps": 64, "batch_size": 256}
+    steps = 3 * 16 * 64
+    plan = small_plan(recipe=recipe(CIRCLE).replace(steps=steps, n_envs=16, parameters=parameters))
+    ours, theirs = make_compiled(plan), make_model(plan, plan.make_flights())
+    nets, networks = theirs.policy.mlp_extractor, ours.networks
+    pairs = [(theirs.policy.log_std, networks.log_std)]
+    for table, layers in (
+        (networks.actor, (*nets.policy_net, theirs.policy.action_net)),
+        (networks.critic, (*nets.value_net, theirs.policy.value_net)),
+    ):
+        linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
+        for layer, (W, b) in zip(linear, networks.layers(table), strict=True):
+            pairs += [(layer.weight, W), (layer.bias, b)]
+    for tensor, view in pairs:
+        tensor.data[:] = torch.as_tensor(view)
+    before = [view.copy() for _, view in pairs]
+    ours._rng = SameDraws(torch, 16, 64)
+    ours.learn(steps)
+    SameDraws(torch, 16, 64)
+    theirs.learn(steps)
+    for (tensor, found), first in zip(pairs, before, strict=True):
+        want = tensor.detach().numpy()
+        assert np.linalg.norm(found - want) < 1e-4 * np.linalg.norm(want - first)
+    assert len(ours._finished) > 30
+    episodes = [record["r"] for record in theirs.ep_info_buffer]
+    assert ours.training_return == pytest.approx(np.mean(episodes), rel=1e-3)
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    run(small_plan(), tmp_path)
+    record = json.loads((tmp_path / "training.json").read_text())
+    (tmp_path / "training.json").write_text(json.dumps(record | {"finished": False}))
+    with zipfile.ZipFile(tmp_path / "last.npz") as archive:
+        assert STATE in archive.namelist()
+    (tmp_path / "last.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(ValueError, match="damaged"):
+        run(small_plan(), tmp_path, resume=True)
+    with pytest.raises(ValueError, match=r"another plan \(different: engine\)"):
+        run(small_plan(engine="sb3"), tmp_path, resume=True)
+
+
+def command(tmp_path, *more):
+    line = [sys.executable, str(ROOT / "scripts/train.py"), CIRCLE, "--engine", "compiled"]
+    line += ["--output", str(tmp_path / "run")]
+    line += ["--no-progress", "--threads", "1", "--episodes", "4", "--env", "duration=1.0"]
+    line += ["--n-envs", "16", "--steps", "1024", "--set", "n_steps=16", "batch_size=128"]
+    return subprocess.run([*line, *more], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+
+def test_the_command_trains_and_exports(tmp_path):
+    done = command(tmp_path, "--export", "policy.npz")
+    assert done.returncode == 0, done.stderr
+    assert "best.npz" in done.stdout
+    assert MlpPolicy.load(tmp_path / "policy.npz").record["plan"]["engine"] == "compiled"
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--algorithm", "sac"], "must be one of ppo"),
+        (["--set", "target_kl=0.1"], "target_kl is not a keyword of the compiled PPO"),
+    ],
+)
+def test_what_the_engine_lacks_is_refused_before_anything_is_trained(tmp_path, more, message):
+    done = command(tmp_path, *more)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (tmp_path / "run" / "last.npz").exists()
+
+
+def test_nothing_of_it_needs_torch():
+    code = (
+        "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
+        "import baselines.training, baselines.compiled_ppo.run"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

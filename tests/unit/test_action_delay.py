@@ -1,0 +1,181 @@
+"""Delayed actions: the flight of a delay is the flight of the actions shifted by it."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import Uniform
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.params.task import TaskParams
+from quad_gym.records import Autoreset, Control, Source
+
+TRUTH = ("r", "v", "q", "w", "rotor_speeds")
+ESTIMATE = (*TRUTH, "r_hat", "v_hat", "R_hat", "L")
+HOVER = TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e6)
+COUNT, STEPS = 3, 14
+
+
+def late_rtk():
+    suite = quad_gym.sensor_suite("rtk")
+    return suite.replace(
+        gnss=suite.gnss.replace(latency=0.1), camera=suite.camera.replace(latency=0.04)
+    )
+
+
+def batch(source=Source.TRUTH, control=Control.CTBR, rate=50.0, task=HOVER, **keywords):
+    made = FlightBatch(
+        COUNT,
+        task=task,
+        source=source,
+        control=control,
+        control_rate=rate,
+        autoreset=Autoreset.DISABLED,
+        threads=1,
+        **keywords,
+    )
+    made.reset(seeds=range(COUNT))
+    return made
+
+
+def commands(seed=1, steps=STEPS):
+    return np.random.default_rng(seed).uniform(-0.3, 0.3, (steps, COUNT, 4))
+
+
+def fly(flights, actions, fields=TRUTH):
+    """The fields after each action."""
+    found = []
+    for action in actions:
+        flights.step(action)
+        found.append([flights.read(name) for name in fields])
+    return found
+
+
+def equal(first, second):
+    return all(
+        np.array_equal(a, b)
+        for x, y in zip(first, second, strict=True)
+        for a, b in zip(x, y, strict=True)
+    )
+
+
+@pytest.mark.parametrize("delay", [1, 3, 10])
+@pytest.mark.parametrize("control", [Control.CTBR, Control.MOTOR, Control.VELOCITY])
+def test_a_delay_of_whole_steps_shifts_the_actions(delay, control):
+    actions = commands()
+    shifted = np.concatenate([np.zeros((delay, COUNT, 4)), actions])[:STEPS]
+    assert equal(
+        fly(batch(control=control, action_delay=delay), actions),
+        fly(batch(control=control), shifted),
+    )
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 3, 5, 7])
+def test_a_delay_of_parts_of_a_step_shifts_them_by_ticks(ticks):
+    """Four ticks in a step: as the same actions at 200 Hz, each four times, shifted."""
+    actions = commands()
+    every_tick = np.repeat(actions, 4, axis=0)
+    every_tick = np.concatenate([np.zeros((ticks, COUNT, 4)), every_tick])[: 4 * STEPS]
+    at_every_tick = fly(batch(rate=200.0), every_tick)
+    assert equal(fly(batch(action_delay=ticks / 4), actions), at_every_tick[3::4])
+
+
+@pytest.mark.parametrize("latency", [False, True], ids=["prompt", "late measurements"])
+def test_delays_are_the_same_on_the_estimate(latency):
+    actions = commands()
+    shifted = np.concatenate([np.zeros((2, COUNT, 4)), actions])[:STEPS]
+    options = {"sensors": late_rtk()} if latency else {}
+    delayed = batch(Source.ESTIMATE, Control.ATTITUDE, action_delay=2, **options)
+    prompt = batch(Source.ESTIMATE, Control.ATTITUDE, **options)
+    assert equal(fly(delayed, actions, ESTIMATE), fly(prompt, shifted, ESTIMATE))
+
+
+def test_each_episode_draws_its_own_delay():
+    """And flies as with that delay, rounded to ticks, given to all."""
+    randomization = {"action_delay": Uniform(0.0, 3.0)}
+    flights, actions = batch(randomization=randomization), commands()
+    drawn = flights.drawn()["action_delay"]
+    assert np.ptp(drawn) > 0.25
+    found = fly(flights, actions)
+    for flight, delay in enumerate(drawn):
+        alone = fly(batch(action_delay=np.floor(4.0 * delay + 0.5) / 4.0), actions)
+        for now, then in zip(found, alone, strict=True):
+            for a, b in zip(now, then, strict=True):
+                np.testing.assert_array_equal(a[flight], b[flight])
+    flights.reset()
+    assert not np.array_equal(flights.drawn()["action_delay"], drawn)
+
+
+def test_a_new_episode_forgets_the_actions_before_it():
+    short = HOVER.replace(duration=0.1)
+    flights = FlightBatch(
+        COUNT,
+        task=short,
+        source=Source.TRUTH,
+        control=Control.CTBR,
+        control_rate=50.0,
+        action_delay=3,
+        autoreset=Autoreset.SAME_STEP,
+        threads=1,
+    )
+    flights.reset(seeds=range(COUNT))
+    fly(flights, np.ones((5, COUNT, 4)))
+    assert (flights.read("episode") == 2.0).all()
+    assert not flights.read("past_actions")[:, :4].any()
+    flights.step(np.ones((COUNT, 4)))
+    assert not flights.read("delayed_action").any()
+
+
+def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
+    """While the delay lasts nothing but the cost of changes, 0.02 |da|^2 a step, differs."""
+    last = quad_gym.observation_layout("truth")[-1]
+    assert last.name == "last_action"
+    keywords = {"observation": "truth", "start": "hover"}
+    idle = gymnasium.make("QuadGym/Hover-v0", **keywords)
+    late = gymnasium.make("QuadGym/Hover-v0", action_delay=2, **keywords)
+    idle.reset(seed=3)
+    late.reset(seed=3)
+    before, zeros = np.zeros(4), np.zeros(4, np.float32)
+    for action in (np.full(4, 0.5, np.float32), np.full(4, -0.5, np.float32)):
+        observation, reward, *_ = late.step(action)
+        np.testing.assert_array_equal(observation[last.slice], action)
+        other, unchanged, *_ = idle.step(zeros)
+        np.testing.assert_array_equal(observation[: last.slice.start], other[: last.slice.start])
+        cost = 0.02 * np.sum((action - before) ** 2)
+        assert unchanged - reward == pytest.approx(cost, rel=1e-9)
+        before = action
+    observation, *_ = late.step(zeros)  # carries out the first action
+    other, *_ = idle.step(zeros)
+    assert not np.array_equal(observation[: last.slice.start], other[: last.slice.start])
+
+
+def test_a_vector_environment_flies_as_the_single_one():
+    keywords = {"action_delay": 1.5, "randomize": True}
+    many = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, **keywords)
+    one = gymnasium.make("QuadGym/Circle-v0", **keywords)
+    rows, _ = many.reset(seed=7)
+    row, _ = one.reset(seed=9)
+    np.testing.assert_array_equal(rows[2], row)
+    for action in commands(2, 5).astype(np.float32):
+        rows, *_ = many.step(action)
+        row, *_ = one.step(action[2])
+        np.testing.assert_array_equal(rows[2], row)
+
+
+@pytest.mark.parametrize("delay", [-0.1, 10.5, np.nan, "1", None])
+def test_a_delay_that_cannot_be_is_refused(delay):
+    with pytest.raises(ValueError, match="action_delay must be"):
+        batch(action_delay=delay)
+
+
+def test_a_draw_beyond_the_longest_delay_is_refused():
+    with pytest.raises(ValueError, match="action_delay"):
+        batch(randomization={"action_delay": Uniform(0.0, 11.0)})
+
+
+@pytest.mark.parametrize(
+    "delayed", [{"action_delay": 1}, {"randomization": {"action_delay": Uniform(0, 1)}}]
+)
+def test_a_flight_without_actions_takes_no_delay(delayed):
+    with pytest.raises(ValueError, match="action_delay needs actions"):
+        batch(control=Control.PD, **delayed)

@@ -1,0 +1,262 @@
+"""The slow error of GNSS positions among the filter's states."""
+
+import decimal
+from decimal import Decimal
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.faults import GnssJump, GnssOutliers
+from tests.circle_flight import record_circle
+from tests.field_flights import fly, nees, state_errors, steps
+from tests.reference_late import Rewinding
+from tests.reference_ukf import PlainEKF, PlainUKF, array_of, east_north_up
+
+CONSUMER, LAB = quad_gym.sensor_suite("consumer"), quad_gym.sensor_suite("lab")
+DRIFTING = LAB.replace(gnss=LAB.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=20.0))
+
+
+def with_filter(suite, **choices):
+    return suite.replace(estimator=suite.estimator.replace(**choices))
+
+
+# ---- against a plain filter of eighteen states -----------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "kinds", [(UnscentedKalmanFilter, PlainUKF), (ExtendedKalmanFilter, PlainEKF)]
+)
+@pytest.mark.parametrize(
+    "suite",
+    [
+        DRIFTING,
+        DRIFTING.replace(camera=None),
+        with_filter(DRIFTING, integration="midpoint", covariance_reset="turn", alpha=0.7),
+        with_filter(DRIFTING, covariance_reset="turn"),
+    ],
+    ids=["with camera", "GNSS alone", "field filter", "Euler and turn"],
+)
+def test_the_filter_equals_a_plain_one_with_the_slow_error_in_its_state(suite, kinds):
+    """The plain one computes in 45 digits; measurements come and go."""
+    ours_class, plain_class = kinds
+    ticks, seed = 40, 3
+    recording = record_circle(suite, ticks, seed)
+    recording.gnss_position += np.linspace(0.0, 0.3, ticks)[:, np.newaxis]
+    has = np.random.default_rng(seed).random((ticks, 2)) < 0.7
+    with decimal.localcontext() as context:
+        context.prec = 45
+        ours, plain = ours_class(suite), plain_class(suite, Decimal)
+        for one in (ours, plain):
+            one.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
+        for k in range(ticks):
+            for one in (ours, plain):
+                one.update(
+                    recording.gnss_position[k] if has[k, 0] else None,
+                    recording.gnss_baseline[k] if has[k, 1] else None,
+                    recording.pixels[k],
+                )
+                one.predict(recording.gyro[k], recording.accel[k])
+        for name, tolerance in (
+            ("position", 1e-9),
+            ("velocity", 1e-8),
+            ("R_BI", 1e-9),
+            ("accel_bias", 1e-7),
+            ("gyro_bias", 1e-10),
+            ("gnss_drift", 1e-9),
+        ):
+            gap = abs(array_of(Decimal, getattr(ours, name)) - getattr(plain, name)).max()
+            assert float(gap) < tolerance, name
+        P = plain.P.astype(float)
+    sigma = np.sqrt(np.diag(P))
+    relative = np.outer(sigma, sigma)
+    assert abs((ours.covariance - P[:15, :15]) / relative[:15, :15]).max() < 1e-7
+    assert abs((ours.gnss_drift_covariance - P[15:, 15:]) / relative[15:, 15:]).max() < 1e-7
+    assert abs(ours.gnss_drift).max() > 0.01  # there was something to find
+    assert ours.status == 0
+
+
+def test_a_filter_without_a_slow_error_has_none():
+    ours = UnscentedKalmanFilter(LAB)
+    ours.initialize(np.ones(3), np.array([0.1, 0.0, 0.0]))
+    ours.update(gnss_position_G=np.ones(3))
+    np.testing.assert_array_equal(ours.gnss_drift, 0.0)
+    np.testing.assert_array_equal(ours.gnss_drift_covariance, 0.0)
+
+
+def test_a_slow_error_in_one_axis_leaves_the_others_without():
+    suite = CONSUMER.replace(gnss=CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.0, 0.0)))
+    batch = fly(suite, 50, task="hover")
+    steps(batch, 5.0)
+    assert not batch.read("filter_status").any()
+    drift = batch.read("gnss_drift_hat")
+    assert (abs(drift[:, 1:]) < 1e-5).all()
+    assert abs(drift[:, 0]).max() > 0.1
+
+
+# ---- against the best that linear theory allows ----------------------------------------------
+
+
+def riccati(gnss, axis, seconds, speed_sigma=0.03):
+    """Variance of the position of a vehicle on a line, by a Kalman filter of (r, v, b, d).
+
+    Attitude and lever arms are known, so that no filter of the vehicle can do better.
+    """
+    dt, imu = 1.0 / gnss.rate, CONSUMER.imu
+    decay, kept = np.exp(-dt / imu.accel_bias_tau), np.exp(-dt / gnss.drift_tau)
+    F = np.array([[1, dt, -(dt**2) / 2, 0], [0, 1, -dt, 0], [0, 0, decay, 0], [0, 0, 0, kept]])
+    white, slow = gnss.position_sigma_I[axis], gnss.drift_sigma_I[axis]
+    Q = np.diag([0, 0, imu.accel_bias_sigma**2 * (1 - decay**2), slow**2 * (1 - kept**2)])
+    Q[:2, :2] = imu.accel_noise_density**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    P = np.diag([white**2, speed_sigma**2, imu.accel_bias_sigma**2, 0.0])
+    H, R = np.array([[1.0, 0, 0, 1], [0, 1.0, 0, 0]]), np.diag([white**2, gnss.velocity_sigma**2])
+    for _ in range(round(seconds / dt)):
+        P = F @ P @ F.T + Q
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+        P = P - K @ H @ P
+    return P[0, 0]
+
+
+def test_the_position_is_about_as_good_as_theory_allows():
+    """Within 15 % after 10 s; the mean square of 300 flights is off by 4 % or so by chance."""
+    batch = fly(CONSUMER, 300)
+    steps(batch, 10.0)
+    square = np.square(state_errors(batch)[:, :3]).mean(axis=0)
+    best = np.array([riccati(CONSUMER.gnss, axis, 10.0) for axis in range(3)])
+    assert (square > 0.75 * best).all()
+    assert square.sum() < 1.32 * best.sum()
+
+
+def test_the_slow_error_is_estimated_as_well_as_claimed():
+    batch = fly(CONSUMER, 300)
+    steps(batch, 10.0)
+    error, L = batch.read("gnss_drift") - batch.read("gnss_drift_hat"), batch.read("L_drift")
+    P = L @ L.transpose(0, 2, 1)
+    square = np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., np.newaxis])[..., 0])
+    assert square.mean() == pytest.approx(3.0, abs=5 * np.sqrt(6 / 300))
+    assert (
+        np.square(error).mean(axis=0) < 0.25 * np.square(batch.read("gnss_drift")).mean(axis=0)
+    ).all()
+
+
+# ---- warm, late, gated -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+@pytest.mark.parametrize("start", ["cold", "warm"])
+@pytest.mark.parametrize("latency", [0.0, 0.1, 0.2])
+def test_the_filter_is_consistent(kind, start, latency):
+    """A mean over 300 flights has a deviation of 0.32; here are five of them."""
+    suite = with_filter(CONSUMER, kind=kind)
+    suite = suite.replace(gnss=suite.gnss.replace(latency=latency))
+    batch = fly(suite, 300, filter_start=start)
+    for _ in range(3):
+        steps(batch, 1.5)
+        assert nees(batch).mean() == pytest.approx(15.0, abs=1.6)
+    assert not batch.read("filter_status").any()
+
+
+def test_a_warm_start_draws_the_slow_error_of_a_receiver_that_has_run():
+    """It has its variance after ten seconds, and goes with the errors as the filter claims."""
+    batch = fly(CONSUMER, 4000, task="hover", filter_start="warm")
+    true, error = batch.read("gnss_drift"), batch.read("gnss_drift") - batch.read("gnss_drift_hat")
+    expected = np.array(CONSUMER.gnss.drift_sigma_I) * np.sqrt(1 - np.exp(-20.0 / 60.0))
+    np.testing.assert_allclose(true.std(axis=0), expected, rtol=0.06)
+    L = np.zeros((4000, 18, 18))
+    L[:, :15, :15], L[:, 15:] = batch.read("L"), batch.read("L_drift")
+    joint = np.concatenate([state_errors(batch), error], axis=1)
+    white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0]
+    np.testing.assert_allclose(np.cov(white.T), np.eye(18), atol=0.1)
+    # an estimate is independent of its error
+    correlation = (batch.read("gnss_drift_hat") * error).mean(axis=0) / error.std(axis=0)
+    assert (abs(correlation / batch.read("gnss_drift_hat").std(axis=0)) < 0.08).all()
+
+
+def test_late_fixes_leave_what_filtering_all_over_again_does():
+    """Fixes of 10 Hz that arrive after 0.1 s, and a filter that goes back to every one of them."""
+    lab = LAB.replace(camera=None).with_rates(gnss=10.0)
+    gnss = lab.gnss.replace(
+        drift_sigma_I=(0.6, 0.6, 1.0), position_sigma_I=(0.2, 0.2, 0.4), latency=0.1, phase=0.5
+    )
+    suite = with_filter(
+        lab.replace(imu=lab.imu.replace(samples="average"), gnss=gnss),
+        integration="midpoint",
+        covariance_reset="turn",
+        reuse_first_fix=False,
+    )
+    batch = fly(suite, 1, task="hover")
+    plain = PlainUKF(suite.replace(gnss=suite.gnss.replace(latency=0.0)))
+    reference = start_like(batch, plain)
+    for tick in range(1, 601):
+        batch.step()
+        reference.predict(batch.read("gyro")[0], batch.read("accel")[0])
+        if batch.read("position_valid")[0]:
+            reference.update(
+                tick - 20,
+                gnss_position_G=batch.read("gnss_position")[0],
+                gnss_baseline_G=batch.read("gnss_baseline")[0],
+            )
+    sigma = np.sqrt(np.diag(plain.P))
+    assert (abs(batch.read("r_hat")[0] - plain.r) < 0.1 * sigma[:3]).all()
+    assert (abs(batch.read("gnss_drift_hat")[0] - plain.d) < 0.1 * sigma[15:]).all()
+    ours = np.sqrt(np.diag(batch.read("L_drift")[0] @ batch.read("L_drift")[0].T))
+    np.testing.assert_allclose(ours, sigma[15:], rtol=0.05)
+
+
+def start_like(batch, plain):
+    """A plain filter with a memory that begins as the filter of a batch's only flight."""
+    for name, field in (
+        ("r", "r_hat"),
+        ("v", "v_hat"),
+        ("R", "R_hat"),
+        ("b_a", "b_a_hat"),
+        ("b_g", "b_g_hat"),
+        ("d", "gnss_drift_hat"),
+    ):
+        setattr(plain, name, batch.read(field)[0])
+    plain.P = np.zeros((18, 18))
+    plain.P[:15, :15] = batch.covariance()[0]
+    plain.P[15:, 15:] = 1e-20 * np.eye(3)
+    return Rewinding(plain)
+
+
+def test_a_gross_outlier_is_rejected():
+    """A third of the fixes are off by 5 m and more, and the estimate hardly feels it."""
+    outliers = GnssOutliers(share=0.3, size=(10.0, 30.0))
+    batch, sound = fly(CONSUMER, 100, faults=outliers), fly(CONSUMER, 100)
+    struck = rejected = 0
+    for _ in range(1000):
+        batch.step()
+        hit = (batch.read("position_valid") > 0.0) & (batch.read("outlier") > 0.0)
+        struck += hit.sum()
+        rejected += (hit & (batch.read("gate")[:, 0] == 2.0)).sum()
+    assert struck > 1000
+    assert rejected > 0.98 * struck
+    steps(sound, 5.0)
+    rms = [np.sqrt(np.square(state_errors(b)[:, :3]).sum(axis=1).mean()) for b in (batch, sound)]
+    assert rms[0] < 1.2 * rms[1]
+
+
+def test_a_jump_of_the_fixes_shows_in_the_innovations_and_moves_the_slow_error():
+    batch = fly(CONSUMER, 100, task="hover", faults=GnssJump(start=3.0, size=5.0, duration=1e3))
+    steps(batch, 3.2)
+    assert (batch.read("block_nis")[:, 0] > 100.0).mean() > 0.9
+    assert (batch.read("gate")[:, 0] == 2.0).all()
+    steps(batch, 3.0)  # the gate is reopened meanwhile
+    assert batch.read("reopened")[:, 0].min() >= 1.0
+    assert (batch.read("gate")[:, 0] == 1.0).all()
+    assert nees(batch, slice(0, 3)).mean() < 30.0
+
+
+def test_the_estimate_follows_the_fixes_in_an_environment():
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=8, sensors="consumer")
+    env.reset(seed=1)
+    batch = env.unwrapped.flights.batch
+    R_IG = east_north_up(CONSUMER.gnss.reference_antenna_G)
+    for _ in range(50):
+        env.step(np.zeros((8, 4), np.float32))
+    fix = batch.read("gnss_position") @ R_IG.T - batch.read("r_hat") - batch.read("gnss_drift_hat")
+    assert np.abs(fix - [0.0, 0.0, 0.0472]).max() < 5 * 0.4
+    env.close()

@@ -1,0 +1,306 @@
+"""Errors of scale and alignment, vibration, constant heading errors, and what limits a camera.
+
+Flights on the true state fly alike whatever measures them, so that samples with an effect and
+without it, of the same seeds, differ by the effect alone.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.packing.flight import params_record
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
+from quad_gym.records import Autoreset, Control, Source
+from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
+from quad_gym.vehicle import state_derivative
+
+LAB, STANDARD = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("standard")
+HOVER = TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e6, max_tilt=math.pi)
+CALM_IMU = {
+    "accel_noise_density": 1e-12,
+    "gyro_noise_density": 1e-12,
+    "accel_bias_sigma": 1e-12,
+    "gyro_bias_sigma": 1e-12,
+}
+ERRORS = {
+    "accel_scale_sigma": 0.004,
+    "accel_misalignment_sigma": 0.002,
+    "gyro_scale_sigma": 0.01,
+    "gyro_misalignment_sigma": 0.005,
+}
+
+
+def batch(suite, count=64, control=Control.MOTOR, **keywords):
+    made = FlightBatch(
+        count,
+        sensors=suite,
+        task=keywords.pop("task", HOVER),
+        source=Source.TRUTH,
+        control=control,
+        run_filter=True,
+        autoreset=Autoreset.DISABLED,
+        threads=1,
+        **keywords,
+    )
+    made.reset(seeds=range(count))
+    return made
+
+
+def with_imu(suite, **changes):
+    return suite.replace(imu=suite.imu.replace(**changes))
+
+
+def with_camera(**changes):
+    camera = LAB.camera.replace(
+        features_I=tuple(
+            (x, y, z) for x in (-4.0, 0.0, 4.0) for y in (-3.0, 3.0) for z in (0, 1.0)
+        ),
+        **changes,
+    )
+    return LAB.replace(camera=camera)
+
+
+def fly(flights, actions, fields):
+    """(steps, flights, ...) of each field."""
+    found = [[] for _ in fields]
+    for action in actions:
+        flights.step(np.broadcast_to(action, (flights.count, 4)))
+        for values, name in zip(found, fields, strict=True):
+            values.append(flights.read(name))
+    return [np.array(values) for values in found]
+
+
+def shaking(count, steps=40, seed=5):
+    return np.random.default_rng(seed).uniform(-0.6, 0.6, (steps, count, 4))
+
+
+def specific_force(state, vehicle, lever):
+    """What an accelerometer at `lever` feels, by the public model of the vehicle."""
+    rate = state_derivative(state, np.zeros(4), np.zeros(3), vehicle)
+    w, dw = state["body_rates"], rate["body_rates"]
+    f = state["R_BI"] @ (rate["velocity"] + [0.0, 0.0, vehicle.gravity])
+    return f + np.cross(dw, lever) + np.cross(w, np.cross(w, lever))
+
+
+@pytest.mark.parametrize(
+    "lever", [(0.0, 0.0, 0.0), (0.05, -0.03, 0.02)], ids=["center", "lever arm"]
+)
+def test_regression_on_the_true_force_recovers_scale_and_alignment(lever):
+    """With exact sensors; the errors' standard deviations are those asked for."""
+    count, vehicle = 96, VehicleParams()
+    suite = with_imu(LAB, **CALM_IMU, **ERRORS, lever_arm_B=lever)
+    fast = {"start_velocity_I": quad_gym.Uniform(-5.0, 5.0)}  # so that there is drag
+    flights = batch(suite, count, randomization=fast)
+    names = ("r", "v", "q", "w", "rotor_speeds", "accel", "gyro")
+    r, v, q, w, speeds, accel, gyro = fly(flights, shaking(count), names)
+    accel_errors, gyro_errors = np.empty((2, count, 3, 3))
+    for k in range(count):
+        force = np.array(
+            [
+                specific_force(
+                    {
+                        "position": r[t, k],
+                        "velocity": v[t, k],
+                        "R_BI": quaternion_to_dcm(q[t, k]),
+                        "body_rates": w[t, k],
+                        "rotor_speeds": speeds[t, k],
+                    },
+                    vehicle,
+                    np.array(lever),
+                )
+                for t in range(len(r))
+            ]
+        )
+        excess = force - [0.0, 0.0, vehicle.gravity]
+        accel_errors[k] = np.linalg.lstsq(excess, accel[:, k] - force, rcond=None)[0].T
+        gyro_errors[k] = np.linalg.lstsq(w[:, k], gyro[:, k] - w[:, k], rcond=None)[0].T
+    np.testing.assert_allclose(accel_errors, flights.read("accel_error"), atol=2e-6)
+    np.testing.assert_allclose(gyro_errors, flights.read("gyro_error"), atol=2e-6)
+    diagonal = np.eye(3, dtype=bool)
+    for errors, name in ((accel_errors, "accel"), (gyro_errors, "gyro")):
+        for kind, entries in (
+            ("scale", errors[:, diagonal]),
+            ("misalignment", errors[:, ~diagonal]),
+        ):
+            total = np.sum(np.square(entries / ERRORS[f"{name}_{kind}_sigma"]))
+            low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], entries.size)
+            assert low < total < high, (name, kind)
+
+
+def test_averaged_samples_err_in_what_differs_from_rest():
+    """The mean over a tick with errors is (I + D) that without, about (0, 0, g)."""
+    plain, erring = batch(STANDARD), batch(with_imu(STANDARD, **ERRORS))
+    names = ("accel", "gyro", "w_meas", "r", "q")
+    without, found = (fly(b, shaking(64, 20), names) for b in (plain, erring))
+    D_a, D_g = erring.read("accel_error"), erring.read("gyro_error")
+    excess = without[0] - [0.0, 0.0, VehicleParams().gravity]
+    np.testing.assert_allclose(
+        found[0] - without[0], np.einsum("kij,tkj->tki", D_a, excess), atol=1e-12
+    )
+    for k in (1, 2):
+        np.testing.assert_allclose(
+            found[k] - without[k], np.einsum("kij,tkj->tki", D_g, without[k]), atol=1e-12
+        )
+    for k in (3, 4):
+        np.testing.assert_array_equal(found[k], without[k])
+
+
+def test_errors_last_an_episode():
+    flights = batch(with_imu(STANDARD, **ERRORS), 8)
+    first = flights.read("accel_error")
+    flights.step(np.zeros((8, 4)))
+    np.testing.assert_array_equal(flights.read("accel_error"), first)
+    flights.reset()
+    assert not np.isclose(flights.read("accel_error"), first).any()
+
+
+@pytest.mark.parametrize("suite", [LAB, STANDARD], ids=["instant", "average"])
+def test_vibration_grows_with_the_square_of_the_rotor_speeds(suite):
+    """Its variance is that of hovering times the mean fourth power of the speeds over hover's."""
+    vehicle, count = VehicleParams(), 64
+    hover = vehicle.motor_speed_per_volt * vehicle.hover_voltage
+    shaken = with_imu(suite, accel_vibration=0.3, gyro_vibration=0.02)
+    for level in ((0.0, 0.0, 0.0, 0.0), (-0.3, 0.4, -0.3, 0.4)):
+        # rotors settle in ten time constants; what a wild attitude does to means does not matter
+        actions = np.broadcast_to(np.array(level), (130, count, 4))
+        names = ("accel", "gyro", "w_meas", "rotor_speeds")
+        without, found = (fly(batch(s, count), actions, names) for s in (suite, shaken))
+        speeds = found[3][100:]
+        expected = np.mean(speeds**4, axis=-1) / hover**4
+        if not any(level):
+            np.testing.assert_allclose(expected, 1.0, rtol=1e-6)
+        for k, sigma in ((0, 0.3), (1, 0.02), (2, 0.02)):
+            scaled = (found[k] - without[k])[100:] / (sigma * np.sqrt(expected))[..., np.newaxis]
+            low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], scaled.size)
+            assert low < np.sum(scaled**2) < high, (level, k)
+            assert abs(np.mean(scaled[1:] * scaled[:-1])) < 5.0 / math.sqrt(scaled.size)
+
+
+def test_the_filter_takes_vibration_for_white_noise_and_the_sensor_does_not():
+    imu = STANDARD.imu.replace(accel_vibration=0.3, gyro_vibration=0.02)
+    record = params_record(VehicleParams(), STANDARD.replace(imu=imu))[0]
+    root = math.sqrt(imu.rate)
+    assert record["accel_sigma"] == pytest.approx(imu.accel_noise_density * root, rel=1e-14)
+    assert record["accel_noise"] == pytest.approx(math.hypot(record["accel_sigma"], 0.3), rel=1e-14)
+    assert record["gyro_noise"] == pytest.approx(math.hypot(record["gyro_sigma"], 0.02), rel=1e-14)
+
+
+# ---- headings ---------------------------------------------------------------------------------
+
+
+def test_baselines_of_an_episode_share_a_turn_about_body_z():
+    sigma, count = 0.1, 400
+    erring = LAB.replace(gnss=LAB.gnss.replace(heading_error_sigma=sigma))
+    plain, turned = batch(LAB, count), batch(erring, count)
+    actions = shaking(count, 10)
+    (without, q), (found, _) = (fly(b, actions, ("gnss_baseline", "q")) for b in (plain, turned))
+    R_IG = quad_gym.frames.ecef_to_enu(LAB.gnss.reference_antenna_G)
+    error = turned.read("heading_error")
+    for t in range(10):
+        R_BI = quaternion_to_dcm(q[t])
+        before = np.einsum("kij,jl,kl->ki", R_BI, R_IG, without[t])
+        after = np.einsum("kij,jl,kl->ki", R_BI, R_IG, found[t])
+        angle = np.arctan2(after[:, 1], after[:, 0]) - np.arctan2(before[:, 1], before[:, 0])
+        np.testing.assert_allclose(np.sin(angle), np.sin(error), atol=1e-9)
+        np.testing.assert_allclose(after[:, 2], before[:, 2], atol=1e-9)
+    low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], count)
+    assert low < np.sum(np.square(error / sigma)) < high
+
+
+def test_the_filter_counts_a_constant_heading_error_for_the_length_of_a_flight():
+    """Conditioned on white baselines for a minute, its variance is half that of the constant."""
+    gnss = LAB.gnss.replace(rate=10.0, baseline_sigma=1e-4, heading_error_sigma=0.05)
+    information = 60.0 * gnss.rate / gnss.believed_baseline_sigma**2
+    assert 1.0 / (1.0 / gnss.first_baseline_sigma**2 + information) == pytest.approx(
+        0.05**2 / 2.0, rel=1e-3
+    )
+
+
+# ---- the camera -------------------------------------------------------------------------------
+
+
+def seen_by_projection(flights, camera, ground=None):
+    """Which features a camera sees, by NumPy."""
+    R_CB = euler_to_dcm(camera.attitude)
+    features, expected = np.array(camera.features_I), []
+    for r, q in zip(flights.read("r"), flights.read("q"), strict=True):
+        R_BI = quaternion_to_dcm(q)
+        center = r + R_BI.T @ camera.position_B
+        v_C = (R_CB @ R_BI @ (features - center).T).T
+        front = v_C[:, 2] > 0.0
+        pixels = camera.focal_length * v_C[:, :2] / np.where(front, v_C[:, 2], 1.0)[:, np.newaxis]
+        inside = np.all(np.abs(pixels) <= np.array(camera.image_size) / 2.0, axis=1)
+        near = np.linalg.norm(features - center, axis=1) <= camera.max_range
+        seen = front & inside & near
+        if ground is not None:
+            seen &= (center[2] >= ground) & (features[:, 2] >= ground)
+        expected.append(seen)
+    return np.array(expected)
+
+
+def test_features_beyond_the_range_are_not_seen():
+    suite = with_camera(max_range=5.5)
+    flights = batch(suite, 200, randomization={"start_yaw": quad_gym.Uniform(-3.0, 3.0)})
+    found = flights.read("feature_valid")[:, :12] > 0.0
+    np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera))
+    unlimited = seen_by_projection(flights, suite.camera.replace(max_range=math.inf))
+    assert 0.1 < found.sum() / unlimited.sum() < 0.9
+
+
+@pytest.mark.parametrize("ground", [-0.1, 0.5, 1.05])
+def test_the_ground_hides_what_is_below_it_and_everything_from_below(ground):
+    """Features are at 0 and 1 m, cameras about 1 m high."""
+    suite = with_camera(ground_hides=True)
+    flights = batch(suite, 200, world=WorldParams(ground_height=ground))
+    found = flights.read("feature_valid")[:, :12] > 0.0
+    np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera, ground))
+    above = seen_by_projection(flights, suite.camera)
+    assert found.any() == (ground < 1.0)
+    assert (found.sum() < above.sum()) == (ground > 0.0)
+
+
+def test_a_feature_on_the_ground_is_seen():
+    suite = with_camera(ground_hides=True)
+    flights = batch(suite, 50, world=WorldParams(ground_height=0.0))
+    found = flights.read("feature_valid")[:, :12] > 0.0
+    np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera))
+
+
+@pytest.mark.parametrize("rate", [0.0, 2.0])
+def test_blur_grows_with_the_body_rate(rate):
+    """Places in a smear of focal_length |w| exposure pixels, evenly."""
+    spin = {"start_body_rates": [None, None, quad_gym.Uniform(rate, rate)]}
+    sharp, blurred = with_camera(), with_camera(exposure=0.004)
+    plain, found = (batch(s, 400, randomization=spin) for s in (sharp, blurred))
+    seen = found.read("feature_valid") > 0.0
+    np.testing.assert_array_equal(seen, plain.read("feature_valid") > 0.0)
+    shift = (found.read("pixels") - plain.read("pixels"))[seen].ravel()
+    smear = sharp.camera.focal_length * rate * 0.004
+    if rate == 0.0:
+        assert not shift.any()
+        return
+    assert np.abs(shift).max() <= smear / 2.0 * (1.0 + 1e-9)
+    assert stats.kstest(shift, stats.uniform(-smear / 2.0, smear).cdf).pvalue > 1e-5
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("imu", "accel_scale_sigma", -0.1),
+        ("imu", "gyro_misalignment_sigma", 0.2),
+        ("imu", "accel_vibration", math.nan),
+        ("gnss", "heading_error_sigma", -1.0),
+        ("camera", "max_range", 0.0),
+        ("camera", "exposure", -0.001),
+        ("camera", "ground_hides", 1),
+    ],
+)
+def test_values_that_cannot_be_are_refused(part, name, value):
+    with pytest.raises(ValueError, match=name):
+        getattr(LAB, part).replace(**{name: value})
