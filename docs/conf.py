@@ -21,7 +21,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "extensions.docstrings",
     "extensions.environment_pages",
-    "extensions.mathml",
+    "extensions.equations",
 ]
 exclude_patterns = ["_build", "gallery", "tutorials/*.ipynb", "tutorials/*.py"]
 suppress_warnings = [
@@ -65,7 +65,7 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
 }
 
-html_math_renderer = "mathml"
+html_math_renderer = "pictures"
 html_theme = "furo"
 html_title = f"quad_gym {version}"
 html_static_path = ["_static"]

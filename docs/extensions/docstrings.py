@@ -4,11 +4,15 @@ Tables in docstrings are Markdown's, as `help` shows them best. The specificatio
 `QuadEnv`'s docstring, has its own pages (`environment_pages.py`); its arguments stay.
 """
 
+import re
 from collections.abc import Iterator
 from itertools import groupby
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from sphinx.application import Sphinx
+from sphinx.util.typing import stringify_annotation
 
 SPECIFICATION = (
     "A quadrotor that is controlled on estimated state.",
@@ -16,6 +20,20 @@ SPECIFICATION = (
     "Observation, action, reward, start, endings and `info` are on the page of each environment.",
     "",
 )
+ALIAS = re.compile("Alias for field number")
+"""What Python says of the fields of a named tuple."""
+
+ARRAYS = {
+    stringify_annotation(long, "smart"): short
+    for long, short in (
+        (ArrayLike, "~numpy.typing.ArrayLike"),
+        (NDArray[np.float64], "NDArray[float64]"),
+        (NDArray[np.float32], "NDArray[float32]"),
+        (NDArray[np.int64], "NDArray[int64]"),
+        (NDArray[np.bool_], "NDArray[bool]"),
+        (NDArray[Any], "NDArray"),
+    )
+}
 
 
 def _cells(line: str) -> list[str]:
@@ -48,8 +66,29 @@ def rewrite(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
         found += _list_table(part) if is_table and len(part) > 2 else part
     lines[:] = found
 
+    if what in ("attribute", "data", "property"):
+        # Napoleon would take what stands before a colon, such as "I: inertial", for a type
+        lines[:] = ["", *(line for line in lines if not ALIAS.match(line))]
+
+
+def shorten(
+    app: Sphinx,
+    what: str,
+    name: str,
+    obj: Any,
+    options: Any,
+    signature: str | None,
+    returns: str | None,
+) -> tuple[str | None, str | None]:
+    """Types of arrays by the names that the code has for them."""
+    parts = [signature, returns]
+    for long, short in ARRAYS.items():
+        parts = [part and part.replace(long, short) for part in parts]
+    return parts[0], parts[1]
+
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Rewrite docstrings before Napoleon does."""
     app.connect("autodoc-process-docstring", rewrite, priority=100)
+    app.connect("autodoc-process-signature", shorten)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

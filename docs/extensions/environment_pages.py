@@ -29,6 +29,7 @@ from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights.record import COLUMNS, FEATURES
 from quad_gym.params.suites import SUITES
 from quad_gym.records import FLIGHT_FIELDS
+from quad_gym.tasks.fields import VIEW_FIELDS
 
 FOLDER = "generated"
 """Where the pages go, inside the sources of the site; Git ignores it."""
@@ -146,6 +147,9 @@ def _keywords_page() -> str:
         for name in looks
         if name.startswith("render_") and name != "render_mode"
     }
+    missing = sorted(set(defaults) - set(said))
+    if missing:
+        raise ExtensionError(f"the specification says nothing of {', '.join(missing)}")
     rows = [(f"`{name}`", _value(value), said[name]) for name, value in defaults.items()]
     return (
         "# Keywords of every environment\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
@@ -216,6 +220,7 @@ def _suites_page() -> str:
 def _fields_page() -> str:
     """What a flight's record and a recorded flight hold."""
     fields = [(f"`{f.name}`", str(f.shape), f.unit, f.meaning) for f in FLIGHT_FIELDS]
+    view = [(f"`{f.name}`", f.shape, f.unit, f.frame, f.meaning) for f in VIEW_FIELDS]
     columns = [
         (
             f"`{c.name}`",
@@ -231,7 +236,10 @@ def _fields_page() -> str:
         "a row for each control step.\n\n"
         + _table(("column", "shape of a row", "unit", "frame", "meaning"), columns)
         + "\n## Fields of a flight's record\n\nWhat `FlightBatch.read` returns by name, with the "
-        "flights as a first axis.\n\n" + _table(("field", "shape", "unit", "meaning"), fields)
+        "flights as a first axis.\n\n"
+        + _table(("field", "shape", "unit", "meaning"), fields)
+        + "\n## Fields of a view\n\nWhat the methods of a `quad_gym.Task` read.\n\n"
+        + _table(("field", "shape", "unit", "frame", "meaning"), view)
     )
 
 

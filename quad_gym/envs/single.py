@@ -170,8 +170,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize, duration,
             out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration, gate_count,
             gate_radius, preview; see `quad_gym.TaskParams`.
-        custom: Reward, endings, observation and reset of your own: a `quad_gym.Task`, a class of
-            them, or its "module:name".
+        custom: A task of your own, laid over that of the id: a `quad_gym.Task`, its class, or
+            "module:name" of either.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.
         render_size: Width and height of a frame [pixels].

@@ -130,7 +130,7 @@ class Heading(Piece):
 
 @dataclass(frozen=True)
 class Effort(Piece):
-    """|a - a_last|^2: how much the action has changed."""
+    """`|a - a_last|^2`: how much the action has changed."""
 
     def __call__(self, view: "View") -> Floats:
         """(n,) at least 0."""
@@ -140,7 +140,7 @@ class Effort(Piece):
 
 @dataclass(frozen=True)
 class BodyRates(Piece):
-    """|w|^2 of the true body rates [rad^2/s^2]."""
+    """`|w|^2` of the true body rates [rad^2/s^2]."""
 
     def __call__(self, view: "View") -> Floats:
         """(n,) at least 0."""

@@ -156,7 +156,7 @@ def in_interface():
     text = "\n".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs" / "api").glob("*.md"))
     modules = set(re.findall(r"automodule:: ([\w.]+)", text))
     objects = set(re.findall(r"auto(?:class|function|data):: ([\w.]+)", text))
-    return {name.rpartition(".")[2] for name in objects} | {
+    return {name.rpartition(".")[2] for name in objects | modules} | {
         name
         for module in map(importlib.import_module, modules)
         for name, value in vars(module).items()

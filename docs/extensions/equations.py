@@ -1,0 +1,49 @@
+"""Equations as pictures within the page: no script, no network, no installation of LaTeX.
+
+Ziamath draws LaTeX as SVG, in the color of the text around it. Widths are in `em`: equations
+grow with the text.
+"""
+
+from typing import Any
+from xml.etree import ElementTree
+
+import ziamath
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util import logging
+
+LOGGER = logging.getLogger(__name__)
+SIZE, SCALE = 18.0, 1.08
+"""At which equations are drawn [pixels], and how much larger than the text they appear."""
+
+
+def _picture(node: nodes.Element, *, inline: bool) -> str:
+    tex = " ".join(node.astext().split())
+    try:
+        drawn = ziamath.Latex(tex, size=SIZE, inline=inline, color="currentColor")
+        svg = drawn.svgxml()
+    except Exception as error:  # whatever is wrong with it, the page and line say where
+        LOGGER.warning("equation: %r", error, location=node)
+        return ""
+    for side in ("width", "height"):
+        svg.set(side, f"{float(svg.get(side)) / SIZE * SCALE:.3f}em")
+    svg.set("style", f"vertical-align: {drawn.getyofst() / SIZE * SCALE:.3f}em")
+    svg.set("role", "img")
+    svg.set("aria-label", tex)
+    return ElementTree.tostring(svg, encoding="unicode")
+
+
+def _inline(self: Any, node: nodes.math) -> None:
+    self.body.append(_picture(node, inline=True))
+    raise nodes.SkipNode
+
+
+def _display(self: Any, node: nodes.math_block) -> None:
+    self.body.append(f'<div class="math" tabindex="0">{_picture(node, inline=False)}</div>\n')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Tell Sphinx of the renderer."""
+    app.add_html_math_renderer("pictures", (_inline, None), (_display, None))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
