@@ -149,8 +149,8 @@ _WATCH_FIELDS = (
     Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
     Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
     # tests for steps of the gyro's bias, see kernels/filter/gyro_tests.py
-    Field("correction_sum", (3,), "rad/s", "discounted sum of what updates have added to b_g_hat"),
-    Field("correction_variance", (3,), "rad^2/s^2", "variance of that in a right filter"),
+    Field("correction_sum", (6,), "mixed", "discounted sum of what updates have added to b_a_hat and b_g_hat"),
+    Field("correction_variance", (6,), "mixed", "variance of that in a right filter"),
     Field("correction_tick", (), "ticks", "when the last was added"),
     Field("heading_trend", (2,), "rad, rad/s", "line through the innovations of the heading: value now, slope"),
     Field("trend_gain", (3,), "mixed", "covariance that weighs the next one: of value, both, slope"),

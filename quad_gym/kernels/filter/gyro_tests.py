@@ -1,22 +1,21 @@
 """Two tests for a step of the gyro's bias, which innovations sensor by sensor may not show.
 
 * **Corrections.** What the updates of a right filter add to an estimate is white, and each has the
-  variance by which it reduces that of the estimate. Their discounted sum, of each axis of the gyro
-  bias, tells in B what innovations in I do not while the vehicle turns, and weighs all sensors as
-  the filter does.
+  variance by which it reduces that of the estimate. Their discounted sum, of each axis of both
+  biases, tells in B what innovations in I do not while the vehicle turns, and weighs all sensors as
+  the filter does. In a steady turn a bias of the gyro tilts the attitude by a constant angle in B,
+  which looks like a bias of the accelerometer: its estimate moves then, and hides the other.
 * **The trend of the heading.** A filter that hardly believes its headings, as they may have a
   constant error, learns little from them. Yet they show changes: the innovation of the heading,
   plus what updates have turned the estimate by, is a constant plus white noise less the integral of
   the error of the gyro bias about the vertical. A straight line through the last ones, by least
   squares that forget, has that error as its slope s, with a variance M known from white noise.
 
-Neither takes the filter for lost at once, but makes it honest. Sums that are too large multiply
-the variance of the gyro bias by `GROWTH`, and begin anew. Where s^2 exceeds what M and the
-covariance claim, the variance of the bias about the vertical grows until s is `_HONEST` deviations.
-The variance of the attitude grows with both, and with sums that of the accelerometer bias, as in a
-steady turn a bias of the gyro tilts the attitude by a constant angle in B, which looks like one of
-the accelerometer. The filter is lost where this goes beyond what any
-gyro of its suite has.
+Neither takes the filter for lost at once, but makes it honest. Sums that are too large add `STEP`
+deviations of the suite's gyros to what is claimed of the bias, and begin anew. Where s^2 exceeds
+what M and the covariance claim, the variance of the bias about the vertical grows until s is
+`_HONEST` deviations. The variance of the attitude grows with both, and with sums that of the
+accelerometer bias. The filter is lost where this goes beyond what any gyro of its suite has.
 
 Source: for the sum of corrections, the innovations' cumulative sum of M. Basseville and I. V.
 Nikiforov, Detection of Abrupt Changes, 1993; for the line, R. G. Brown, Smoothing, Forecasting and
@@ -26,19 +25,19 @@ Prediction of Discrete Time Series, 1963 (discounted least squares); how they ar
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BG, E
+from quad_gym.kernels.filter.error_state import BA, BG, E
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import dot, load33
 from quad_gym.kernels.simd.lanes import select
 
 _SUM_MEMORY = 10.0
 """For how long a correction counts [s]."""
-_SUM_LIMIT, _SUM_ALARM = 11.0, 26.0
-"""Squares of a sum over its variance, chi-square in a right filter: beyond the first, once in 400
-times for the worst of three axes, variances grow; beyond the second, once in a million times, the
-filter is lost."""
-GROWTH = 9.0
-"""Of the variance of the gyro bias."""
+_SUM_LIMIT, _SUM_ALARM = 12.0, 27.0
+"""Squares of a sum over its variance, chi-square in a right filter: beyond the first, once in 300
+times for the worst of six, variances grow; beyond the second, once in 800,000 times, the filter is
+lost."""
+STEP = 4.0
+"""Size of a step of the gyro bias, in deviations that gyros of the suite have."""
 TURNED_FOR = 3.0
 """How long a gyro bias has turned the attitude when sums show it [s]."""
 TREND_MEMORY = 2.8
@@ -46,7 +45,7 @@ TREND_MEMORY = 2.8
 _TREND_LIMIT, _HONEST = 2.5, 2.0
 """Deviations of a slope beyond which variances grow, and what they grow to."""
 TREND_ALARM = 5.0
-"""Deviations of a slope from which on the filter counts as lost, by what the gyro is known for."""
+"""Deviations of a slope beyond which the filter is lost, by what gyros of its suite have."""
 _VAGUE = math.radians(0.15)
 """A slope whose own deviation is larger is not judged [rad/s]."""
 _FLATTEST = 0.5
@@ -60,7 +59,7 @@ _FIRST_OFFSET, _FIRST_SLOPE = 100.0, 0.01
 @kernel
 def begin_gyro_tests(flight, mask):
     """Forget all corrections and headings at the start of an episode, where `mask`."""
-    for i in range(3):
+    for i in range(6):
         flight.correction_sum[i] = select(mask, 0.0, flight.correction_sum[i])
         flight.correction_variance[i] = select(mask, 0.0, flight.correction_variance[i])
     flight.correction_tick = select(mask, 0.0, flight.correction_tick)
@@ -144,8 +143,8 @@ def follow_corrections(flight, p, dx, L9, columns, last, ok):
     dt = (flight.tick - flight.correction_tick) * p.dt
     keep = 1.0 / (1.0 + dt / _SUM_MEMORY)
     L = flight.L
-    for i in range(3):
-        row = BG + i
+    for i in range(6):
+        row = BA + i
         gained = 0.0 * dt
         for j in range(min(columns, row + 1)):
             before, after = L[row, j], L9[row, last - j]
@@ -175,7 +174,7 @@ def judge_sums(flight, p, variance, mask):
         mask: Which lanes.
     """
     score = 0.0 * flight.tick
-    for i in range(3):
+    for i in range(6):
         total = flight.correction_sum[i]
         own = maximum(flight.correction_variance[i], _LEAST_VARIANCE)
         score = maximum(score, total * total / own)
@@ -187,7 +186,7 @@ def judge_sums(flight, p, variance, mask):
 @kernel
 def forget_corrections(flight, mask):
     """Begin to sum up corrections anew, where `mask`."""
-    for i in range(3):
+    for i in range(6):
         flight.correction_sum[i] = select(mask, 0.0, flight.correction_sum[i])
         flight.correction_variance[i] = select(mask, 0.0, flight.correction_variance[i])
 

@@ -7,8 +7,8 @@ Three things tell a filter that its covariance does not explain what is measured
   then speak for the estimate: GNSS stays out as long as they do.
 * **Drifts.** Innovations of a right filter are white. Their mean over the last 50 or so, in
   deviations, exceeds `DRIFT_ALARM` in a right filter about once in a million times.
-* **The gyro's bias.** Corrections of it that add up, or headings that drift although nobody believes
-  them, see `gyro_tests.py`.
+* **The gyro's bias.** Corrections of it that add up, or headings that drift away although the
+  filter hardly counts them, see `gyro_tests.py`.
 
 What may be wrong is not only what the sensor measures. An innovation that has grown for a time T
 since the last acceptance may come from biases, so their variances grow likewise: nu / T of an angle
@@ -27,7 +27,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.drift import add_to_drift, keep_drift
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.gyro_tests import (
-    GROWTH,
+    STEP,
     TREND_MEMORY,
     TURNED_FOR,
     forget_corrections,
@@ -270,7 +270,9 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
 
     # a drift alone: four times the deviations of the biases; what the tests of the gyro say
     more_a = 15.0 * _variance_of(flight, BA)
-    more_g = select(drifting, 15.0, select(adding_up, GROWTH - 1.0, 0.0)) * gyro_variance
+    step = STEP * p.gyro_bias_sigma
+    more_g = select(drifting, 15.0 * gyro_variance, 0.0)
+    more_g = maximum(more_g, select(adding_up, step * step + 8.0 * gyro_variance, 0.0))
     more_g = minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS)
     D_a = D_a + select(drifting, minimum(more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
     D_g = D_g + more_g
