@@ -49,7 +49,7 @@ class CameraParams(Checked):
         self._check(check.number, "latency", least=0.0)
         self._check(check.number, "exposure", least=0.0, most=1.0)
         check.flag("CameraParams.ground_hides", self.ground_hides)
-        if self.max_range != math.inf:
+        if not (isinstance(self.max_range, float) and self.max_range == math.inf):
             self._check(check.positive, "max_range")
         self._check(check.phase, "phase")
         self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")

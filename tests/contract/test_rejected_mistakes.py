@@ -127,10 +127,10 @@ def test_a_crash_is_never_truncation_and_a_time_limit_never_a_crash():
 
 def test_a_crash_in_the_last_step_is_a_crash():
     down = np.array([-1.0, 0.0, 0.0, 0.0])
-    env = QuadEnv("circle")
+    env = QuadEnv("circle", pad=False)
     env.reset(seed=1)
     last = next(k for k in range(1, 100) if env.step(down)[2])
-    env = QuadEnv("circle", max_episode_steps=last)
+    env = QuadEnv("circle", pad=False, max_episode_steps=last)
     env.reset(seed=1)
     for _ in range(last):
         _, _, terminated, truncated, info = env.step(down)

@@ -170,7 +170,8 @@ def test_the_endings_say_why():
         assert ((info["ending"] != "none") == (terminated | truncated)).all()
         assert (info["ending"][truncated] == "time_limit").all()
         found |= set(info["ending"][terminated])
-    assert found == {"task", "tipped_over"}
+    assert "task" in found
+    assert found <= {"task", "tipped_over", "out_of_bounds", "on_the_ground"}
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

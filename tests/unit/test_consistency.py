@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import quad_gym
 from quad_gym import FilterParams, sensor_suite
 from quad_gym.analysis.consistency import (
     InnovationRecorder,
@@ -187,7 +188,8 @@ def test_of_an_image_the_first_feature_seen_counts():
 
 
 def test_a_batch_hands_its_innovations_to_a_recorder():
-    batch = FlightBatch(64, sensors="rtk", innovations=True)
+    suite = quad_gym.sensor_suite("rtk").simplified()
+    batch = FlightBatch(64, sensors=suite, innovations=True)
     batch.reset(seeds=range(64))
     recorder = InnovationRecorder(batch, [0.0, 0.5, 1.0])
     for tick in range(1, 201):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.maths.linalg import load3, store4
+from quad_gym.kernels.maths.linalg import load3, load4, store4
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.control import act, allocate
 from quad_gym.packing.flight import params_block, params_record
@@ -40,7 +40,7 @@ def allocate_all(demands, params, voltages):
 @entry
 def act_on_floats(flights, params, mode, ref):
     reference = (load3(ref[0]), load3(ref[1]), load3(ref[2]), load3(ref[3]))
-    act(flights[0], params[0], mode, reference)
+    act(flights[0], load4(flights[0].action), params[0], mode, reference)
 
 
 @entry
@@ -52,7 +52,8 @@ def act_on_lanes(blocks, params, mode, ref):
         (one * ref[2, 0], one * ref[2, 1], one * ref[2, 2]),
         (one * ref[3, 0], one * ref[3, 1], one * ref[3, 2]),
     )
-    act(lanes_of(blocks[0]), lanes_of(params[0]), mode, reference)
+    flight = lanes_of(blocks[0])
+    act(flight, load4(flight.action), lanes_of(params[0]), mode, reference)
 
 
 def numbers_of(vehicle):

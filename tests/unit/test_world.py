@@ -111,7 +111,12 @@ def motors_only(world, *, vehicle=LAB, voltage=0.0, speed=0.0, velocity=(0, 0, 0
         source=Source.TRUTH,
         control=Control.MOTOR,
         task=quad_gym.TaskParams(
-            kind="hover", start="ground", duration=0.0, out_of_bounds=1e9, ground=-1e9
+            kind="hover",
+            start="ground",
+            pad=False,
+            duration=0.0,
+            out_of_bounds=1e9,
+            ground=-1e9,
         ),
         world=world,
         **more,
@@ -321,7 +326,7 @@ def test_air_that_does_nothing_changes_nothing_but_rounding():
 def test_presets_are_known_by_name_and_fly():
     for name in ("calm", "breeze", "fresh_breeze"):
         batch = states_after(world=name)
-        assert batch.world == quad_gym.params.world(name)
+        assert batch.world == quad_gym.world_params(name)
         assert np.isfinite(batch.read("r")).all()
     with pytest.raises(ValueError, match="world must be one of calm"):
         FlightBatch(1, world="storm")
