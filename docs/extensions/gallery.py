@@ -11,6 +11,8 @@ LESSONS = (
     "sensor_suite.py",
     "faults.py",
     "wind.py",
+    "moving_target.py",
+    "look_at_markers.py",
     "filter_alone.py",
 )
 """The order in which to read them; others follow by name."""

@@ -15,6 +15,13 @@ configuration and the seeds (consistency.json). For example:
   quad-gym consistency --estimator ekf             an extended Kalman filter
   quad-gym consistency --mass-factor 1.2           a vehicle heavier than it is taken for
   quad-gym consistency --noise-factor 1.5          sensors worse than the filter believes
+
+With --matrix it flies every suite on every task from both starts, and with faults, latencies,
+mountings, randomization, drawn starts and wind on one task, and writes one table of all means.
+A run that was interrupted goes on where it was when it is started again.
+
+  quad-gym consistency --matrix                    everything; some 250 cells
+  quad-gym consistency --matrix --cells suites     the suites on all tasks
 """
 
 import math
@@ -34,7 +41,12 @@ from quad_gym.analysis.consistency_plots import (
     whiteness_figure,
 )
 from quad_gym.analysis.plots import house_style, require_matplotlib, save_figure
-from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.analysis.reports import (
+    require_writable,
+    text_table,
+    versions,
+    write_json,
+)
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import SuiteName, usage_errors
 from quad_gym.envs.configuration import TASK_DEFAULTS
@@ -46,8 +58,8 @@ from quad_gym.records import Source
 class Args:
     """Options of the experiment."""
 
-    flights: int = 4000
-    """flights"""
+    flights: int | None = None
+    """flights; if not given, 4000, or 400 in each cell of a matrix"""
     first_seed: int = 0
     """seed of the first flight; the others follow it"""
     duration: float = 10.0
@@ -63,8 +75,14 @@ class Args:
     """time between two looks at the errors [s]"""
     settle: float = 0.0
     """time at the start that does not count [s]"""
-    output: Path = Path("results/consistency")
-    """folder for figures and numbers; made if it is missing"""
+    output: Path | None = None
+    """folder for figures and numbers, made if it is missing; if not given, results/consistency, or
+    results/consistency_matrix"""
+    matrix: bool = False
+    """fly the matrix of configurations; of the other options only flights, first-seed, duration,
+    output and threads concern it"""
+    cells: Literal["all", "suites", "conditions"] = "all"
+    """with --matrix: the suites on all tasks, other conditions on one task, or both"""
     threads: int | None = None
     """threads; if not given, as many as there are cores; results do not depend on it"""
 
@@ -104,14 +122,33 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.flights < 2:
+        if self.flights is None:
+            object.__setattr__(self, "flights", 400 if self.matrix else 4000)
+        if self.output is None:
+            folder = "consistency_matrix" if self.matrix else "consistency"
+            object.__setattr__(self, "output", Path("results") / folder)
+        if self.count < 2:
             raise ValueError(f"--flights must be at least 2, got {self.flights}")
+        if self.cells != "all" and not self.matrix:
+            raise ValueError("--cells needs --matrix")
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value}")
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
+
+    @property
+    def count(self) -> int:
+        """How many flights."""
+        assert self.flights is not None
+        return self.flights
+
+    @property
+    def folder(self) -> Path:
+        """Where results go."""
+        assert self.output is not None
+        return self.output
 
 
 def suite_of(args: Args) -> SensorSuite:
@@ -144,7 +181,7 @@ def batch_of(args: Args) -> FlightBatch:
         motor_time_constant=args.motor_lag_factor * vehicle.motor_time_constant,
     )
     return FlightBatch(
-        args.flights,
+        args.count,
         vehicle=vehicle,
         sensors=suite,
         gains="tuned",
@@ -172,7 +209,7 @@ def fly(args: Args, batch: FlightBatch) -> Findings:
 
     return measure_consistency(
         batch,
-        seeds=range(args.first_seed, args.first_seed + args.flights),
+        seeds=range(args.first_seed, args.first_seed + args.count),
         duration=args.duration,
         every=args.every,
         settle=args.settle,
@@ -228,14 +265,39 @@ def report_of(findings: Findings) -> str:
     return "\n\n".join([*tables, "\n".join(lines)])
 
 
+def fly_matrix(args: Args) -> None:
+    """Fly the matrix, and say where it is written."""
+    from quad_gym.commands.consistency_matrix import cells_of, run_matrix
+
+    with usage_errors():
+        require_writable("--output", args.folder)
+    cells = run_matrix(
+        cells_of(args.cells),
+        args.folder,
+        flights=args.count,
+        duration=args.duration,
+        first_seed=args.first_seed,
+        threads=args.threads,
+    )
+    unexpected = sum(
+        not ("" in cell["expected"] or name in cell["expected"])
+        for cell in cells.values()
+        for name in cell["misses"]
+    )
+    print(f"{len(cells)} cells, {unexpected} unexpected misses; see {args.folder / 'matrix.md'}.")
+
+
 def main(args: Args) -> None:
     """Fly, measure, judge, draw and write."""
+    if args.matrix:
+        fly_matrix(args)
+        return
     with usage_errors():
         require_matplotlib()
         batch = batch_of(args)
-        args.output.mkdir(parents=True, exist_ok=True)
+        args.folder.mkdir(parents=True, exist_ok=True)
     began, title = time.monotonic(), title_of(batch, args)
-    print(f"{title}; {args.flights:,} flights of {args.duration:g} s, {args.task}.\n")
+    print(f"{title}; {args.count:,} flights of {args.duration:g} s, {args.task}.\n")
     whole = fly(args, batch)
     findings = whole.since(args.settle)
     print(report_of(findings))
@@ -251,7 +313,7 @@ def main(args: Args) -> None:
         if findings.whiteness:
             figures["whiteness"] = whiteness_figure(findings.whiteness, title)
         for name, figure in figures.items():
-            files += save_figure(figure, args.output / name)
+            files += save_figure(figure, args.folder / name)
     squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
     found = {
         "consistent": findings.consistent,
@@ -267,7 +329,7 @@ def main(args: Args) -> None:
         "vehicle": batch.vehicle,
         "world": batch.world,
         "faults": batch.faults,
-        "seeds": [args.first_seed, args.first_seed + args.flights - 1],
+        "seeds": [args.first_seed, args.first_seed + args.count - 1],
         "versions": versions("numpy", "numba", "scipy"),
         "nees": whole.nees,
         "nis": whole.nis,
@@ -275,6 +337,6 @@ def main(args: Args) -> None:
         "rms_errors": whole.errors,
         "rms_claimed": whole.claimed,
     }
-    files.append(write_json(args.output / "consistency.json", found))
+    files.append(write_json(args.folder / "consistency.json", found))
     seconds = time.monotonic() - began
-    print(f"\nWrote {len(files)} files to {args.output} after {seconds:.1f} s.")
+    print(f"\nWrote {len(files)} files to {args.folder} after {seconds:.1f} s.")

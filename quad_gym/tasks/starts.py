@@ -40,7 +40,7 @@ def starts(
             f"{label(task)}.reset must return None or start values by name, of "
             f"{', '.join(_SHAPES)}; got {returned!r}"
         )
-    count, found = len(chosen), dict(given)
+    count, found = len(chosen), {name: given.get(name) for name in _SHAPES}
     for name, value in returned.items():
         values = answers.numbers(task, "reset", value, name)
         shape = (count, *_SHAPES[name])

@@ -35,7 +35,7 @@ def test_wrong_models_stand_beside_the_matched_one(tmp_path):
 
 
 def test_forms_of_the_filter_stand_beside_each_other(tmp_path):
-    printed, found = run(tmp_path, "filters", "--suite", "indoor")
+    printed, found = run(tmp_path, "filters", "--sensors", "indoor")
     rows = found["rows"]
     assert list(rows)[:2] == ["UKF", "EKF"]
     assert all(name in printed for name in rows)

@@ -9,8 +9,10 @@ import quad_gym
 from quad_gym.commands.benchmark import against, interfaces, stages
 from quad_gym.commands.benchmark import main as script
 from quad_gym.commands.options import parse
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.records import WIDTH
+from tests.console import plain
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,7 +48,7 @@ def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path
     rows = run(tmp_path, "--only", "tick", "--batch", "16")["sections"]["tick"]
     for suite in ("standard", "lab"):
         mine = {row["part"]: row for row in rows if row["suite"] == suite}
-        batch = quad_gym.FlightBatch(1, sensors=suite)
+        batch = quad_gym.FlightBatch(1, sensors=suite, task=TASK_DEFAULTS["hover"])
         stages = {stage.name.lower() for stage in needed_stages(batch._settings[0])}
         assert stages < set(mine)
         assert set(mine) - stages == {"whole tick", "filter", "sum of the tick's stages"}
@@ -62,7 +64,7 @@ def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path
     assert parts - {row["part"] for row in rows if row["suite"] == "lab"} == {"average_imu"}
 
 
-def test_blocks_over_a_period_measure_as_often_as_the_sensors_do(script):
+def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
     """GNSS at 10 Hz and a camera at 25 Hz measure in 1 of 20 and 1 of 8 ticks of 5 ms."""
     batch = stages.hovering(40 * WIDTH, sensors="rtk")
     blocks = stages.over_a_period(batch)
@@ -112,7 +114,7 @@ def test_another_checkout_is_timed_by_turns_and_compared(tmp_path, capsys):
     assert "here / there" in capsys.readouterr().out
 
 
-def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys(script):
+def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys():
 
     class Other:
         folder = ROOT
@@ -153,7 +155,7 @@ def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(tmp_path)
     assert rows["full"]["seconds"] < rows["empty"]["seconds"]
 
 
-def test_all_sections_are_those_that_do_not_compile(script):
+def test_all_sections_are_those_that_do_not_compile():
     chosen = script.chosen_sections(parse(script.Args, []))
     assert chosen == ["filter", "tick", "options", "interfaces", "memory", "rendering"]
 
@@ -173,11 +175,10 @@ def test_all_sections_are_those_that_do_not_compile(script):
     ],
     ids=" ".join,
 )
-def test_invalid_options_are_one_line_and_exit_code_2(options, capsys):
+def test_invalid_options_are_told_and_exit_code_2(options, capsys):
     with pytest.raises(SystemExit) as caught:
         parse(script.Args, options)
     assert caught.value.code == 2
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert len(printed.err.strip().splitlines()) == 1
-    assert options[0] in printed.err
+    assert options[0] in plain(printed.err)

@@ -15,7 +15,7 @@ from tests.field_flights import fly, nees, state_errors, steps
 from tests.reference_late import Rewinding
 from tests.reference_ukf import PlainEKF, PlainUKF, array_of, east_north_up
 
-CONSUMER, LAB = quad_gym.sensor_suite("consumer"), quad_gym.sensor_suite("lab")
+CONSUMER, LAB = quad_gym.sensor_suite("consumer").simplified(), quad_gym.sensor_suite("lab")
 DRIFTING = LAB.replace(gnss=LAB.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=20.0))
 
 

@@ -1,0 +1,41 @@
+"""A task that uses everything: state, draws, start, reward, endings, observation."""
+
+import numpy as np
+
+import quad_gym
+from quad_gym.tasks import Observed
+
+
+class Chase(quad_gym.Task):
+    """Follow a target that moves on a straight line, new in each episode."""
+
+    state = {"target": np.zeros(3), "velocity": np.zeros(3), "best": np.inf, "caught": False}
+    observes = {"target": Observed("m", "B", -20.0, 20.0)}
+
+    def reset(self, view, rng):
+        view.state.target = view.reference_position + rng.uniform(-0.5, 0.5, (view.count, 3))
+        view.state.velocity = rng.normal(0.0, 0.3, (view.count, 3))
+        near = view.state.target + (0.0, 0.0, 0.2)
+        return {"position": near, "yaw": rng.uniform(-1.0, 1.0)}
+
+    def update(self, view, rng):
+        view.state.velocity += rng.normal(0.0, 0.02, (view.count, 3))
+        view.state.target += view.period * view.state.velocity
+        distance = np.linalg.norm(view.state.target - view.position, axis=1)
+        view.state.best = np.minimum(view.state.best, distance)
+        view.state.caught = distance < 0.1
+
+    def reward(self, view):
+        distance = np.linalg.norm(view.state.target - view.position, axis=1)
+        return np.exp(-distance) + view.state.caught
+
+    def terminated(self, view):
+        far = np.linalg.norm(view.state.target - view.position, axis=1) > 1.0
+        return far | view.shipped.terminated
+
+    def observe(self, view):
+        gap = view.state.target - view.seen.position
+        return {
+            "target": np.einsum("nij,nj->ni", view.seen.R_BI, gap),
+            "best": view.state.best.clip(0.0, 5.0),
+        }

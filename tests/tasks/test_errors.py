@@ -1,0 +1,240 @@
+"""Wrong tasks raise errors that name the method and the flights, and leave flights usable."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import TaskError
+from quad_gym.envs.vector import QuadVectorEnv
+from tests.contract.comparing import assert_same
+
+FLIGHTS = 9
+
+
+def at(flights, value):
+    """(n,) ones, with a value at some flights."""
+    array = np.ones(FLIGHTS)
+    array[list(flights)] = value
+    return array
+
+
+WRONG = {
+    "reward": [
+        (lambda v: np.ones(3), r"reward must return shape \(9,\).*got \(3,\)"),
+        (lambda v: np.ones((FLIGHTS, 1)), r"reward must return shape \(9,\).*got \(9, 1\)"),
+        (lambda v: 1.0, r"reward must return shape \(9,\)"),
+        (lambda v: None, "reward must return numbers, got None"),
+        (lambda v: ["a"] * FLIGHTS, "reward must return numbers"),
+        (lambda v: np.ones(FLIGHTS) * 1j, "reward must return numbers"),
+        (lambda v: at([2, 5], np.nan), "reward must return finite rewards.*nan.*flights 2, 5"),
+        (lambda v: at([8], -np.inf), "finite rewards.*inf.*flight 8"),
+        (lambda v: at([8], 1e40), "finite rewards.*flight 8"),
+        (lambda v: at(range(8), np.nan), "flights 0, 1, 2, 3, 4 and 3 more"),
+        (lambda v: 1 / 0, "reward failed, for all flights: ZeroDivisionError"),
+        (lambda v: v.altitude, "reward failed.*no attribute 'altitude'"),
+        (lambda v: v.position.__setitem__(0, 1.0), "reward failed.*read-only"),
+        (lambda v: v.shipped.reward.__iadd__(1.0), "reward failed.*read-only"),
+        (lambda v: setattr(v, "mine", 1.0), "reward failed.*keep your own in view.state"),
+        (lambda v: setattr(v.state, "count", 1.0), "reward failed.*read-only"),
+        (lambda v: v.state.other, "declares no state 'other'"),
+    ],
+    "terminated": [
+        (lambda v: np.zeros(FLIGHTS), "terminated must return booleans.*got float64"),
+        (lambda v: np.zeros(2, bool), r"terminated must return booleans of shape \(9,\)"),
+        (lambda v: False, "terminated must return booleans of shape"),
+        (lambda v: v.nothing, "terminated failed"),
+    ],
+    "truncated": [(lambda v: np.zeros(FLIGHTS, int), "truncated must return booleans")],
+    "update": [(lambda v, rng: rng.normal(size=3), "update failed.*size must begin")],
+    "observe": [
+        (lambda v: np.ones((FLIGHTS, 3)), "as many numbers as at first"),
+        (lambda v: {"observed": np.ones(FLIGHTS), "more": np.ones(FLIGHTS)}, "as many numbers"),
+        (lambda v: np.ones(3), r"observe must return shape \(9,\) or \(9, k\)"),
+        (lambda v: np.ones((FLIGHTS, 1, 1)), "observe must return shape"),
+        (lambda v: at([3], np.nan), "observe must return finite 'observed'.*flight 3"),
+        (lambda v: at([3], np.inf), "observe must return finite 'observed'.*flight 3"),
+        (lambda v: {"observed": "a"}, "observe must return numbers"),
+        (lambda v: v.position, r"cannot read the truth \(view.position\).*view.seen"),
+        (lambda v: v.truth.position, r"cannot read the truth \(view.truth\)"),
+        (lambda v: v.shipped.reward, r"cannot read the truth \(view.shipped\)"),
+        (lambda v: v.position_error, r"cannot read the truth \(view.position_error\)"),
+    ],
+}
+CASES = [(method, *case) for method, cases in WRONG.items() for case in cases]
+
+
+class Switch:
+    """A method that is right until it is switched."""
+
+    def __init__(self, method, wrong):
+        right = {
+            "reward": lambda v: np.ones(v.count),
+            "observe": lambda v: np.ones(v.count),
+            "update": lambda v, rng: None,
+        }
+        self.right = right.get(method, lambda v: np.zeros(v.count, bool))
+        self.wrong, self.on = wrong, False
+
+    def __call__(self, *arguments):
+        return (self.wrong if self.on else self.right)(*arguments)
+
+
+def with_switch(method, wrong, mode):
+    switch = Switch(method, wrong)
+    task = quad_gym.Task.of(state={"count": 0.0}, **{method: switch})
+    env = QuadVectorEnv(FLIGHTS, "hover", custom=task, autoreset_mode=mode, threads=1)
+    env.reset(seed=3)
+    return env, switch
+
+
+@pytest.mark.parametrize(("method", "wrong", "message"), CASES)
+def test_the_error_names_the_method_and_the_flights_and_a_reset_makes_good(method, wrong, message):
+    actions = np.zeros((FLIGHTS, 4))
+    env, switch = with_switch(method, wrong, "NextStep")
+    fresh, _ = with_switch(method, wrong, "NextStep")
+    env.step(actions)
+    switch.on = True
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(TaskError, match=f"Task.{method} .*|{message}") as caught,
+    ):
+        env.step(actions)
+    assert caught.match(message)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before step.*flights 0, 1, 2, 3, 4"):
+        env.step(actions)
+    switch.on = False
+    assert_same(env.reset(seed=8), fresh.reset(seed=8))
+    for _ in range(3):
+        assert_same(env.step(actions), fresh.step(actions))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_a_snapshot_from_before_an_error_can_be_flown_on(mode):
+    env, switch = with_switch("reward", lambda v: at([1], np.nan), mode)
+    actions = np.full((FLIGHTS, 4), 0.1)
+    env.step(actions)
+    instant = env.flights.batch.snapshot()
+    expected = env.step(actions)
+    env.flights.batch.restore(instant)
+    switch.on = True
+    with pytest.raises(TaskError):
+        env.step(actions)
+    env.flights.batch.restore(instant)
+    switch.on = False
+    assert_same(env.step(actions), expected)
+
+
+def test_a_reset_of_the_flights_that_failed_is_needed():
+    class Wrong(quad_gym.Task):
+        """Starts where it must not, if told so."""
+
+        wrong = None
+
+        def reset(self, view, rng):
+            return self.wrong
+
+    env = QuadVectorEnv(3, "hover", custom=Wrong(), autoreset_mode="Disabled")
+    task = env.flights.batch.custom
+    env.reset(seed=0)
+    mask = np.array([False, True, False])
+    for wrong, message in (
+        ({"position": np.full((3, 3), np.nan)}, "finite numbers for 'position'.*flight 1"),
+        ({"position": np.zeros(2)}, r"shape \(3, 3\) for 'position', got \(2,\)"),
+        ({"height": 1.0}, "None or start values by name, of position, velocity, yaw"),
+        ({"velocity": np.full(3, 1e6)}, "wrong start: velocity must be at most"),
+        (7, "None or start values by name"),
+    ):
+        task.wrong = wrong
+        with pytest.raises(TaskError, match=f"Wrong.reset .*{message}"):
+            env.reset(options={"reset_mask": mask})
+        with pytest.raises(RuntimeError, match=r"call reset\(\).*Wrong has failed for flight 1"):
+            env.step(np.zeros((3, 4)))
+    task.wrong = None
+    env.reset(options={"reset_mask": mask})
+    env.step(np.zeros((3, 4)))
+
+
+def test_an_interruption_leaves_flights_that_need_a_reset():
+    def stop(view):
+        raise KeyboardInterrupt
+
+    env, switch = with_switch("reward", stop, "SameStep")
+    switch.on = True
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.zeros((FLIGHTS, 4)))
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step(np.zeros((FLIGHTS, 4)))
+
+
+def test_a_privileged_task_may_observe_the_truth():
+    class Open(quad_gym.Task):
+        """Sees it all."""
+
+        privileged = True
+
+        def observe(self, view):
+            return {"truth": view.position, "reward": view.shipped.reward}
+
+    for mode in ("SameStep", "NextStep"):
+        env = QuadVectorEnv(2, "hover", custom=Open(), autoreset_mode=mode, max_episode_steps=3)
+        plain = QuadVectorEnv(2, "hover", autoreset_mode=mode, max_episode_steps=3)
+        assert_same(env.reset(seed=0)[0][:, :28].copy(), plain.reset(seed=0)[0])
+        for _ in range(7):
+            action = np.full((2, 4), 0.1)
+            observation, reward, *_, over, info = env.step(action)
+            theirs, their_reward, *_ = plain.step(action)
+            np.testing.assert_array_equal(observation[:, :28], theirs)
+            np.testing.assert_array_equal(reward, their_reward)
+            position = env.flights.batch.read("r").astype(np.float32)
+            np.testing.assert_array_equal(observation[:, 28:31], position)
+            started = over if mode == "SameStep" else env.flights.batch.began
+            expected = np.where(started, 0.0, reward).astype(np.float32)
+            np.testing.assert_array_equal(observation[:, 31], expected)
+            if "final_obs" in info:
+                final = np.stack(list(info["final_obs"]))
+                np.testing.assert_array_equal(final[:, 31], reward.astype(np.float32))
+
+
+def test_flights_that_are_no_more_end_whatever_the_task_says():
+    task = quad_gym.Task.of(
+        terminated=lambda view: np.zeros(view.count, bool),
+        reward=lambda view: view.position[:, 0],
+        observe=lambda view: view.seen.position,
+    )
+    env = QuadVectorEnv(2, "hover", custom=task, autoreset_mode="SameStep")
+    env.reset(seed=0)
+    env.flights.batch._blocks["v"][0, :, 1] = np.nan
+    with np.errstate(invalid="ignore"):
+        observation, reward, terminated, _, info = env.step(np.zeros((2, 4)))
+    assert list(terminated) == [False, True]
+    assert reward[1] == 0.0
+    assert info["final_info"]["ending"][1] == "out_of_bounds"
+    assert np.isfinite(observation).all()
+    assert np.isfinite(info["final_obs"][1]).all()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"state": {"a b": 1.0}}, "state must hold values by name"),
+        ({"state": {"a": "text"}}, "state must hold numbers"),
+        ({"observes": {"a": 3}, "observe": lambda v: {"a": v.time}}, "must hold Observed"),
+        (
+            {"observes": {"b": quad_gym.Observed()}, "observe": lambda v: {"a": v.time}},
+            "observes has 'b', which observe does not return",
+        ),
+        ({"observe": lambda v: {"up": v.time}}, "must not return 'up'"),
+        ({"observe": lambda v: {}, "replaces_observation": True}, "must return something"),
+        ({"replaces_observation": 1}, "replaces_observation of Task must be True or False"),
+    ],
+)
+def test_wrong_declarations_are_refused_when_the_environment_is_made(attributes, message):
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make("QuadGym/Hover-v0", custom=quad_gym.Task.of(**attributes))
+
+
+def test_a_wrong_observe_is_refused_when_the_environment_is_made():
+    task = quad_gym.Task.of(observe=lambda view: view.position)
+    with pytest.raises(TaskError, match=r"observe failed.*cannot read the truth"):
+        gymnasium.make("QuadGym/Hover-v0", custom=task)

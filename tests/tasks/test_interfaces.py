@@ -1,0 +1,208 @@
+"""What else takes a task: checkers, registration, policies, commands, rendering."""
+
+import json
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from stable_baselines3.common.env_checker import check_env as sb3_check
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym.evaluation import evaluate, roll_out
+from quad_gym.tasks import Observed
+from tests.contract.comparing import assert_same
+from tests.tasks.chase import Chase
+
+
+class Half(quad_gym.Task):
+    """Half the reward that ships."""
+
+    def reward(self, view):
+        return 0.5 * view.shipped.reward
+
+
+def distance(view):
+    gap = view.features - view.seen.position[:, np.newaxis]
+    return {"marker": np.linalg.norm(gap, axis=2).min(axis=1)}
+
+
+@pytest.fixture
+def registered():
+    quad_gym.register_task("Mine/Chase-v0", Chase, "QuadGym/Hover-v0", max_episode_steps=30)
+    yield "Mine/Chase-v0"
+    del gymnasium.registry["Mine/Chase-v0"]
+
+
+@pytest.mark.parametrize("keywords", [{}, {"privileged": True}, {"observation": "sensors"}])
+def test_both_checkers_pass(keywords):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):
+            env = gymnasium.make("QuadGym/Hover-v0", custom=Chase(), **keywords)
+            gymnasium_check(env.unwrapped)
+            sb3_check(env.unwrapped)
+
+
+def test_a_registered_id_makes_all_interfaces(registered):
+    one = gymnasium.make(registered)
+    assert one.spec.max_episode_steps == 30
+    assert one.observation_space.shape == (32,)
+    many = gymnasium.make_vec(registered, num_envs=3, sensors="rtk")
+    theirs = quad_gym.make_sb3_vec_env(registered, n_envs=3, seed=5, sensors="rtk")
+    np.testing.assert_array_equal(many.reset(seed=5)[0], theirs.reset())
+    assert evaluate(PDPolicy(many), registered, episodes=3).lengths.max() <= 30
+
+
+def test_registration_refuses_wrong_ids():
+    with pytest.raises(ValueError, match="env_id must be a new one"):
+        quad_gym.register_task("QuadGym/Hover-v0", Chase)
+    with pytest.raises(ValueError, match="base must be one of"):
+        quad_gym.register_task("Mine/Chase-v0", Chase, "CartPole-v1")
+    with pytest.raises(ValueError, match=r"env_id must be one of .* got 'CartPole-v1'"):
+        quad_gym.make_sb3_vec_env("CartPole-v1")
+
+
+def test_roll_out_sums_the_rewards_of_the_task():
+    def returns(**keywords):
+        env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=4, **keywords)
+        return roll_out(PDPolicy(env), env, seed=0).returns
+
+    np.testing.assert_allclose(returns(custom=Half()), 0.5 * returns(), rtol=1e-12)
+
+
+def test_an_ending_of_the_task_is_no_crash():
+    def late(view):
+        return view.time > 0.5
+
+    env = gymnasium.make_vec(
+        "QuadGym/Hover-v0", num_envs=3, custom=quad_gym.Task.of(terminated=late)
+    )
+    episodes = roll_out(PDPolicy(env), env, seed=0)
+    assert list(episodes.ending) == ["task"] * 3
+    assert list(episodes.lengths) == [26] * 3
+    assert not episodes.crashed.any()
+
+
+@pytest.mark.parametrize("layout", ["relative", "absolute"])
+@pytest.mark.parametrize("keywords", [{}, {"privileged": True, "include_covariance": True}])
+def test_pd_control_finds_its_part_of_a_longer_observation(layout, keywords):
+    task = quad_gym.Task.of(observe=distance)
+    made = {"num_envs": 3, "layout": layout, **keywords}
+    plain = gymnasium.make_vec("QuadGym/Circle-v0", **made)
+    longer = gymnasium.make_vec("QuadGym/Circle-v0", custom=task, **made)
+    actions = [
+        PDPolicy(env).predict(env.reset(seed=3)[0], deterministic=True)[0]
+        for env in (plain, longer)
+    ]
+    np.testing.assert_array_equal(*actions)
+
+
+def test_pd_control_refuses_an_observation_without_its_part():
+    task = quad_gym.Task.of(observe=distance, replaces_observation=True)
+    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=1, custom=task)
+    with pytest.raises(ValueError, match=r"env must observe body_rates: its task replaces"):
+        PDPolicy(env)
+
+
+def test_the_table_of_observations_has_the_part_of_the_task_before_the_privileged_one():
+    env = gymnasium.make("QuadGym/Hover-v0", custom=Chase(), privileged=True)
+    table = env.unwrapped.flights.table
+    named = {field.name: field for field in table}
+    assert [field.slice.start for field in table] == [0] + [f.slice.stop for f in table[:-1]]
+    assert named["target"] == ("target", slice(28, 31), "m", "B", -20.0, 20.0)
+    assert named["best"][1] == slice(31, 32)
+    assert named["true_position_error"].slice.start == 32
+    observation, _ = env.reset(seed=0)
+    assert observation["policy"].shape == (32,)
+    plain, _ = gymnasium.make("QuadGym/Hover-v0", privileged=True).reset(seed=0)
+    assert observation["privileged"].shape == plain["privileged"].shape
+
+
+def test_observations_are_held_within_the_bounds_of_the_task():
+    far = quad_gym.Task.of(
+        observe=lambda view: {"a": np.full((view.count, 2), 7.0), "b": np.full(view.count, -1e9)},
+        observes={"a": Observed(low=0.0, high=0.5)},
+    )
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, custom=far)
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation[:, 28:], [[0.5, 0.5, -1e6]] * 2)
+    assert env.observation_space.contains(observation)
+
+
+def test_a_lone_array_needs_no_name():
+    env = gymnasium.make(
+        "QuadGym/Hover-v0", custom=quad_gym.Task.of(observe=lambda view: view.seen.position)
+    )
+    assert env.unwrapped.flights.table[-1][:2] == ("observed", slice(28, 31))
+    observation, _ = env.reset(seed=0)
+    seen = env.unwrapped.flights.batch.read("r_hat")[0].astype(np.float32)
+    np.testing.assert_array_equal(observation[28:], seen)
+
+
+def test_reward_per_second_multiplies_the_reward_of_the_task():
+    task, rewards = quad_gym.Task.of(reward=lambda view: np.full(view.count, 3.0)), []
+    for per in ("step", "second"):
+        env = gymnasium.make("QuadGym/Hover-v0", custom=task, reward_per=per, control_rate=40)
+        env.reset(seed=0)
+        rewards.append(env.step(np.zeros(4))[1])
+    assert rewards == pytest.approx([3.0, 3.0 / 40.0], rel=1e-15)
+
+
+def test_a_task_is_named_by_its_module():
+    named = gymnasium.make_vec(
+        "QuadGym/Hover-v0", num_envs=2, custom="tests.tasks.chase:Chase"
+    ).reset(seed=0)
+    assert_same(
+        named, gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, custom=Chase).reset(seed=0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("custom", "message"),
+    [
+        ("tests.tasks.chase", '"module:name"'),
+        ("tests.tasks.chase:Nobody", "must name a quad_gym.Task.*Nobody"),
+        ("no.such.module:Chase", "must name a quad_gym.Task.*No module"),
+        ("tests.tasks.chase:np", "must be a quad_gym.Task"),
+        (lambda view: 0.0, "must be a quad_gym.Task"),
+        (quad_gym.QuadEnv, "must be a quad_gym.Task"),
+    ],
+)
+def test_what_is_no_task_is_refused(custom, message):
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make("QuadGym/Hover-v0", custom=custom)
+
+
+def test_functions_have_to_have_the_names_of_methods():
+    with pytest.raises(TypeError, match=r"a task has no rewards"):
+        quad_gym.Task.of(rewards=distance)
+    with pytest.raises(TypeError, match="reward must be a function"):
+        quad_gym.Task.of(reward=1.0)
+
+
+def test_the_command_line_flies_and_names_a_task_of_the_working_directory(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\nimport quad_gym\n"
+        "One = quad_gym.Task.of(reward=lambda view: np.ones(view.count))\n"
+    )
+    words = "evaluate QuadGym/Hover-v0 --policy pd --observation estimate --episodes 2"
+    words += " --env custom=mine:One max_episode_steps=5 --output out"
+    command = [sys.executable, "-m", "quad_gym", *words.split()]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    (case,) = json.loads((tmp_path / "out/summary.json").read_text())["cases"]
+    assert case["return"] == 5.0
+
+
+def test_rendering_and_recording_take_a_task():
+    pytest.importorskip("pygame")
+    env = gymnasium.make("QuadGym/Hover-v0", custom=Half(), render_mode="rgb_array")
+    env.reset(seed=0)
+    reward = env.step(np.zeros(4))[1]
+    assert env.render().shape == (480, 640, 3)
+    (flight,) = env.unwrapped.rendering.flights
+    assert flight["reward"][-1] == reward != 0.0

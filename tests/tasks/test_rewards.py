@@ -1,0 +1,120 @@
+"""Pieces of rewards: sums of them are the rewards that ship, and each is what it says."""
+
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym import rewards
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.tasks.rewards import BLOCKS, Constant, Piece
+
+
+@pytest.mark.parametrize("per", ["step", "second"])
+@pytest.mark.parametrize("task", list(quad_gym.IDS))
+def test_sums_of_pieces_are_the_rewards_that_ship(task, per):
+    piece = rewards.COURSE if "Waypoints" in task else rewards.FOLLOWING
+    made = {"num_envs": 6, "reward_per": per, "randomize": True, "max_episode_steps": 120}
+    plain = gymnasium.make_vec(task, **made)
+    ours = gymnasium.make_vec(task, custom=quad_gym.Task.of(reward=piece), **made)
+    observation, _ = plain.reset(seed=3)
+    ours.reset(seed=3)
+    policy, rng, gates = PDPolicy(plain), np.random.default_rng(5), 0
+    for _ in range(150):
+        action = policy.predict(observation)[0] + rng.normal(0.0, 0.2, (6, 4))
+        observation, expected, *_, info = plain.step(action)
+        _, got, *_ = ours.step(action)
+        np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-11)
+        gates = max(gates, info["gates_passed"].max())
+    assert gates > 0 or "Waypoints" not in task
+
+
+def view_after(steps=10, **keywords):
+    env = QuadVectorEnv(4, "hover", custom=quad_gym.Task(), autoreset_mode="Disabled", **keywords)
+    env.reset(seed=2)
+    rng = np.random.default_rng(2)
+    for _ in range(steps):
+        env.step(rng.uniform(-0.3, 0.3, (4, 4)))
+    return env.flights.batch.view
+
+
+def test_sums_differences_and_multiples_are_pieces():
+    view = view_after()
+    a, b = rewards.Tracking(1.0), rewards.Effort()
+    x, y = a(view), b(view)
+    for piece, expected in (
+        (a + b, x + y),
+        (a - 2.0 * b, x - 2.0 * y),
+        (-(a - b) * 3.0, -3.0 * (x - y)),
+        (1.0 - a, 1.0 - x),
+        (a + 2, x + 2.0),
+        (a + (lambda view: view.time), x + view.time),
+        (0.5 * (a + 0.5 * b), 0.5 * x + 0.25 * y),
+    ):
+        assert isinstance(piece, Piece)
+        np.testing.assert_allclose(piece(view), expected, rtol=1e-14)
+    assert pickle.loads(pickle.dumps(rewards.FOLLOWING)) == rewards.FOLLOWING
+    with pytest.raises(ValueError, match="piece must be a number"):
+        a + "b"
+    with pytest.raises(ValueError, match="weight must be finite"):
+        a * np.nan
+
+
+def test_each_piece_is_what_it_says():
+    view = view_after()
+    change = view.action - view.last_action
+    for piece, expected in (
+        (rewards.Tracking(3.0), np.exp(-3.0 * view.position_error)),
+        (rewards.Heading(), np.einsum("ni,ni->n", view.R_BI[:, 0], view.reference_heading)),
+        (rewards.Effort(), np.linalg.norm(change, axis=1) ** 2),
+        (rewards.BodyRates(), np.linalg.norm(view.body_rates, axis=1) ** 2),
+        (rewards.Gate(), np.zeros(4)),
+        (rewards.Crash(), np.zeros(4)),
+        (rewards.Visibility(), view.truth.features_in_view.sum(axis=1)),
+        (Constant(2.0), np.full(4, 2.0)),
+    ):
+        np.testing.assert_allclose(piece(view), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_uncertainty_is_the_trace_or_the_log_determinant_of_the_block(block):
+    view, k = view_after(), 3 * BLOCKS.index(block)
+    P = view.estimate.covariance[:, k : k + 3, k : k + 3]
+    np.testing.assert_allclose(
+        rewards.Uncertainty(block)(view), np.trace(P, axis1=1, axis2=2), rtol=1e-9
+    )
+    values = np.linalg.eigvalsh(P)
+    np.testing.assert_allclose(
+        rewards.Uncertainty(block, "log_det")(view), np.log(values).sum(axis=1), rtol=1e-6
+    )
+
+
+def test_uncertainty_refuses_what_it_does_not_know():
+    with pytest.raises(ValueError, match="of must be one of"):
+        rewards.Uncertainty("height")
+    with pytest.raises(ValueError, match="measure must be one of"):
+        rewards.Uncertainty(measure="det")
+
+
+def test_progress_is_the_speed_toward_the_reference():
+    before = view_after(9).position_error
+    view = view_after(10)
+    np.testing.assert_allclose(
+        rewards.Progress()(view), (before - view.position_error) / 0.02, rtol=1e-9
+    )
+
+
+def test_a_crash_costs_where_the_vehicle_crashes():
+    env = QuadVectorEnv(
+        2, "hover", autoreset_mode="SameStep", custom=quad_gym.Task.of(reward=rewards.Crash())
+    )
+    env.reset(seed=0)
+    total, ended = np.zeros(2), np.zeros(2)
+    for _ in range(100):
+        _, reward, terminated, _, _ = env.step(np.tile([-1.0, 0.0, 0.0, 0.0], (2, 1)))
+        total, ended = total + reward, ended + terminated
+    assert (ended >= 1).all()
+    np.testing.assert_array_equal(total, ended)

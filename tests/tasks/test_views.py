@@ -1,0 +1,248 @@
+"""What a view shows, against closed forms and the records of the flights."""
+
+import inspect
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.tasks.fields import VIEW_FIELDS
+
+FLIGHTS = 5
+
+
+class Nothing(quad_gym.Task):
+    """Only there so that there is a view."""
+
+
+def flown(task="circle", steps=20, **keywords):
+    """Flights with a view, and the view after some steps."""
+    env = QuadVectorEnv(FLIGHTS, task, custom=Nothing(), **keywords)
+    env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        env.step(rng.uniform(-0.2, 0.3, (FLIGHTS, 4)))
+    return env.flights.batch, env.flights.batch.view
+
+
+def value_of(view, name):
+    for part in name.split("."):
+        view = getattr(view, part)
+    return view
+
+
+def every_name():
+    blocks = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+    for field in VIEW_FIELDS:
+        for block in blocks if "X" in field.name else ("",):
+            yield field._replace(name=field.name.replace("X", block))
+
+
+@pytest.mark.parametrize("task", ["circle", "waypoints"])
+def test_the_table_has_the_shape_and_the_type_of_every_array(task):
+    batch, view = flown(task, sensors="rtk", randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
+    lengths = {"n": FLIGHTS, "m": len(batch.sensors.camera.features_I), "k": 28}
+    lengths["gates"] = 5 if task == "waypoints" else 0
+    for field in every_name():
+        value = value_of(view, field.name)
+        if not field.shape or field.shape.startswith("dict"):
+            continue
+        letters = re.fullmatch(r"\((.*)\)( \w+)?", field.shape)
+        shape = [x.strip() for x in letters[1].split(",") if x.strip()]
+        assert value.shape == tuple(lengths.get(x) or (int(x) if x.isdigit() else 0) for x in shape)
+        kind = {" int": "i", " bool": "b", None: "f"}[letters[2]]
+        assert value.dtype.kind == kind, field.name
+        assert not value.flags.writeable, field.name
+    assert set(view.truth.drawn) == {"mass"}
+
+
+def test_every_public_array_of_a_view_is_in_the_table():
+    _, view = flown(steps=1)
+    told = {field.name for field in every_name()}
+    shorts = {"position", "velocity", "R_BI", "quaternion", "body_rates", "rotor_speeds"}
+    shorts |= {"accel_bias", "gyro_bias", "position_error", "estimation_error"}
+    for prefix, group in [("", view)] + [
+        (name, getattr(view, name)) for name in ("truth", "estimate", "seen", "measured", "shipped")
+    ]:
+        for name, _ in inspect.getmembers(type(group)):
+            own = not (name.startswith("_") or callable(getattr(group, name)))
+            if own and name not in ("truth", "shipped", "estimate", "seen", "measured", "state"):
+                full = f"{prefix}.{name}".strip(".")
+                assert full in told or (not prefix and name in shorts), full
+
+
+def test_the_truth_is_that_of_the_records():
+    batch, view = flown(world="breeze")
+    for name, field in {
+        **{"position": "r", "velocity": "v", "quaternion": "q", "body_rates": "w"},
+        **{"rotor_speeds": "rotor_speeds", "accel_bias": "b_a", "gyro_bias": "b_g"},
+        **{"wind": "wind", "position_error": "position_error"},
+        **{"estimation_error": "estimation_error"},
+    }.items():
+        np.testing.assert_array_equal(getattr(view.truth, name), batch.read(field))
+    R_IB = Rotation.from_quat(view.quaternion, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(view.R_BI, R_IB.transpose(0, 2, 1), atol=1e-12)
+    np.testing.assert_array_equal(view.truth.forward, view.R_BI[:, 0])
+    assert view.position is view.truth.position
+
+
+def test_the_estimate_and_its_covariance_are_those_of_the_filter():
+    batch, view = flown()
+    estimate, P = view.estimate, batch.covariance()
+    for name, field in {
+        **{"position": "r_hat", "velocity": "v_hat", "R_BI": "R_hat"},
+        **{"accel_bias": "b_a_hat", "gyro_bias": "b_g_hat", "factor": "L"},
+    }.items():
+        np.testing.assert_array_equal(getattr(estimate, name), batch.read(field))
+    np.testing.assert_allclose(estimate.covariance, P, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(
+        estimate.sigma, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), rtol=1e-12
+    )
+    names = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
+    for k, name in enumerate(names):
+        rows = slice(3 * k, 3 * k + 3)
+        block = getattr(estimate, f"{name}_covariance")
+        np.testing.assert_allclose(block, P[:, rows, rows], rtol=1e-9, atol=1e-18)
+        np.testing.assert_array_equal(getattr(estimate, f"{name}_sigma"), estimate.sigma[:, rows])
+    error = np.zeros((FLIGHTS, 15))
+    error[:, :3] = batch.read("r") - batch.read("r_hat")
+    error[:, 3:6] = batch.read("v") - batch.read("v_hat")
+    turn = Rotation.from_matrix(view.R_BI @ estimate.R_BI.transpose(0, 2, 1))
+    error[:, 6:9] = -turn.as_rotvec()  # e for small angles
+    error[:, 9:12] = batch.read("b_a") - batch.read("b_a_hat")
+    error[:, 12:] = batch.read("b_g") - batch.read("b_g_hat")
+    expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
+    np.testing.assert_allclose(view.truth.nees, expected, rtol=0.02)
+
+
+def test_the_reference_of_a_circle_is_its_closed_form():
+    _, view = flown(steps=30)
+    t, w, z = 30 / 50.0, 2.0 * np.pi / 10.0, 1.0
+    assert view.time == pytest.approx(np.full(FLIGHTS, t), abs=1e-12)
+    assert list(view.step) == [30] * FLIGHTS
+
+    def position(t):
+        return np.array([4.0 * np.cos(w * t), 4.0 * np.sin(w * t), z])
+
+    c, s = np.cos(w * t), np.sin(w * t)
+    for value, expected in (
+        (view.reference_position, position(t)),
+        (view.reference_velocity, 4.0 * w * np.array([-s, c, 0.0])),
+        (view.reference_acceleration, -4.0 * w * w * np.array([c, s, 0.0])),
+        (view.reference_heading, np.array([-c, -s, 0.0])),
+        (view.preview[:, 0], position(t + 0.2)),
+        (view.preview[:, 1], position(t + 0.4)),
+    ):
+        np.testing.assert_allclose(value, np.tile(expected, (FLIGHTS, 1)), atol=1e-12)
+
+
+def test_what_is_seen_relative_to_the_reference_is_the_shipped_observation():
+    batch, view = flown("lemniscate", randomize=True)
+    layout = {field.name: field.slice for field in quad_gym.observation_layout()}
+    for name in ("position_error", "velocity_error", "up", "heading", "reference_acceleration"):
+        shipped = view.observation[:, layout[name]]
+        np.testing.assert_allclose(getattr(view.seen, name), shipped, atol=1e-6)
+    R, gap = batch.read("R_hat"), view.reference_position - batch.read("r_hat")
+    np.testing.assert_allclose(
+        view.seen.position_error, np.einsum("nij,nj->ni", R, gap), atol=1e-12
+    )
+    ahead = np.einsum("nij,nkj->nki", R, view.preview - view.reference_position[:, np.newaxis])
+    np.testing.assert_allclose(view.seen.preview, ahead, atol=1e-12)
+    np.testing.assert_array_equal(view.seen.position, batch.read("r_seen"))
+    np.testing.assert_array_equal(view.seen.body_rates, batch.read("w_seen"))
+
+
+def test_the_features_in_view_are_those_that_the_camera_has_seen():
+    seen = np.zeros(2, int)
+    env = QuadVectorEnv(FLIGHTS, "hover", custom=Nothing(), start="hover", pad=False)
+    env.reset(seed=1)
+    view = env.flights.batch.view
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        env.step(rng.uniform(-0.8, 0.8, (FLIGHTS, 4)))
+        flying = ~view.began
+        np.testing.assert_array_equal(
+            view.truth.features_in_view[flying], env.flights.batch.read("feature_valid")[flying, :2]
+        )
+        seen += np.bincount(view.truth.features_in_view[flying].ravel(), minlength=2)
+    assert (seen > 20).all()  # both cases came
+
+
+def test_measurements_that_were_not_taken_are_nan():
+    _, view = flown(sensors="rtk", steps=7, gnss_rate=10, camera_rate=10, start="hover")
+    rows, valid = view.measured.gnss_position, view.measured.gnss_valid
+    assert not valid.all()
+    assert np.isnan(rows[~valid]).all()
+    batch, view = flown(steps=10, start="hover")
+    assert view.measured.gnss_valid.all()
+    gap = np.linalg.norm(view.measured.gnss_position - view.position, axis=1)
+    assert (gap < 0.5).all()  # the antenna is on the vehicle
+    np.testing.assert_array_equal(view.measured.gyro, batch.read("gyro"))
+    np.testing.assert_array_equal(view.measured.accel, batch.read("accel"))
+    seen = view.measured.features_seen
+    pixels = batch.read("pixels")[:, :2]
+    np.testing.assert_array_equal(view.measured.pixels[seen], pixels[seen])
+    assert np.isnan(view.measured.pixels[~seen]).all()
+
+
+def test_gates_and_progress_of_a_course():
+    env = QuadVectorEnv(FLIGHTS, "waypoints", custom=Nothing(), autoreset_mode="Disabled")
+    env.reset(seed=2)
+    batch = env.flights.batch
+    first = batch.view.gates[:, 0]
+    np.testing.assert_array_equal(batch.view.reference_position, first)
+    np.testing.assert_array_equal(batch.view.preview, batch.view.gates[:, 1:3])
+    env.reset(
+        seed=2,
+        options={"position": first + (0.6, 0.0, 0.0), "velocity": np.array([-1.0, 0.0, 0.0])},
+    )
+    gates, passed = batch.view.gates, np.zeros(FLIGHTS, bool)
+    for _ in range(40):
+        target = gates[np.arange(FLIGHTS), batch.view.gates_passed]
+        before = np.linalg.norm(target - batch.read("r"), axis=1)
+        env.step(np.zeros((FLIGHTS, 4)))
+        after = np.linalg.norm(target - batch.read("r"), axis=1)
+        np.testing.assert_allclose(
+            batch.view.truth.progress, (before - after) / 0.02, rtol=1e-9, atol=1e-9
+        )
+        np.testing.assert_array_equal(batch.view.gate_passed, after < 0.3)
+        passed |= batch.view.gate_passed
+    assert passed.any()
+
+
+def test_a_view_knows_faults_by_name():
+    batch, view = flown(sensors="rtk", faults="gnss_outage")
+    batch.switch_faults(True)
+    batch.step(np.zeros((FLIGHTS, 4)))
+    view = batch.view
+    assert list(view.truth.faults) == list(batch.active_faults())
+    assert all(active.all() for active in view.truth.faults.values())
+
+
+def test_without_a_filter_the_estimate_says_what_is_missing():
+    _, view = flown(observation="truth")
+    with pytest.raises(ValueError, match=r"view.estimate needs a filter"):
+        _ = view.estimate.sigma
+    with pytest.raises(ValueError, match=r"view.measured needs sensors"):
+        _ = view.measured.gyro
+    np.testing.assert_array_equal(view.seen.position, view.position)
+
+
+def test_a_view_is_of_the_episode_that_the_step_belongs_to():
+    said = []
+
+    def reward(view):
+        said.append((view.step.copy(), view.began.copy()))
+        return view.step * 1.0
+
+    task = quad_gym.Task.of(reward=reward)
+    for mode, began in (("SameStep", 0), ("NextStep", 1)):
+        said.clear()
+        env = QuadVectorEnv(1, "hover", custom=task, max_episode_steps=3, autoreset_mode=mode)
+        env.reset(seed=0)
+        rewards = [float(env.step(np.zeros((1, 4)))[1][0]) for _ in range(5)]
+        assert sum(b.sum() for _, b in said) == began
+        assert rewards == ([1.0, 2.0, 3.0, 1.0, 2.0] if not began else [1.0, 2.0, 3.0, 0.0, 1.0])

@@ -1,0 +1,101 @@
+"""The matrix of consistency: its cells, a small slice of it, what it marks, and how it resumes."""
+
+import json
+
+import pytest
+
+import quad_gym
+from quad_gym.commands import consistency
+from quad_gym.commands import consistency_matrix as matrix
+from quad_gym.commands.options import parse
+from quad_gym.params.suites import SUITES
+
+SMALL = {"flights": 64, "duration": 1.0, "first_seed": 0}
+
+
+def chosen(*names):
+    found = [cell for cell in matrix.cells_of("all") if cell.name in names]
+    assert len(found) == len(names)
+    return found
+
+
+def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
+    cells = matrix.cells_of("all")
+    names = [cell.name for cell in cells]
+    assert len(set(names)) == len(names)
+    tasks = {(c.suite, c.task, c.start) for c in cells if c.condition == "as it is"}
+    assert len(tasks) == len(SUITES) * 5 * 2
+    conditions = {c.condition for c in cells if c.suite == "rtk"}
+    assert {"gnss_outage", "camera_occlusion", "two periods late", "lever arm"} <= conditions
+    assert "gnss_ramp" not in conditions  # it does not end
+    assert "gnss_outage" not in {c.condition for c in cells if c.suite == "indoor"}
+
+
+def test_latencies_are_none_half_and_all_of_two_periods():
+    late = {c.condition: c.flown for c in matrix.cells_of("conditions") if c.suite == "rtk"}
+    found = [late[f"{name} late"].gnss.latency for name in ("one period", "two periods")]
+    assert found == pytest.approx([0.1, 0.2])
+    assert late["no latency"].camera.latency == 0.0
+    assert late["two periods late"].camera.latency == pytest.approx(0.08)
+
+
+def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
+    cells = chosen("rtk, hover, warm, as it is", "lab, circle, cold, as it is")
+    done = matrix.run_matrix(cells, tmp_path, **SMALL)
+    sound, report = (
+        done[f"{name}, as it is"] for name in ("rtk, hover, warm", "lab, circle, cold")
+    )
+    assert 13.0 < sound["values"]["state"] < 17.0  # 3 deviations of the mean of 64 at one instant
+    assert report["values"]["state"] > 17.0
+    assert report["misses"]
+    assert report["expected"] == {"": "the report's filter"}
+    written = json.loads((tmp_path / "matrix.json").read_text())
+    assert written["seeds"] == [0, 63]
+    assert written["cells"][cells[0].name]["sensors"]["imu"]["rate"] == 200.0
+
+
+def test_a_run_goes_on_where_it_was_and_begins_anew_with_other_flights(tmp_path, monkeypatch):
+    flown = []
+
+    def measured(cell, **options):
+        flown.append(cell.name)
+        return {
+            **{"values": {"state": 15.0}, "misses": [], "expected": {}, "filters_failed": 0},
+            "sensors": cell.flown,
+        }
+
+    monkeypatch.setattr(matrix, "measure", measured)
+    cells = matrix.cells_of("suites")
+    matrix.run_matrix(cells[:2], tmp_path, **SMALL)
+    matrix.run_matrix(cells[:4], tmp_path, **SMALL)
+    assert flown == [cell.name for cell in cells[:4]]
+    matrix.run_matrix(cells[:1], tmp_path, **SMALL | {"flights": 65})
+    assert flown[4:] == [cells[0].name]
+
+
+def test_the_table_marks_misses_and_those_that_are_expected():
+    cell = {"values": {"state": 20.0, "position": 4.0}, "misses": ["state", "position"]}
+    cell |= {"expected": {"state": "wrong noise"}, "filters_failed": 2}
+    text = matrix.table_of({"one": cell}, 400)
+    assert "| one | *20.00* | **4.00** |" in text
+    assert "state: wrong noise; **2 filters failed**" in text
+
+
+def test_wrong_options_are_refused():
+    with pytest.raises(SystemExit):
+        parse(consistency.Args, ["--cells", "suites"])
+    assert parse(consistency.Args, []).count == 4000
+    assert parse(consistency.Args, ["--matrix"]).count == 400
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", matrix.STARTS)
+@pytest.mark.parametrize("task", ["hover", "circle", "random_trajectory"])
+@pytest.mark.parametrize("suite", [name for name in SUITES if name != "lab"])
+def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
+    """Means over 400 flights of 10 s: 0.8 is 2.9 deviations even if a flight's errors stayed."""
+    cell = matrix.Cell(suite, task, start)
+    found = matrix.measure(cell, flights=400, duration=10.0, first_seed=0)
+    assert found["filters_failed"] == 0
+    assert 14.2 < found["values"]["state"] < 15.8
+    assert cell.flown == quad_gym.sensor_suite(suite)
