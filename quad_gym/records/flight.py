@@ -148,14 +148,6 @@ _WATCH_FIELDS = (
     Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
     Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
     Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
-    # tests for steps of the gyro's bias, see kernels/filter/gyro_tests.py
-    Field("correction_sum", (6,), "mixed", "discounted sum of what updates have added to b_a_hat and b_g_hat"),
-    Field("correction_variance", (6,), "mixed", "variance of that in a right filter"),
-    Field("correction_tick", (), "ticks", "when the last was added"),
-    Field("heading_trend", (2,), "rad, rad/s", "line through the innovations of the heading: value now, slope"),
-    Field("trend_gain", (3,), "mixed", "covariance that weighs the next one: of value, both, slope"),
-    Field("trend_variance", (3,), "mixed", "likewise what white noise makes of the line"),
-    Field("trend_tick", (), "ticks", "when the last heading was measured"),
 )
 _LATE_FIELDS = (
     # what the IMU has summed up since the start of the episode, biases and gravity included

@@ -257,7 +257,7 @@ def test_unknown_ids_are_refused(env_id):
 
 
 @pytest.mark.parametrize("count", [0, -1, 2.5, "two", None, True])
-def test_a_number_of_flights_that_makes_no_sense_is_refused(count):
+def test_a_number_of_flights_that_is_invalid_is_refused(count):
     with pytest.raises(ValueError, match=r"count|num_envs|n_envs"):
         QuadVectorEnv(count, "hover")
     with pytest.raises(ValueError, match=r"count|num_envs|n_envs"):
@@ -265,7 +265,7 @@ def test_a_number_of_flights_that_makes_no_sense_is_refused(count):
 
 
 @pytest.mark.parametrize("threads", [0, -2, 1.5, "all", True])
-def test_a_number_of_threads_that_makes_no_sense_is_refused(threads):
+def test_a_number_of_threads_that_is_invalid_is_refused(threads):
     with pytest.raises(ValueError, match="threads"):
         QuadVectorEnv(4, "hover", threads=threads)
 

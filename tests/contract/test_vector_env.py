@@ -198,7 +198,7 @@ def test_seeds_that_do_not_fit_are_refused(seed):
         (np.array([1.0, 0.0, 1.0]), TypeError),
     ],
 )
-def test_a_reset_mask_that_makes_no_sense_changes_nothing(mask, error):
+def test_a_reset_mask_that_is_invalid_changes_nothing(mask, error):
     env = QuadVectorEnv(3, "hover", autoreset_mode="Disabled")
     env.reset(seed=1)
     before = state_of(env)
@@ -306,7 +306,7 @@ def test_without_a_duration_an_episode_has_no_limit():
 
 
 @pytest.mark.parametrize("steps", [0, -1, 2.5, True, "many"])
-def test_a_limit_that_makes_no_sense_is_refused(steps):
+def test_a_limit_that_is_invalid_is_refused(steps):
     with pytest.raises(ValueError, match="max_episode_steps"):
         QuadVectorEnv(2, "hover", max_episode_steps=steps)
 

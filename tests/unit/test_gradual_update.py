@@ -86,6 +86,6 @@ def test_a_rough_start_is_consistent_after_the_first_image_in_steps_only(kind):
     assert expected.sf(sums[None]) < ALARM
 
 
-def test_a_deviation_that_makes_no_sense_is_refused():
+def test_a_deviation_that_is_invalid_is_refused():
     with pytest.raises(ValueError, match=r"^FilterParams.gradual_above must be"):
         quad_gym.FilterParams(gradual_above=0.0)

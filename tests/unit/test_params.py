@@ -135,6 +135,7 @@ BAD_VALUES = {
     ("Clocks", "substeps"): [0, -1, 1.5, True, *NO_NUMBERS],
     ("TaskParams", "kind"): ["square", None, 1],
     ("TaskParams", "start"): ["air", None],
+    ("TaskParams", "reward_per"): ["episode", None, 1],
     ("TaskParams", "radius"): NOT_POSITIVE,
     ("TaskParams", "period"): NOT_POSITIVE,
     ("TaskParams", "height"): NOT_POSITIVE,
@@ -183,7 +184,7 @@ def test_parameters_are_values_that_compare_and_hash(kind):
 
 
 @pytest.mark.parametrize(("kind", "name"), BAD_VALUES, ids=lambda part: part)
-def test_a_value_that_makes_no_sense_is_refused_by_the_name_of_its_field(kind, name):
+def test_a_value_that_is_invalid_is_refused_by_the_name_of_its_field(kind, name):
     for bad in BAD_VALUES[kind, name]:
         with pytest.raises(ValueError, match=rf"\b{name}\b"):
             getattr(quad_gym, kind)(**{name: bad})

@@ -223,7 +223,7 @@ def assert_alike(left, right, flight=0):
         )
 
 
-OTHERS = {"rotor_efficiency", "camera_rotation"}
+OTHERS = {"rotor_efficiency", "camera_rotation", "action_delay"}
 TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startswith("start_")]
 
 
@@ -384,7 +384,7 @@ def test_a_snapshot_keeps_what_was_drawn():
     ],
     ids=str,
 )  # fmt: skip
-def test_a_randomization_that_makes_no_sense_is_refused(given, message):
+def test_a_randomization_that_is_invalid_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         FlightBatch(1, randomization=given)
 
@@ -421,7 +421,7 @@ def test_a_camera_that_is_not_there_cannot_be_drawn():
         (lambda: Randomization({}, known="yes"), "known"),
     ],
 )
-def test_a_distribution_that_makes_no_sense_is_refused(make, message):
+def test_a_distribution_that_is_invalid_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 

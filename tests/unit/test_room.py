@@ -85,7 +85,8 @@ def test_what_is_not_used_takes_no_memory():
 
     truth = size(**TRUTH)
     assert truth < 0.5 * size(sensors="lab")
-    assert size(sensors="lab") < size(sensors="rtk") < size(sensors=late("rtk"))
+    prompt = quad_gym.sensor_suite("rtk").simplified()
+    assert size(sensors="lab") < size(sensors=prompt) < size(sensors="rtk")
     assert truth < size(**TRUTH | MORE["drawn"]) < size(**TRUTH | MORE["faults"])
 
 

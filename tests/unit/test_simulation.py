@@ -162,7 +162,7 @@ def test_a_batch_flies_on_the_motors_it_is_told():
     ],
     ids=str,
 )
-def test_a_batch_that_makes_no_sense_raises(options):
+def test_a_batch_that_is_invalid_raises(options):
     with pytest.raises(ValueError, match=r".+"):
         FlightBatch(**{"count": 4, **options})
 

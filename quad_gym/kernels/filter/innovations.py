@@ -20,7 +20,6 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.gyro_tests import begin_gyro_tests, follow_heading
 from quad_gym.kernels.filter.recovery import (
     FITTING_FEATURES,
     LARGEST,
@@ -242,9 +241,6 @@ def judge_innovations(
         counts = select(has & logical_not(rejected & trusted), 1.0, 0.0)
         total, freedoms = total + counts * nis, freedoms + 2.0 * counts
         if gating:
-            u = (work.h[k], work.h[k + 1], work.h[k + 2])
-            side = flight.innovation[BASELINE_BLOCK, 0]
-            follow_heading(flight, p, u, side, first & logical_not(rejected))
             _mask_block(work, k, rejected, columns)
             _count_in_row(flight, BASELINE_BLOCK, has, rejected, again)
             left_out = left_out + select(rejected, 3.0, 0.0)
@@ -310,7 +306,6 @@ def mark_failed(flight, feature_count, failed):
 @kernel
 def forget_innovations(flight, feature_count, mask):
     """Begin an episode without innovations, where `mask`."""
-    begin_gyro_tests(flight, mask)
     for s in range(FEATURE_BLOCKS + feature_count):
         flight.block_nis[s] = select(mask, np.nan, flight.block_nis[s])
         flight.gate[s] = select(mask, 0.0, flight.gate[s])

@@ -1,14 +1,12 @@
 """A filter that notices that it is wrong: what it doubts then, and when it counts as lost.
 
-Three things tell a filter that its covariance does not explain what is measured.
+Two things tell a filter that its covariance does not explain what is measured.
 
 * **Rejections.** A kind of measurement was rejected `gate_patience` times in a row. Then the filter
   is likelier wrong than the sensor - unless GNSS is rejected while the camera's features fit, which
   then speak for the estimate: GNSS stays out as long as they do.
 * **Drifts.** Innovations of a right filter are white. Their mean over the last 50 or so, in
   deviations, exceeds `DRIFT_ALARM` in a right filter about once in a million times.
-* **The gyro's bias.** Corrections of it that add up, or headings that drift away although the
-  filter hardly counts them, see `gyro_tests.py`.
 
 What may be wrong is not only what the sensor measures. An innovation that has grown for a time T
 since the last acceptance may come from biases, so their variances grow likewise: nu / T of an angle
@@ -26,15 +24,6 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.drift import add_to_drift, keep_drift
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
-from quad_gym.kernels.filter.gyro_tests import (
-    STEP,
-    TREND_MEMORY,
-    TURNED_FOR,
-    forget_corrections,
-    judge_sums,
-    judge_trend,
-    vertical_of,
-)
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -42,6 +31,7 @@ from quad_gym.kernels.maths.linalg import (
     add_outer,
     add_to_diagonal,
     load3,
+    load33,
     load_block,
     norm,
     scale,
@@ -158,7 +148,8 @@ def _doubt_attitude(flight, baseline):
     """The square of a baseline's innovation about the vertical and about the horizontal."""
     zero = 0.0 * flight.tick
     nothing = (zero, zero, zero)
-    vertical = vertical_of(flight)
+    R_BI = load33(flight.R_hat)
+    vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
     side = select(baseline, flight.innovation[BASELINE_BLOCK, 0], 0.0)
     up = select(baseline, flight.innovation[BASELINE_BLOCK, 1], 0.0)
     D_e = add_to_diagonal((nothing, nothing, nothing), up * up)
@@ -196,7 +187,7 @@ def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, drift, D_d):
     store_block(P, V, V, add33(load_block(P, V, V), D_v))
     store_block(P, E, E, add33(load_block(P, E, E), D_e))
     store_block(P, BA, BA, add_to_diagonal(load_block(P, BA, BA), D_a))
-    store_block(P, BG, BG, add33(load_block(P, BG, BG), D_g))
+    store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), D_g))
     states = 15
     if drift is not None:
         states = 18
@@ -242,12 +233,8 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
     drifting = (_drifts(flight, POSITION_BLOCK) | _drifts(flight, BASELINE_BLOCK)) & free
     drifting = drifting | _drifts(flight, VELOCITY_BLOCK) | _drifts(flight, FEATURE_BLOCKS)
     drifting = drifting & mask
-    gyro_variance = _variance_of(flight, BG)
-    adding_up, lost = judge_sums(flight, p, gyro_variance, mask)
-    lacking, turning = judge_trend(flight, p, mask & (flight.baseline_valid > 0.0))
-    doubtful = position | baseline | velocity | camera | drifting | lost
-    inflated = doubtful | adding_up | (lacking > 0.0)
-    if not any_of(inflated):
+    doubtful = position | baseline | velocity | camera | drifting
+    if not any_of(doubtful):
         return
     nu = flight.innovation
     D_r, D_v = _squares(nu[POSITION_BLOCK], position), _squares(nu[VELOCITY_BLOCK], velocity)
@@ -268,25 +255,12 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
     T_c = _time_of(flight, p, FEATURE_BLOCKS)
     D_g = D_g + _square_of(math.sqrt(angle) / T_c, _MOST_GYRO_BIAS, camera)
 
-    # a drift alone: four times the deviations of the biases; what the tests of the gyro say
-    more_a = 15.0 * _variance_of(flight, BA)
-    step = STEP * p.gyro_bias_sigma
-    more_g = select(drifting, 15.0 * gyro_variance, 0.0)
-    more_g = maximum(more_g, select(adding_up, step * step + 8.0 * gyro_variance, 0.0))
-    more_g = minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS)
+    # a drift alone: four times the deviations of the biases
+    more_a, more_g = 15.0 * _variance_of(flight, BA), 15.0 * _variance_of(flight, BG)
     D_a = D_a + select(drifting, minimum(more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
-    D_g = D_g + more_g
-    tilt = select(adding_up, more_g * TURNED_FOR * TURNED_FOR, 0.0)
-    tilt = minimum(tilt, _MOST_TILT * _MOST_TILT)
-    D_e, D_a = add_to_diagonal(D_e, tilt), D_a + p.gravity * p.gravity * tilt
-    zero, up = 0.0 * D_g, vertical_of(flight)
-    D_gg = ((D_g, zero, zero), (zero, D_g, zero), (zero, zero, D_g))
-    D_gg = add_outer(D_gg, scale(lacking, up), up)
-    D_e = add_outer(D_e, scale(lacking * TREND_MEMORY * TREND_MEMORY, up), up)
+    D_g = D_g + select(drifting, minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS), 0.0)
 
-    failed = _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_gg, inflated, drift, D_d)
-    forget_corrections(flight, doubtful | adding_up)
-    doubtful = doubtful | turning
+    failed = _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, doubtful, drift, D_d)
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)

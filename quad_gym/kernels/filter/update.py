@@ -16,7 +16,6 @@ from quad_gym.kernels.filter.drift import load_drift, measure_drift, shift_drift
 from quad_gym.kernels.filter.ekf import measure_columns
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.expected import compare_center, measure_sigma_points
-from quad_gym.kernels.filter.gyro_tests import follow_corrections
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
 from quad_gym.kernels.filter.recovery import raise_doubts
 from quad_gym.kernels.maths.elementary import is_finite
@@ -227,8 +226,6 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
         turn_factor(L9, reset_matrix((dx[E], dx[E + 1], dx[E + 2])), states, columns)
     wanted = mask & (measured > 0.0)
     ok = wanted & (pivot > 0.0) & is_finite(total)
-    if (form & _GATE) != 0:
-        follow_corrections(flight, p, dx, L9, columns, last, ok)
     keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))
     keep3(flight.v_hat, ok, add(load3(flight.v_hat), (dx[V], dx[V + 1], dx[V + 2])))
     R_BI = multiply(euler_to_dcm((dx[E], dx[E + 1], dx[E + 2])), load33(flight.R_hat))
