@@ -62,6 +62,7 @@ benchmark: setup  ## steps per second of every face and the cost of each part
 	$(BIN)/quad-gym benchmark --output results/benchmark
 
 docs: $(VENV)/.writer  ## the site in docs/_build/html/index.html; runs the tutorials, some minutes
+	$(BIN)/quad-gym compile --stages all # here, so that no tutorial says that it compiles
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they hold

@@ -20,6 +20,12 @@ SPECIFICATION = (
     "Observation, action, reward, start, endings and `info` are on the page of each environment.",
     "",
 )
+PLAIN = ("attribute", "data", "property")
+"""What has no sections in its docstring."""
+
+kept: dict[str, list[str]] = {}
+"""Such docstrings, while Napoleon works."""
+
 ALIAS = re.compile("Alias for field number")
 """What Python says of the fields of a named tuple."""
 
@@ -66,9 +72,14 @@ def rewrite(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: li
         found += _list_table(part) if is_table and len(part) > 2 else part
     lines[:] = found
 
-    if what in ("attribute", "data", "property"):
-        # Napoleon would take what stands before a colon, such as "I: inertial", for a type
-        lines[:] = ["", *(line for line in lines if not ALIAS.match(line))]
+    if what in PLAIN:
+        kept[name] = [line for line in lines if not ALIAS.match(line)]
+
+
+def restore(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Undo what Napoleon makes of fields: types of what stands before a colon."""
+    if what in PLAIN:
+        lines[:] = kept.pop(name)
 
 
 def shorten(
@@ -88,7 +99,8 @@ def shorten(
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Rewrite docstrings before Napoleon does."""
+    """Rewrite docstrings before Napoleon does, and after."""
     app.connect("autodoc-process-docstring", rewrite, priority=100)
+    app.connect("autodoc-process-docstring", restore, priority=900)
     app.connect("autodoc-process-signature", shorten)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

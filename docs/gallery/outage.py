@@ -14,7 +14,7 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym.faults import AccelBiasStep, GnssOutage
 
-FLIGHTS, SECONDS = 200, 16
+FLIGHTS, SECONDS = 200, 20
 
 
 def fly(*faults):
@@ -94,6 +94,9 @@ print(f"lost filters: at most {100 * lost.max():.0f} %, at the end {100 * lost[-
 print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 
 # %%
+# One recovery is not always enough. Where the new bias is still mostly unknown, the estimate drifts
+# off again, which the upper curve of the error shows, until the filter doubts itself once more.
+#
 # ``end_when_lost=True`` truncates an episode when its filter is lost. See
 # :doc:`/sensors-and-filter` for the thresholds, and :doc:`/filter-equations` for what is
 # inflated.
