@@ -69,7 +69,7 @@ EDITS = {
     "a comment in a record": ("quad_gym/records/flight.py", "", COMMENT, (0, 0, 0)),
     "metrics": ("quad_gym/analysis/metrics.py", "", STATEMENT, (0, 0, 0)),
     "environments": ("quad_gym/envs/single.py", "", STATEMENT, (0, 0, 0)),
-    "parameters": ("quad_gym/params.py", "", STATEMENT, (0, 0, 0)),
+    "parameters": ("quad_gym/params/task.py", "", STATEMENT, (0, 0, 0)),
     "another test": ("tests/other.py", "", STATEMENT, (0, 0, 0)),
     "who compiles": ("quad_gym/kernels/compiling/workers.py", "", STATEMENT, (0, 0, 0)),
     "the cache": ("quad_gym/kernels/compiling/cache.py", "", STATEMENT, (0, 0, 0)),
