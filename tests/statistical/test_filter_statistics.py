@@ -36,7 +36,7 @@ def attitudes_of_quaternions(q):
 def circle_batch(sensors=LAB, source=Source.ESTIMATE, **options):
     """The report's experiment, one flight per seed."""
     batch = FlightBatch(
-        FLIGHTS, sensors=sensors, source=source, task=TaskParams(duration=0), **options
+        FLIGHTS, sensors=sensors, source=source, task=TaskParams(duration=0, pad=False), **options
     )
     batch.reset(seeds=list(range(FLIGHTS)))
     return batch
