@@ -142,7 +142,7 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
     if settings.action_delays > 0:
         call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
-    if settings.gnss_delay + settings.camera_delay > 0:
+    if settings.run_filter and settings.gnss_delay + settings.camera_delay > 0:
         call_stage(stages, _BEGIN_LATE, flight, world, model, settings, work, 0)
     call_stage(stages, _BEGIN, flight, world, model, settings, work, 0)
     if settings.run_filter and settings.imu_errs + settings.heading_errs > 0:

@@ -46,6 +46,11 @@ def cases():
             found[f"{task}, {suite}"] = {"id": task, "sensors": suite, "randomize": True}
     for observation in ("truth", "noisy", "sensors"):
         found[f"observation {observation}"] = {"observation": observation}
+    for suite in SUITES:
+        found[f"observation truth, {suite}"] = {
+            **{"observation": "truth", "sensors": suite, "filter_start": "warm", "randomize": True},
+            **{"faults": ["rotor_loss"], "world": "fresh_breeze", "action_delay": 0.5},
+        }
     for action in ("motor", "wrench", "attitude", "velocity"):
         found[f"action {action}"] = {"action": action}
     for fault in PRESETS:

@@ -1,4 +1,4 @@
-"""The table of stages of this process: compiled or loaded when a batch first needs them."""
+"""The stages of this process, and a table of those that a batch needs: compiled or loaded then."""
 
 import threading
 from typing import Any
@@ -10,8 +10,7 @@ from quad_gym.kernels.compiling.stages import SIGNATURE, SOURCES, STAGE_TABLE, S
 from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
 
 FLY = "quad_gym.kernels.batch:fly"
-_table: NDArray[Any] = np.zeros(1, STAGE_TABLE)
-_linked: set[Stage] = set()
+_addresses: dict[Stage, int] = {}
 _lock = threading.Lock()
 
 
@@ -28,15 +27,20 @@ def names_of(needed: frozenset[Stage]) -> list[str]:
 
 
 def linked_table(needed: frozenset[Stage]) -> NDArray[Any]:
-    """The table of addresses, (1,) STAGE_TABLE, with at least the stages that are needed."""
-    if needed <= _linked:
-        return _table
+    """The table of addresses, (1,) STAGE_TABLE, of the stages that are needed and no others.
+
+    A batch has memory for what these stages use, see `used_parts`: a stage that it calls without
+    needing it must fail rather than find what another batch has linked.
+    """
     with _lock:
-        prepare(names_of(needed))
-        for stage in needed - _linked:
-            _table["address"][0, stage] = _address(name_of(stage))
-            _linked.add(stage)
-    return _table
+        missing = needed - _addresses.keys()
+        if missing:
+            prepare(names_of(needed))
+            _addresses.update((stage, _address(name_of(stage))) for stage in missing)
+    table = np.zeros(1, STAGE_TABLE)
+    for stage in needed:
+        table["address"][0, stage] = _addresses[stage]
+    return table
 
 
 def _address(name: str) -> int:
