@@ -8,6 +8,7 @@ from typing import Any
 
 from quad_gym import faults
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
+from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
@@ -15,6 +16,7 @@ from quad_gym.params.distributions import LogUniform, Normal, Uniform
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
+from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -55,6 +57,7 @@ _LAZY = {
 __all__ = [
     "IDS",
     "ActionParams",
+    "BarometerParams",
     "BatteryParams",
     "CameraParams",
     "Clocks",
@@ -62,6 +65,7 @@ __all__ = [
     "GnssParams",
     "ImuParams",
     "LogUniform",
+    "MagnetometerParams",
     "NoisyObservationParams",
     "Normal",
     "PDGains",

@@ -9,11 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.workers import prepare
+from quad_gym.packing.aids import pack_aid_settings
 from quad_gym.packing.flight import form_of, params_record
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterForm, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, FLIGHT, SETTINGS, WORK, FilterForm, FilterStatus
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
@@ -89,7 +90,8 @@ class _KalmanFilter:
         self._form = int(form)
         self._flight = np.zeros(1, FLIGHT)
         self._flight["block_nis"] = self._flight["w_before"] = np.nan
-        self._work = np.zeros(1, WORK)
+        self._work, self._settings = np.zeros(1, WORK), np.zeros(1, SETTINGS)
+        pack_aid_settings(self._settings[0], sensors, sensors)
         self._running = False
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -181,7 +183,7 @@ class _KalmanFilter:
         _prepare(self.sensors.drifts)
         self._flight["tick"], self._flight["w_before"] = 0.0, np.nan
         self._flight["rejected_in_row"] = self._flight["reopened"] = 0.0
-        single.ukf_initialize(self._flight, self._params, x_I)
+        single.ukf_initialize(self._flight, self._params, x_I, self._settings)
 
     def update(
         self,
@@ -236,8 +238,11 @@ class _KalmanFilter:
             f["feature_valid"][0, : self._features] = seen
             f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
         before = self.status
-        run = single.drift_update if self.sensors.drifts else single.ukf_update
-        run(f, self._params, self._work, self._features, self._form)
+        arguments = (f, self._params, self._work, self._features, self._form)
+        if self.sensors.drifts:
+            single.drift_update(*arguments, self._settings)
+        else:
+            single.ukf_update(*arguments)
         self._warn_of_news(before)
 
     def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
@@ -263,8 +268,11 @@ class _KalmanFilter:
         self._flight["w_before"] = self._flight["w_meas"] if known else rates
         self._flight["w_meas"] = rates
         before = self.status
-        run = single.drift_predict if self.sensors.drifts else single.ukf_predict
-        run(self._flight, self._params, self._work, self._form)
+        arguments = (self._flight, self._params, self._work, self._form)
+        if self.sensors.drifts:
+            single.drift_predict(*arguments, self._settings)
+        else:
+            single.ukf_predict(*arguments)
         self._warn_of_news(before)
 
     # ---- the estimate -------------------------------------------------------------------------
@@ -306,12 +314,12 @@ class _KalmanFilter:
 
         It is zero at the start: positions count from where the receiver has the vehicle then.
         """
-        return self._read("gnss_drift_hat")
+        return self._read("slow_hat")[:3]
 
     @property
     def gnss_drift_covariance(self) -> NDArray[np.float64]:
         """(3, 3) covariance of its error [m^2]."""
-        L = self._read("L_drift")
+        L = self._read("L_slow")[:3]
         return L @ L.T
 
     @property

@@ -18,13 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.analysis.metrics import STATE_DIMENSION, nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.records import (
+    AID_BLOCKS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     FREEDOMS,
-    MAX_BLOCKS,
     POSITION_BLOCK,
     VELOCITY_BLOCK,
     WIDTH,
+    Aid,
 )
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
@@ -231,7 +232,8 @@ SENSOR_BLOCKS = {
     "position": (POSITION_BLOCK,),
     "baseline": (BASELINE_BLOCK,),
     "velocity": (VELOCITY_BLOCK,),
-    "feature": tuple(range(FEATURE_BLOCKS, MAX_BLOCKS)),
+    "feature": tuple(range(FEATURE_BLOCKS, AID_BLOCKS)),
+    **{aid.name.lower(): (AID_BLOCKS + aid,) for aid in Aid},
 }
 """Blocks of the measurement by sensor. Features share an attitude and a position, so that only the
 first one seen is taken of each image: what is taken at one instant is independent then."""
@@ -283,8 +285,8 @@ class InnovationRecorder:
 
     def add(self, batch: FlightBatch, time: float) -> None:
         """Take in what was measured at the present instant, `time` after the start [s]."""
-        names = ("position_valid", "baseline_valid", "velocity_valid")
-        valid = np.column_stack([*map(batch.read, names), batch.read("feature_valid")]) > 0.0
+        names = ("position", "baseline", "velocity", "feature", "aid")
+        valid = np.column_stack([batch.read(f"{name}_valid") for name in names]) > 0.0
         if not valid.any():
             return
         nis, innovation = batch.read("block_nis"), batch.read("innovation")

@@ -20,6 +20,12 @@ from quad_gym.records import (
 _UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
 """Fields that are NaN until they are measured or given."""
 
+_PARTS_OF = {
+    "gnss_drift_hat": ("slow_hat", (slice(0, 3),)),
+    "L_drift": ("L_slow", (slice(0, 3), slice(0, 18))),
+}
+"""Parts of fields that have names: of suites whose GNSS positions drift."""
+
 
 class FlightMemory:
     """The records of `count` flights, in blocks of WIDTH."""
@@ -61,6 +67,9 @@ class FlightMemory:
         if name in self.randomization.names:
             values = self.drawn()[name]
             return values if flights is None else values[flights]
+        if name in _PARTS_OF:
+            field, part = _PARTS_OF[name]
+            return self.read(field, flights)[(slice(None), *part)]
         if name not in (FLIGHT_BLOCK.names or ()):
             drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
             raise ValueError(

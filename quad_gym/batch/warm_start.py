@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.packing.aids import slow_states
 from quad_gym.params import portable
 from quad_gym.params.gnss import LEAST_DRIFT, GnssParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import WARM_DRAWS, WARM_DRIFT_DRAWS, Autoreset, Control, Source
+from quad_gym.records import MAX_STATES, WARM_DRAWS, Autoreset, Control, Source
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 FILTER_STARTS = ("cold", "warm")
@@ -79,8 +80,8 @@ def converged_covariance(
         substeps: Runge-Kutta steps in a tick.
 
     Returns:
-        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east; (18,
-        18) with the slow error d of GNSS positions last, if the filter estimates that.
+        (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east;
+        larger with the slow errors of sensors last, if the filter estimates such.
 
     Raises:
         ValueError: If a filter fails on the way, or is lost at its end, as one that has nothing to
@@ -118,10 +119,10 @@ def converged_covariance(
             f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
             "filter its heading, such as a level baseline or the mark of `placement`?"
         )
-    states = 18 if sensors.drifts else 15
+    states = 15 + len(slow_states(sensors).errors)
     mean = np.zeros((states, states))
     for q, L in zip(batch.read("q"), _factors(batch), strict=True):
-        root = portable.product(_turned_east(q).T[:states, :states], L[:states, :states])
+        root = portable.product(_turned_east(q, sensors).T[:states, :states], L[:states, :states])
         mean += portable.product(root, root.T) / FLIGHTS
     return mean
 
@@ -133,20 +134,28 @@ def _attitude_errors(batch: Any) -> Floats:
 
 
 def _factors(batch: Any) -> Floats:
-    """(n, 18, 18) factors of the joint covariances."""
-    factors = np.zeros((batch.count, 18, 18))
-    factors[:, :15, :15], factors[:, 15:] = batch.read("L"), batch.read("L_drift")
+    """(n, 24, 24) factors of the joint covariances."""
+    factors = np.zeros((batch.count, MAX_STATES, MAX_STATES))
+    factors[:, :15, :15], factors[:, 15:] = batch.read("L"), batch.read("L_slow")
     return factors
 
 
-def _turned_east(q: Floats) -> Floats:
-    """(18, 18) turn of what is in I from a vehicle that looks east to this one."""
+def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:
+    """(24, 24) turn of what is in I from a vehicle that looks east to this one.
+
+    Three slow numbers of an aiding sensor are in B, as hard iron is. How they go with the error of
+    the heading depends on where the field is, so that they are kept as seen from I.
+    """
     w, x, y, z = map(float, q)
     forward = (w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z))
     c, s = (component / portable.norm(forward) for component in forward)
-    turn = np.eye(18)
-    for block in (slice(0, 3), slice(3, 6), slice(15, 18)):
-        turn[block, block] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    turn, level, states = np.eye(MAX_STATES), np.eye(3), slow_states(sensors)
+    level[:2, :2] = [[c, -s], [s, c]]
+    for first in (0, 3, *([15] if states.drifts else [])):
+        turn[first : first + 3, first : first + 3] = level
+    for first in states.vectors:
+        if first >= 0:
+            turn[15 + first : 18 + first, 15 + first : 18 + first] = level.T
     return turn
 
 
@@ -162,28 +171,30 @@ def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     A filter that started from the distribution of the biases, of covariance S, has an estimate that
     is independent of its error, so that cov(error, bias) = P_b, the columns of P for the biases.
     Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals. Likewise the slow
-    error of GNSS positions.
+    errors of sensors.
 
     Args:
-        P: (15, 15) or (18, 18) covariance, whose share of biases and slow error is not larger than
-            S.
+        P: (n, n) covariance, n at least 15, whose share of biases and slow errors is not larger
+            than S.
         sensors: As the filter believes them to be; say what S is.
 
     Returns:
-        (15, WARM_DRAWS), with the columns of the biases last; or (18, WARM_DRAWS +
-        WARM_DRIFT_DRAWS), with three more, and those of the slow error, behind these.
+        (n, WARM_DRAWS + 2 (n - 15)), with the columns of the biases after the first fifteen; behind
+        them, by threes, those of the slow errors alone and those of the true ones.
     """
     imu = sensors.imu
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
-    if len(P) == 15:
-        W = np.zeros((15, WARM_DRAWS))
-    else:
-        assert sensors.gnss is not None
-        sigma = np.concatenate([sigma, np.maximum(drift_sigma(sensors.gnss), LEAST_DRIFT)])
-        W = np.zeros((18, WARM_DRAWS + WARM_DRIFT_DRAWS))
+    slow = np.array([error.sigma for error in slow_states(sensors).errors])
+    if sensors.gnss is not None and sensors.drifts:
+        slow[:3] = np.maximum(drift_sigma(sensors.gnss), LEAST_DRIFT)
+    sigma = np.concatenate([sigma, slow])
+    W = np.zeros((len(P), WARM_DRAWS + 2 * len(slow)))
     with_truth = P[:, 9:] / sigma
     # what the truth does not explain; where it explains everything, rounding leaves some of it
     rest = portable.lower_root(P - portable.product(with_truth, with_truth.T), np.diag(P))
     W[:, :15], W[:, 15:21] = rest[:, :15], with_truth[:, :6]
-    W[:, 21 : 21 + len(P) - 15], W[:, 24:] = rest[:, 15:], with_truth[:, 6:]
+    for k in range(0, len(slow), 3):
+        own = WARM_DRAWS + 2 * k
+        W[:, own : own + 3] = rest[:, 15 + k : 18 + k]
+        W[:, own + 3 : own + 6] = with_truth[:, 6 + k : 9 + k]
     return W

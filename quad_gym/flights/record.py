@@ -16,7 +16,7 @@ from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights.stage import Stage
 from quad_gym.packing.flight import params_record
-from quad_gym.records import FEATURE_BLOCKS, Source
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, Source
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 if TYPE_CHECKING:
@@ -314,7 +314,7 @@ class FlightRecorder:
             seen = self._read("feature_fresh") + self._read("feature_valid") > 0.0
             pixels = np.where(seen[:, np.newaxis], self._read("pixels"), np.nan)
             row["pixels"] = pixels[:features]
-            row["feature_gate"] = np.where(seen, gate[FEATURE_BLOCKS:], np.nan)[:features]
+            row["feature_gate"] = np.where(seen, gate[FEATURE_BLOCKS:AID_BLOCKS], np.nan)[:features]
 
     def _stage_of_episode(self) -> Stage:
         batch, model = self._batch, self._model

@@ -17,6 +17,7 @@ from quad_gym.kernels.simd.addresses import (
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 from quad_gym.kernels.simd.lanes import all_of, any_of, select
 from quad_gym.records import (
+    AIDS,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
     SETTINGS,
@@ -163,6 +164,9 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
     flight.baseline_fresh = 0.0
     for i in range(settings.feature_count):
         flight.feature_fresh[i] = 0.0
+    if settings.run_filter and settings.aids > 0:
+        for s in range(AIDS):
+            flight.aid_fresh[s] = 0.0
     instant = flight.instant
     for left in range(settings.ticks_per_step - 1, -1, -1):
         _fetch_ahead(call, index, settings, left)

@@ -11,9 +11,10 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.maths.linalg import load3, load4, norm, sub
+from quad_gym.kernels.measurements.aid import ACTS, call_aids
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import Start, Supply
+from quad_gym.records import Act, Start, Supply
 
 _DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
 _DELAY_ACTION = int(Stage.DELAY_ACTION)
@@ -25,15 +26,16 @@ _PREDICT, _INCREMENT, _UPDATE = int(Stage.PREDICT), int(Stage.INCREMENT), int(St
 _DRIFT_BIASES, _ADVANCE_FAULTS = int(Stage.DRIFT_BIASES), int(Stage.ADVANCE_FAULTS)
 _SET_ASIDE, _SAMPLE, _LOOK = int(Stage.SET_ASIDE), int(Stage.SAMPLE), int(Stage.LOOK)
 _EXCHANGE, _LATE_UPDATE = int(Stage.EXCHANGE), int(Stage.LATE_UPDATE)
-_PREDICT_WITH_DRIFT = int(Stage.PREDICT_WITH_DRIFT)
-_UPDATE_WITH_DRIFT = int(Stage.UPDATE_WITH_DRIFT)
-_WARM_WITH_DRIFT = int(Stage.WARM_WITH_DRIFT)
-_LATE_UPDATE_WITH_DRIFT = int(Stage.LATE_UPDATE_WITH_DRIFT)
+_PREDICT_WITH_SLOW = int(Stage.PREDICT_WITH_SLOW)
+_UPDATE_WITH_SLOW = int(Stage.UPDATE_WITH_SLOW)
+_WARM_WITH_SLOW = int(Stage.WARM_WITH_SLOW)
+_LATE_UPDATE_WITH_SLOW = int(Stage.LATE_UPDATE_WITH_SLOW)
 _ALIGN, _WARM = int(Stage.ALIGN), int(Stage.WARM)
 _DRAW, _IMPOSE, _BEGIN = int(Stage.DRAW), int(Stage.IMPOSE), int(Stage.BEGIN)
 _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
 _BEGIN_FAULTS = int(Stage.BEGIN_FAULTS)
 
+_BEGIN_AID, _SAMPLE_AID = int(Act.BEGIN), int(Act.SAMPLE)
 _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
 
 
@@ -54,24 +56,26 @@ def sense(flight, world, model, settings, work, stages, mask, starting, within):
     """
     work.mask = select(mask, 1.0, 0.0)
     if settings.run_filter:
-        late = settings.gnss_delay + settings.camera_delay > 0
+        late = settings.late > 0
         if late:
             call_stage(stages, _SET_ASIDE, flight, world, model, settings, work, 0)
         call_stage(stages, _SAMPLE, flight, world, model, settings, work, starting)
+        if settings.aids > 0:
+            call_aids(flight, world, model, settings, work, stages, _SAMPLE_AID + ACTS * starting)
         if starting:
             call_stage(stages, _ALIGN, flight, world, model, settings, work, 0)
             if settings.warm:
-                warm = _WARM_WITH_DRIFT if settings.estimates_drift else _WARM
+                warm = _WARM_WITH_SLOW if settings.slow_states > 0 else _WARM
                 call_stage(stages, warm, flight, world, model, settings, work, 0)
         if late:
             call_stage(stages, _EXCHANGE, flight, world, model, settings, work, starting)
         if late and settings.rewinds and not starting:
-            late_update = _LATE_UPDATE_WITH_DRIFT if settings.estimates_drift else _LATE_UPDATE
+            late_update = _LATE_UPDATE_WITH_SLOW if settings.slow_states > 0 else _LATE_UPDATE
             call_stage(stages, late_update, flight, world, model, settings, work, 0)
             work.mask = select(mask, 1.0, 0.0)
         else:
             features = settings.feature_count
-            update = _UPDATE_WITH_DRIFT if settings.estimates_drift else _UPDATE
+            update = _UPDATE_WITH_SLOW if settings.slow_states > 0 else _UPDATE
             call_stage(stages, update, flight, world, model, settings, work, features)
     call_stage(stages, _LOOK, flight, world, model, settings, work, within)
 
@@ -114,9 +118,9 @@ def tick(flight, world, model, settings, work, stages, last):
                 call_stage(stages, _DISTURB_IMU, flight, world, model, settings, work, 0)
             if settings.faults:
                 call_stage(stages, _SATURATE_IMU, flight, world, model, settings, work, 0)
-        predict = _PREDICT_WITH_DRIFT if settings.estimates_drift else _PREDICT
+        predict = _PREDICT_WITH_SLOW if settings.slow_states > 0 else _PREDICT
         call_stage(stages, predict, flight, world, model, settings, work, 0)
-        if settings.gnss_delay + settings.camera_delay > 0:
+        if settings.late > 0:
             call_stage(stages, _INCREMENT, flight, world, model, settings, work, 0)
         call_stage(stages, _DRIFT_BIASES, flight, world, model, settings, work, 0)
     flight.tick = flight.tick + 1.0
@@ -142,11 +146,13 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
     if settings.action_delays > 0:
         call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
-    if settings.run_filter and settings.gnss_delay + settings.camera_delay > 0:
+    if settings.run_filter and settings.late > 0:
         call_stage(stages, _BEGIN_LATE, flight, world, model, settings, work, 0)
     call_stage(stages, _BEGIN, flight, world, model, settings, work, 0)
     if settings.run_filter and settings.imu_errs + settings.heading_errs > 0:
         call_stage(stages, _BEGIN_IMPERFECT, flight, world, model, settings, work, 0)
+    if settings.run_filter and settings.aids > 0:
+        call_aids(flight, world, model, settings, work, stages, _BEGIN_AID)
     if settings.air:
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:

@@ -10,8 +10,8 @@ from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling import entry
 from quad_gym.kernels.filter.align import initialize
-from quad_gym.kernels.filter.drift import begin_drift
 from quad_gym.kernels.filter.predict import predict
+from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.update import update
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.linalg import (
@@ -76,11 +76,11 @@ def _entry(*arguments, returns=types.none):
     return lambda function: entry(function, returns(*arguments))
 
 
-@_entry(_FLIGHT, _PARAMS, _VECTOR)
-def ukf_initialize(flights, params, x_I):
+@_entry(_FLIGHT, _PARAMS, _VECTOR, _SETTINGS)
+def ukf_initialize(flights, params, x_I, settings):
     """Start the filter of flights[0] from its first fix; x_I is (3,), zero if it is not known."""
     initialize(flights[0], params[0], True, load3(x_I))
-    begin_drift(flights[0], True)
+    begin_slow(flights[0], params[0], settings[0], True)
 
 
 @_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64)
@@ -95,16 +95,16 @@ def ukf_predict(flights, params, work, form):
     predict(flights[0], params[0], work[0], form)
 
 
-@_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64)
-def drift_update(flights, params, work, feature_count, form):
-    """As `ukf_update`, of a filter that estimates the slow error of GNSS positions."""
-    update(flights[0], params[0], work[0], feature_count, True, form, flights[0].L_drift)
+@_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64, _SETTINGS)
+def drift_update(flights, params, work, feature_count, form, settings):
+    """As `ukf_update`, of a filter that estimates slow errors of sensors."""
+    update(flights[0], params[0], work[0], feature_count, True, form, settings[0])
 
 
-@_entry(_FLIGHT, _PARAMS, _WORK, types.int64)
-def drift_predict(flights, params, work, form):
+@_entry(_FLIGHT, _PARAMS, _WORK, types.int64, _SETTINGS)
+def drift_predict(flights, params, work, form, settings):
     """As `ukf_predict`, likewise."""
-    predict(flights[0], params[0], work[0], form, flights[0].L_drift)
+    predict(flights[0], params[0], work[0], form, settings[0])
 
 
 @_entry(_FLIGHT, _PARAMS)

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy import special
 
 from quad_gym.frames import ecef_to_enu
+from quad_gym.packing.aids import pack_aid_settings, pack_aids, phase_ticks
 from quad_gym.packing.world import pack_world
 from quad_gym.params import portable
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
-from quad_gym.params.gnss import LEAST_DRIFT
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.sensors import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
@@ -102,10 +102,6 @@ def params_record(
         period = 1.0 / (gnss.rate * gnss.drift_tau)
         p["drift_decay"] = math.exp(-period)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
-        period = imu.dt / gnss.drift_tau
-        p["drift_tick_decay"] = math.exp(-period)
-        believed = np.maximum(gnss.drift_sigma_I, LEAST_DRIFT)
-        p["drift_tick_drive"] = believed * math.sqrt(-math.expm1(-2.0 * period))
     else:  # the place of the start, as if its center and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
         p["gnss_sigma"] = sensors.placement.position_sigma
@@ -123,6 +119,7 @@ def params_record(
         p["max_range"], p["blur"] = camera.max_range, camera.blur
         p["features"][: len(camera.features_I)] = camera.features_I
 
+    pack_aids(p, sensors)
     p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
     p["sigma_kappa"] = estimator.kappa
     p["direction_floor"] = estimator.direction_variance_floor
@@ -181,15 +178,10 @@ _HARMONICS = {Task.CIRCLE: 1, Task.LEMNISCATE: 2, Task.RANDOM_TRAJECTORY: MAX_HA
 """Terms of the series of a task's reference; none elsewhere."""
 
 
-def _phase_ticks(phase: float | None, period: int) -> int:
-    """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
-    return -1 if phase is None else min(round(phase * period), period - 1)
-
-
 def pack_latency(
-    settings: Any, measures: SensorSuite, clocks: Clocks, believes: FilterParams
+    settings: Any, measures: SensorSuite, clocks: Clocks, believes: SensorSuite
 ) -> None:
-    """Fill the settings' fields of late measurements.
+    """Fill the settings' fields of aiding sensors, and of late measurements.
 
     Args:
         settings: One SETTINGS record.
@@ -200,13 +192,16 @@ def pack_latency(
     Raises:
         ValueError: If a sensor is too late for its rate.
     """
+    pack_aid_settings(settings, measures, believes)
     for name in ("gnss", "camera"):
         sensor = getattr(measures, name)
         if sensor is not None:
             label = f"{type(sensor).__name__}.latency"
             rate = getattr(clocks, f"{name}_rate")
             settings[f"{name}_delay"] = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
-    settings["rewinds"] = believes.late_measurements == "rewind"
+    latest = max(settings["gnss_delay"], settings["camera_delay"], *settings["aid_delay"])
+    settings["late"] = latest > 0
+    settings["rewinds"] = believes.estimator.late_measurements == "rewind"
 
 
 def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
@@ -253,12 +248,12 @@ def settings_record(
     if sensors.gnss is not None:
         s["gnss_ticks"] = clocks.ticks_between("gnss")
         s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
-        s["gnss_phase"] = _phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
-    s["gnss_drifts"], s["estimates_drift"] = gnss_drifts, sensors.drifts
+        s["gnss_phase"] = phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
+    s["gnss_drifts"] = gnss_drifts
     s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
     if sensors.camera is not None:
         s["camera_ticks"] = clocks.ticks_between("camera")
-        s["camera_phase"] = _phase_ticks(sensors.camera.phase, s["camera_ticks"])
+        s["camera_phase"] = phase_ticks(sensors.camera.phase, s["camera_ticks"])
         s["feature_count"] = len(sensors.camera.features_I)
     s["source"], s["control"], s["layout"] = source, control, layout
     s["include_covariance"], s["privileged"] = include_covariance, privileged

@@ -9,12 +9,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from quad_gym.params import checks as check
+from quad_gym.params.aids import AidParams
+from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.checks import Checked
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
-from quad_gym.records import MAX_UNDER_WAY
+from quad_gym.params.magnetometer import MagnetometerParams
+from quad_gym.records import MAX_UNDER_WAY, Aid
+
+AID_PARAMS: dict[str, type[AidParams]] = {
+    "barometer": BarometerParams,
+    "magnetometer": MagnetometerParams,
+}
+"""Parameters of aiding sensors by their fields in `SensorSuite`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +89,10 @@ class SensorSuite(Checked):
     """None: no GNSS; the filter then starts from `placement`"""
     camera: CameraParams | None = field(default_factory=CameraParams)
     """None: no camera"""
+    barometer: BarometerParams | None = None
+    """None: no barometer"""
+    magnetometer: MagnetometerParams | None = None
+    """None: no magnetometer"""
     placement: PlacementParams = field(default_factory=PlacementParams)
     estimator: FilterParams = field(default_factory=FilterParams)
     noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
@@ -102,6 +115,19 @@ class SensorSuite(Checked):
             delay_ticks(
                 "CameraParams.latency", self.camera.latency, self.camera.rate, self.imu.rate
             )
+        for name, params in AID_PARAMS.items():
+            sensor = getattr(self, name)
+            if sensor is not None:
+                check.instance(f"SensorSuite.{name}", sensor, params)
+                check.ticks(f"{params.__name__}.rate", sensor.rate, self.imu.rate)
+                label = f"{params.__name__}.latency"
+                delay_ticks(label, sensor.latency, sensor.rate, self.imu.rate)
+
+    @property
+    def aids(self) -> dict[Aid, AidParams]:
+        """The aiding sensors that there are."""
+        found = {aid: getattr(self, aid.name.lower()) for aid in Aid}
+        return {aid: params for aid, params in found.items() if params is not None}
 
     @property
     def drifts(self) -> bool:
@@ -143,7 +169,7 @@ class SensorSuite(Checked):
                 "true_sensors must have the IMU samples of sensors, as they order the tick: "
                 f"{true_sensors.imu.samples!r} is not {self.imu.samples!r}"
             )
-        for name in ("gnss", "camera"):
+        for name in ("gnss", "camera", *AID_PARAMS):
             if (getattr(true_sensors, name) is None) != (getattr(self, name) is None):
                 raise ValueError(f"true_sensors must have a {name} if sensors has, and only then")
         for what, true, believed in self._schedule(true_sensors):
@@ -166,6 +192,10 @@ class SensorSuite(Checked):
             yield "camera phase", image.phase, expected.phase
             counts = [len(p.features_I) for p in (image, expected)]
             yield "number of camera features", counts[0], counts[1]
+        for aid in self.aids:
+            name = aid.name.lower()
+            yield f"{name} rate [Hz]", true.aids[aid].rate, self.aids[aid].rate
+            yield f"{name} phase", true.aids[aid].phase, self.aids[aid].phase
 
     def with_rates(
         self,
@@ -173,6 +203,7 @@ class SensorSuite(Checked):
         imu: float | None = None,
         gnss: float | None = None,
         camera: float | None = None,
+        **aids: float | None,
     ) -> "SensorSuite":
         """A copy whose sensors run at other rates [Hz]; None keeps a rate.
 
@@ -182,6 +213,7 @@ class SensorSuite(Checked):
             ValueError: If a rate is not positive or not a whole division of the IMU's, or there is
                 no GNSS, or no camera, that could have the rate given for it.
         """
+        check.keywords(aids, tuple(AID_PARAMS), "with_rates")
         imu_rate = self.imu.rate
         if imu is not None:
             imu_rate = check.positive("imu_rate", imu, least=1.0, most=1e6)
@@ -204,8 +236,16 @@ class SensorSuite(Checked):
             )
         elif camera is not None:
             raise ValueError(f"camera_rate must not be given without a camera, got {camera} Hz")
+        changed = {}
+        for name in AID_PARAMS:
+            sensor, wanted = getattr(self, name), aids.get(name)
+            if sensor is not None:
+                rate = rate_of(f"{name}_rate", wanted, sensor.rate)
+                changed[name] = sensor.replace(rate=rate)
+            elif wanted is not None:
+                raise ValueError(f"{name}_rate must not be given without one, got {wanted} Hz")
         return self.replace(  # type: ignore[no-any-return]
-            imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params
+            imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params, **changed
         )
 
     def simplified(self) -> "SensorSuite":
@@ -229,7 +269,10 @@ class SensorSuite(Checked):
             accel_vibration=0.0,
             gyro_vibration=0.0,
         )
-        return self.replace(imu=imu, gnss=gnss, camera=camera)  # type: ignore[no-any-return]
+        aids = {aid.name.lower(): params.simplified() for aid, params in self.aids.items()}
+        return self.replace(  # type: ignore[no-any-return]
+            imu=imu, gnss=gnss, camera=camera, **aids
+        )
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
         """A copy whose white noise is `factor` times as large, as a filter of this suite knows."""
@@ -250,4 +293,5 @@ class SensorSuite(Checked):
             ),
             gnss=gnss,
             camera=camera,
+            **{aid.name.lower(): params.scaled_noise(factor) for aid, params in self.aids.items()},
         )

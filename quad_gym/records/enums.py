@@ -67,6 +67,32 @@ class Control(IntEnum):
     """No action: the report's controller follows the reference at every tick."""
 
 
+class Aid(IntEnum):
+    """Aiding sensors: those beside IMU, GNSS and camera, each a file in `kernels/measurements/`.
+
+    The name in lower case is that of the field of `SensorSuite`; the fault that silences one is
+    called after it in `FaultKind`.
+    """
+
+    BAROMETER = 0
+    MAGNETOMETER = 1
+
+
+class Act(IntEnum):
+    """What the stage of an aiding sensor is called for."""
+
+    BEGIN = 0
+    """begin an episode: draw errors that last, set clocks"""
+    SAMPLE = 1
+    """measure where it is due, let what is late wait, and what has waited arrive"""
+    EXPECT = 2
+    """predict the measurement: its center, noise and columns"""
+    JUDGE = 3
+    """keep the innovation and mask it beyond the gate"""
+    DOUBT = 4
+    """add to the covariance of what may be wrong"""
+
+
 class Task(IntEnum):
     """What a flight is to do."""
 
@@ -152,3 +178,5 @@ class FaultKind(IntEnum):
     GYRO_BIAS_STEP = 9
     IMU_SATURATION = 10
     ROTOR_LOSS = 11
+    BAROMETER_LOSS = 12
+    MAGNETOMETER_LOSS = 13

@@ -2,6 +2,7 @@
 
 from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
+    AIDS,
     DELAY_SLOTS,
     FAULT_KINDS,
     MAX_ACTION_DELAY,
@@ -9,7 +10,10 @@ from quad_gym.records.sizes import (
     MAX_FEATURES,
     MAX_GATES,
     MAX_HARMONICS,
+    MAX_SLOW,
+    MAX_STATES,
     SENSOR_GROUPS,
+    STAMP,
     Field,
 )
 
@@ -126,8 +130,8 @@ _FILTER_FIELDS = (
     Field("update_failures", (), "-", "updates that failed since the filter's start"),
     Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
-    Field("rejected_in_row", (4,), "-", "positions, baselines, velocities, images wholly rejected since the last accepted one"),
-    Field("reopened", (4,), "-", "times that the gate of each of these was reopened in this episode"),
+    Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, aiding sensors, since the last accepted one"),
+    Field("reopened", (SENSOR_GROUPS,), "-", "times that the gate of each of these was reopened in this episode"),
     Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
     Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
     Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
@@ -142,7 +146,7 @@ _ERROR_FIELDS = (
     Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
 )
 _WATCH_FIELDS = (
-    # the innovations of the last measurements, one by one: position, baseline, velocity, features
+    # the innovations of the last measurements, one by one: position, baseline, velocity, features, aiding sensors
     Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
     Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
     Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
@@ -170,10 +174,25 @@ _LATE_FIELDS = (
     Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
     Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
 )
-_DRIFT_FIELDS = (
-    # the slow error of GNSS positions, where the filter estimates it
-    Field("gnss_drift_hat", (3,), "m", "estimated slow error d in I"),
-    Field("L_drift", (3, 18), "mixed", "rows of d below L in the factor of the joint covariance"),
+_SLOW_FIELDS = (
+    # the slow errors of sensors, where the filter estimates them
+    Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
+    Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
+)
+_AID_FIELDS = (
+    # aiding sensors, in the order of Aid
+    Field("aid_wait", (AIDS,), "ticks", "until it measures next"),
+    Field("aid_valid", (AIDS,), "0 or 1", "whether a measurement reaches the filter at the present instant"),
+    Field("aid_fresh", (AIDS,), "0 or 1", "whether one has done so since the last step"),
+    Field("aid_measurement", (AIDS, 3), "m; T", "altitude, then zeros; magnetic field in B"),
+    Field("aid_vector", (AIDS, 3), "T", "true slow error in B, if it has one of three numbers: hard iron"),
+    Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination less the believed one"),
+    Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),
+)
+_LATE_AID_FIELDS = (
+    # the measurements of aiding sensors in transit, the latest first
+    Field("aid_stamps", (AIDS, DELAY_SLOTS, STAMP), "mixed", "when they were taken: the tick (NaN: none), C, V, X, B, w_meas"),
+    Field("aid_waiting", (AIDS, DELAY_SLOTS, 3), "m; T", "aid_measurement"),
 )
 # fmt: on
 PARTS = (
@@ -185,7 +204,9 @@ PARTS = (
     ("errors", _ERROR_FIELDS),
     ("watch", _WATCH_FIELDS),
     ("late", _LATE_FIELDS),
-    ("drift", _DRIFT_FIELDS),
+    ("slow", _SLOW_FIELDS),
+    ("aids", _AID_FIELDS),
+    ("late_aids", _LATE_AID_FIELDS),
 )
 """The parts of a record, in the order in which they lie in memory. All flights have the core; what
 a batch uses beside it is best close to it, as the memory of a flight has no gaps: see `Room`."""

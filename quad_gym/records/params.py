@@ -1,6 +1,6 @@
 """The numbers of a vehicle, its sensors and its world, as they are or as they are believed to be."""
 
-from quad_gym.records.sizes import MAX_FEATURES, Field
+from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, Field
 
 # fmt: off
 PARAMS_FIELDS = (
@@ -73,8 +73,6 @@ PARAMS_FIELDS = (
     Field("gnss_sigma", (3,), "m", "white position noise in I; of the placement where there is no GNSS"),
     Field("drift_decay", (), "-", "of the slow position error between two measurements"),
     Field("drift_drive", (3,), "m", "sigma of its driving noise"),
-    Field("drift_tick_decay", (), "-", "of the same over a tick"),
-    Field("drift_tick_drive", (3,), "m", "likewise; a micrometer's where there is no slow error"),
     Field("baseline_sigma", (), "rad", "direction noise of the baseline"),
     Field("heading_error_sigma", (), "rad", "of the baseline's constant error"),
     Field("first_baseline_sigma", (), "rad", "of the direction of one baseline"),
@@ -90,6 +88,21 @@ PARAMS_FIELDS = (
     Field("max_range", (), "m", "beyond which a feature is too small"),
     Field("blur", (), "pixels/(rad/s)", "noise per body rate"),
     Field("features", (MAX_FEATURES, 3), "m", "features in I"),
+    # aiding sensors, in the order of Aid
+    Field("aid_sigma", (AIDS,), "m; T", "white noise of each number"),
+    Field("aid_vector_sigma", (AIDS,), "T", "of the three numbers of the slow error, at the start"),
+    Field("aid_vector_decay", (AIDS,), "-", "of the same between two measurements"),
+    Field("aid_vector_drive", (AIDS,), "T", "sigma of its driving noise"),
+    Field("aid_scalar_sigma", (AIDS,), "m; rad", "of the slow error of one number, at the start"),
+    Field("aid_scalar_decay", (AIDS,), "-", "of the same between two measurements"),
+    Field("aid_scalar_drive", (AIDS,), "m; rad", "sigma of its driving noise"),
+    Field("aid_matrix_sigma", (AIDS,), "-", "of each error of scale and alignment"),
+    Field("aid_gate", (AIDS,), "-", "largest accepted NIS"),
+    Field("magnetic_field", (3,), "T", "the Earth's in I"),
+    # slow errors among the filter's states
+    Field("slow_sigma", (MAX_SLOW,), "mixed", "of each at the start"),
+    Field("slow_decay", (MAX_SLOW,), "-", "over a tick"),
+    Field("slow_drive", (MAX_SLOW,), "mixed", "sigma of the driving noise over a tick"),
     Field("sigma_spread", (), "-", "alpha of the unscented transform"),
     Field("sigma_beta", (), "-", "beta of the unscented transform"),
     Field("sigma_kappa", (), "-", "kappa of the unscented transform"),

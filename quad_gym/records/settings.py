@@ -1,7 +1,14 @@
 """What a batch does, the same for all its flights."""
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import FAULT_KINDS, WARM_DRAWS, WARM_DRIFT_DRAWS, Field
+from quad_gym.records.sizes import (
+    AIDS,
+    FAULT_KINDS,
+    MAX_STATES,
+    WARM_DRAWS,
+    WARM_SLOW_DRAWS,
+    Field,
+)
 
 # fmt: off
 SETTINGS_FIELDS = (
@@ -13,7 +20,15 @@ SETTINGS_FIELDS = (
     Field("camera_phase", (), "ticks", "from the start to the first image; -1: at random", "i8"),
     Field("gnss_velocity", (), "0 or 1", "whether GNSS measures velocity", "i8"),
     Field("gnss_drifts", (), "0 or 1", "whether GNSS positions have a slow error", "i8"),
-    Field("estimates_drift", (), "0 or 1", "whether the filter has this slow error among its states", "i8"),
+    Field("estimates_drift", (), "0 or 1", "whether the filter has this slow error among its states, as the first three of the slow ones", "i8"),
+    Field("slow_states", (), "-", "slow errors among the filter's states, a multiple of three", "i8"),
+    Field("aids", (), "-", "aiding sensors in use", "i8"),
+    Field("aid_on", (AIDS,), "0 or 1", "whether there is one of each kind", "i8"),
+    Field("aid_ticks", (AIDS,), "ticks", "between its measurements", "i8"),
+    Field("aid_phase", (AIDS,), "ticks", "from the start to the first one; -1: at random", "i8"),
+    Field("aid_delay", (AIDS,), "ticks", "until a measurement reaches the filter", "i8"),
+    Field("aid_vector", (AIDS,), "-", "first of its three slow states; -1: it has none", "i8"),
+    Field("aid_scalar", (AIDS,), "-", "its slow state of one number; -1: it has none", "i8"),
     Field("reuse_first_fix", (), "0 or 1", "whether the fix that starts the filter is its first measurement, too", "i8"),
     Field("warm", (), "0 or 1", "whether the filter has converged before an episode begins", "i8"),
     Field("feature_count", (), "-", "features in use", "i8"),
@@ -49,12 +64,13 @@ SETTINGS_FIELDS = (
     Field("preview", (2,), "s", "how far ahead the observation shows the reference"),
     Field("start_velocity_variance", (3,), "m^2/s^2", "mean square of what is drawn on top of the start's velocity"),
     Field("start_tilt_variance", (3,), "rad^2", "likewise of roll and pitch, then 0"),
-    Field("warm_covariance", (18, 18), "mixed", "of a converged filter whose vehicle looks east; the last three: of the slow error, if it has that"),
-    Field("warm_root", (18, WARM_DRAWS + WARM_DRIFT_DRAWS), "mixed", "W with W W^T = warm_covariance; six columns from the 16th on: of the true biases; the last three: of the true slow error"),
+    Field("warm_covariance", (MAX_STATES, MAX_STATES), "mixed", "of a converged filter whose vehicle looks east; last the slow errors, if it has any"),
+    Field("warm_root", (MAX_STATES, WARM_DRAWS + WARM_SLOW_DRAWS), "mixed", "W with W W^T = warm_covariance; six columns from the 16th on: of the true biases; the rest as WARM_SLOW_DRAWS says"),
     Field("warm_drift_sigma", (3,), "m", "of the true slow error after the filter's convergence"),
     # late measurements
     Field("gnss_delay", (), "ticks", "until a GNSS measurement reaches the filter", "i8"),
     Field("camera_delay", (), "ticks", "until an image reaches the filter", "i8"),
+    Field("late", (), "0 or 1", "whether any measurement reaches the filter late", "i8"),
     Field("rewinds", (), "0 or 1", "whether the filter goes back to time stamps", "i8"),
     # what sensors do wrong
     Field("imu_errs", (), "0 or 1", "whether the IMU has errors of scale or alignment", "i8"),

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from quad_gym.records.enums import FaultKind
+from quad_gym.records.enums import Aid, FaultKind
 from quad_gym.records.width import WIDTH as WIDTH
 
 MAX_HARMONICS = 6
@@ -17,22 +17,37 @@ DELAY_SLOTS = MAX_UNDER_WAY + 1
 """Measurements that wait: at a latency of MAX_UNDER_WAY periods one is taken as another arrives."""
 MAX_ACTION_DELAY = 10
 """Longest delay of an action, in control steps."""
-MAX_BLOCKS = 3 + MAX_FEATURES
-"""Blocks of the stacked measurement: antenna position, baseline, velocity, features."""
+AIDS = len(Aid)
+"""Number of kinds of aiding sensors."""
+AID_BLOCKS = 3 + MAX_FEATURES
+"""Where their blocks begin in a flight's fields of innovations; that of aid i is AID_BLOCKS + i."""
+MAX_BLOCKS = AID_BLOCKS + AIDS
+"""Blocks of the measurement: antenna position, baseline, velocity, features, aiding sensors."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS
 """Length of the stacked measurement; a direction has three numbers."""
-SENSOR_GROUPS = 4
-"""Kinds of measurements: positions, baselines, velocities, images."""
+AID_GROUPS = 4
+"""Where aiding sensors begin among the kinds of measurements."""
+SENSOR_GROUPS = AID_GROUPS + AIDS
+"""Kinds of measurements: positions, baselines, velocities, images, and aiding sensors."""
 POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = 0, 1, 2, 3
 """Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
-FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES)
+AID_FREEDOMS = (1, 3)
+"""Numbers that an aiding sensor measures, in the order of `Aid`."""
+FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES, *AID_FREEDOMS)
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 256
 """Numbers that an observation can hold."""
 WARM_DRAWS = 21
 """Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""
-WARM_DRIFT_DRAWS = 6
-"""More of them, for the slow error of GNSS positions: three, and three that make the true one."""
+MAX_SLOW = 9
+"""Slow errors of sensors that a filter can have among its states, a multiple of three: the drift of
+GNSS positions, the hard iron of a magnetometer, and one number of each aiding sensor."""
+MAX_STATES = 15 + MAX_SLOW
+"""States of a filter with all of them."""
+WARM_SLOW_DRAWS = 2 * MAX_SLOW
+"""More of these normals, for slow errors: by threes those of their own, and those of the true ones."""
+STAMP = 28
+"""Numbers of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates."""
 FAULT_KINDS = len(FaultKind)
 """Number of kinds of faults."""
 

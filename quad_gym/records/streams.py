@@ -7,7 +7,14 @@ the instant and n. Each quantity owns a range of numbers. A draw gives two numbe
 from typing import NamedTuple
 
 from quad_gym.records.draws import DRAWN_SIZE
-from quad_gym.records.sizes import FAULT_KINDS, MAX_FEATURES, MAX_GATES, MAX_HARMONICS
+from quad_gym.records.sizes import (
+    AIDS,
+    FAULT_KINDS,
+    MAX_FEATURES,
+    MAX_GATES,
+    MAX_HARMONICS,
+    MAX_SLOW,
+)
 
 DRAWS_OF_FAULT = 8
 """Draws of a kind of fault: when it comes (2), what it is (2), what it does to one sample (4)."""
@@ -51,6 +58,8 @@ DRAW_FAULTS = _claim("faults", 1024, DRAWS_OF_FAULT * FAULT_KINDS)
 DRAW_HIDDEN = _claim("features that an occlusion hides", 2048, MAX_FEATURES)
 DRAW_VIBRATION = _claim("vibration of the IMU", 576, 3)
 DRAW_BLUR = _claim("places in blurred images", 592, MAX_FEATURES)
+DRAW_AID = _claim("white noise of aiding sensors", 720, 2 * AIDS)
+DRAW_AID_DRIFT = _claim("slow errors of aiding sensors", 736, 2 * AIDS)
 # of an episode's first instant
 DRAW_COURSE = _claim("phase, radius, period and sense of the reference", 64, 2)
 DRAW_START = _claim("start", 66, 5)
@@ -64,4 +73,7 @@ DRAW_MARK = _claim("heading that the mark of the start tells", 519, 1)
 DRAW_WARM = _claim("errors of a warm start", 544, 8)
 DRAW_IMU_ERRORS = _claim("errors of scale and alignment of the IMU", 640, 9)
 DRAW_HEADING = _claim("constant error of the baseline", 649, 1)
+DRAW_SLOW = _claim("slow errors of aiding sensors at the start", 656, MAX_SLOW)
+DRAW_AID_MATRIX = _claim("errors of scale and alignment of aiding sensors", 672, 5 * AIDS)
+DRAW_AID_PHASE = _claim("phases of aiding sensors", 704, AIDS)
 DRAW_WARM_DRIFT = _claim("slow error of GNSS positions at a warm start", 552, 3)

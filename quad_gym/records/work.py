@@ -1,6 +1,15 @@
 """The workspace of a thread: nothing in it outlasts a step."""
 
-from quad_gym.records.sizes import MAX_FEATURES, MAX_MEASUREMENTS, MAX_OBSERVATION, Field
+from quad_gym.records.sizes import (
+    AIDS,
+    MAX_FEATURES,
+    MAX_MEASUREMENTS,
+    MAX_OBSERVATION,
+    MAX_SLOW,
+    MAX_STATES,
+    STAMP,
+    Field,
+)
 
 # fmt: off
 WORK_FIELDS = (
@@ -8,22 +17,29 @@ WORK_FIELDS = (
     Field("mask", (), "0 or 1", "lanes that the stage works on"),
     Field("start", (17,), "mixed", "true state at the start of the tick: r, v, q, w, rotor speeds"),
     # prediction
-    Field("P", (18, 18), "mixed", "lower triangle of the predicted covariance; then its factor"),
+    Field("P", (MAX_STATES, MAX_STATES), "mixed", "lower triangle of the predicted covariance; then its factor"),
     Field("F", (9, 15), "mixed", "half-differences of the propagated sigma points / c; rows r, v, e"),
     Field("S", (6, 9), "mixed", "half-sums of the propagated sigma points less the center / c: of the acceleration, then e"),
-    # update; the nine columns of L that matter come last first; with drift, all eighteen
+    # update; the nine columns of L that matter come last first; with slow errors, all columns
     Field("X_B", (MAX_FEATURES, 3), "m", "features relative to the center of mass, in B"),
     Field("inverse_distance", (MAX_FEATURES,), "1/m", "of the features from the camera"),
     Field("h", (MAX_MEASUREMENTS,), "mixed", "measurement predicted at the center"),
     Field("z", (MAX_MEASUREMENTS,), "mixed", "innovation; then whitened"),
-    Field("A", (18, MAX_MEASUREMENTS), "mixed", "half-differences of the measured sigma points / c; then whitened"),
+    Field("A", (MAX_STATES, MAX_MEASUREMENTS), "mixed", "half-differences of the measured sigma points / c; then whitened"),
     Field("E", (9, MAX_MEASUREMENTS), "mixed", "half-sums of the measured sigma points less the center / c"),
     Field("mu", (MAX_MEASUREMENTS,), "mixed", "mean of the measured sigma points less the center"),
     Field("Rz", (MAX_MEASUREMENTS, MAX_MEASUREMENTS), "mixed", "noise, part even in the sigma points included; then its factor"),
-    Field("N", (18, 18), "-", "I + C C^T; then its factor"),
-    Field("t", (18,), "-", "C times the whitened innovation; then whitened by N"),
-    Field("L9", (18, 18), "mixed", "the columns of L that matter; then of the updated factor"),
+    Field("N", (MAX_STATES, MAX_STATES), "-", "I + C C^T; then its factor"),
+    Field("t", (MAX_STATES,), "-", "C times the whitened innovation; then whitened by N"),
+    Field("L9", (MAX_STATES, MAX_STATES), "mixed", "the columns of L that matter; then of the updated factor"),
     Field("inverse_diagonal", (MAX_MEASUREMENTS,), "mixed", "of a Cholesky factor"),
+    # what the stages of aiding sensors are told of an update, and what they tell
+    Field("spread", (), "-", "c of the sigma points"),
+    Field("taking", (), "0 or 1", "lanes that are updated"),
+    Field("again", (), "0 or 1", "lanes that have met these measurements before"),
+    Field("judged_nis", (), "-", "sum of their NIS"),
+    Field("judged_freedoms", (), "-", "sum of their degrees of freedom"),
+    Field("left_out", (), "-", "numbers masked"),
     # the batch
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
@@ -40,11 +56,14 @@ WORK_FIELDS = (
     Field("kept_b_a", (3,), "m/s^2", "b_a_hat"),
     Field("kept_b_g", (3,), "rad/s", "b_g_hat"),
     Field("kept_L", (15, 15), "mixed", "L"),
-    Field("kept_drift", (3,), "m", "gnss_drift_hat"),
-    Field("kept_L_drift", (3, 18), "mixed", "L_drift"),
+    Field("kept_slow", (MAX_SLOW,), "mixed", "slow_hat"),
+    Field("kept_L_slow", (MAX_SLOW, MAX_STATES), "mixed", "L_slow"),
+    Field("kept_aids", (AIDS,), "0 or 1", "aid_valid"),
     Field("kept_rates", (3,), "rad/s", "w_meas"),
     Field("kept_failures", (), "-", "update_failures"),
     # the instant to which a late update goes back
+    Field("stamp", (STAMP,), "mixed", "the present sums of the IMU, as a stamp"),
+    Field("slow_decay", (MAX_SLOW,), "-", "of the slow errors since then"),
     Field("since_time", (), "s", "T since then"),
     Field("since_turn", (3, 3), "-", "C of then"),
     Field("since_velocity", (3,), "m/s", "V of then"),

@@ -17,7 +17,7 @@ from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.parts import run_stage
 
 SUITES = ("standard", "lab")
-FILTER = (Stage.PREDICT, Stage.UPDATE, Stage.PREDICT_WITH_DRIFT, Stage.UPDATE_WITH_DRIFT)
+FILTER = (Stage.PREDICT, Stage.UPDATE, Stage.PREDICT_WITH_SLOW, Stage.UPDATE_WITH_SLOW)
 AT_THE_START = frozenset(
     {
         Stage.DRAW,
@@ -27,7 +27,7 @@ AT_THE_START = frozenset(
         Stage.BEGIN_FAULTS,
         Stage.ALIGN,
         Stage.WARM,
-        Stage.WARM_WITH_DRIFT,
+        Stage.WARM_WITH_SLOW,
     }
 )
 """Stages of the first instant of an episode; all others are a tick's."""
@@ -73,7 +73,7 @@ class Staged:
 
 def flag_of(stage: Stage, batch: FlightBatch) -> int:
     """What a flight calls a stage with."""
-    if stage in (Stage.UPDATE, Stage.UPDATE_WITH_DRIFT):
+    if stage in (Stage.UPDATE, Stage.UPDATE_WITH_SLOW):
         return int(batch._settings["feature_count"][0])
     return int(stage in AT_THE_START)
 

@@ -27,6 +27,7 @@ from quad_gym.records import (
     PARAMS_BLOCK,
     SETTINGS,
     WORK_BLOCK,
+    Aid,
     FilterForm,
     Start,
     Supply,
@@ -72,10 +73,12 @@ class Stage(IntEnum):
     JUDGE = auto()
     OBSERVE = auto()
     SHOW = auto()
-    PREDICT_WITH_DRIFT = auto()
-    UPDATE_WITH_DRIFT = auto()
-    LATE_UPDATE_WITH_DRIFT = auto()
-    WARM_WITH_DRIFT = auto()
+    PREDICT_WITH_SLOW = auto()
+    UPDATE_WITH_SLOW = auto()
+    LATE_UPDATE_WITH_SLOW = auto()
+    WARM_WITH_SLOW = auto()
+    BAROMETER = auto()
+    MAGNETOMETER = auto()
 
 
 class Source(NamedTuple):
@@ -107,7 +110,7 @@ def _corrupts(s: Any) -> bool:
 
 
 def _late(s: Any) -> bool:
-    return bool(s["run_filter"] and s["gnss_delay"] + s["camera_delay"] > 0)
+    return bool(s["run_filter"] and s["late"] > 0)
 
 
 def _imu_disturbed(s: Any) -> bool:
@@ -122,12 +125,16 @@ def _rewinds(s: Any) -> bool:
     return bool(_late(s) and s["rewinds"] > 0)
 
 
-def _with_drift(s: Any) -> bool:
-    return bool(s["run_filter"] and s["estimates_drift"])
+def _with_slow(s: Any) -> bool:
+    return bool(s["run_filter"] and s["slow_states"] > 0)
 
 
-def _without_drift(s: Any) -> bool:
-    return bool(s["run_filter"] and not s["estimates_drift"])
+def _without_slow(s: Any) -> bool:
+    return bool(s["run_filter"] and not s["slow_states"] > 0)
+
+
+def _aid(aid: Aid) -> Callable[[Any], bool]:
+    return lambda s: bool(s["run_filter"] and s["aid_on"][aid] > 0)
 
 
 def _pad(s: Any) -> bool:
@@ -139,16 +146,22 @@ def _drawn(s: Any) -> bool:
 
 
 SOURCES = {
-    Stage.UPDATE_WITH_DRIFT: Source("filter.update", "update_with_drift_stage", _with_drift),
-    Stage.UPDATE: Source("filter.update", "update_stage", _without_drift),
-    Stage.PREDICT_WITH_DRIFT: Source("filter.predict", "predict_with_drift_stage", _with_drift),
-    Stage.PREDICT: Source("filter.predict", "predict_stage", _without_drift),
-    Stage.LATE_UPDATE_WITH_DRIFT: Source(
-        "filter.late", "late_update_with_drift_stage", lambda s: _with_drift(s) and _rewinds(s)
+    Stage.UPDATE_WITH_SLOW: Source("filter.update", "update_with_slow_stage", _with_slow),
+    Stage.UPDATE: Source("filter.update", "update_stage", _without_slow),
+    Stage.PREDICT_WITH_SLOW: Source("filter.predict", "predict_with_slow_stage", _with_slow),
+    Stage.PREDICT: Source("filter.predict", "predict_stage", _without_slow),
+    Stage.LATE_UPDATE_WITH_SLOW: Source(
+        "filter.late", "late_update_with_slow_stage", lambda s: _with_slow(s) and _rewinds(s)
     ),
     Stage.LATE_UPDATE: Source(
-        "filter.late", "late_update_stage", lambda s: _without_drift(s) and _rewinds(s)
+        "filter.late", "late_update_stage", lambda s: _without_slow(s) and _rewinds(s)
     ),
+    **{
+        Stage[aid.name]: Source(
+            f"measurements.{aid.name.lower()}", f"{aid.name.lower()}_stage", _aid(aid)
+        )
+        for aid in Aid
+    },
     Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
     Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
     Stage.IMPOSE: Source("task.draws", "impose_stage", _drawn),
@@ -162,10 +175,10 @@ SOURCES = {
     Stage.CONTROL: Source("vehicle.control", "control_stage", _always),
     Stage.MOVE: Source("vehicle.dynamics", "move_stage", lambda s: not _air(s)),
     Stage.BEGIN_IN_AIR: Source("vehicle.air", "begin_in_air_stage", _air),
-    Stage.WARM_WITH_DRIFT: Source(
-        "filter.warm", "warm_with_drift_stage", lambda s: _with_drift(s) and s["warm"] > 0
+    Stage.WARM_WITH_SLOW: Source(
+        "filter.warm", "warm_with_slow_stage", lambda s: _with_slow(s) and s["warm"] > 0
     ),
-    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_drift(s) and s["warm"] > 0),
+    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_slow(s) and s["warm"] > 0),
     Stage.AVERAGE_IMU: Source(
         "sensors.measure", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
     ),
@@ -216,7 +229,9 @@ def used_parts(settings: Any) -> frozenset[str]:
         "errors": _lasting(settings),
         "watch": _filter(settings) and bool(watches),
         "late": _late(settings),
-        "drift": _with_drift(settings),
+        "slow": _with_slow(settings),
+        "aids": bool(settings["run_filter"] and settings["aids"] > 0),
+        "late_aids": bool(settings["run_filter"] and (settings["aid_delay"] > 0).any()),
     }
     return frozenset(name for name, used in uses.items() if used)
 

@@ -8,10 +8,10 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.drift import begin_drift
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
+from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky33, lower33, solve_right33
@@ -173,8 +173,8 @@ def known_velocity(flight, settings):
 def align_stage(flight, world, model, settings, work, stages, flag):
     """Start the filter from its first fix."""
     flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
-    if settings.estimates_drift:
-        begin_drift(flying, mask)
+    if settings.slow_states > 0:
+        begin_slow(flying, lanes_of(model), settings, mask)
     if (settings.form & _WATCH) != 0:
         forget_innovations(flying, settings.feature_count, mask)
     x_I = look_along_mark(flying, lanes_of(world))

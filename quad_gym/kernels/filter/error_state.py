@@ -27,7 +27,7 @@ from quad_gym.kernels.maths.linalg import (
 
 R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
 """First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
-of the slow error of GNSS positions where the filter has that, see `drift.py`."""
+of the slow errors of sensors where the filter has such, see `slow.py`."""
 
 
 @kernel

@@ -50,7 +50,7 @@ def _has_feature(flight, k):
 
 
 @kernel
-def compare_center(flight, p, work, feature_count, use_position, use_baseline, use_velocity, drift):
+def compare_center(flight, p, work, feature_count, use_position, use_baseline, use_velocity, slow):
     """Fill work.h (center), work.z (measured) and work.Rz's diagonal blocks; return n_z."""
     h, z, Rz = work.h, work.z, work.Rz
     R_IG, R_BI, R_CB = load33(p.R_IG), load33(flight.R_hat), load33(p.R_CB)
@@ -59,8 +59,9 @@ def compare_center(flight, p, work, feature_count, use_position, use_baseline, u
     if use_position:
         has = flight.position_valid > 0.0
         antenna_I = add(r, apply_transposed(R_BI, load3(p.antenna)))
-        if drift is not None:
-            antenna_I = add(antenna_I, load3(flight.gnss_drift_hat))
+        if slow is not None:
+            if slow.estimates_drift:
+                antenna_I = add(antenna_I, load3(flight.slow_hat))
         set_triple(h, k, has, antenna_I)
         set_triple(z, k, has, apply(R_IG, load3(flight.gnss_position)))
         s = load3(p.gnss_sigma)

@@ -15,7 +15,6 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
-from quad_gym.kernels.filter.drift import carry_drift, decay_over, keep_drift
 from quad_gym.kernels.filter.preintegration import (
     NOISE,
     add_increment,
@@ -23,6 +22,14 @@ from quad_gym.kernels.filter.preintegration import (
     put_noise,
     take_columns,
     take_mean,
+)
+from quad_gym.kernels.filter.slow import (
+    begin_to_carry_slow,
+    carry_slow,
+    keep_slow_factor,
+    restore_slow,
+    set_slow_aside,
+    shift_carried_slow,
 )
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -40,12 +47,13 @@ from quad_gym.kernels.maths.linalg import (
     sub,
     sum_of_outers,
 )
+from quad_gym.kernels.measurements.stamps import go_to_stamp
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import DELAY_SLOTS, FilterStatus
+from quad_gym.records import AIDS, DELAY_SLOTS, FilterStatus
 
-_GNSS, _CAMERA, _PRESENT = 0, 1, 2
-_UPDATE, _UPDATE_WITH_DRIFT = int(Stage.UPDATE), int(Stage.UPDATE_WITH_DRIFT)
+_GNSS, _CAMERA, _FIRST_AID, _PRESENT = 0, 1, 2, 2 + AIDS
+_UPDATE, _UPDATE_WITH_SLOW = int(Stage.UPDATE), int(Stage.UPDATE_WITH_SLOW)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -187,7 +195,7 @@ def exchange(flight, work, settings, mask, starting):
 
 
 @kernel
-def _keep_estimate(flight, work, drift):
+def _keep_estimate(flight, work, slow):
     """Copy the estimate, for lanes in which nothing arrives or an update fails."""
     store3(work.kept_r, load3(flight.r_hat))
     store3(work.kept_v, load3(flight.v_hat))
@@ -199,21 +207,23 @@ def _keep_estimate(flight, work, drift):
     for i in range(15):
         for j in range(i + 1):
             work.kept_L[i, j] = flight.L[i, j]
-    if drift is not None:
-        store3(work.kept_drift, load3(flight.gnss_drift_hat))
-        for i in range(3):
-            for j in range(18):
-                work.kept_L_drift[i, j] = drift[i, j]
+    if slow is not None:
+        set_slow_aside(flight, slow, work)
 
 
 @kernel
-def _find_stamp(flight, p, work, sensor, delay, arrived):
+def _find_stamp(flight, p, work, sensor, delay, arrived, slow):
     """Fill work.since_* with the instant at which was measured what arrives, else with now."""
     store33(work.since_turn, load33(flight.imu_turn))
     store33(work.since_bias_gain, load33(flight.imu_bias_gain))
     store3(work.since_velocity, load3(flight.imu_velocity))
     store3(work.since_position, load3(flight.imu_position))
-    for slot in range(DELAY_SLOTS):
+    if slow is not None:
+        if sensor >= _FIRST_AID:
+            for slot in range(DELAY_SLOTS):
+                row = flight.aid_stamps[sensor - _FIRST_AID, slot]
+                go_to_stamp(row, flight, work, arrived & (row[0] == flight.tick - delay))
+    for slot in range(DELAY_SLOTS if sensor < _FIRST_AID else 0):
         here = arrived & (flight.stamp_tick[sensor, slot] == flight.tick - delay)
         keep33(work.since_turn, here, load33(flight.stamp_turn[sensor, slot]))
         keep33(work.since_bias_gain, here, load33(flight.stamp_bias_gain[sensor, slot]))
@@ -229,7 +239,7 @@ def _find_stamp(flight, p, work, sensor, delay, arrived):
 
 
 @kernel
-def _factor_columns(flight, p, work, noise, drift, decay, back):
+def _factor_columns(flight, p, work, noise, slow, back):
     """L of the covariance of work.columns, whose noise counts `noise` times; its least pivot."""
     M, P = work.columns, work.P
     for i in range(0, 15, 3):
@@ -239,9 +249,9 @@ def _factor_columns(flight, p, work, noise, drift, decay, back):
                 block = add_outer(block, scale(noise, load_column3(M, i, k)), load_column3(M, j, k))
             store_block(P, i, j, block)
     states = 15
-    if drift is not None:
-        states = 18
-        carry_drift(drift, p, work, noise, decay, back)
+    if slow is not None:
+        states = 15 + slow.slow_states
+        carry_slow(flight, slow, p, work, noise, back)
     pivot = cholesky(P, states, work.inverse_diagonal)
     for i in range(15):
         for j in range(i + 1):
@@ -259,7 +269,7 @@ def _load_factor(flight, work):
 
 
 @kernel
-def _carry(flight, p, work, back, ticks, drift):
+def _carry(flight, p, work, back, ticks, slow):
     """Take the estimate to the time stamp of what arrives, or from there to the present.
 
     Where more noise than uncertainty would be left out on the way back, the noise is left in.
@@ -270,7 +280,7 @@ def _carry(flight, p, work, back, ticks, drift):
         work: Workspace.
         back: Whether it goes back.
         ticks: How far.
-        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
 
     Returns:
         Where the covariance stays positive definite.
@@ -280,26 +290,24 @@ def _carry(flight, p, work, back, ticks, drift):
     put_noise(p, work, R_s, dR, dv)
     take_columns(work, R_s, dR, dv, dr, back)
     noise, sign = work.since_noise, -1.0 if back else 1.0
-    decay = 1.0 + 0.0 * p.dt
-    if drift is not None:
-        decay = select(work.since_time > 0.0, decay_over(p, ticks), 1.0)
+    if slow is not None:
+        begin_to_carry_slow(slow, p, work, ticks)
     good = noise > 0.0
     for _ in range(2):
-        good = _factor_columns(flight, p, work, sign * noise, drift, decay, back) > 0.0
+        good = _factor_columns(flight, p, work, sign * noise, slow, back) > 0.0
         if not any_of(logical_not(good)):
             break
         if back:
             noise = select(good, noise, 0.0)
     work.since_noise = noise
-    if drift is not None:
-        d = load3(flight.gnss_drift_hat)
-        d = scale(1.0 / decay, d) if back else scale(decay, d)
-        keep_drift(flight, drift, work, noise == noise, d)
+    if slow is not None:
+        shift_carried_slow(flight, slow, work, back)
+        keep_slow_factor(flight, slow, work, noise == noise)
     return good
 
 
 @kernel
-def _restore_estimate(flight, work, arrived, good, drift):
+def _restore_estimate(flight, work, arrived, good, slow):
     """Undo what has happened but where something arrived and all went well."""
     old = logical_not(arrived & good)
     keep3(flight.r_hat, old, load3(work.kept_r))
@@ -310,11 +318,8 @@ def _restore_estimate(flight, work, arrived, good, drift):
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(old, work.kept_L[i, j], flight.L[i, j])
-    if drift is not None:
-        keep3(flight.gnss_drift_hat, old, load3(work.kept_drift))
-        for i in range(3):
-            for j in range(18):
-                drift[i, j] = select(old, work.kept_L_drift[i, j], drift[i, j])
+    if slow is not None:
+        restore_slow(flight, slow, work, old)
     store3(flight.w_meas, load3(work.kept_rates))
     failed = arrived & old
     status = flight.filter_status
@@ -324,10 +329,13 @@ def _restore_estimate(flight, work, arrived, good, drift):
 
 
 @kernel
-def _count_arrived(flight, settings, sensor):
+def _count_arrived(flight, settings, sensor, slow):
     """How many measurements of a late sensor arrive now, lane by lane."""
     if sensor == _GNSS:
         return flight.position_valid + flight.baseline_valid + flight.velocity_valid
+    if slow is not None:
+        if sensor >= _FIRST_AID:
+            return flight.aid_valid[sensor - _FIRST_AID]
     count = 0.0 * flight.tick
     for i in range(settings.feature_count):
         count = count + flight.feature_valid[i]
@@ -335,7 +343,29 @@ def _count_arrived(flight, settings, sensor):
 
 
 @kernel
-def update_in_turn(flight, p, work, settings, stages, mask, drift=None):
+def _keep_aids(flight, work, slow):
+    """Copy the aiding sensors' flags of validity."""
+    if slow.aids > 0:
+        for s in range(AIDS):
+            work.kept_aids[s] = flight.aid_valid[s]
+
+
+@kernel
+def _choose_aids(flight, work, slow, turn):
+    """Let the aiding sensors be valid whose turn it is; return whether there are any."""
+    chosen = False
+    if slow.aids > 0:
+        for s in range(AIDS):
+            late = slow.aid_delay[s] > 0
+            its = turn == _FIRST_AID + s if late else turn == _PRESENT
+            its = its and slow.aid_on[s] > 0
+            flight.aid_valid[s] = (1.0 if its else 0.0) * work.kept_aids[s]
+            chosen = chosen or its
+    return chosen
+
+
+@kernel
+def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
     """Update with what has arrived, where `mask`: late fixes, late images, then what is fresh.
 
     Args:
@@ -345,15 +375,20 @@ def update_in_turn(flight, p, work, settings, stages, mask, drift=None):
         settings: Which sensors are late.
         stages: Has the update.
         mask: Which lanes.
-        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
     late_gnss, late_camera = settings.gnss_delay > 0, settings.camera_delay > 0
     flags = (flight.position_valid, flight.baseline_valid, flight.velocity_valid)
+    if slow is not None:
+        _keep_aids(flight, work, slow)
     for turn in range(_GNSS, _PRESENT + 1):
         late = turn != _PRESENT
         fixes = turn == (_GNSS if late_gnss else _PRESENT)
         images = turn == (_CAMERA if late_camera else _PRESENT)
-        if not (fixes or images):
+        others = False
+        if slow is not None:
+            others = _choose_aids(flight, work, slow, turn)
+        if not (fixes or images or others):
             continue
         share = 1.0 if fixes else 0.0
         flight.position_valid = share * flags[0]
@@ -361,25 +396,32 @@ def update_in_turn(flight, p, work, settings, stages, mask, drift=None):
         flight.velocity_valid = share * flags[2]
         features = settings.feature_count if images else 0
         delay = settings.gnss_delay if turn == _GNSS else settings.camera_delay
+        if slow is not None:
+            if turn >= _FIRST_AID and turn < _PRESENT:
+                delay = slow.aid_delay[turn - _FIRST_AID]
         arrived = mask
         if late:
-            arrived = mask & (_count_arrived(flight, settings, turn) > 0.0)
+            arrived = mask & (_count_arrived(flight, settings, turn, slow) > 0.0)
             if not any_of(arrived):
                 continue
-            _keep_estimate(flight, work, drift)
-            _find_stamp(flight, p, work, turn, delay, arrived)
+            _keep_estimate(flight, work, slow)
+            _find_stamp(flight, p, work, turn, delay, arrived, slow)
         good = arrived
         for leg in range(2 if late else 1):  # loops, so that there is one copy of what is in them
             if late:
-                good = good & _carry(flight, p, work, leg == 0, delay, drift)
+                good = good & _carry(flight, p, work, leg == 0, delay, slow)
             if leg == 0:
                 work.mask = select(good, 1.0, 0.0)
-                update = _UPDATE if drift is None else _UPDATE_WITH_DRIFT
+                update = _UPDATE if slow is None else _UPDATE_WITH_SLOW
                 call_stage(stages, update, flight, p, p, settings, work, features)
         if late:
             good = good & (flight.update_failures == work.kept_failures)
-            _restore_estimate(flight, work, arrived, good, drift)
+            _restore_estimate(flight, work, arrived, good, slow)
     flight.position_valid, flight.baseline_valid, flight.velocity_valid = flags
+    if slow is not None:
+        if slow.aids > 0:
+            for s in range(AIDS):
+                flight.aid_valid[s] = work.kept_aids[s]
 
 
 # ---- stages ----------------------------------------------------------------------------------
@@ -418,8 +460,8 @@ def late_update_stage(flight, world, model, settings, work, stages, flag):
 
 
 @stage
-def late_update_with_drift_stage(flight, world, model, settings, work, stages, flag):
-    """The same by a filter that estimates the slow error of GNSS positions."""
-    flying, scratch = lanes_of(flight), lanes_of(work)
-    mask, drift = scratch.mask > 0.0, flying.L_drift
-    update_in_turn(flying, lanes_of(model), scratch, settings, stages, mask, drift)
+def late_update_with_slow_stage(flight, world, model, settings, work, stages, flag):
+    """The same by a filter that estimates slow errors of sensors."""
+    scratch = lanes_of(work)
+    mask = scratch.mask > 0.0
+    update_in_turn(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask, settings)

@@ -26,10 +26,10 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.drift import keep_drift, predict_drift, turn_drift
 from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
+from quad_gym.kernels.filter.slow import decay_slow, keep_slow_factor, predict_slow, turn_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -255,7 +255,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, form):
 
 
 @kernel
-def predict(flight, p, work, form=0, drift=None):
+def predict(flight, p, work, form=0, slow=None):
     """Carry the estimate over one tick with its IMU sample.
 
     The report's form, with the sample as of the tick's start:
@@ -278,7 +278,7 @@ def predict(flight, p, work, form=0, drift=None):
         p: Parameters as the filter believes them.
         work: Workspace.
         form: A `FilterForm`.
-        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
     dt = p.dt
     midpoint = (form & _MIDPOINT) != 0
@@ -290,12 +290,13 @@ def predict(flight, p, work, form=0, drift=None):
         half = vector_to_dcm(scale(0.5 * dt, w_B))
     if (form & LEVER_ARM) != 0:
         f_B = sub(f_B, lever_force(flight, p, form, half))
-    states = 15 if drift is None else 18
-    augmented = 27.0 if drift is None else 33.0  # with the noise
+    states, augmented = 15, 27.0  # the latter with the noise
+    if slow is not None:
+        states, augmented = 15 + slow.slow_states, 27.0 + 2.0 * slow.slow_states
     mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented)
     _sum_moments(flight, p, work, mean_a, mean_e, form)
-    if drift is not None:
-        predict_drift(flight, drift, p, work)
+    if slow is not None:
+        predict_slow(flight, slow, p, work)
     turn = add(scale(dt, w_B), mean_e)
     if midpoint:
         _add_gyro_noise(work.P, p, R_BI, f_B, half)
@@ -304,8 +305,8 @@ def predict(flight, p, work, form=0, drift=None):
         R_pred = multiply(euler_to_dcm(turn), R_BI)
         if (form & _TURN) != 0:
             turn_covariance(work.P, reset_matrix(turn))
-            if drift is not None:
-                turn_drift(work.P, reset_matrix(turn))
+            if slow is not None:
+                turn_slow(slow, work.P, reset_matrix(turn))
     ok = cholesky(work.P, states, work.inverse_diagonal) > 0.0
 
     a_I = apply_transposed(R_BI, f_B)
@@ -323,9 +324,9 @@ def predict(flight, p, work, form=0, drift=None):
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
-    if drift is not None:
-        d = scale(p.drift_tick_decay, load3(flight.gnss_drift_hat))
-        keep_drift(flight, drift, work, ok, d)
+    if slow is not None:
+        decay_slow(flight, slow, p, ok)
+        keep_slow_factor(flight, slow, work, ok)
     flight.filter_status = select(
         ok, flight.filter_status, flight.filter_status | _PREDICTION_FAILED
     )
@@ -339,7 +340,6 @@ def predict_stage(flight, world, model, settings, work, stages, flag):
 
 
 @stage
-def predict_with_drift_stage(flight, world, model, settings, work, stages, flag):
-    """The same by a filter that estimates the slow error of GNSS positions."""
-    flying = lanes_of(flight)
-    predict(flying, lanes_of(model), lanes_of(work), settings.form, flying.L_drift)
+def predict_with_slow_stage(flight, world, model, settings, work, stages, flag):
+    """The same by a filter that estimates slow errors of sensors."""
+    predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form, settings)

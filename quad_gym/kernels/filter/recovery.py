@@ -21,9 +21,9 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.drift import add_to_drift, keep_drift
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
+from quad_gym.kernels.filter.slow import add_to_slow, keep_slow_factor
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -41,14 +41,19 @@ from quad_gym.kernels.maths.linalg import (
 )
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
+    AID_GROUPS,
+    AIDS,
     BASELINE_BLOCK,
     FEATURE_BLOCKS,
     POSITION_BLOCK,
     SENSOR_GROUPS,
     VELOCITY_BLOCK,
+    Act,
+    Aid,
     FilterStatus,
 )
 
+_FIRST_AID, _DOUBT = int(Stage[Aid(0).name]), int(Act.DOUBT)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 DRIFT_ALARM = 0.55
 """Mean of the last innovations, in deviations, from which on they drift."""
@@ -174,7 +179,7 @@ def _doubt_features(flight, p, feature_count, camera):
 
 
 @kernel
-def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, drift, D_d):
+def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, slow, D_d, p, stages):
     """P + D, with D of all parts of the state, where `mask`; return where it failed.
 
     There the covariance stays as it was.
@@ -189,15 +194,21 @@ def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, drift, D_d):
     store_block(P, BA, BA, add_to_diagonal(load_block(P, BA, BA), D_a))
     store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), D_g))
     states = 15
-    if drift is not None:
-        states = 18
-        add_to_drift(flight, drift, P, D_d)
+    if slow is not None:
+        states = 15 + slow.slow_states
+        add_to_slow(flight, slow, P, D_d)
+    if stages is not None:
+        if slow.aids > 0:
+            work.taking = select(mask, 1.0, 0.0)
+            for s in range(AIDS):
+                if slow.aid_on[s] > 0:
+                    call_stage(stages, _FIRST_AID + s, flight, p, p, slow, work, _DOUBT)
     ok = mask & (cholesky(P, states, work.inverse_diagonal) > 0.0)
     for i in range(15):
         for j in range(i + 1):
             L[i, j] = select(ok, P[i, j], L[i, j])
-    if drift is not None:
-        keep_drift(flight, drift, work, ok, load3(flight.gnss_drift_hat))
+    if slow is not None:
+        keep_slow_factor(flight, slow, work, ok)
     return mask & logical_not(ok)
 
 
@@ -213,7 +224,7 @@ def _variance_of(flight, row):
 
 
 @kernel
-def raise_doubts(flight, p, work, feature_count, mask, drift):
+def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
     """Inflate the covariance of what may be wrong, where the filter is, and `mask`.
 
     Args:
@@ -222,7 +233,8 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
         work: Workspace.
         feature_count: Features in use.
         mask: Which lanes.
-        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
+        stages: The table of stages, where there are aiding sensors, or None.
     """
     row, patience = flight.rejected_in_row, p.gate_patience
     free = logical_not(camera_fits(flight, p))
@@ -234,6 +246,10 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
     drifting = drifting | _drifts(flight, VELOCITY_BLOCK) | _drifts(flight, FEATURE_BLOCKS)
     drifting = drifting & mask
     doubtful = position | baseline | velocity | camera | drifting
+    if slow is not None:
+        if slow.aids > 0:
+            for s in range(AIDS):
+                doubtful = doubtful | (mask & (row[AID_GROUPS + s] >= patience))
     if not any_of(doubtful):
         return
     nu = flight.innovation
@@ -260,7 +276,9 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
     D_a = D_a + select(drifting, minimum(more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
     D_g = D_g + select(drifting, minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS), 0.0)
 
-    failed = _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, doubtful, drift, D_d)
+    failed = _add_to_covariance(
+        flight, work, D_r, D_v, D_e, D_a, D_g, doubtful, slow, D_d, p, stages
+    )
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
@@ -271,5 +289,5 @@ def raise_doubts(flight, p, work, feature_count, mask, drift):
         flight.reopened[group] = select(done, flight.reopened[group] + 1.0, flight.reopened[group])
         flight.rejected_in_row[group] = select(done, 0.0, row[group])
         for i in range(3):
-            drift = flight.innovation_drift[group, i]
-            flight.innovation_drift[group, i] = select(doubtful, 0.0, drift)
+            mean = flight.innovation_drift[group, i]
+            flight.innovation_drift[group, i] = select(doubtful, 0.0, mean)

@@ -12,12 +12,12 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.drift import load_drift, measure_drift, shift_drift
 from quad_gym.kernels.filter.ekf import measure_columns
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V, reset_matrix, turn_factor
+from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.expected import compare_center, measure_sigma_points
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
 from quad_gym.kernels.filter.recovery import raise_doubts
+from quad_gym.kernels.filter.slow import load_slow, measure_slow, shift_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
@@ -38,6 +38,7 @@ from quad_gym.kernels.maths.linalg import (
     sum_of_squares,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm
+from quad_gym.kernels.measurements.aid import expect_aids, judge_aids, measured_by_aids
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import FilterForm, FilterStatus
@@ -81,7 +82,7 @@ _DOUBTS = (100.0, 100.0 / 9.0, 100.0 / 90.0)
 
 
 @kernel
-def update(flight, p, work, feature_count, mask, form=0, drift=None):
+def update(flight, p, work, feature_count, mask, form=0, slow=None, stages=None):
     """Condition the estimate on the valid measurements of the present instant, where `mask`.
 
     A lane whose result is not finite keeps its state bit for bit, sets UPDATE_FAILED and counts it.
@@ -101,7 +102,8 @@ def update(flight, p, work, feature_count, mask, form=0, drift=None):
         feature_count: Features in use.
         mask: Which lanes.
         form: A `FilterForm`.
-        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
+        stages: The table of stages, where there are aiding sensors, or None.
     """
     loose, first = mask & (p.sigma_spread < 0.0), 2  # nobody
     if (form & _GRADUAL) != 0 and feature_count > 0:
@@ -113,7 +115,7 @@ def update(flight, p, work, feature_count, mask, form=0, drift=None):
         doubt = select(loose, _DOUBTS[part], 1.0)
         well = flight.update_failures == failures  # a step that fails is the last
         taking, again = mask & well & (loose | (part == 2)), loose & (part > 0)
-        _update_by(flight, p, work, feature_count, taking, form, doubt, again, drift)
+        _update_by(flight, p, work, feature_count, taking, form, doubt, again, slow, stages)
     if (form & _GRADUAL) != 0:
         flight.nis = select(loose, np.nan, flight.nis)
 
@@ -130,7 +132,7 @@ def _is_loose(flight, p, feature_count):
 
 
 @kernel
-def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
+def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, stages):
     """Condition the estimate on the measurements with `doubt` times their noise, where `mask`.
 
     `again`: where these measurements were met before, with another doubt.
@@ -139,17 +141,24 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
     use_baseline = any_of(flight.baseline_valid > 0.0)
     use_velocity = any_of(flight.velocity_valid > 0.0)
     states, columns = 15, 9  # of the state, and of L those that matter
-    if drift is not None:
-        states, columns = 18, 18
+    if slow is not None:
+        states = 15 + slow.slow_states
+        columns = states
     last = columns - 1
     n = compare_center(
-        flight, p, work, feature_count, use_position, use_baseline, use_velocity, drift
+        flight, p, work, feature_count, use_position, use_baseline, use_velocity, slow
     )
+    first_of_aids = n
+    if stages is not None:
+        sensors, numbers = measured_by_aids(flight, slow)
+        n += 3 * sensors
     if n == 0:
         return
     measured = 3.0 * (flight.position_valid + flight.baseline_valid + flight.velocity_valid)
     for i in range(feature_count):
         measured = measured + 3.0 * flight.feature_valid[i]
+    if stages is not None:
+        measured = measured + numbers
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * states + measured)
     if (form & _EKF) != 0:
         measure_columns(
@@ -159,10 +168,14 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
         measure_sigma_points(
             flight, p, work, feature_count, use_position, use_baseline, use_velocity, c, last
         )
-    if drift is not None:
-        measure_drift(flight, drift, work, n, use_position)
+    if slow is not None:
+        measure_slow(flight, slow, work, n, use_position)
+    if stages is not None:
+        expect_aids(flight, p, work, slow, stages, first_of_aids, c)
     _innovate(work, n, c)
     if (form & _WATCH) != 0:
+        if stages is not None:
+            judge_aids(flight, p, work, slow, stages, first_of_aids, mask, again)
         left_out = judge_innovations(
             flight,
             p,
@@ -175,6 +188,7 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
             mask,
             again,
             columns,
+            stages,
         )
         measured = measured - left_out
     _sum_noise(p, work, n, doubt)
@@ -210,8 +224,8 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
     for i in range(15):
         for j in range(min(columns, 15)):
             L9[i, last - j] = L[i, j]
-    if drift is not None:
-        load_drift(drift, L9)
+    if slow is not None:
+        load_slow(flight, slow, L9)
     solve_right(L9, states, N, columns, work.inverse_diagonal, columns - 3)
 
     dx = work.h  # no longer needed
@@ -235,8 +249,8 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
     for i in range(15):
         for j in range(min(i + 1, columns)):
             L[i, j] = select(ok, L9[i, last - j], L[i, j])
-    if drift is not None:
-        shift_drift(flight, drift, L9, ok, (dx[D], dx[D + 1], dx[D + 2]))
+    if slow is not None:
+        shift_slow(flight, slow, L9, ok, dx)
     flight.nis = select(ok, nis, flight.nis)
     flight.nis_dimension = select(ok, measured, flight.nis_dimension)
     failed = wanted & logical_not(ok)
@@ -245,9 +259,9 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, drift):
     )
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
     if (form & _WATCH) != 0 and any_of(failed):
-        mark_failed(flight, feature_count, failed)
+        mark_failed(flight, feature_count, failed, slow)
     if (form & _GATE) != 0:
-        raise_doubts(flight, p, work, feature_count, mask & logical_not(failed), drift)
+        raise_doubts(flight, p, work, feature_count, mask & logical_not(failed), slow, stages)
 
 
 @stage
@@ -258,8 +272,8 @@ def update_stage(flight, world, model, settings, work, stages, flag):
 
 
 @stage
-def update_with_drift_stage(flight, world, model, settings, work, stages, flag):
-    """The same by a filter that estimates the slow error of GNSS positions."""
+def update_with_slow_stage(flight, world, model, settings, work, stages, flag):
+    """The same by a filter that estimates slow errors of sensors."""
     flying, scratch = lanes_of(flight), lanes_of(work)
-    mask, drift = scratch.mask > 0.0, flying.L_drift
-    update(flying, lanes_of(model), scratch, flag, mask, settings.form, drift)
+    mask, form = scratch.mask > 0.0, settings.form
+    update(flying, lanes_of(model), scratch, flag, mask, form, settings, stages)

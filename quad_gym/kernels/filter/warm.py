@@ -4,15 +4,16 @@ Its covariance P is one that filters of the same configuration reach, turned to 
 start; its errors are drawn from exactly that covariance. They go with the true biases as those of a
 real filter do, whose estimate and error are independent: of P = W W^T, the last six columns of W
 belong to the standard normals that the true biases were drawn with. Where the filter estimates the
-slow error of GNSS positions, that is not zero any more, and goes with its error likewise.
+slow errors of sensors, these go with the true ones likewise.
 """
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.drift import keep_drift
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.filter.slow import keep_slow_factor
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     apply,
+    apply_transposed,
     keep3,
     keep33,
     load3,
@@ -29,11 +30,12 @@ from quad_gym.kernels.maths.rotation import euler_to_dcm, quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import (
+    AIDS,
     DRAW_FIRST_BIASES,
+    DRAW_SLOW,
     DRAW_WARM,
     DRAW_WARM_DRIFT,
     WARM_DRAWS,
-    WARM_DRIFT_DRAWS,
 )
 
 
@@ -47,11 +49,11 @@ def _heading(R_BI):
 
 
 @kernel
-def _draw_errors(settings, stream, work, drift):
+def _draw_errors(settings, stream, work, slow):
     """Fill work.h with the errors W u of a vehicle that looks east; return the normals of d."""
     states, draws = 15, WARM_DRAWS
-    if drift is not None:
-        states, draws = 18, WARM_DRAWS + WARM_DRIFT_DRAWS
+    if slow is not None:
+        states, draws = 15 + slow.slow_states, WARM_DRAWS + 2 * slow.slow_states
     u, errors = work.z, work.h
     for k in range(8):
         u[2 * k], u[2 * k + 1] = normal_pair(stream, DRAW_WARM + k)
@@ -59,10 +61,14 @@ def _draw_errors(settings, stream, work, drift):
     for i in range(3):
         u[15 + i], u[18 + i] = n_a[i], n_g[i]
     n_d = n_a
-    if drift is not None:
-        n_own, n_d = six_normals(stream, DRAW_WARM_DRIFT)
-        for i in range(3):
-            u[WARM_DRAWS + i], u[WARM_DRAWS + 3 + i] = n_own[i], n_d[i]
+    if slow is not None:
+        for i in range(slow.slow_states):
+            k = WARM_DRAWS + i + i // 3 * 3
+            u[k], u[k + 3] = normal_pair(stream, DRAW_SLOW + i)  # the second made the true error
+        if slow.estimates_drift:
+            n_own, n_d = six_normals(stream, DRAW_WARM_DRIFT)
+            for i in range(3):
+                u[WARM_DRAWS + i], u[WARM_DRAWS + 3 + i] = n_own[i], n_d[i]
     for i in range(states):
         total = settings.warm_root[i, 0] * u[0]
         for k in range(1, draws):
@@ -72,7 +78,38 @@ def _draw_errors(settings, stream, work, drift):
 
 
 @kernel
-def start_warm(flight, settings, stream, work, mask, drift=None):
+def _turn_of_slow(slow, i, T, other):
+    """The turn from a vehicle that looks east of the states from `i` on, slow ones among them.
+
+    The drift of positions is in I, as positions are. What aiding sensors have of three numbers is
+    in B, but goes with the heading as seen from I, see `batch/warm_start.py`.
+    """
+    turn = other
+    if slow.estimates_drift and i == D:
+        turn = T
+    for s in range(AIDS):
+        if slow.aid_vector[s] >= 0 and i == D + slow.aid_vector[s]:
+            turn = transpose(T)
+    return turn
+
+
+@kernel
+def _start_aids(flight, slow, T, d, mask):
+    """Estimates of the slow errors of aiding sensors: the true ones less their errors."""
+    for s in range(AIDS):
+        k = slow.aid_vector[s]
+        if k >= 0:
+            error = apply_transposed(T, load3(d[D + k : D + k + 3]))
+            estimate = sub(load3(flight.aid_vector[s]), error)
+            keep3(flight.slow_hat[k : k + 3], mask, estimate)
+        k = slow.aid_scalar[s]
+        if k >= 0:
+            estimate = flight.aid_scalar[s] - d[D + k]
+            flight.slow_hat[k] = select(mask, estimate, flight.slow_hat[k])
+
+
+@kernel
+def start_warm(flight, settings, stream, work, mask, slow=None):
     """Start a converged filter, where `mask`.
 
     Args:
@@ -81,12 +118,14 @@ def start_warm(flight, settings, stream, work, mask, drift=None):
         stream: The random stream at the episode's first instant.
         work: Workspace.
         mask: Which lanes.
-        drift: Rows of the factor for the slow error of GNSS positions, see `drift.py`, or None.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
-    states = 15 if drift is None else 18
+    states = 15
+    if slow is not None:
+        states = 15 + slow.slow_states
     R_BI = quaternion_to_dcm(load4(flight.q))
     T = _heading(R_BI)
-    n_d = _draw_errors(settings, stream, work, drift)
+    n_d = _draw_errors(settings, stream, work, slow)
     d = work.h
     keep3(flight.r_hat, mask, sub(load3(flight.r), apply(T, load3(d[R : R + 3]))))
     keep3(flight.v_hat, mask, sub(load3(flight.v), apply(T, load3(d[V : V + 3]))))
@@ -99,20 +138,28 @@ def start_warm(flight, settings, stream, work, mask, drift=None):
     one = zero + 1.0
     eye = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
     for i in range(0, states, 3):
-        left = T if i < E or i == D else eye  # the rest is in B
+        left = T if i < E else eye  # the rest is in B
+        if slow is not None:
+            left = _turn_of_slow(slow, i, T, left)
         for j in range(0, i + 3, 3):
-            right = T if j < E or j == D else eye
+            right = T if j < E else eye
+            if slow is not None:
+                right = _turn_of_slow(slow, j, T, right)
             block = multiply(left, load_block(settings.warm_covariance, i, j))
             store_block(work.P, i, j, multiply(block, transpose(right)))
     cholesky(work.P, states, work.inverse_diagonal)  # P is known to be positive definite
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(mask, work.P[i, j], flight.L[i, j])
-    if drift is not None:
-        s = load3(settings.warm_drift_sigma)
-        true = apply(T, (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2]))
-        keep3(flight.gnss_drift, mask, true)
-        keep_drift(flight, drift, work, mask, sub(true, apply(T, load3(d[D : D + 3]))))
+    if slow is not None:
+        keep_slow_factor(flight, slow, work, mask)
+        if slow.estimates_drift:
+            s = load3(settings.warm_drift_sigma)
+            true = apply(T, (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2]))
+            keep3(flight.gnss_drift, mask, true)
+            keep3(flight.slow_hat, mask, sub(true, apply(T, load3(d[D : D + 3]))))
+        if slow.aids > 0:
+            _start_aids(flight, slow, T, d, mask)
 
 
 @stage
@@ -123,8 +170,7 @@ def warm_stage(flight, world, model, settings, work, stages, flag):
 
 
 @stage
-def warm_with_drift_stage(flight, world, model, settings, work, stages, flag):
-    """The same of a filter that estimates the slow error of GNSS positions."""
+def warm_with_slow_stage(flight, world, model, settings, work, stages, flag):
+    """The same of a filter that estimates slow errors of sensors."""
     flying, scratch = lanes_of(flight), lanes_of(work)
-    mask, drift = scratch.mask > 0.0, flying.L_drift
-    start_warm(flying, settings, stream_of(flying), scratch, mask, drift)
+    start_warm(flying, settings, stream_of(flying), scratch, scratch.mask > 0.0, settings)

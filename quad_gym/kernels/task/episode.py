@@ -7,6 +7,7 @@ from quad_gym.kernels.maths.elementary import atan2, clip, maximum, minimum, sin
 from quad_gym.kernels.maths.linalg import add, dot, keep3, load3, multiply, scale
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
 from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
+from quad_gym.kernels.measurements.clock import first_wait
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
@@ -218,23 +219,12 @@ def draw_start(flight, p, model, settings, stream, mask):
 
 
 @kernel
-def _first_wait(phase, period, share):
-    """Ticks to a sensor's first measurement: its phase, or at random within its period."""
-    ticks = 0.0 * share
-    for k in range(1, period):
-        ticks = ticks + select(share * period >= 1.0 * k, 1.0, 0.0)
-    if phase >= 0:
-        ticks = 0.0 * share + phase
-    return ticks
-
-
-@kernel
 def begin_clocks(flight, settings, stream, mask):
     """Set when GNSS and camera measure first, where `mask`; nothing has been measured yet."""
     gnss_share, camera_share = uniform_pair(stream, DRAW_PHASE)
-    wait = _first_wait(settings.gnss_phase, settings.gnss_ticks, gnss_share)
+    wait = first_wait(settings.gnss_phase, settings.gnss_ticks, gnss_share)
     flight.gnss_wait = select(mask, wait, flight.gnss_wait)
-    wait = _first_wait(settings.camera_phase, settings.camera_ticks, camera_share)
+    wait = first_wait(settings.camera_phase, settings.camera_ticks, camera_share)
     flight.camera_wait = select(mask, wait, flight.camera_wait)
     keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
     flight.position_fresh = select(mask, 0.0, flight.position_fresh)

@@ -1,0 +1,292 @@
+"""Slow errors d of sensors as more states of the filter, behind the other fifteen.
+
+A measurement with a slow error is `z = h(x) + d + white noise`, where each d is a Gauss-Markov
+process of first order,
+
+    d+ = alpha d + v,  alpha = exp(-dt / tau),  var(v) = sigma^2 (1 - alpha^2),
+
+or a constant (alpha = 1, v = 0). With d as a state the filter knows that measurements share their
+error: what else tells the position or the heading tells d, and the measurement tells these only as
+far as it is better than that. White noise in its place would have to be so strong that measurements
+counted for nothing. (R. G. Brown and P. Y. C. Hwang, Introduction to Random Signals and Applied
+Kalman Filtering, section on colored measurement noise.)
+
+There can be the drift of GNSS positions (three states in I, the first three of d), and what aiding
+sensors have (`kernels/measurements/`): three numbers each, then one number each. As blocks are 3 x
+3, their number is a multiple of three; what fills it up is constant, of variance one, and measured
+by nothing.
+
+The factor of the joint covariance has the rows of `flight.L` and below them those of
+`flight.L_slow`. As d comes last, the first fifteen rows are the factor of the covariance of the
+fifteen states, as ever, and the prediction of these does not know of d. Kernels of the filter take
+`slow`, which is the settings record, or None where no sensor has a slow error: what is under `slow
+is None` is decided as they are compiled, so that a filter without d has none of this.
+"""
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.error_state import BA, BG, D, E
+from quad_gym.kernels.maths.linalg import (
+    add33,
+    load3,
+    load_block,
+    multiply,
+    scale,
+    store_block,
+    sum_of_outers,
+    sum_of_squares,
+    transpose,
+)
+from quad_gym.kernels.simd.lanes import select
+
+
+@kernel
+def begin_slow(flight, p, slow, mask):
+    """Begin an episode, where `mask`: slow errors are estimated as zero, with their deviations."""
+    for i in range(slow.slow_states):
+        flight.slow_hat[i] = select(mask, 0.0, flight.slow_hat[i])
+        for j in range(D + slow.slow_states):
+            value = p.slow_sigma[i] if j == D + i else 0.0 * p.slow_sigma[i]
+            flight.L_slow[i, j] = select(mask, value, flight.L_slow[i, j])
+
+
+@kernel
+def add_diagonal(m, d):
+    """M + diag(d)."""
+    return (
+        (m[0][0] + d[0], m[0][1], m[0][2]),
+        (m[1][0], m[1][1] + d[1], m[1][2]),
+        (m[2][0], m[2][1], m[2][2] + d[2]),
+    )
+
+
+@kernel
+def _scale_rows(a, m):
+    """Diag(a) M."""
+    return (scale(a[0], m[0]), scale(a[1], m[1]), scale(a[2], m[2]))
+
+
+@kernel
+def _scale_both(a, b, m):
+    """Diag(a) M diag(b)."""
+    return (
+        (a[0] * b[0] * m[0][0], a[0] * b[1] * m[0][1], a[0] * b[2] * m[0][2]),
+        (a[1] * b[0] * m[1][0], a[1] * b[1] * m[1][1], a[1] * b[2] * m[1][2]),
+        (a[2] * b[0] * m[2][0], a[2] * b[1] * m[2][1], a[2] * b[2] * m[2][2]),
+    )
+
+
+@kernel
+def keep_slow_factor(flight, slow, work, ok):
+    """Take over the rows of d of the factor in work.P, where `ok`."""
+    for i in range(slow.slow_states):
+        for j in range(D + i + 1):
+            flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
+
+
+# ---- prediction ------------------------------------------------------------------------------
+
+
+@kernel
+def predict_slow(flight, slow, p, work):
+    """Fill the rows of d in work.P, as of the end of a tick; d does not act on other states."""
+    L, F, P, M = flight.L, work.F, work.P, flight.L_slow
+    for i in range(0, slow.slow_states, 3):
+        a, s = load3(p.slow_decay[i : i + 3]), load3(p.slow_drive[i : i + 3])
+        for j in range(0, BA, 3):
+            store_block(P, D + i, j, _scale_rows(a, sum_of_outers(M, i, F, j, 15)))
+        with_a, with_g = sum_of_outers(M, i, L, BA, 12), sum_of_outers(M, i, L, BG, 15)
+        store_block(P, D + i, BA, _scale_rows(scale(p.accel_bias_decay, a), with_a))
+        store_block(P, D + i, BG, _scale_rows(scale(p.gyro_bias_decay, a), with_g))
+        for j in range(0, i, 3):
+            b = load3(p.slow_decay[j : j + 3])
+            other = sum_of_outers(M, i, M, j, D + j + 3)
+            store_block(P, D + i, D + j, _scale_both(a, b, other))
+        own = _scale_both(a, a, sum_of_squares(M, i, D + i + 3))
+        store_block(P, D + i, D + i, add_diagonal(own, (s[0] * s[0], s[1] * s[1], s[2] * s[2])))
+
+
+@kernel
+def decay_slow(flight, slow, p, ok):
+    """Carry the estimates of d over a tick, where `ok`."""
+    for i in range(slow.slow_states):
+        d = flight.slow_hat[i]
+        flight.slow_hat[i] = select(ok, p.slow_decay[i] * d, d)
+
+
+@kernel
+def turn_slow(slow, P, T):
+    """What `turn_covariance` is for the correlation of d with the error angles."""
+    for i in range(0, slow.slow_states, 3):
+        store_block(P, D + i, E, multiply(load_block(P, D + i, E), transpose(T)))
+
+
+# ---- update ----------------------------------------------------------------------------------
+
+
+@kernel
+def measure_slow(flight, slow, work, n, use_position):
+    """Add to work.A what a fix has of d, in all columns of the factor.
+
+    Column j is row `last - j`; the columns from the tenth on, on which nothing else depends, are
+    empty so far.
+    """
+    drifting = use_position and slow.estimates_drift > 0
+    last = D + slow.slow_states - 1
+    for j in range(last + 1):
+        row = work.A[last - j]
+        if j >= 9:
+            for k in range(n):
+                row[k] = 0.0 * work.h[0]
+        if drifting:
+            for i in range(3):
+                d = select(flight.position_valid > 0.0, flight.L_slow[i, j], 0.0)
+                row[i] = row[i] + d
+
+
+@kernel
+def load_slow(flight, slow, columns):
+    """Complete the factor in `columns`, last first, that has those of fifteen states."""
+    last = D + slow.slow_states - 1
+    for i in range(D):
+        for j in range(D, last + 1):
+            columns[i, last - j] = 0.0 * flight.slow_hat[0]
+    for i in range(slow.slow_states):
+        for j in range(last + 1):
+            columns[D + i, last - j] = flight.L_slow[i, j]
+
+
+@kernel
+def shift_slow(flight, slow, columns, ok, shift):
+    """Take over what an update has made of d and its rows, where `ok`.
+
+    Args:
+        flight: Record.
+        slow: The settings.
+        columns: The factor, columns last first.
+        ok: Which lanes.
+        shift: Of all states.
+    """
+    last = D + slow.slow_states - 1
+    for i in range(slow.slow_states):
+        d = flight.slow_hat[i]
+        flight.slow_hat[i] = select(ok, d + shift[D + i], d)
+        for j in range(D + i + 1):
+            flight.L_slow[i, j] = select(ok, columns[D + i, last - j], flight.L_slow[i, j])
+
+
+# ---- doubts ----------------------------------------------------------------------------------
+
+
+@kernel
+def add_to_slow(flight, slow, P, D_d):
+    """Fill the rows of d in P with the present ones and D_d more of the drift of GNSS positions."""
+    L, M = flight.L, flight.L_slow
+    for i in range(0, slow.slow_states, 3):
+        for j in range(0, D, 3):
+            store_block(P, D + i, j, sum_of_outers(M, i, L, j, j + 3))
+        for j in range(0, i, 3):
+            store_block(P, D + i, D + j, sum_of_outers(M, i, M, j, D + j + 3))
+        store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
+    if slow.estimates_drift:
+        store_block(P, D, D, add33(load_block(P, D, D), D_d))
+
+
+# ---- late measurements -----------------------------------------------------------------------
+
+
+@kernel
+def begin_to_carry_slow(slow, p, work, ticks):
+    """Fill work.slow_decay with alpha over a number of ticks, one where nothing is late."""
+    for i in range(slow.slow_states):
+        decay = 1.0 + 0.0 * p.dt
+        for _ in range(ticks):
+            decay = decay * p.slow_decay[i]
+        work.slow_decay[i] = select(work.since_time > 0.0, decay, 1.0)
+
+
+@kernel
+def _gained(p, work, i, noise):
+    """Variances that three slow errors have gained over the time, counted `noise` times."""
+    decay, one = load3(work.slow_decay[i : i + 3]), load3(p.slow_decay[i : i + 3])
+    s = load3(p.slow_drive[i : i + 3])
+    fall = (
+        (1.0 - one[0]) * (1.0 + one[0]),
+        (1.0 - one[1]) * (1.0 + one[1]),
+        (1.0 - one[2]) * (1.0 + one[2]),
+    )
+    share = (
+        noise * ((1.0 - decay[0]) * (1.0 + decay[0]) / fall[0]),
+        noise * ((1.0 - decay[1]) * (1.0 + decay[1]) / fall[1]),
+        noise * ((1.0 - decay[2]) * (1.0 + decay[2]) / fall[2]),
+    )
+    return (  # a constant gains nothing
+        select(fall[0] > 0.0, share[0] * s[0] * s[0], 0.0),
+        select(fall[1] > 0.0, share[1] * s[1] * s[1], 0.0),
+        select(fall[2] > 0.0, share[2] * s[2] * s[2], 0.0),
+    )
+
+
+@kernel
+def _factors(work, i, back):
+    """By which three slow errors change over the time, or on the way back."""
+    a = load3(work.slow_decay[i : i + 3])
+    if back:
+        return (1.0 / a[0], 1.0 / a[1], 1.0 / a[2])
+    return a
+
+
+@kernel
+def carry_slow(flight, slow, p, work, noise, back):
+    """Fill the rows of d in work.P for a filter that goes back in time by work.slow_decay, or on.
+
+    What d has gained since then counts `noise` times, as the noise of the IMU does.
+
+    Args:
+        flight: Record.
+        slow: The settings.
+        p: Parameters as the filter believes them.
+        work: Workspace; work.columns has the fifteen columns of the other states, as taken.
+        noise: -1 or 0 on the way back, 1 or 0 on the way on.
+        back: Whether the filter goes back.
+    """
+    M, P, rows = work.columns, work.P, flight.L_slow
+    for i in range(0, slow.slow_states, 3):
+        a, gained = _factors(work, i, back), _gained(p, work, i, noise)
+        for j in range(0, D, 3):
+            store_block(P, D + i, j, _scale_rows(a, sum_of_outers(rows, i, M, j, 15)))
+        for j in range(0, i, 3):
+            other = sum_of_outers(rows, i, rows, j, D + j + 3)
+            store_block(P, D + i, D + j, _scale_both(a, _factors(work, j, back), other))
+        own = sum_of_squares(rows, i, D + i + 3)
+        if back:
+            own = _scale_both(a, a, add_diagonal(own, gained))
+        else:
+            own = add_diagonal(_scale_both(a, a, own), gained)
+        store_block(P, D + i, D + i, own)
+
+
+@kernel
+def shift_carried_slow(flight, slow, work, back):
+    """Carry the estimates of d back or on."""
+    for i in range(slow.slow_states):
+        d, decay = flight.slow_hat[i], work.slow_decay[i]
+        flight.slow_hat[i] = (1.0 / decay) * d if back else decay * d
+
+
+@kernel
+def set_slow_aside(flight, slow, work):
+    """Copy the slow errors, for lanes in which nothing arrives or an update fails."""
+    for i in range(slow.slow_states):
+        work.kept_slow[i] = flight.slow_hat[i]
+        for j in range(D + slow.slow_states):
+            work.kept_L_slow[i, j] = flight.L_slow[i, j]
+
+
+@kernel
+def restore_slow(flight, slow, work, old):
+    """Undo what has happened to them, where `old`."""
+    for i in range(slow.slow_states):
+        flight.slow_hat[i] = select(old, work.kept_slow[i], flight.slow_hat[i])
+        for j in range(D + slow.slow_states):
+            kept = work.kept_L_slow[i, j]
+            flight.L_slow[i, j] = select(old, kept, flight.L_slow[i, j])

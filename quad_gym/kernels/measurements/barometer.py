@@ -1,0 +1,79 @@
+"""The barometer: altitude by static pressure.
+
+It measures `z = r_z + b + v` with white noise v and a slow error b, as the pressure on the ground
+and the sensor's temperature change: a Gauss-Markov process of first order, which is a state of the
+filter (`filter/slow.py`). The model is linear, so that sigma points and derivatives agree.
+"""
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.error_state import D, R
+from quad_gym.kernels.maths.random import normal_pair, stream_of
+from quad_gym.kernels.measurements.aid import ACTS, aid_due, begin_aid, deliver, judge_aid
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Act, Aid
+
+_S = int(Aid.BAROMETER)
+_BEGIN, _SAMPLE = int(Act.BEGIN), int(Act.SAMPLE)
+_EXPECT, _JUDGE = int(Act.EXPECT), int(Act.JUDGE)
+
+
+@kernel
+def _measure(flight, p, settings, mask, starting):
+    """Measure where it is due."""
+    due = aid_due(flight, p, settings, _S, mask, starting)
+    n, _ = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
+    altitude = flight.r[2] + flight.aid_scalar[_S] + p.aid_sigma[_S] * n
+    zero = 0.0 * altitude
+    deliver(flight, settings, _S, mask, due, (altitude, zero, zero))
+
+
+@kernel
+def _expect(flight, p, work, settings, k):
+    """Fill rows k to k + 2: the altitude, and two masked ones."""
+    has, first = flight.aid_valid[_S] > 0.0, settings.aid_scalar[_S]
+    variance = p.aid_sigma[_S] * p.aid_sigma[_S]
+    for i in range(3):
+        work.h[k + i], work.z[k + i] = 0.0 * variance, 0.0 * variance
+        for j in range(3):
+            work.Rz[k + i, k + j] = (1.0 if i == j else 0.0) + 0.0 * variance
+    work.h[k] = select(has, flight.r_hat[2] + flight.slow_hat[first], 0.0)
+    work.z[k] = select(has, flight.aid_measurement[_S, 0], 0.0)
+    work.Rz[k, k] = select(has, variance, 1.0)
+    last = D + settings.slow_states - 1
+    for j in range(last + 1):
+        row, value = work.A[last - j], flight.L_slow[first, j]
+        if j <= R + 2:
+            value = value + flight.L[R + 2, j]
+        row[k] = select(has, value, 0.0)
+        row[k + 1], row[k + 2] = 0.0 * variance, 0.0 * variance
+    for j in range(9):
+        for i in range(3):
+            work.E[j, k + i] = 0.0 * variance
+
+
+@kernel
+def _doubt(flight, p, work, settings, mask):
+    """Add the square of a rejected innovation to the variance of the slow error, and of height."""
+    doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
+    nu, k = flight.innovation[AID_BLOCKS + _S, 0], D + settings.aid_scalar[_S]
+    more = select(doubted, nu * nu, 0.0)
+    work.P[k, k] = work.P[k, k] + more
+    work.P[R + 2, R + 2] = work.P[R + 2, R + 2] + more
+
+
+@stage
+def barometer_stage(flight, world, model, settings, work, stages, flag):
+    """An `Act` of the barometer; see `aid.py` for `flag`."""
+    flying, scratch, act, k = lanes_of(flight), lanes_of(work), flag % ACTS, flag // ACTS
+    p, mask = lanes_of(model), scratch.mask > 0.0
+    if act == _BEGIN:
+        begin_aid(flying, lanes_of(world), settings, _S, mask)
+    elif act == _SAMPLE:
+        _measure(flying, lanes_of(world), settings, mask, k > 0)
+    elif act == _EXPECT:
+        _expect(flying, p, scratch, settings, k)
+    elif act == _JUDGE:
+        judge_aid(flying, p, scratch, settings, _S, k)
+    else:
+        _doubt(flying, p, scratch, settings, scratch.taking > 0.0)

@@ -1,0 +1,109 @@
+"""Aiding sensors and slow errors as numbers in the records that kernels read."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from quad_gym.params import checks as check
+from quad_gym.params.aids import SlowError
+from quad_gym.params.gnss import LEAST_DRIFT
+from quad_gym.params.sensors import SensorSuite, delay_ticks
+from quad_gym.records import AID_FREEDOMS, AIDS, MAX_SLOW
+
+
+class SlowStates(NamedTuple):
+    """The slow errors among the states of a suite's filter, in their order."""
+
+    errors: tuple[SlowError, ...]
+    """a multiple of three; those that measure nothing are constant, of deviation one"""
+    drifts: bool
+    """whether the first three are the drift of GNSS positions, which is zero at the start"""
+    vectors: tuple[int, ...]
+    """the first of an aiding sensor's three, in the order of `Aid`; -1: it has none"""
+    scalars: tuple[int, ...]
+    """an aiding sensor's single one, likewise"""
+
+    @property
+    def first_sigmas(self) -> NDArray[np.float64]:
+        """(n,) standard deviations at the start."""
+        sigmas = np.array([error.sigma for error in self.errors])
+        sigmas[: 3 * self.drifts] = 0.0
+        return sigmas
+
+
+def slow_states(sensors: SensorSuite) -> SlowStates:
+    """The slow errors that a filter which believes in these sensors estimates."""
+    errors: list[SlowError] = []
+    vectors, scalars = [-1] * AIDS, [-1] * AIDS
+    if sensors.gnss is not None and sensors.drifts:
+        tau = sensors.gnss.drift_tau
+        errors = [SlowError(max(s, LEAST_DRIFT), tau) for s in sensors.gnss.drift_sigma_I]
+    for aid, params in sensors.aids.items():
+        if params.believed_vector is not None:
+            vectors[aid] = len(errors)
+            errors += [params.believed_vector] * 3
+    for aid, params in sensors.aids.items():
+        if params.slow_scalar is not None:
+            scalars[aid] = len(errors)
+            errors.append(params.slow_scalar)
+    errors += [SlowError(1.0)] * (-len(errors) % 3)
+    return SlowStates(tuple(errors), sensors.drifts, tuple(vectors), tuple(scalars))
+
+
+def _fall(error: SlowError, time: float) -> tuple[float, float]:
+    """Decay of a slow error over a time [s], and standard deviation of what drives it."""
+    decay = math.exp(-time / error.tau)
+    return decay, error.sigma * math.sqrt(-math.expm1(-2.0 * time / error.tau))
+
+
+def pack_aids(p: Any, sensors: SensorSuite) -> None:
+    """Write the numbers of aiding sensors and slow errors into a parameter record."""
+    p["slow_decay"] = p["slow_sigma"] = 1.0
+    states = slow_states(sensors)
+    for k, error in enumerate(states.errors):
+        p["slow_decay"][k], p["slow_drive"][k] = _fall(error, sensors.imu.dt)
+    p["slow_sigma"][: len(states.errors)] = states.first_sigmas
+    for aid, params in sensors.aids.items():
+        p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.white_sigma, params.matrix_sigma
+        p["aid_gate"][aid] = special.chdtri(AID_FREEDOMS[aid], sensors.estimator.gate_false_alarm)
+        for name in ("vector", "scalar"):
+            slow = getattr(params, f"slow_{name}")
+            if slow is not None:
+                decay, drive = _fall(slow, 1.0 / params.rate)
+                p[f"aid_{name}_sigma"][aid] = slow.sigma
+                p[f"aid_{name}_decay"][aid], p[f"aid_{name}_drive"][aid] = decay, drive
+        for name, value in params.fields.items():
+            p[name] = value
+
+
+def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuite) -> None:
+    """Write which aiding sensors and slow errors there are, and their clocks.
+
+    Args:
+        settings: One SETTINGS record.
+        measures: The sensors as they are.
+        believes: The sensors as the filter believes them to be.
+
+    Raises:
+        ValueError: If a sensor is too late for its rate.
+    """
+    states = slow_states(believes)
+    assert len(states.errors) <= MAX_SLOW
+    settings["slow_states"], settings["estimates_drift"] = len(states.errors), states.drifts
+    settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
+    settings["aids"] = len(believes.aids)
+    for aid, params in measures.aids.items():
+        ticks = check.ticks(f"{type(params).__name__}.rate", params.rate, measures.imu.rate)
+        label = f"{type(params).__name__}.latency"
+        settings["aid_on"][aid], settings["aid_ticks"][aid] = True, ticks
+        settings["aid_phase"][aid] = phase_ticks(params.phase, ticks)
+        delay = delay_ticks(label, params.latency, params.rate, measures.imu.rate)
+        settings["aid_delay"][aid] = delay
+
+
+def phase_ticks(phase: float | None, period: int) -> int:
+    """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
+    return -1 if phase is None else min(round(phase * period), period - 1)
