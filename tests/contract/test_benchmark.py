@@ -28,7 +28,8 @@ def test_the_filter_section_compares_all_filters(tmp_path, capsys):
     assert list(found["sections"]) == ["filter"]
     rows = found["sections"]["filter"]
     kinds = {(row["kind"], row["measurements"]) for row in rows}
-    assert {(kind, n) for kind in ("lanes", "scalar", "plain NumPy") for n in (6, 12)} <= kinds
+    expected = ("lanes", "UnscentedKalmanFilter", "plain NumPy")
+    assert {(kind, n) for kind in expected for n in (6, 12)} <= kinds
     for row in rows:
         more = {"kind", "measurements", "suite", "times_lanes"}
         assert set(row) == {"name", "seconds", "spread"} | more
