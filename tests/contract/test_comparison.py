@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from tests.console_commands import run
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def read_csv(file):

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import time
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -25,7 +24,6 @@ from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
 from baselines.training import train  # noqa: E402
 from tests import console_commands  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
 CIRCLE = "QuadGym/Circle-v0"
 
 
