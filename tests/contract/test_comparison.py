@@ -97,7 +97,7 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
 
 
 def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind(tmp_path):
-    options = ["--steps", "1000000", "--env", "duration=1.0", "--output", tmp_path / "out"]
+    options = ["--steps", "300000", "--env", "duration=1.0", "--output", tmp_path / "out"]
     line = console_commands.line("compare.py", "--seeds", "1", "--jobs", "2", *options)
     process = subprocess.Popen(
         line, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
