@@ -35,6 +35,8 @@ FREEDOMS = {name: part.stop - part.start for name, part in PARTS.items()} | {
     "nis_baseline": 2,
     "nis_velocity": 3,
     "nis_feature": 2,
+    "nis_barometer": 1,
+    "nis_magnetometer": 3,
 }
 """What the columns' means are about, if the filter is consistent."""
 
@@ -88,7 +90,11 @@ def _latencies(suite: SensorSuite) -> Iterator[tuple[str, SensorSuite]]:
             gnss = gnss.replace(latency=periods / gnss.rate)
         if camera is not None:
             camera = camera.replace(latency=periods / camera.rate)
-        yield words, suite.replace(gnss=gnss, camera=camera)
+        aids = {
+            aid.name.lower(): params.replace(latency=periods / params.rate)
+            for aid, params in suite.aids.items()
+        }
+        yield words, suite.replace(gnss=gnss, camera=camera, **aids)
 
 
 def _draws(suite: SensorSuite) -> dict[str, Any]:

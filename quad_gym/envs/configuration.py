@@ -184,6 +184,7 @@ class Flights:
             privileged=privileged,
             feature_count=features,
             gnss_velocity=suite.gnss is not None and suite.gnss.velocity_sigma is not None,
+            aids=tuple(suite.aids),
             drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
         bounds = layout_bounds(self.table)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults.presets import named_faults
-from quad_gym.records import FEATURE_BLOCKS
+from quad_gym.packing.aids import blocks_of
 
 Parts = dict[str, dict[str, NDArray[Any]]]
 
@@ -28,26 +28,28 @@ def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
 
 
 def innovations_of(batch: FlightBatch) -> dict[str, NDArray[Any]]:
-    """The last innovations of all flights, block by block: position, baseline, velocity, features.
+    """The last innovations of all flights, block by block.
+
+    The blocks are position, baseline, velocity and features; then barometer and magnetometer, if
+    the suite has such.
 
     Returns:
         Arrays (n, blocks, ...): "measured" (since the last step), "innovation" and "sigma" (what
         the filter expected), three numbers each, of which a direction has two; "nis"; "gate", see
         `quad_gym.records.Gate`; "rejections" in this episode. NaN: not measured yet.
     """
-    camera = batch.sensors.camera
-    blocks = FEATURE_BLOCKS + (0 if camera is None else len(camera.features_I))
+    blocks = list(blocks_of(batch.sensors))
     position, baseline = batch.read("position_fresh"), batch.read("baseline_fresh")
     has_velocity = batch.sensors.gnss is not None and batch.sensors.gnss.velocity_sigma is not None
-    features = batch.read("feature_fresh")
-    measured = np.column_stack([position, baseline, position * has_velocity, features])
+    others = batch.read("feature_fresh"), batch.read("aid_fresh")
+    measured = np.column_stack([position, baseline, position * has_velocity, *others])
     return {
-        "measured": measured[:, :blocks] > 0.0,
-        "innovation": batch.read("innovation")[:, :blocks],
-        "sigma": batch.read("innovation_sigma")[:, :blocks],
-        "nis": batch.read("block_nis")[:, :blocks],
-        "gate": batch.read("gate")[:, :blocks].astype(np.int64),
-        "rejections": batch.read("rejections")[:, :blocks].astype(np.int64),
+        "measured": measured[:, blocks] > 0.0,
+        "innovation": batch.read("innovation")[:, blocks],
+        "sigma": batch.read("innovation_sigma")[:, blocks],
+        "nis": batch.read("block_nis")[:, blocks],
+        "gate": batch.read("gate")[:, blocks].astype(np.int64),
+        "rejections": batch.read("rejections")[:, blocks].astype(np.int64),
     }
 
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.records import COLUMNS, Control, Layout, Source
+from quad_gym.records import COLUMNS, Aid, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
@@ -86,7 +86,16 @@ _FLAG = 0.0
 """A bound of zero marks a flag, in [0, 1]."""
 
 
-def _sensor_fields(feature_count: int, gnss_velocity: bool) -> tuple[Part, ...]:
+_AIDS: dict[Aid, Part] = {
+    Aid.BAROMETER: ("barometer", 1, "m", "I", 1000.0),
+    Aid.MAGNETOMETER: ("magnetometer", 3, "of the field", "B", 10.0),
+}
+"""What aiding sensors measure, each followed by its flag."""
+
+
+def _sensor_fields(
+    feature_count: int, gnss_velocity: bool, aids: Sequence[Aid]
+) -> tuple[Part, ...]:
     fields = [
         ("gyro", 3, "rad/s", "B", 200.0),
         ("accel", 3, "m/s^2", "B", 1000.0),
@@ -101,6 +110,8 @@ def _sensor_fields(feature_count: int, gnss_velocity: bool) -> tuple[Part, ...]:
     for k in range(1, feature_count + 1):
         fields.append((f"feature_{k}", 2, "half images", "C", 2.0))
         fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
+    for aid in aids:
+        fields += [_AIDS[aid], (f"{_AIDS[aid][0]}_valid", 1, "0 or 1", "-", _FLAG)]
     return (*fields, *_REFERENCE)
 
 
@@ -135,6 +146,7 @@ def observation_layout(
     privileged: bool = False,
     feature_count: int = 2,
     gnss_velocity: bool = False,
+    aids: Sequence[Aid] = (),
     drawn: Sequence[str] | None = None,
 ) -> tuple[ObservationField, ...]:
     """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
@@ -147,6 +159,7 @@ def observation_layout(
             environment returns that part under a key of its own.
         feature_count: Features of the camera, for "sensors".
         gnss_velocity: Whether GNSS measures velocity, for "sensors".
+        aids: Barometer and magnetometer, as far as there are such, for "sensors".
         drawn: What is drawn for every episode, see `quad_gym.Randomization`: the truth ends with
             the wind and the draws. None: in a calm world without draws it does not.
 
@@ -160,7 +173,7 @@ def observation_layout(
     check.choice("layout", layout, tuple(LAYOUTS))
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
     if observation == "sensors":
-        parts = _sensor_fields(feature_count, gnss_velocity)
+        parts = _sensor_fields(feature_count, gnss_velocity, aids)
     parts = (*parts, _LAST_ACTION)
     if include_covariance:
         units = ("m", "m/s", "rad", "m/s^2", "rad/s")

@@ -20,6 +20,7 @@ Which faults are active is told by `info["faults"]` (name: True or False), by
 "outlier" and "feature_mistaken", for `FlightBatch.read`. Neither filter nor controller knows.
 """
 
+from quad_gym.faults.aids import BarometerLoss, MagnetometerLoss
 from quad_gym.faults.base import Fault, Span, ends
 from quad_gym.faults.camera import CameraOcclusion, WrongAssociations
 from quad_gym.faults.gnss import BaselineLoss, GnssJump, GnssOutage, GnssOutliers, GnssRamp
@@ -28,6 +29,7 @@ from quad_gym.faults.vehicle import PositionJump, RotorLoss
 
 __all__ = [
     "AccelBiasStep",
+    "BarometerLoss",
     "BaselineLoss",
     "CameraOcclusion",
     "Fault",
@@ -37,6 +39,7 @@ __all__ = [
     "GnssRamp",
     "GyroBiasStep",
     "ImuSaturation",
+    "MagnetometerLoss",
     "PositionJump",
     "RotorLoss",
     "Span",

@@ -12,7 +12,8 @@ from quad_gym.params.portable import norm
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FaultKind
 
-_SENSORS = {"gnss": "GNSS", "camera": "a camera"}
+_SENSORS = {"gnss": "GNSS"}
+"""Parts of a suite that take no article."""
 
 Span = float | tuple[float, float]
 """A number, or the ends of a range from which it is drawn uniformly each time a fault comes."""
@@ -101,9 +102,10 @@ class Fault(Checked):
             ValueError: If it does.
         """
         if self.needs and getattr(sensors, self.needs) is None:
+            what = _SENSORS.get(self.needs, f"a {self.needs}")
             raise ValueError(
-                f"faults must concern sensors that there are: {type(self).__name__} needs "
-                f"{_SENSORS[self.needs]}, which this sensor suite does not have"
+                f"faults must concern sensors that there are: {type(self).__name__} needs {what}, "
+                f"which this sensor suite does not have"
             )
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from quad_gym.faults import (
     AccelBiasStep,
+    BarometerLoss,
     BaselineLoss,
     CameraOcclusion,
     Fault,
@@ -17,6 +18,7 @@ from quad_gym.faults import (
     GnssRamp,
     GyroBiasStep,
     ImuSaturation,
+    MagnetometerLoss,
     PositionJump,
     RotorLoss,
     WrongAssociations,
@@ -45,6 +47,8 @@ PRESETS: dict[str, tuple[Fault, ...]] = {
     "imu_bias_step": (AccelBiasStep(start=_SOON), GyroBiasStep(start=_SOON)),
     "imu_saturation": (ImuSaturation(),),
     "rotor_loss": (RotorLoss(start=_SOON),),
+    "barometer_loss": (BarometerLoss(start=_SOON, duration=_A_WHILE),),
+    "magnetometer_loss": (MagnetometerLoss(start=_SOON, duration=_A_WHILE),),
 }
 """Faults by name, made for episodes of ten seconds and more."""
 

@@ -11,14 +11,16 @@ from quad_gym.params import checks as check
 from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import LEAST_DRIFT
 from quad_gym.params.sensors import SensorSuite, delay_ticks
-from quad_gym.records import AID_FREEDOMS, AIDS, MAX_SLOW
+from quad_gym.records import AID_BLOCKS, AID_FREEDOMS, AIDS, FEATURE_BLOCKS, MAX_SLOW
 
 
 class SlowStates(NamedTuple):
     """The slow errors among the states of a suite's filter, in their order."""
 
     errors: tuple[SlowError, ...]
-    """a multiple of three; those that measure nothing are constant, of deviation one"""
+    """a multiple of three; the last ones, which fill it up, are constant, of deviation one"""
+    estimated: int
+    """how many of them are errors of sensors"""
     drifts: bool
     """whether the first three are the drift of GNSS positions, which is zero at the start"""
     vectors: tuple[int, ...]
@@ -49,8 +51,15 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
         if params.slow_scalar is not None:
             scalars[aid] = len(errors)
             errors.append(params.slow_scalar)
-    errors += [SlowError(1.0)] * (-len(errors) % 3)
-    return SlowStates(tuple(errors), sensors.drifts, tuple(vectors), tuple(scalars))
+    count = len(errors)
+    errors += [SlowError(1.0)] * (-count % 3)
+    return SlowStates(tuple(errors), count, sensors.drifts, tuple(vectors), tuple(scalars))
+
+
+def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
+    """The blocks of innovations of a suite: position, baseline, velocity, features, aids."""
+    features = 0 if sensors.camera is None else len(sensors.camera.features_I)
+    return (*range(FEATURE_BLOCKS + features), *(AID_BLOCKS + aid for aid in sensors.aids))
 
 
 def _fall(error: SlowError, time: float) -> tuple[float, float]:
@@ -67,6 +76,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
         p["slow_decay"][k], p["slow_drive"][k] = _fall(error, sensors.imu.dt)
     p["slow_sigma"][: len(states.errors)] = states.first_sigmas
     for aid, params in sensors.aids.items():
+        p["aid_scale"][aid] = params.scale
         p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.white_sigma, params.matrix_sigma
         p["aid_gate"][aid] = special.chdtri(AID_FREEDOMS[aid], sensors.estimator.gate_false_alarm)
         for name in ("vector", "scalar"):
@@ -92,7 +102,8 @@ def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuit
     """
     states = slow_states(believes)
     assert len(states.errors) <= MAX_SLOW
-    settings["slow_states"], settings["estimates_drift"] = len(states.errors), states.drifts
+    settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
+    settings["estimates_drift"] = states.drifts
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
     settings["aids"] = len(believes.aids)
     for aid, params in measures.aids.items():

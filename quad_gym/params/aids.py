@@ -64,6 +64,11 @@ class AidParams(Checked):
         return 0.0
 
     @property
+    def scale(self) -> float:
+        """What counts as one in observations."""
+        return 1.0
+
+    @property
     def fields(self) -> dict[str, Any]:
         """Further numbers that kernels read of it, by their names in the parameter record."""
         return {}

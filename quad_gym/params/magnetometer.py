@@ -99,6 +99,11 @@ class MagnetometerParams(AidParams):
         return self.soft_iron_sigma
 
     @property
+    def scale(self) -> float:
+        """The strength of the field [T]."""
+        return self.strength
+
+    @property
     def fields(self) -> dict[str, Any]:
         """The field, for kernels."""
         return {"magnetic_field": self.field_I}

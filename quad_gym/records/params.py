@@ -97,6 +97,7 @@ PARAMS_FIELDS = (
     Field("aid_scalar_decay", (AIDS,), "-", "of the same between two measurements"),
     Field("aid_scalar_drive", (AIDS,), "m; rad", "sigma of its driving noise"),
     Field("aid_matrix_sigma", (AIDS,), "-", "of each error of scale and alignment"),
+    Field("aid_scale", (AIDS,), "m; T", "one in observations"),
     Field("aid_gate", (AIDS,), "-", "largest accepted NIS"),
     Field("magnetic_field", (3,), "T", "the Earth's in I"),
     # slow errors among the filter's states

@@ -55,7 +55,7 @@ def judge_innovations(
     mask,
     again,
     columns,
-    stages,
+    slow,
 ):
     """Keep the innovations of the present measurements and mask those beyond the gate.
 
@@ -71,7 +71,8 @@ def judge_innovations(
         mask: Which lanes.
         again: Which lanes take a later step of measurements that they have met before.
         columns: Rows of work.A in use.
-        stages: Not None where there may be aiding sensors, which have been judged before.
+        slow: The settings, where there may be aiding sensors, or None; these have been judged
+            before.
 
     Returns:
         How many measurements were masked in each lane.
@@ -79,7 +80,7 @@ def judge_innovations(
     gating = (form & _GATE) != 0
     zero = 0.0 * p.sigma_beta
     left_out, total, freedoms = zero, zero, zero
-    if stages is not None:
+    if slow is not None:
         left_out, total, freedoms = work.left_out, work.judged_nis, work.judged_freedoms
     count, side, up = zero, zero, zero
     trusted = camera_fits(flight, p)

@@ -292,7 +292,7 @@ def predict(flight, p, work, form=0, slow=None):
         f_B = sub(f_B, lever_force(flight, p, form, half))
     states, augmented = 15, 27.0  # the latter with the noise
     if slow is not None:
-        states, augmented = 15 + slow.slow_states, 27.0 + 2.0 * slow.slow_states
+        states, augmented = 15 + slow.slow_states, 27.0 + 2.0 * slow.slow_errors
     mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented)
     _sum_moments(flight, p, work, mean_a, mean_e, form)
     if slow is not None:

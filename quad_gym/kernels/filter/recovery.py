@@ -197,7 +197,7 @@ def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, slow, D_d, p
     if slow is not None:
         states = 15 + slow.slow_states
         add_to_slow(flight, slow, P, D_d)
-    if stages is not None:
+    if slow is not None:
         if slow.aids > 0:
             work.taking = select(mask, 1.0, 0.0)
             for s in range(AIDS):
@@ -234,7 +234,7 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
         feature_count: Features in use.
         mask: Which lanes.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
-        stages: The table of stages, where there are aiding sensors, or None.
+        stages: The table of stages, which has those of aiding sensors; None without slow errors.
     """
     row, patience = flight.rejected_in_row, p.gate_patience
     free = logical_not(camera_fits(flight, p))

@@ -103,7 +103,7 @@ def update(flight, p, work, feature_count, mask, form=0, slow=None, stages=None)
         mask: Which lanes.
         form: A `FilterForm`.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
-        stages: The table of stages, where there are aiding sensors, or None.
+        stages: The table of stages, which has those of aiding sensors; None without slow errors.
     """
     loose, first = mask & (p.sigma_spread < 0.0), 2  # nobody
     if (form & _GRADUAL) != 0 and feature_count > 0:
@@ -149,7 +149,7 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, s
         flight, p, work, feature_count, use_position, use_baseline, use_velocity, slow
     )
     first_of_aids = n
-    if stages is not None:
+    if slow is not None:
         sensors, numbers = measured_by_aids(flight, slow)
         n += 3 * sensors
     if n == 0:
@@ -157,9 +157,10 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, s
     measured = 3.0 * (flight.position_valid + flight.baseline_valid + flight.velocity_valid)
     for i in range(feature_count):
         measured = measured + 3.0 * flight.feature_valid[i]
-    if stages is not None:
+    if slow is not None:
         measured = measured + numbers
-    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * states + measured)
+    estimated = 15 if slow is None else 15 + slow.slow_errors
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
     if (form & _EKF) != 0:
         measure_columns(
             flight, p, work, n, feature_count, use_position, use_baseline, use_velocity, last
@@ -170,11 +171,11 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, s
         )
     if slow is not None:
         measure_slow(flight, slow, work, n, use_position)
-    if stages is not None:
+    if slow is not None:
         expect_aids(flight, p, work, slow, stages, first_of_aids, c)
     _innovate(work, n, c)
     if (form & _WATCH) != 0:
-        if stages is not None:
+        if slow is not None:
             judge_aids(flight, p, work, slow, stages, first_of_aids, mask, again)
         left_out = judge_innovations(
             flight,
@@ -188,7 +189,7 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, s
             mask,
             again,
             columns,
-            stages,
+            slow,
         )
         measured = measured - left_out
     _sum_noise(p, work, n, doubt)

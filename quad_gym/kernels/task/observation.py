@@ -8,7 +8,16 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
-from quad_gym.records import DRAWN_SIZE, FIXED, MAX_GATES, Layout, Source, Task
+from quad_gym.records import (
+    AID_FREEDOMS,
+    AIDS,
+    DRAWN_SIZE,
+    FIXED,
+    MAX_GATES,
+    Layout,
+    Source,
+    Task,
+)
 
 
 @kernel
@@ -88,6 +97,19 @@ def _put_absolute(flight, p, settings, row):
 
 
 @kernel
+def _put_aids(flight, p, settings, row, k):
+    """What aiding sensors have measured since the last step, else zeros."""
+    for s in range(AIDS):
+        if settings.aid_on[s] > 0:
+            fresh, scaled = flight.aid_fresh[s], flight.aid_fresh[s] / p.aid_scale[s]
+            for i in range(AID_FREEDOMS[s]):
+                row[k + i] = scaled * flight.aid_measurement[s, i]
+            row[k + AID_FREEDOMS[s]] = fresh
+            k += AID_FREEDOMS[s] + 1
+    return k
+
+
+@kernel
 def _put_sensors(flight, p, settings, row):
     """The last IMU sample; GNSS and camera where they measured since the last step, else zeros."""
     R_IG = load33(p.R_IG)
@@ -112,6 +134,8 @@ def _put_sensors(flight, p, settings, row):
         row[k + 1] = fresh * flight.pixels[i, 1] / p.half_image[1]
         row[k + 2] = fresh
         k += 3
+    if settings.aids > 0:
+        k = _put_aids(flight, p, settings, row, k)
     return _put_reference(flight, p, settings, row, k)
 
 

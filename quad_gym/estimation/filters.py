@@ -1,64 +1,33 @@
-"""State estimation for one vehicle: Wahba's problem, an unscented and an extended Kalman filter."""
+"""An unscented and an extended Kalman filter for one vehicle."""
 
-import functools
 import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.estimation.estimate import Estimate
 from quad_gym.kernels import single
-from quad_gym.kernels.compiling.workers import prepare
+from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.compiling.stages import Stage
 from quad_gym.packing.aids import pack_aid_settings
-from quad_gym.packing.flight import form_of, params_record
+from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT, SETTINGS, WORK, FilterForm, FilterStatus
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    SETTINGS,
+    WORK_BLOCK,
+    Aid,
+    FilterForm,
+    aligned_zeros,
+)
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
 FARTHEST_FIX = 1e6
 """From the reference antenna [m]; positions from the center of the Earth are farther."""
-
-
-def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[np.float64]:
-    """The rotation that best turns vectors in I into the same vectors seen in B.
-
-    Minimises `sum_i a_i |v_B,i - R_BI v_I,i|^2`.
-
-    Args:
-        weights: (n,) weights a_i, none negative and not all zero.
-        v_I: (n, 3) vectors in I.
-        v_B: (n, 3) the same vectors in B.
-
-    Returns:
-        (3, 3) R_BI, a proper rotation.
-
-    Raises:
-        ValueError: If the shapes do not fit, a value is not finite, or the vectors leave the
-            rotation open (all parallel, for example).
-
-    Source: report section 4.1; F. L. Markley, J. Astronautical Sciences 36(3), 1988.
-    """
-    a = check.array("weights", weights, (None,))
-    vectors_I = check.array("v_I", v_I, (len(a), 3))
-    vectors_B = check.array("v_B", v_B, (len(a), 3))
-    if (a < 0.0).any() or not (a > 0.0).any():
-        raise ValueError(f"weights must be at least 0 and not all zero, got {a}")
-    R_BI = np.empty((3, 3))
-    uniqueness = single.wahba_of_vectors(a, vectors_I, vectors_B, R_BI)
-    if not uniqueness > 1e-10:
-        raise ValueError(
-            "v_I and v_B must determine a rotation: two directions at least must differ"
-        )
-    return R_BI
-
-
-@functools.cache
-def _prepare(drifts: bool) -> None:
-    """Compile what a filter calls, side by side, unless this process has it."""
-    prepare(single.DRIFT_FILTER if drifts else single.FILTER)
 
 
 def _require_relative(position_G: NDArray[np.float64]) -> None:
@@ -71,8 +40,11 @@ def _require_relative(position_G: NDArray[np.float64]) -> None:
         )
 
 
-class _KalmanFilter:
-    """What the filters have in common: their interface, and all but the kind of their kernels."""
+class _KalmanFilter(Estimate):
+    """What the filters have in common: their interface, and all but the kind of their kernels.
+
+    They run the stages of flights on one block, all of whose lanes hold the same flight.
+    """
 
     _kind: str
 
@@ -82,16 +54,19 @@ class _KalmanFilter:
         sensors.require_filter()
         self.sensors = sensors
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-        self._params = params_record(VehicleParams(), sensors)
-        self._params["gravity"] = sensors.estimator.gravity
+        params = params_record(VehicleParams(), sensors)
+        params["gravity"] = sensors.estimator.gravity
+        self._params = params_block(params)
         lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
         estimator = sensors.estimator.replace(kind=self._kind)
         form = form_of(estimator, innovations=True, lever_arm=lever_arm)
-        self._form = int(form)
-        self._flight = np.zeros(1, FLIGHT)
-        self._flight["block_nis"] = self._flight["w_before"] = np.nan
-        self._work, self._settings = np.zeros(1, WORK), np.zeros(1, SETTINGS)
+        self._settings = np.zeros(1, SETTINGS)
+        self._settings["form"], self._settings["feature_count"] = int(form), self._features
         pack_aid_settings(self._settings[0], sensors, sensors)
+        self._slow = bool(self._settings["slow_states"] > 0)
+        self._flight = aligned_zeros(1, FLIGHT_BLOCK)
+        self._work = aligned_zeros(1, WORK_BLOCK)
+        self._work["mask"] = 1.0
         self._running = False
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -127,7 +102,8 @@ class _KalmanFilter:
         if heading is not None:
             angle = check.number("heading", heading)
             x_I[:2] = np.cos(angle), np.sin(angle)
-        self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
+        self._set("gnss_position", position)
+        self._set("gnss_baseline", baseline)
         self._start(x_I)
         self._running = True
 
@@ -173,17 +149,40 @@ class _KalmanFilter:
             check.array("gyro_bias", gyro_bias, (3,)),
         )
         self._start(np.zeros(3))  # what the filter remembers begins anew; the estimate is given
-        for name, value in zip(_STATE, values, strict=True):
-            self._flight[name] = value
-        self._flight["L"] = L
+        for name, value in zip((*_STATE, "L"), (*values, L), strict=True):
+            self._set(name, value)
         self._running = True
 
     def _start(self, x_I: NDArray[np.float64]) -> None:
         """Start from the fix in the record, with clocks at zero and nothing remembered."""
-        _prepare(self.sensors.drifts)
+        self._table()
         self._flight["tick"], self._flight["w_before"] = 0.0, np.nan
-        self._flight["rejected_in_row"] = self._flight["reopened"] = 0.0
-        single.ukf_initialize(self._flight, self._params, x_I, self._settings)
+        single.start_filter(self._flight, self._params, self._settings, self._work, x_I)
+
+    def _table(self) -> NDArray[Any]:
+        """The table of the stages that the filter runs."""
+        stages = single.SLOW_FILTER_STAGES if self._slow else single.FILTER_STAGES
+        own = {Stage[aid.name] for aid in self.sensors.aids}
+        return linked_table(stages | own, single.FILTER_ENTRIES)
+
+    def _run(self, stage: Stage, with_slow: Stage) -> None:
+        """Run a stage, or the one of a filter that estimates slow errors; warn of news.
+
+        News are what goes wrong in it.
+        """
+        chosen = with_slow if self._slow else stage
+        before, p = self.status, self._params
+        others = (p, p, self._settings, self._work, self._table(), self._features)
+        single.run_stage(self._flight.ctypes.data, 0, 1, chosen, *others)
+        news = self.status & ~before
+        if news:
+            warnings.warn(
+                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
+            )
+
+    def _set(self, name: str, value: NDArray[Any]) -> None:
+        """Write a field of the flight."""
+        self._flight[name][0] = value[..., np.newaxis]
 
     def update(
         self,
@@ -191,6 +190,8 @@ class _KalmanFilter:
         gnss_baseline_G: ArrayLike | None = None,
         pixels: ArrayLike | None = None,
         gnss_velocity_G: ArrayLike | None = None,
+        barometer_altitude: float | None = None,
+        magnetic_field_B: ArrayLike | None = None,
     ) -> None:
         """Condition the estimate on measurements of one instant; None: not measured.
 
@@ -201,14 +202,24 @@ class _KalmanFilter:
                 seen.
             gnss_velocity_G: (3,) velocity of the primary antenna, in G [m/s]; for suites whose GNSS
                 measures it. Its lever arm is turned with the last `gyro` predicted with.
+            barometer_altitude: Height in I by static pressure [m]; for suites with a barometer.
+            magnetic_field_B: (3,) magnetic field in B [T]; for suites with a magnetometer.
 
         Raises:
-            ValueError: If an argument has another shape or is not finite, or the suite has no GNSS
-                but its measurement is given; the estimate is unchanged then.
+            ValueError: If an argument has another shape or is not finite, or the suite lacks the
+                sensor whose measurement is given; the estimate is unchanged then.
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
         f = self._flight
+        aided = {}
+        if barometer_altitude is not None:
+            self._require_aid(Aid.BAROMETER)
+            height = check.number("barometer_altitude", barometer_altitude)
+            aided[Aid.BAROMETER] = np.array([height, 0.0, 0.0])
+        if magnetic_field_B is not None:
+            self._require_aid(Aid.MAGNETOMETER)
+            aided[Aid.MAGNETOMETER] = check.array("magnetic_field_B", magnetic_field_B, (3,))
         if gnss_position_G is not None or gnss_baseline_G is not None:
             self._require_gnss("update")
         position = baseline = velocity = image = None
@@ -226,24 +237,21 @@ class _KalmanFilter:
 
         f["position_valid"], f["baseline_valid"] = position is not None, baseline is not None
         f["velocity_valid"] = velocity is not None
-        f["feature_valid"] = 0.0
+        f["feature_valid"], f["aid_valid"] = 0.0, 0.0
+        for aid, value in aided.items():
+            f["aid_valid"][0, aid] = 1.0
+            f["aid_measurement"][0, aid] = value[:, np.newaxis]
         if position is not None:
-            f["gnss_position"] = position
+            self._set("gnss_position", position)
         if baseline is not None:
-            f["gnss_baseline"] = baseline
+            self._set("gnss_baseline", baseline)
         if velocity is not None:
-            f["gnss_velocity"] = velocity
+            self._set("gnss_velocity", velocity)
         if image is not None:
-            seen = np.asarray(~np.isnan(image).any(axis=1))
+            seen = np.asarray(~np.isnan(image).any(axis=1))[:, np.newaxis]
             f["feature_valid"][0, : self._features] = seen
-            f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
-        before = self.status
-        arguments = (f, self._params, self._work, self._features, self._form)
-        if self.sensors.drifts:
-            single.drift_update(*arguments, self._settings)
-        else:
-            single.ukf_update(*arguments)
-        self._warn_of_news(before)
+            f["pixels"][0, : self._features] = np.where(seen, image, 0.0)[..., np.newaxis]
+        self._run(Stage.UPDATE, Stage.UPDATE_WITH_SLOW)
 
     def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
         """Carry the estimate over one tick.
@@ -261,102 +269,23 @@ class _KalmanFilter:
         self._require_start()
         rates = check.array("gyro", gyro, (3,))
         force = check.array("accel", accel, (3,))
-        self._flight["gyro"], self._flight["accel"] = rates, force
+        f = self._flight
+        known = np.isfinite(f["w_before"]).all()
+        self._set("gyro", rates)
+        self._set("accel", force)
+        f["tick"] += 1.0
         # they turn the lever arms of a velocity and of the accelerometer
-        self._flight["tick"] += 1.0
-        known = np.isfinite(self._flight["w_before"]).all()
-        self._flight["w_before"] = self._flight["w_meas"] if known else rates
-        self._flight["w_meas"] = rates
-        before = self.status
-        arguments = (self._flight, self._params, self._work, self._form)
-        if self.sensors.drifts:
-            single.drift_predict(*arguments, self._settings)
-        else:
-            single.ukf_predict(*arguments)
-        self._warn_of_news(before)
-
-    # ---- the estimate -------------------------------------------------------------------------
-
-    @property
-    def position(self) -> NDArray[np.float64]:
-        """(3,) estimated position of the center of mass in I [m]."""
-        return self._read("r_hat")
-
-    @property
-    def velocity(self) -> NDArray[np.float64]:
-        """(3,) estimated velocity in I [m/s]."""
-        return self._read("v_hat")
-
-    @property
-    def R_BI(self) -> NDArray[np.float64]:
-        """(3, 3) estimated attitude."""
-        return self._read("R_hat")
-
-    @property
-    def accel_bias(self) -> NDArray[np.float64]:
-        """(3,) estimated accelerometer bias in B [m/s^2]."""
-        return self._read("b_a_hat")
-
-    @property
-    def gyro_bias(self) -> NDArray[np.float64]:
-        """(3,) estimated gyro bias in B [rad/s]."""
-        return self._read("b_g_hat")
-
-    @property
-    def covariance(self) -> NDArray[np.float64]:
-        """(15, 15) covariance of the errors, in the order r, v, e, b_a, b_g."""
-        L = self._read("L")
-        return L @ L.T
-
-    @property
-    def gnss_drift(self) -> NDArray[np.float64]:
-        """(3,) estimated slow error of GNSS positions in I [m], zero for suites without one.
-
-        It is zero at the start: positions count from where the receiver has the vehicle then.
-        """
-        return self._read("slow_hat")[:3]
-
-    @property
-    def gnss_drift_covariance(self) -> NDArray[np.float64]:
-        """(3, 3) covariance of its error [m^2]."""
-        L = self._read("L_slow")[:3]
-        return L @ L.T
-
-    @property
-    def status(self) -> FilterStatus:
-        """What has gone wrong since the start; `FilterStatus(0)` when nothing has."""
-        return FilterStatus(int(self._flight["filter_status"][0]))
-
-    @property
-    def nis(self) -> tuple[float, int]:
-        """Normalized innovation squared of the last update, and how many measurements it had."""
-        return float(self._flight["nis"][0]), int(self._flight["nis_dimension"][0])
-
-    @property
-    def block_nis(self) -> NDArray[np.float64]:
-        """(n,) normalized innovation squared of the last position, baseline, velocity and features.
-
-        In a filter that is right they are chi-square with 3, 2, 3 and 2 degrees of freedom; NaN:
-        not measured yet.
-        """
-        return self._read("block_nis")[: FEATURE_BLOCKS + self._features]
-
-    @property
-    def gate_decisions(self) -> NDArray[np.int64]:
-        """(n,) what became of each of these, see `quad_gym.records.Gate`."""
-        return self._read("gate")[: FEATURE_BLOCKS + self._features].astype(np.int64)
-
-    def _read(self, name: str) -> NDArray[Any]:
-        self._require_start()
-        return np.array(self._flight[name][0])
-
-    def _require_start(self) -> None:
-        if not self._running:
-            raise RuntimeError("call initialize() or set_state() before using the filter")
+        f["w_before"] = f["w_meas"] if known else f["gyro"]
+        f["w_meas"] = f["gyro"]
+        self._run(Stage.PREDICT, Stage.PREDICT_WITH_SLOW)
 
     def _require_gnss(self, what: str) -> None:
         if self.sensors.gnss is None:
             raise ValueError(f"the sensor suite has no GNSS to {what}")
+
+    def _require_aid(self, aid: Aid) -> None:
+        if aid not in self.sensors.aids:
+            raise ValueError(f"the sensor suite has no {aid.name.lower()} to update with")
 
     def _checked_baseline(self, gnss_baseline_G: ArrayLike) -> NDArray[np.float64]:
         baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
@@ -365,13 +294,6 @@ class _KalmanFilter:
             raise ValueError("gnss_baseline_G must have a direction, got zeros")
         # its length does not count: by a power of two it comes near one, exactly
         return np.ldexp(baseline, -int(np.frexp(largest)[1]))
-
-    def _warn_of_news(self, before: FilterStatus) -> None:
-        news = self.status & ~before
-        if news:
-            warnings.warn(
-                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
-            )
 
 
 class UnscentedKalmanFilter(_KalmanFilter):
