@@ -32,6 +32,12 @@ RANDOMIZATION = {
 }
 
 
+AIDED = quad_gym.sensor_suite("rtk").replace(
+    barometer=quad_gym.BarometerParams(latency=0.04),
+    magnetometer=quad_gym.MagnetometerParams(soft_iron_sigma=0.01),
+)
+
+
 def _late(suite, gnss=0.1, camera=0.06):
     suite = quad_gym.sensor_suite(suite)
     late = suite.gnss.replace(latency=gnss)
@@ -55,11 +61,26 @@ def cases():
         found[f"action {action}"] = {"action": action}
     for fault in PRESETS:
         suite = "indoor" if "camera" in fault else "rtk"
+        suite = AIDED if "meter" in fault else suite
         found[f"fault {fault}"] = {"sensors": suite, "faults": [fault], "start": "hover"}
     rtk = {"sensors": "rtk", "start": "hover"}
     return found | {
         "late": {"sensors": _late("rtk"), "start": "hover"},
         "late, not gated": {"sensors": _late("lab", 0.005, 0.005)},
+        "barometer and magnetometer": {"sensors": AIDED, "innovations": True},
+        "barometer alone, warm": {
+            "sensors": quad_gym.sensor_suite("indoor").replace(
+                barometer=quad_gym.BarometerParams()
+            ),
+            "filter_start": "warm",
+        },
+        "magnetometer, ekf, raw": {
+            "sensors": quad_gym.sensor_suite("lab").replace(
+                magnetometer=quad_gym.MagnetometerParams(latency=0.01)
+            ),
+            "estimator": "ekf",
+            "observation": "sensors",
+        },
         "ekf": {"estimator": "ekf", "sensors": "rtk"},
         "innovations": rtk | {"innovations": True},
         "warm": rtk | {"filter_start": "warm"},
