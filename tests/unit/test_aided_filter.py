@@ -1,0 +1,173 @@
+"""Filters with a barometer and a magnetometer equal plain ones that have their errors as states."""
+
+import decimal
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import BarometerParams, MagnetometerParams
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.records import AID_BLOCKS, Aid, Gate
+from tests.circle_flight import record_circle
+from tests.reference_aids import AidedEKF, AidedUKF
+from tests.reference_ukf import array_of
+
+LAB = quad_gym.sensor_suite("lab")
+BOTH = {"barometer": BarometerParams(bias_tau=20.0), "magnetometer": MagnetometerParams()}
+DRIFTING = LAB.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=20.0)
+FIELD = LAB.estimator.replace(integration="midpoint", covariance_reset="turn", alpha=0.7)
+SUITES = {
+    "both": LAB.replace(**BOTH),
+    "barometer alone": LAB.replace(barometer=BOTH["barometer"], camera=None),
+    "magnetometer alone": LAB.replace(magnetometer=BOTH["magnetometer"], camera=None),
+    "with GNSS that drifts": LAB.replace(gnss=DRIFTING, camera=None, **BOTH),
+    "field filter": LAB.replace(gnss=DRIFTING, camera=None, estimator=FIELD, **BOTH),
+}
+
+
+def measured_by_aids(suite, recording, ticks, seed):
+    """Altitudes and fields of a recording, with constant errors and noise; None: not measured."""
+    rng = np.random.default_rng(seed)
+    altitudes, fields = [None] * ticks, [None] * ticks
+    hard_iron = rng.normal(0.0, 1e-6, 3)
+    for k in range(ticks):
+        if suite.barometer is not None and rng.random() < 0.6:
+            altitudes[k] = recording.r[k, 2] + 0.4 + rng.normal(0.0, suite.barometer.noise_sigma)
+        if suite.magnetometer is not None and rng.random() < 0.6:
+            field = recording.R_BI[k] @ suite.magnetometer.field_I + hard_iron
+            fields[k] = field + rng.normal(0.0, suite.magnetometer.noise_sigma, 3)
+    return altitudes, fields
+
+
+@pytest.mark.parametrize(
+    "kinds", [(UnscentedKalmanFilter, AidedUKF), (ExtendedKalmanFilter, AidedEKF)]
+)
+@pytest.mark.parametrize("name", SUITES)
+def test_the_filter_equals_a_plain_one(name, kinds):
+    """The plain one computes in 45 digits; measurements come and go."""
+    suite, ticks, seed = SUITES[name], 25, 5
+    ours_class, plain_class = kinds
+    recording = record_circle(suite, ticks, seed)
+    altitudes, fields = measured_by_aids(suite, recording, ticks, seed)
+    has = np.random.default_rng(seed).random((ticks, 2)) < 0.5
+    with decimal.localcontext() as context:
+        context.prec = 45
+        ours, plain = ours_class(suite), plain_class(suite, Decimal)
+        for one in (ours, plain):
+            one.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
+        for k in range(ticks):
+            for one in (ours, plain):
+                one.update(
+                    gnss_position_G=recording.gnss_position[k] if has[k, 0] else None,
+                    gnss_baseline_G=recording.gnss_baseline[k] if has[k, 1] else None,
+                    pixels=recording.pixels[k] if suite.camera is not None else None,
+                    barometer_altitude=altitudes[k],
+                    magnetic_field_B=fields[k],
+                )
+                one.predict(recording.gyro[k], recording.accel[k])
+        for field, tolerance in (
+            ("position", 1e-9),
+            ("velocity", 1e-8),
+            ("R_BI", 1e-9),
+            ("accel_bias", 1e-7),
+            ("gyro_bias", 1e-10),
+        ):
+            gap = abs(array_of(Decimal, getattr(ours, field)) - getattr(plain, field)).max()
+            assert float(gap) < tolerance, field
+        P, d = plain.P.astype(float), plain._state().astype(float)
+    sigma = np.sqrt(np.diag(P))
+    scale = np.outer(sigma, sigma)[:15, :15]
+    assert abs((ours.covariance - P[:15, :15]) / scale).max() < 1e-7
+    if suite.barometer is not None:
+        assert ours.barometer_bias == pytest.approx(d[plain.altitude_bias], abs=1e-9)
+        assert abs(ours.barometer_bias) > 0.05  # there was something to find
+    if suite.magnetometer is not None:
+        np.testing.assert_allclose(ours.hard_iron, d[plain.hard_iron], rtol=0, atol=1e-15)
+        assert ours.declination_error == pytest.approx(d[plain.declination], abs=1e-10)
+        assert abs(ours.hard_iron).max() > 1e-8
+    assert ours.status == 0
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_normalized_innovations_are_those_of_the_plain_filter(kind):
+    suite, k = SUITES["both"].replace(camera=None), 0
+    plain_class = AidedUKF if kind is UnscentedKalmanFilter else AidedEKF
+    recording = record_circle(suite, 1, 7)
+    altitude = float(recording.r[0, 2]) + 1.0
+    field = recording.R_BI[0] @ suite.magnetometer.field_I + 2e-6
+    ours, plain = kind(suite), plain_class(suite)
+    for one in (ours, plain):
+        one.initialize(recording.gnss_position[k], recording.gnss_baseline[k])
+    z, H = np.append(altitude, field), []
+    ours.update(barometer_altitude=altitude, magnetic_field_B=field)
+    assert ours.nis[1] == 4
+    # by hand: a vehicle of known covariance whose measurement is linear enough
+    x = plain._state()
+    for i in range(plain.states):
+        step = np.zeros(plain.states)
+        step[i] = 1e-6
+        ahead, behind = ((x + s * step)[np.newaxis] for s in (1, -1))
+        both = [np.append(plain._altitude(p), plain._field_B(p)) for p in (ahead, behind)]
+        H.append((both[0] - both[1]) / 2e-6)
+    H = np.array(H).T
+    R = np.diag([suite.barometer.noise_sigma**2, *[suite.magnetometer.noise_sigma**2] * 3])
+    S = H @ plain.P @ H.T + R
+    nu = z - np.append(plain._altitude(x[np.newaxis]), plain._field_B(x[np.newaxis]))
+    expected = [nu[0] ** 2 / S[0, 0], nu[1:] @ np.linalg.solve(S[1:, 1:], nu[1:])]
+    tolerance = 1e-6 if kind is ExtendedKalmanFilter else 0.02  # the sigma points' second order
+    np.testing.assert_allclose(ours.block_nis[-2:], expected, rtol=tolerance)
+
+
+def test_what_is_beyond_the_gate_is_left_out_and_at_last_believed():
+    gated = LAB.estimator.replace(gate_false_alarm=1e-4, gate_patience=5)
+    suite = LAB.replace(camera=None, estimator=gated, **BOTH)
+    recording = record_circle(suite, 1, 1)
+    ours = UnscentedKalmanFilter(suite)
+    ours.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
+    altitude, before = recording.r[0, 2] + 10.0, ours.barometer_bias
+    for _ in range(5):
+        ours.update(barometer_altitude=altitude)
+        assert ours.gate_decisions[-2] == Gate.REJECTED
+        assert ours.barometer_bias == before
+    ours.update(barometer_altitude=altitude)  # the filter has doubted itself
+    assert ours.gate_decisions[-2] == Gate.ACCEPTED
+    assert ours.barometer_bias > 3.0
+    field = recording.R_BI[0] @ suite.magnetometer.field_I + 3e-5
+    for _ in range(5):
+        ours.update(magnetic_field_B=field)
+        assert ours.gate_decisions[-1] == Gate.REJECTED
+    ours.update(magnetic_field_B=field)
+    assert ours.gate_decisions[-1] == Gate.ACCEPTED
+    assert ours.gate_decisions.shape == (3 + 2,)
+    assert AID_BLOCKS + Aid.MAGNETOMETER >= 5
+
+
+@pytest.mark.parametrize(
+    ("measurement", "message"),
+    [
+        ({"barometer_altitude": 1.0}, "barometer"),
+        ({"magnetic_field_B": np.ones(3)}, "magnetometer"),
+    ],
+)
+def test_a_sensor_that_the_suite_lacks_cannot_be_given(measurement, message):
+    ours = UnscentedKalmanFilter(LAB)
+    ours.initialize(np.ones(3), np.array([0.1, 0.0, 0.0]))
+    with pytest.raises(ValueError, match=message):
+        ours.update(**measurement)
+    assert ours.barometer_bias == ours.declination_error == 0.0
+    np.testing.assert_array_equal(ours.hard_iron, 0.0)
+
+
+@pytest.mark.parametrize(
+    "measurement",
+    [{"barometer_altitude": np.nan}, {"magnetic_field_B": np.ones(2)}],
+)
+def test_an_invalid_measurement_changes_nothing(measurement):
+    ours = UnscentedKalmanFilter(SUITES["both"])
+    ours.initialize(np.ones(3), np.array([0.1, 0.0, 0.0]))
+    before = ours.covariance
+    with pytest.raises(ValueError, match=next(iter(measurement))):
+        ours.update(**measurement)
+    np.testing.assert_array_equal(ours.covariance, before)
