@@ -39,7 +39,7 @@ class Aided:
             angle = magnetometer.declination
             east, north = level * number(math.sin(angle)), level * number(math.cos(angle))
             self.field = np.array([east, north, up])
-            self.field_turned = np.array([-north, east, 0 * up])
+            self.field_turned = np.array([north, -east, 0 * up])
         self.states = 15 + len(tail)
         sigmas = array_of(number, [sigma for sigma, _ in tail])
         times = [number(tau) if tau < math.inf else None for _, tau in tail]

@@ -10,6 +10,8 @@ from quad_gym.packing.flight import params_record
 from quad_gym.records import MAX_FEATURES, MAX_GATES
 
 CLASSES = [
+    quad_gym.BarometerParams,
+    quad_gym.MagnetometerParams,
     quad_gym.VehicleParams,
     quad_gym.ImuParams,
     quad_gym.GnssParams,
@@ -84,6 +86,21 @@ BAD_VALUES = {
     ("GnssParams", "heading_error_sigma"): BELOW_ZERO,
     ("GnssParams", "drift_sigma_I"): [*NO_VECTORS, (0.1, -0.1, 0.1)],
     ("GnssParams", "drift_tau"): NOT_POSITIVE,
+    **{
+        (kind, name): bad
+        for kind in ("BarometerParams", "MagnetometerParams")
+        for name, bad in (("rate", NOT_POSITIVE), ("phase", NO_PHASES), ("latency", BELOW_ZERO))
+    },
+    ("BarometerParams", "noise_sigma"): NOT_POSITIVE,
+    ("BarometerParams", "bias_sigma"): NOT_POSITIVE,
+    ("BarometerParams", "bias_tau"): NOT_POSITIVE,
+    ("MagnetometerParams", "noise_sigma"): NOT_POSITIVE,
+    ("MagnetometerParams", "hard_iron_sigma"): NOT_POSITIVE,
+    ("MagnetometerParams", "soft_iron_sigma"): BELOW_ZERO,
+    ("MagnetometerParams", "strength"): [*NOT_POSITIVE, 46.0],
+    ("MagnetometerParams", "declination"): [4.0, -4.0, *NO_NUMBERS],
+    ("MagnetometerParams", "inclination"): [2.0, 1.5707, *NO_NUMBERS],
+    ("MagnetometerParams", "declination_sigma"): NOT_POSITIVE,
     ("CameraParams", "phase"): NO_PHASES,
     ("CameraParams", "latency"): BELOW_ZERO,
     ("CameraParams", "exposure"): BELOW_ZERO,

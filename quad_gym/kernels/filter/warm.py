@@ -20,6 +20,7 @@ from quad_gym.kernels.maths.linalg import (
     load4,
     load_block,
     multiply,
+    store3,
     store_block,
     sub,
     transpose,
@@ -49,7 +50,7 @@ def _heading(R_BI):
 
 
 @kernel
-def _draw_errors(settings, stream, work, slow):
+def _draw_errors(settings, stream, work, slow, T):
     """Fill work.h with the errors W u of a vehicle that looks east; return the normals of d."""
     states, draws = 15, WARM_DRAWS
     if slow is not None:
@@ -65,6 +66,10 @@ def _draw_errors(settings, stream, work, slow):
         for i in range(slow.slow_states):
             k = WARM_DRAWS + i + i // 3 * 3
             u[k], u[k + 3] = normal_pair(stream, DRAW_SLOW + i)  # the second made the true error
+        for s in range(AIDS):
+            k = WARM_DRAWS + 2 * slow.aid_vector[s] + 3
+            if slow.aid_vector[s] >= 0:  # as seen from I, as its errors are
+                store3(u[k : k + 3], apply(T, load3(u[k : k + 3])))
         if slow.estimates_drift:
             n_own, n_d = six_normals(stream, DRAW_WARM_DRIFT)
             for i in range(3):
@@ -125,7 +130,7 @@ def start_warm(flight, settings, stream, work, mask, slow=None):
         states = 15 + slow.slow_states
     R_BI = quaternion_to_dcm(load4(flight.q))
     T = _heading(R_BI)
-    n_d = _draw_errors(settings, stream, work, slow)
+    n_d = _draw_errors(settings, stream, work, slow, T)
     d = work.h
     keep3(flight.r_hat, mask, sub(load3(flight.r), apply(T, load3(d[R : R + 3]))))
     keep3(flight.v_hat, mask, sub(load3(flight.v), apply(T, load3(d[V : V + 3]))))

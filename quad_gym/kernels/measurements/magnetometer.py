@@ -4,13 +4,13 @@ It measures `z = (I + D) R(delta) m_I + b + v` in B with white noise v, where m_
 a model of the Earth's field tells, delta the error of that model's declination, b hard iron and D
 soft iron. The filter has b and delta among its states (`filter/slow.py`) and knows nothing of D:
 
-    h = R_BI (m_I + delta e3 x m_I) + b
+    h = R_BI (m_I + delta m_I x e3) + b
 
 With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in its offset as
 
     odd:   odd R f + (I + even) ddelta R g + db,   even:   even R f + ddelta odd R g,
 
-f = m_I + delta g and g = e3 x m_I; and the derivative along an offset is (R f) x de + ddelta R g +
+f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
 """
 
@@ -60,7 +60,7 @@ def _measure(flight, p, settings, mask, starting):
     a, b = normal_pair(stream, DRAW_AID + 2 * _S)
     c, _ = normal_pair(stream, DRAW_AID + 2 * _S + 1)
     m, (s, t) = load3(p.magnetic_field), sin_cos(flight.aid_scalar[_S])
-    field_I = (t * m[0] - s * m[1], s * m[0] + t * m[1], m[2])
+    field_I = (t * m[0] + s * m[1], t * m[1] - s * m[0], m[2])
     field_B = apply(quaternion_to_dcm(load4(flight.q)), field_I)
     field_B = add(field_B, apply(load33(flight.aid_matrix[_S]), field_B))
     noise = scale(p.aid_sigma[_S], (a, b, c))
@@ -72,7 +72,7 @@ def _measure(flight, p, settings, mask, starting):
 def _expected_field(flight, p, settings):
     """R f and R g, see above."""
     R_BI, m, delta = load33(flight.R_hat), load3(p.magnetic_field), settings.aid_scalar[_S]
-    g = (-m[1], m[0], 0.0 * m[2])
+    g = (m[1], -m[0], 0.0 * m[2])
     return apply(R_BI, add(m, scale(flight.slow_hat[delta], g))), apply(R_BI, g)
 
 

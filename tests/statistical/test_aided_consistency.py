@@ -1,0 +1,95 @@
+"""Filters with a barometer and a magnetometer are consistent, in every combination of options.
+
+The slow tests fly 1,000 flights for 10 s; the fast one flies fewer, of both filters, late and
+gated, and fails by chance once in some ten thousand seeds.
+"""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import BarometerParams, MagnetometerParams
+from quad_gym.analysis.consistency_flights import measure_consistency
+from quad_gym.packing.aids import slow_states
+from quad_gym.records import AID_BLOCKS, Aid
+from tests.field_flights import fly, nees, state_errors, steps
+
+
+def aided(suite, kind="ukf", late=False, gate=True, **sensors):
+    """A suite with both, without what a filter does not model; or with those given."""
+    plain = quad_gym.sensor_suite(suite).simplified()
+    choices = {} if gate else {"gate_false_alarm": 0.0}
+    both = {
+        "barometer": BarometerParams(latency=0.03 * late),
+        "magnetometer": MagnetometerParams(latency=0.02 * late),
+    }
+    if late and plain.gnss is not None:
+        sensors["gnss"] = plain.gnss.replace(latency=0.1)
+    estimator = plain.estimator.replace(kind=kind, **choices)
+    return plain.replace(estimator=estimator, **both | sensors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["cold", "warm"])
+@pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+@pytest.mark.parametrize("suite", ["rtk", "consumer", "indoor"])
+def test_a_filter_with_both_is_consistent(suite, kind, late, start):
+    batch = fly(aided(suite, kind, late), 1, filter_start=start)
+    assert_consistent(batch.sensors, start)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gate", [False, True], ids=["open", "gated"])
+@pytest.mark.parametrize("lacking", ["barometer", "magnetometer"])
+@pytest.mark.parametrize("start", ["cold", "warm"])
+def test_a_filter_with_either_is_consistent(lacking, gate, start):
+    assert_consistent(aided("rtk", gate=gate, **{lacking: None}), start)
+
+
+def assert_consistent(sensors, start):
+    batch = fly(sensors, 1000, filter_start=start)
+    findings = measure_consistency(batch, seeds=range(1000), duration=10.0)
+    assert findings.failed == 0
+    assert 14.2 < findings.nees["state"].overall < 15.8
+    for name, part in (findings.nees | findings.nis).items():
+        assert part.consistent, (name, part.share_inside, part.overall)
+    for name, white in findings.whiteness.items():
+        assert white.white, (name, white.largest)
+
+
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_late_and_gated_flights_are_consistent_after_two_seconds(kind):
+    """Mean NEES of 300 flights, of deviation 0.32; NIS of the last ones, of 0.08 and 0.14."""
+    batch = fly(aided("consumer", kind, late=True), 300, filter_start="warm")
+    steps(batch, 2.0)
+    assert not batch.read("filter_status").any()
+    assert nees(batch).mean() == pytest.approx(15.0, abs=1.4)
+    nis = batch.read("block_nis")[:, AID_BLOCKS:].mean(axis=0)
+    assert nis[Aid.BAROMETER] == pytest.approx(1.0, abs=0.35)
+    assert nis[Aid.MAGNETOMETER] == pytest.approx(3.0, abs=0.6)
+    assert (batch.read("rejections")[:, AID_BLOCKS:] <= 1).all()
+
+
+def test_slow_errors_and_state_go_together_as_a_warm_filter_claims():
+    """The joint error has the joint covariance, and nothing to do with the estimate."""
+    sensors = aided("consumer")
+    batch, flights = fly(sensors, 4000, task="hover", filter_start="warm"), 4000
+    places = slow_states(sensors)
+    vector, errors = places.vectors[Aid.MAGNETOMETER], np.zeros((flights, 9))
+    hat = batch.read("slow_hat")
+    errors[:, :3] = batch.read("gnss_drift") - hat[:, :3]
+    iron = batch.read("aid_vector")[:, Aid.MAGNETOMETER]
+    errors[:, vector : vector + 3] = iron - hat[:, vector : vector + 3]
+    for aid in Aid:
+        k = places.scalars[aid]
+        errors[:, k] = batch.read("aid_scalar")[:, aid] - hat[:, k]
+    L = np.zeros((flights, 24, 24))
+    L[:, :15, :15], L[:, 15:] = batch.read("L"), batch.read("L_slow")
+    joint = np.concatenate([state_errors(batch), errors], axis=1)
+    white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0][:, :23]  # the last measures nothing
+    np.testing.assert_allclose(np.cov(white.T), np.eye(23), atol=0.1)
+    estimate = hat[:, vector : vector + 3]
+    correlation = (estimate * errors[:, vector : vector + 3]).mean(axis=0)
+    correlation /= estimate.std(axis=0) * errors[:, vector : vector + 3].std(axis=0)
+    assert (abs(correlation) < 0.08).all()

@@ -1,0 +1,229 @@
+"""Barometer and magnetometer in flights: what they measure, when, late, lost, and who is told."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import BarometerParams, MagnetometerParams
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.faults import BarometerLoss, MagnetometerLoss
+from quad_gym.packing.aids import slow_states
+from quad_gym.records import Aid
+from tests.field_flights import attitudes, fly, steps
+
+LAB = quad_gym.sensor_suite("standard").replace(camera=None)
+BAROMETER, MAGNETOMETER = int(Aid.BAROMETER), int(Aid.MAGNETOMETER)
+AIDED = LAB.replace(
+    barometer=BarometerParams(phase=0.0), magnetometer=MagnetometerParams(phase=0.0)
+)
+
+
+def field_B(batch, magnetometer, declination_error=0.0, soft_iron=0.0):
+    """The field that vehicles are in, by NumPy alone, of a level compass rose."""
+    level = magnetometer.strength * np.cos(magnetometer.inclination)
+    angle = np.pi / 2 - magnetometer.declination - declination_error  # from east toward north
+    down = np.full_like(angle, magnetometer.strength * np.sin(magnetometer.inclination))
+    field_I = np.stack([level * np.cos(angle), level * np.sin(angle), -down], axis=-1)
+    seen = np.einsum("nij,nj->ni", attitudes(batch.read("q")), field_I)
+    return seen + np.einsum("nij,nj->ni", soft_iron + np.zeros((batch.count, 3, 3)), seen)
+
+
+def test_a_barometer_measures_height_bias_and_white_noise():
+    batch = fly(AIDED, 2000, task="hover")
+    steps(batch, 0.02)
+    assert batch.read("aid_valid").all()
+    z, bias = batch.read("aid_measurement")[:, BAROMETER], batch.read("aid_scalar")[:, BAROMETER]
+    noise = z[:, 0] - batch.read("r")[:, 2] - bias
+    assert noise.std() == pytest.approx(AIDED.barometer.noise_sigma, rel=0.07)
+    assert abs(noise.mean()) < 5.0 * AIDED.barometer.noise_sigma / np.sqrt(2000)
+    assert bias.std() == pytest.approx(AIDED.barometer.bias_sigma, rel=0.07)
+    assert (z[:, 1:] == 0.0).all()
+
+
+def test_a_barometers_bias_is_a_gauss_markov_process_of_first_order():
+    suite = AIDED.replace(barometer=BarometerParams(bias_tau=0.5, rate=20.0, phase=0.0))
+    batch = fly(suite, 4000, task="hover")
+    before = batch.read("aid_scalar")[:, BAROMETER]
+    steps(batch, 0.25)
+    after, sigma = batch.read("aid_scalar")[:, BAROMETER], suite.barometer.bias_sigma
+    assert after.std() == pytest.approx(sigma, rel=0.05)
+    assert (before * after).mean() == pytest.approx(sigma**2 * np.exp(-0.5), rel=0.1)
+
+
+def test_a_magnetometer_measures_the_field_with_its_errors():
+    magnetometer = MagnetometerParams(phase=0.0, soft_iron_sigma=0.02, declination_sigma=0.05)
+    batch = fly(LAB.replace(magnetometer=magnetometer), 2000, task="hover")
+    declination = batch.read("aid_scalar")[:, MAGNETOMETER]
+    hard_iron, soft_iron = (
+        batch.read("aid_vector")[:, MAGNETOMETER],
+        batch.read("aid_matrix")[:, MAGNETOMETER],
+    )
+    expected = field_B(batch, magnetometer, declination, soft_iron) + hard_iron
+    noise = batch.read("aid_measurement")[:, MAGNETOMETER] - expected
+    assert noise.std() == pytest.approx(magnetometer.noise_sigma, rel=0.05)
+    assert (abs(noise.mean(axis=0)) < 5.0 * magnetometer.noise_sigma / np.sqrt(2000)).all()
+    assert hard_iron.std() == pytest.approx(magnetometer.hard_iron_sigma, rel=0.05)
+    assert soft_iron.std() == pytest.approx(0.02, rel=0.05)
+    assert declination.std() == pytest.approx(0.05, rel=0.07)
+    steps(batch, 0.1)
+    np.testing.assert_array_equal(batch.read("aid_vector")[:, MAGNETOMETER], hard_iron)
+    np.testing.assert_array_equal(batch.read("aid_scalar")[:, MAGNETOMETER], declination)
+
+
+def test_the_default_field_is_the_models_at_the_laboratory():
+    """East, north and down of the World Magnetic Model 2025 at 2026.0, to 0.1 microtesla."""
+    east, north, up = MagnetometerParams().field_I
+    assert np.hypot(east, north) == pytest.approx(24.06e-6, abs=1e-7)
+    assert up == pytest.approx(-39.53e-6, abs=1e-7)
+    assert east / north == pytest.approx(np.tan(np.radians(3.13)), rel=1e-6)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.5, None])
+def test_sensors_measure_at_their_rates_and_phases(phase):
+    suite = LAB.replace(
+        barometer=BarometerParams(rate=20.0, phase=phase),
+        magnetometer=MagnetometerParams(rate=50.0, phase=phase),
+    )
+    batch = fly(suite, 64, task="hover")
+    valid = [batch.read("aid_valid")]
+    for _ in range(40):
+        batch.step()
+        valid.append(batch.read("aid_valid"))
+    valid = np.array(valid) > 0.0  # (ticks, flights, aids)
+    for aid, period in ((BAROMETER, 10), (MAGNETOMETER, 4)):
+        first = valid[:, :, aid].argmax(axis=0)
+        assert (first < period).all()
+        if phase is None:
+            assert len(set(first)) == period
+        else:
+            assert (first == round(phase * period)).all()
+        ticks = np.arange(41)[:, np.newaxis]
+        np.testing.assert_array_equal(
+            valid[:, :, aid], (ticks >= first) & ((ticks - first) % period == 0)
+        )
+
+
+@pytest.mark.parametrize("periods", [1, 2])
+def test_late_measurements_arrive_as_they_were_taken(periods):
+    """At latencies of one period and of the longest, two: at the limit."""
+    late = LAB.replace(
+        barometer=BarometerParams(phase=0.0, latency=periods * 0.02),
+        magnetometer=MagnetometerParams(phase=0.0, latency=periods * 0.02),
+    )
+    prompt, delayed = fly(AIDED, 16, task="hover"), fly(late, 16, task="hover")
+    delay, noise, truth = 4 * periods, [], []
+    for tick in range(60):
+        # both fly on estimates, which differ: what they have in common is the noise
+        noise.append(prompt.read("aid_measurement")[:, BAROMETER, 0] - undisturbed(prompt))
+        truth.append(undisturbed(delayed))
+        if tick % 4 == 0:
+            assert (delayed.read("aid_valid") == (tick >= delay)).all()
+        if tick % 4 == 0 and tick >= delay:
+            arrived = delayed.read("aid_measurement")[:, BAROMETER, 0] - truth[tick - delay]
+            np.testing.assert_allclose(arrived, noise[tick - delay], atol=1e-9)
+        prompt.step()
+        delayed.step()
+
+
+def undisturbed(batch):
+    """What a barometer without white noise would measure now."""
+    return batch.read("r")[:, 2] + batch.read("aid_scalar")[:, BAROMETER]
+
+
+def test_a_latency_of_more_than_two_periods_is_refused():
+    with pytest.raises(ValueError, match=r"BarometerParams\.latency"):
+        LAB.replace(barometer=BarometerParams(latency=0.045))
+
+
+def test_a_loss_silences_one_sensor_while_it_lasts():
+    faults = (BarometerLoss(start=0.1, duration=0.2), MagnetometerLoss(start=0.2, duration=0.2))
+    batch = fly(AIDED, 8, task="hover", faults=faults)
+    heard = [batch.read("aid_valid")]
+    for _ in range(100):
+        batch.step()
+        heard.append(batch.read("aid_valid"))
+    heard, due = np.array(heard).all(axis=1)[::4], np.arange(26) * 0.02
+    np.testing.assert_array_equal(heard[:, BAROMETER], (due < 0.1 - 1e-9) | (due > 0.3 - 1e-9))
+    np.testing.assert_array_equal(heard[:, MAGNETOMETER], (due < 0.2 - 1e-9) | (due > 0.4 - 1e-9))
+    with pytest.raises(ValueError, match="BarometerLoss needs a barometer"):
+        FlightBatch(1, sensors=LAB, faults=(BarometerLoss(),))
+
+
+def test_sensors_can_be_switched_off_and_on():
+    batch = fly(AIDED, 8, task="hover")
+    batch.switch_sensors(barometer=False)
+    steps(batch, 0.02)
+    assert not batch.read("aid_valid")[:, BAROMETER].any()
+    assert batch.read("aid_valid")[:, MAGNETOMETER].all()
+    batch.switch_sensors(barometer=True)
+    steps(batch, 0.005)
+    assert batch.read("aid_valid")[:, BAROMETER].all()
+    with pytest.raises(ValueError, match="switch_sensors"):
+        fly(LAB, 1, task="hover").switch_sensors(barometer=False)
+
+
+def test_raw_observations_and_info_have_what_was_measured_since_the_last_step():
+    env = gymnasium.make(
+        "QuadGym/Hover-v0", sensors=AIDED, observation="sensors", innovations=True, control_rate=50
+    )
+    observation, _ = env.reset(seed=3)
+    flights = env.unwrapped.flights
+    table = {field.name: field.slice for field in flights.table}
+    for _ in range(3):
+        observation, _, _, _, info = env.step(np.zeros(4, np.float32))
+        measured = flights.batch.read("aid_measurement")[0]
+        np.testing.assert_allclose(observation[table["barometer"]], measured[0, :1], rtol=1e-6)
+        scaled = measured[1] / AIDED.magnetometer.strength
+        np.testing.assert_allclose(observation[table["magnetometer"]], scaled, rtol=1e-6)
+        assert (
+            observation[table["barometer_valid"]] == observation[table["magnetometer_valid"]] == 1
+        )
+    found = info["innovations"]
+    assert found["nis"].shape == (5,)  # position, baseline, velocity, barometer, magnetometer
+    assert found["measured"][3:].all()
+    assert found["nis"][3] == pytest.approx(
+        (found["innovation"][3, 0] / found["sigma"][3, 0]) ** 2, rel=1e-9
+    )
+    assert np.isfinite(found["innovation"][4]).all()
+    env.close()
+
+
+def test_suites_without_them_have_neither_memory_nor_states_for_them():
+    batch, aided = fly(LAB, 8, task="hover"), fly(AIDED, 8, task="hover")
+    assert batch.snapshot().nbytes < aided.snapshot().nbytes
+    assert (batch.read("aid_measurement") == 0.0).all()
+    assert slow_states(LAB).errors == ()
+    assert len(slow_states(AIDED).errors) == 6
+    assert slow_states(AIDED).estimated == 5
+
+
+def test_rates_noise_and_simplification_of_a_suite_reach_them():
+    suite = AIDED.replace(magnetometer=MagnetometerParams(latency=0.02, soft_iron_sigma=0.1))
+    plain = suite.simplified()
+    assert plain.magnetometer.latency == plain.magnetometer.soft_iron_sigma == 0.0
+    louder = suite.scaled_noise(3.0)
+    assert louder.barometer.noise_sigma == pytest.approx(0.3)
+    assert louder.magnetometer.noise_sigma == pytest.approx(1.5e-6)
+    assert suite.with_rates(barometer=25.0).barometer.rate == 25.0
+    assert suite.with_rates(imu=25.0).magnetometer.rate == 25.0
+    with pytest.raises(ValueError, match="barometer_rate"):
+        LAB.with_rates(barometer=25.0)
+    with pytest.raises(ValueError, match="barometer if sensors has"):
+        FlightBatch(1, sensors=AIDED, true_sensors=AIDED.replace(barometer=None))
+    with pytest.raises(ValueError, match="magnetometer rate"):
+        FlightBatch(1, sensors=AIDED, true_sensors=AIDED.with_rates(magnetometer=25.0))
+    with pytest.raises(ValueError, match=r"SensorSuite\.barometer"):
+        LAB.replace(barometer=MagnetometerParams())
+
+
+def test_estimated_slow_errors_come_near_the_true_ones():
+    """GNSS tells the height, so that the barometer's bias is known to some centimeters."""
+    batch = fly(AIDED, 200, task="hover")
+    steps(batch, 3.0)
+    place = slow_states(AIDED).scalars[BAROMETER]
+    error = batch.read("slow_hat")[:, place] - batch.read("aid_scalar")[:, BAROMETER]
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    L = batch.read("L_slow")[:, place]
+    claimed = np.sqrt((L**2).sum(axis=1))
+    assert np.mean((error / claimed) ** 2) == pytest.approx(1.0, abs=0.4)  # 4 sigma
