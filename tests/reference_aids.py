@@ -68,15 +68,15 @@ class Aided:
         tail = self.tail_decay * points[:, 15 : self.states] + noise[:, 12:]
         return np.concatenate([after, tail], axis=1)
 
-    def update(self, barometer_altitude=None, magnetic_field_B=None, **others):
+    def update(self, barometer=None, magnetometer=None, **others):
         eye = array_of(self.number, np.eye(3))
-        if barometer_altitude is not None:
+        if barometer is not None:
             variance = self.number(self.sensors.barometer.noise_sigma) ** 2
-            z = self._array([barometer_altitude])
+            z = self._array([barometer])
             self.pending.append((z, variance * eye[:1, :1], self._altitude))
-        if magnetic_field_B is not None:
+        if magnetometer is not None:
             variance = self.number(self.sensors.magnetometer.noise_sigma) ** 2
-            self.pending.append((self._array(magnetic_field_B), variance * eye, self._field_B))
+            self.pending.append((self._array(magnetometer), variance * eye, self._field_B))
         super().update(**others)
         if self.pending:
             nothing = array_of(self.number, np.zeros((0, 0)))

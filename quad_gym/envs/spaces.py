@@ -12,7 +12,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.records import COLUMNS, Aid, Control, Layout, Source
+from quad_gym.params.sensors import AID_PARAMS
+from quad_gym.records import AID_FREEDOMS, COLUMNS, Aid, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
@@ -86,13 +87,6 @@ _FLAG = 0.0
 """A bound of zero marks a flag, in [0, 1]."""
 
 
-_AIDS: dict[Aid, Part] = {
-    Aid.BAROMETER: ("barometer", 1, "m", "I", 1000.0),
-    Aid.MAGNETOMETER: ("magnetometer", 3, "of the field", "B", 10.0),
-}
-"""What aiding sensors measure, each followed by its flag."""
-
-
 def _sensor_fields(
     feature_count: int, gnss_velocity: bool, aids: Sequence[Aid]
 ) -> tuple[Part, ...]:
@@ -111,7 +105,9 @@ def _sensor_fields(
         fields.append((f"feature_{k}", 2, "half images", "C", 2.0))
         fields.append((f"feature_{k}_valid", 1, "0 or 1", "-", _FLAG))
     for aid in aids:
-        fields += [_AIDS[aid], (f"{_AIDS[aid][0]}_valid", 1, "0 or 1", "-", _FLAG)]
+        name = aid.name.lower()
+        fields.append((name, AID_FREEDOMS[aid], *AID_PARAMS[name].raw))
+        fields.append((f"{name}_valid", 1, "0 or 1", "-", _FLAG))
     return (*fields, *_REFERENCE)
 
 

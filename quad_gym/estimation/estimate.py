@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import Aid, FilterStatus
+from quad_gym.records import FilterStatus
 
 
 class Estimate:
@@ -64,22 +64,20 @@ class Estimate:
         return L @ L.T * self.sensors.drifts
 
     @property
-    def barometer_bias(self) -> float:
-        """Estimated bias of the barometer's altitude [m]; zero for suites without one."""
-        k = int(self._settings["aid_scalar"][0, Aid.BAROMETER])
-        return float(self._read("slow_hat")[k]) if k >= 0 else 0.0
+    def aid_errors(self) -> dict[str, NDArray[np.float64]]:
+        """Estimated slow errors of the suite's aiding sensors, by name.
 
-    @property
-    def hard_iron(self) -> NDArray[np.float64]:
-        """(3,) estimated hard iron in B [T]; zero for suites without a magnetometer."""
-        k = int(self._settings["aid_vector"][0, Aid.MAGNETOMETER])
-        return self._read("slow_hat")[k : k + 3] if k >= 0 else np.zeros(3)
-
-    @property
-    def declination_error(self) -> float:
-        """Estimated true less believed declination [rad]; zero without a magnetometer."""
-        k = int(self._settings["aid_scalar"][0, Aid.MAGNETOMETER])
-        return float(self._read("slow_hat")[k]) if k >= 0 else 0.0
+        "barometer": (1,) its bias [m]; "magnetometer": (4,) hard iron in B [T], then the true less
+        the believed declination [rad].
+        """
+        slow, found = self._read("slow_hat"), {}
+        for aid in self.sensors.aids:
+            vector, scalar = (
+                int(self._settings[f"aid_{kind}"][0, aid]) for kind in ("vector", "scalar")
+            )
+            places = [*range(vector, vector + 3)] if vector >= 0 else []
+            found[aid.name.lower()] = slow[places + ([scalar] if scalar >= 0 else [])]
+        return found
 
     @property
     def status(self) -> FilterStatus:

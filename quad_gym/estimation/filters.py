@@ -16,6 +16,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
+    AID_FREEDOMS,
     FLIGHT_BLOCK,
     SETTINGS,
     WORK_BLOCK,
@@ -190,8 +191,7 @@ class _KalmanFilter(Estimate):
         gnss_baseline_G: ArrayLike | None = None,
         pixels: ArrayLike | None = None,
         gnss_velocity_G: ArrayLike | None = None,
-        barometer_altitude: float | None = None,
-        magnetic_field_B: ArrayLike | None = None,
+        **aids: ArrayLike | None,
     ) -> None:
         """Condition the estimate on measurements of one instant; None: not measured.
 
@@ -202,8 +202,8 @@ class _KalmanFilter(Estimate):
                 seen.
             gnss_velocity_G: (3,) velocity of the primary antenna, in G [m/s]; for suites whose GNSS
                 measures it. Its lever arm is turned with the last `gyro` predicted with.
-            barometer_altitude: Height in I by static pressure [m]; for suites with a barometer.
-            magnetic_field_B: (3,) magnetic field in B [T]; for suites with a magnetometer.
+            aids: What aiding sensors measure that the suite has: `barometer`, the height in I by
+                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T].
 
         Raises:
             ValueError: If an argument has another shape or is not finite, or the suite lacks the
@@ -212,14 +212,7 @@ class _KalmanFilter(Estimate):
         """
         self._require_start()
         f = self._flight
-        aided = {}
-        if barometer_altitude is not None:
-            self._require_aid(Aid.BAROMETER)
-            height = check.number("barometer_altitude", barometer_altitude)
-            aided[Aid.BAROMETER] = np.array([height, 0.0, 0.0])
-        if magnetic_field_B is not None:
-            self._require_aid(Aid.MAGNETOMETER)
-            aided[Aid.MAGNETOMETER] = check.array("magnetic_field_B", magnetic_field_B, (3,))
+        aided = self._checked_aids(aids)
         if gnss_position_G is not None or gnss_baseline_G is not None:
             self._require_gnss("update")
         position = baseline = velocity = image = None
@@ -240,7 +233,7 @@ class _KalmanFilter(Estimate):
         f["feature_valid"], f["aid_valid"] = 0.0, 0.0
         for aid, value in aided.items():
             f["aid_valid"][0, aid] = 1.0
-            f["aid_measurement"][0, aid] = value[:, np.newaxis]
+            f["aid_measurement"][0, aid, : len(value)] = value[:, np.newaxis]
         if position is not None:
             self._set("gnss_position", position)
         if baseline is not None:
@@ -283,9 +276,20 @@ class _KalmanFilter(Estimate):
         if self.sensors.gnss is None:
             raise ValueError(f"the sensor suite has no GNSS to {what}")
 
-    def _require_aid(self, aid: Aid) -> None:
-        if aid not in self.sensors.aids:
-            raise ValueError(f"the sensor suite has no {aid.name.lower()} to update with")
+    def _checked_aids(self, given: dict[str, Any]) -> dict[Aid, NDArray[np.float64]]:
+        """What aiding sensors measure, as arrays; None: not measured."""
+        check.keywords(given, tuple(aid.name.lower() for aid in Aid), "update")
+        found = {}
+        for name, value in given.items():
+            aid = Aid[name.upper()]
+            if value is None:
+                continue
+            if aid not in self.sensors.aids:
+                raise ValueError(f"the sensor suite has no {name} to update with")
+            alone = AID_FREEDOMS[aid] == 1
+            numbers = [check.number(name, value)] if alone else value
+            found[aid] = check.array(name, numbers, (AID_FREEDOMS[aid],))
+        return found
 
     def _checked_baseline(self, gnss_baseline_G: ArrayLike) -> NDArray[np.float64]:
         baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))

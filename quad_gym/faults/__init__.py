@@ -20,7 +20,7 @@ Which faults are active is told by `info["faults"]` (name: True or False), by
 "outlier" and "feature_mistaken", for `FlightBatch.read`. Neither filter nor controller knows.
 """
 
-from quad_gym.faults.aids import BarometerLoss, MagnetometerLoss
+from quad_gym.faults.aids import SensorLoss
 from quad_gym.faults.base import Fault, Span, ends
 from quad_gym.faults.camera import CameraOcclusion, WrongAssociations
 from quad_gym.faults.gnss import BaselineLoss, GnssJump, GnssOutage, GnssOutliers, GnssRamp
@@ -29,7 +29,6 @@ from quad_gym.faults.vehicle import PositionJump, RotorLoss
 
 __all__ = [
     "AccelBiasStep",
-    "BarometerLoss",
     "BaselineLoss",
     "CameraOcclusion",
     "Fault",
@@ -39,9 +38,9 @@ __all__ = [
     "GnssRamp",
     "GyroBiasStep",
     "ImuSaturation",
-    "MagnetometerLoss",
     "PositionJump",
     "RotorLoss",
+    "SensorLoss",
     "Span",
     "WrongAssociations",
     "ends",

@@ -3,20 +3,30 @@
 from dataclasses import dataclass
 
 from quad_gym.faults.base import Fault
-from quad_gym.records import FaultKind
+from quad_gym.params import checks as check
+from quad_gym.records import Aid, FaultKind
 
 
 @dataclass(frozen=True, kw_only=True)
-class BarometerLoss(Fault):
-    """No altitude, as while the sensor's bus fails."""
+class SensorLoss(Fault):
+    """An aiding sensor measures nothing, as while its bus fails.
 
-    kind = FaultKind.BAROMETER_LOSS
-    needs = "barometer"
+    Of a magnetometer also as long as an autopilot distrusts it near iron.
+    """
 
+    sensor: str
+    """which: "barometer" or "magnetometer\""""
 
-@dataclass(frozen=True, kw_only=True)
-class MagnetometerLoss(Fault):
-    """No magnetic field, likewise, or as long as an autopilot distrusts it near iron."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(check.choice, "sensor", choices=tuple(aid.name.lower() for aid in Aid))
 
-    kind = FaultKind.MAGNETOMETER_LOSS
-    needs = "magnetometer"
+    @property
+    def kind(self) -> FaultKind:  # type: ignore[override]
+        """Such as BAROMETER_LOSS."""
+        return FaultKind[f"{self.sensor.upper()}_LOSS"]
+
+    @property
+    def needs(self) -> str:  # type: ignore[override]
+        """The sensor."""
+        return self.sensor

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from quad_gym.faults import (
     AccelBiasStep,
-    BarometerLoss,
     BaselineLoss,
     CameraOcclusion,
     Fault,
@@ -18,12 +17,12 @@ from quad_gym.faults import (
     GnssRamp,
     GyroBiasStep,
     ImuSaturation,
-    MagnetometerLoss,
     PositionJump,
     RotorLoss,
+    SensorLoss,
     WrongAssociations,
 )
-from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.sensors import AID_PARAMS, SensorSuite
 from quad_gym.records import FAULT_KINDS
 
 FaultsGiven = str | Fault | Iterable[str | Fault] | None
@@ -47,8 +46,10 @@ PRESETS: dict[str, tuple[Fault, ...]] = {
     "imu_bias_step": (AccelBiasStep(start=_SOON), GyroBiasStep(start=_SOON)),
     "imu_saturation": (ImuSaturation(),),
     "rotor_loss": (RotorLoss(start=_SOON),),
-    "barometer_loss": (BarometerLoss(start=_SOON, duration=_A_WHILE),),
-    "magnetometer_loss": (MagnetometerLoss(start=_SOON, duration=_A_WHILE),),
+    **{
+        f"{sensor}_loss": (SensorLoss(sensor=sensor, start=_SOON, duration=_A_WHILE),)
+        for sensor in AID_PARAMS
+    },
 }
 """Faults by name, made for episodes of ten seconds and more."""
 

@@ -85,8 +85,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
                 decay, drive = _fall(slow, 1.0 / params.rate)
                 p[f"aid_{name}_sigma"][aid] = slow.sigma
                 p[f"aid_{name}_decay"][aid], p[f"aid_{name}_drive"][aid] = decay, drive
-        for name, value in params.fields.items():
-            p[name] = value
+        p["aid_numbers"][aid] = params.numbers
 
 
 def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuite) -> None:

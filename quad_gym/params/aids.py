@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
@@ -32,6 +32,8 @@ class AidParams(Checked):
     ticks; at most MAX_UNDER_WAY periods [s]"""
 
     aid: ClassVar[Aid]
+    raw: ClassVar[tuple[str, str, float]]
+    """unit, frame and bound of what it measures in raw observations"""
 
     def __post_init__(self) -> None:
         self._check(check.positive, "rate")
@@ -69,9 +71,9 @@ class AidParams(Checked):
         return 1.0
 
     @property
-    def fields(self) -> dict[str, Any]:
-        """Further numbers that kernels read of it, by their names in the parameter record."""
-        return {}
+    def numbers(self) -> tuple[float, float, float]:
+        """Three more numbers that its kernel reads."""
+        return (0.0, 0.0, 0.0)
 
     def simplified(self) -> "AidParams":
         """A copy without latency and without what a filter does not model."""

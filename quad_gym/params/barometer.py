@@ -22,6 +22,7 @@ class BarometerParams(AidParams):
     judgment. The filter estimates the bias, as one more state"""
 
     aid = Aid.BAROMETER
+    raw = ("m", "I", 1000.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

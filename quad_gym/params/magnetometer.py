@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams, SlowError
@@ -43,6 +42,7 @@ class MagnetometerParams(AidParams):
     estimates it, as one more state"""
 
     aid = Aid.MAGNETOMETER
+    raw = ("of the field", "B", 10.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,9 +104,9 @@ class MagnetometerParams(AidParams):
         return self.strength
 
     @property
-    def fields(self) -> dict[str, Any]:
-        """The field, for kernels."""
-        return {"magnetic_field": self.field_I}
+    def numbers(self) -> tuple[float, float, float]:
+        """The field in I [T]."""
+        return self.field_I
 
     def simplified(self) -> "MagnetometerParams":
         """A copy without latency and soft iron."""

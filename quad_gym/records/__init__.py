@@ -17,6 +17,7 @@ from quad_gym.records.draws import (
     Drawable,
 )
 from quad_gym.records.enums import (
+    AID_FREEDOMS,
     Act,
     Aid,
     Autoreset,
@@ -70,7 +71,6 @@ from quad_gym.records.shown import (
 )
 from quad_gym.records.sizes import (
     AID_BLOCKS,
-    AID_FREEDOMS,
     AID_GROUPS,
     AIDS,
     BASELINE_BLOCK,

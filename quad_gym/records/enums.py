@@ -70,12 +70,17 @@ class Control(IntEnum):
 class Aid(IntEnum):
     """Aiding sensors: those beside IMU, GNSS and camera, each a file in `kernels/measurements/`.
 
-    The name in lower case is that of the field of `SensorSuite`; the fault that silences one is
-    called after it in `FaultKind`.
+    The name in lower case is that of the field of `SensorSuite`. This is their only list: the fault
+    that silences one (`FaultKind`), its stage (`kernels.compiling.stages`), its block of the
+    measurement and its part of a raw observation follow from it.
     """
 
     BAROMETER = 0
     MAGNETOMETER = 1
+
+
+AID_FREEDOMS = (1, 3)
+"""Numbers that an aiding sensor measures, in the order of `Aid`."""
 
 
 class Act(IntEnum):
@@ -178,5 +183,7 @@ class FaultKind(IntEnum):
     GYRO_BIAS_STEP = 9
     IMU_SATURATION = 10
     ROTOR_LOSS = 11
-    BAROMETER_LOSS = 12
-    MAGNETOMETER_LOSS = 13
+
+    _ignore_ = "aid"
+    for aid in Aid:  # an aiding sensor is silent: BAROMETER_LOSS and so on
+        vars()[f"{aid.name}_LOSS"] = 12 + aid

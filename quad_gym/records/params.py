@@ -54,6 +54,7 @@ PARAMS_FIELDS = (
     Field("gyro_sigma", (), "rad/s", "white noise of a sample"),
     Field("accel_noise", (), "m/s^2", "noise of a sample that the filter takes for white"),
     Field("gyro_noise", (), "rad/s", "likewise"),
+    Field("accel_error_noise", (), "-", "what it takes for white of scale and alignment, per m/s^2"),
     Field("accel_scale_sigma", (), "-", "scale factor error of each axis"),
     Field("gyro_scale_sigma", (), "-", "likewise"),
     Field("accel_misalignment_sigma", (), "rad", "of each axis toward each other one"),
@@ -99,7 +100,7 @@ PARAMS_FIELDS = (
     Field("aid_matrix_sigma", (AIDS,), "-", "of each error of scale and alignment"),
     Field("aid_scale", (AIDS,), "m; T", "one in observations"),
     Field("aid_gate", (AIDS,), "-", "largest accepted NIS"),
-    Field("magnetic_field", (3,), "T", "the Earth's in I"),
+    Field("aid_numbers", (AIDS, 3), "mixed", "further ones; of the magnetometer: the field in I [T]"),
     # slow errors among the filter's states
     Field("slow_sigma", (MAX_SLOW,), "mixed", "of each at the start"),
     Field("slow_decay", (MAX_SLOW,), "-", "over a tick"),

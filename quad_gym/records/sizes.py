@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from quad_gym.records.enums import Aid, FaultKind
+from quad_gym.records.enums import AID_FREEDOMS, Aid, FaultKind
 from quad_gym.records.width import WIDTH as WIDTH
 
 MAX_HARMONICS = 6
@@ -31,8 +31,6 @@ SENSOR_GROUPS = AID_GROUPS + AIDS
 """Kinds of measurements: positions, baselines, velocities, images, and aiding sensors."""
 POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = 0, 1, 2, 3
 """Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
-AID_FREEDOMS = (1, 3)
-"""Numbers that an aiding sensor measures, in the order of `Aid`."""
 FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES, *AID_FREEDOMS)
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 256

@@ -7,7 +7,7 @@ import pytest
 import quad_gym
 from quad_gym import BarometerParams, MagnetometerParams
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.faults import BarometerLoss, MagnetometerLoss
+from quad_gym.faults import SensorLoss
 from quad_gym.packing.aids import slow_states
 from quad_gym.records import Aid
 from tests.field_flights import attitudes, fly, steps
@@ -137,7 +137,10 @@ def test_a_latency_of_more_than_two_periods_is_refused():
 
 
 def test_a_loss_silences_one_sensor_while_it_lasts():
-    faults = (BarometerLoss(start=0.1, duration=0.2), MagnetometerLoss(start=0.2, duration=0.2))
+    faults = (
+        SensorLoss(sensor="barometer", start=0.1, duration=0.2),
+        SensorLoss(sensor="magnetometer", start=0.2, duration=0.2),
+    )
     batch = fly(AIDED, 8, task="hover", faults=faults)
     heard = [batch.read("aid_valid")]
     for _ in range(100):
@@ -146,8 +149,8 @@ def test_a_loss_silences_one_sensor_while_it_lasts():
     heard, due = np.array(heard).all(axis=1)[::4], np.arange(26) * 0.02
     np.testing.assert_array_equal(heard[:, BAROMETER], (due < 0.1 - 1e-9) | (due > 0.3 - 1e-9))
     np.testing.assert_array_equal(heard[:, MAGNETOMETER], (due < 0.2 - 1e-9) | (due > 0.4 - 1e-9))
-    with pytest.raises(ValueError, match="BarometerLoss needs a barometer"):
-        FlightBatch(1, sensors=LAB, faults=(BarometerLoss(),))
+    with pytest.raises(ValueError, match="SensorLoss needs a barometer"):
+        FlightBatch(1, sensors=LAB, faults=(SensorLoss(sensor="barometer"),))
 
 
 def test_sensors_can_be_switched_off_and_on():

@@ -28,12 +28,15 @@ from quad_gym.faults import (
 )
 from quad_gym.faults.presets import ALL, PRESETS, faults_of
 from quad_gym.frames import ecef_to_enu
-from quad_gym.records import POSITION_BLOCK, FaultKind, Source
+from quad_gym.records import POSITION_BLOCK, Aid, FaultKind, Source
 from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import fly
 from tests.unit.alarms import ALARM, alarm_score
 
 LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
+AIDED = quad_gym.sensor_suite("rtk").replace(
+    barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
+)
 DT = LAB.imu.dt
 BLIND = LAB.replace(camera=None)
 R_IG = ecef_to_enu(LAB.gnss.reference_antenna_G)
@@ -103,11 +106,11 @@ def test_a_fault_with_a_rate_comes_again_after_exponential_waits():
 
 def test_a_fault_that_never_comes_changes_no_bit():
     later = tuple(
-        type(fault)(start=1e6, **({"size": (1.0, 2.0)} if hasattr(fault, "size") else {}))
-        for fault in faults_of(ALL, RTK)
+        fault.replace(start=1e6, **({"size": (1.0, 2.0)} if hasattr(fault, "size") else {}))
+        for fault in faults_of(ALL, AIDED)
     )
     assert len(later) == len(FaultKind)
-    calm, faulty = both(RTK, later, source=Source.ESTIMATE)
+    calm, faulty = both(AIDED, later, source=Source.ESTIMATE)
     for _ in range(200):
         calm.step()
         faulty.step()
@@ -417,6 +420,7 @@ def test_presets_by_name():
     named = faults_of("rotor_loss+gnss_outage", LAB)
     assert [type(fault) for fault in named] == [GnssOutage, RotorLoss]
     assert named == faults_of(["rotor_loss", PRESETS["gnss_outage"][0]], LAB)
-    assert len(faults_of(ALL, RTK)) == len(FaultKind)
+    assert len(faults_of(ALL, AIDED)) == len(FaultKind)
+    assert len(faults_of(ALL, RTK)) == len(FaultKind) - len(Aid)
     for suite in ("consumer", "indoor"):
         assert 0 < len(faults_of(ALL, quad_gym.sensor_suite(suite))) < len(FaultKind)

@@ -77,8 +77,9 @@ class Stage(IntEnum):
     UPDATE_WITH_SLOW = auto()
     LATE_UPDATE_WITH_SLOW = auto()
     WARM_WITH_SLOW = auto()
-    BAROMETER = auto()
-    MAGNETOMETER = auto()
+    _ignore_ = "aid"
+    for aid in Aid:  # one for each aiding sensor, last and in their order
+        vars()[aid.name] = auto()
 
 
 class Source(NamedTuple):

@@ -59,7 +59,7 @@ def _measure(flight, p, settings, mask, starting):
     stream = stream_of(flight)
     a, b = normal_pair(stream, DRAW_AID + 2 * _S)
     c, _ = normal_pair(stream, DRAW_AID + 2 * _S + 1)
-    m, (s, t) = load3(p.magnetic_field), sin_cos(flight.aid_scalar[_S])
+    m, (s, t) = load3(p.aid_numbers[_S]), sin_cos(flight.aid_scalar[_S])
     field_I = (t * m[0] + s * m[1], t * m[1] - s * m[0], m[2])
     field_B = apply(quaternion_to_dcm(load4(flight.q)), field_I)
     field_B = add(field_B, apply(load33(flight.aid_matrix[_S]), field_B))
@@ -71,7 +71,7 @@ def _measure(flight, p, settings, mask, starting):
 @kernel
 def _expected_field(flight, p, settings):
     """R f and R g, see above."""
-    R_BI, m, delta = load33(flight.R_hat), load3(p.magnetic_field), settings.aid_scalar[_S]
+    R_BI, m, delta = load33(flight.R_hat), load3(p.aid_numbers[_S]), settings.aid_scalar[_S]
     g = (m[1], -m[0], 0.0 * m[2])
     return apply(R_BI, add(m, scale(flight.slow_hat[delta], g))), apply(R_BI, g)
 
@@ -121,7 +121,7 @@ def _doubt(flight, p, work, settings, mask):
     """Add the square of a rejected innovation to the variance of hard iron, and of the heading."""
     doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
     nu, k = load3(flight.innovation[AID_BLOCKS + _S]), D + settings.aid_vector[_S]
-    m, R_BI, P = load3(p.magnetic_field), load33(flight.R_hat), work.P
+    m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
     square = nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2]
     angle = select(doubted, square / (m[0] * m[0] + m[1] * m[1]), 0.0)
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
