@@ -34,7 +34,7 @@ from tests.field_flights import fly
 from tests.unit.alarms import ALARM, alarm_score
 
 LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
-AIDED = quad_gym.sensor_suite("rtk").replace(
+AIDED = RTK.replace(
     barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
 )
 DT = LAB.imu.dt
