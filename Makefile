@@ -19,7 +19,7 @@ $(VENV)/.trainer: $(VENV)/.user
 	touch $@
 
 $(VENV)/.developer: $(VENV)/.user
-	$(INSTALL) ".[train,plot,render,pandas,rerun,dev]"
+	$(INSTALL) ".[train,plot,render,pandas,rerun,export,dev]"
 	touch $@
 
 $(VENV)/.writer: $(VENV)/.user

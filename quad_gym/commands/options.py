@@ -117,7 +117,9 @@ Keywords = Annotated[
 ]
 """Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
 
-EnvId = tyro.conf.Positional[Annotated[str, tyro.conf.arg(help=f"what to fly: {', '.join(IDS)}")]]
+EnvId = tyro.conf.Positional[
+    Annotated[str, tyro.conf.arg(metavar="ENV_ID", help=f"what to fly: {', '.join(IDS)}")]
+]
 """The id of an environment, given without the option's name."""
 
 SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(SUITES)}")]
