@@ -13,6 +13,7 @@ and writes gains.json and search.csv.
 
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -54,7 +55,7 @@ class Args:
     start: Literal["lab", "tuned"] = "lab"
     """gains to start from"""
     candidates: int = 400
-    """gains to try, at least"""
+    """gains to fly, those at the start among them"""
     episodes: int = 32
     """that each candidate flies on each task"""
     fresh_episodes: int = 500
@@ -102,6 +103,8 @@ class Search:
     first_seed: int
     """of the episodes that every candidate flies"""
     rows: list[dict[str, Any]] = field(default_factory=list)
+    flown: list[PDGains] = field(default_factory=list)
+    """the gains of each row"""
     yardstick: dict[str, float] = field(default_factory=dict)
     """mean error of each task with the gains at the start [m]"""
 
@@ -122,7 +125,21 @@ class Search:
             )
         cost = float(np.mean(logs))
         self.rows.append({"relative_error": math.exp(cost), **_flat(gains)})
+        self.flown.append(gains)
         return cost
+
+    @property
+    def best(self) -> PDGains:
+        """The gains with the smallest error so far."""
+        return min(zip(self.rows, self.flown, strict=True), key=_error_of_row)[1]
+
+
+def _error_of_row(candidate: tuple[dict[str, Any], PDGains]) -> float:
+    return float(candidate[0]["relative_error"])
+
+
+class _AllFlown(Exception):
+    """As many candidates as were asked for."""
 
 
 def _flat(gains: PDGains) -> dict[str, float]:
@@ -180,34 +197,36 @@ def configure(args: Args) -> Search:
 
 
 def search(args: Args, found: Search) -> PDGains:
-    """The best gains that differential evolution finds."""
+    """The best gains that differential evolution finds with `--candidates` of them."""
     from scipy.optimize import differential_evolution
     from tqdm import tqdm
 
     n = len(found.knobs.names)
-    found.cost(np.zeros(n))  # the yardstick
-    generations = max(1, math.ceil(args.candidates / (POPULATION * n)) - 1)
-    bounds = [(-math.log(RANGE), math.log(RANGE))] * n
-    total = POPULATION * n * (generations + 1)
-    with tqdm(total=total, desc="tuning", unit=" candidates") as bar:
+    at_start = found.cost(np.zeros(n))  # the yardstick
+    with tqdm(total=args.candidates, initial=1, desc="tuning", unit=" candidates") as bar:
 
         def cost(x: Floats) -> float:
+            if not x.any():
+                return at_start
+            if len(found.rows) == args.candidates:
+                raise _AllFlown
             value = found.cost(x)
             bar.update()
             bar.set_postfix(error=f"{min(row['relative_error'] for row in found.rows):.1%}")
             return value
 
-        best = differential_evolution(
-            cost,
-            bounds,
-            x0=np.zeros(n),
-            popsize=POPULATION,
-            maxiter=generations,
-            rng=args.seed,
-            polish=False,
-            tol=0.0,
-        )
-    return found.knobs.gains(best.x)
+        with suppress(_AllFlown):
+            differential_evolution(
+                cost,
+                [(-math.log(RANGE), math.log(RANGE))] * n,
+                x0=np.zeros(n),
+                popsize=POPULATION,
+                maxiter=args.candidates,
+                rng=args.seed,
+                polish=False,
+                tol=0.0,
+            )
+    return found.best
 
 
 def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
