@@ -34,7 +34,7 @@ circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures 
 
 animation: setup  ## the animation of README
 	$(BIN)/quad-gym fly --task circle --no-camera --seed 1 \
-		--fault gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
+		--faults gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
 	rm .github/images/outage.npz
 
 compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds

@@ -146,9 +146,7 @@ def heading_ticks(
     return np.stack([here[chosen], here[chosen] + length * unit], axis=1)
 
 
-def draw_path(
-    axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True
-) -> None:
+def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True) -> None:
     """The flight from above, with the heading as ticks; both axes have one scale.
 
     Args:

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from quad_gym.commands.options import Keywords, SuiteName, usage_errors
+from quad_gym.commands.options import Keywords, SuiteName, full_id, refuse_overwriting, usage_errors
 
 _SUFFIXES = {"c": ".c", "onnx": ".onnx", "json": ".json", "header": ".h"}
 
@@ -84,8 +84,7 @@ def configure(args: Args) -> tuple[str, Path]:
     file = args.output or Path("results/export") / (_name(args) + _SUFFIXES[kind])
     if file.suffix != _SUFFIXES[kind]:
         raise ValueError(f"--output must end in {_SUFFIXES[kind]}, got {file}")
-    if file.exists() and not args.overwrite:
-        raise ValueError(f"{file} exists: give --overwrite to replace it, or another --output")
+    refuse_overwriting(file, args.overwrite)
     require_writable("--output", file.parent)
     return kind, file
 
@@ -97,7 +96,7 @@ def _name(args: Args) -> str:
     if args.policy == "filter":
         return f"filter_{args.sensors}"
     if args.policy == "pretrained":
-        return IDS.get(args.env_id or "", "policy")
+        return IDS.get(full_id(args.env_id or ""), "policy")
     path = Path(args.policy)
     return f"{path.parent.name}_{path.stem}" if path.parent.name else path.stem
 
@@ -112,7 +111,8 @@ def export_policy(args: Args, kind: str, file: Path) -> str:
     """Write a policy; returns what to tell."""
     from baselines.exporting import c_source, controller_of, save_onnx
 
-    controller = controller_of(args.policy, args.env_id, args.env or None)
+    env_id = None if args.env_id is None else full_id(args.env_id)
+    controller = controller_of(args.policy, env_id, args.env or None)
     if kind == "onnx":
         error = save_onnx(controller, file)
         return f"Its actions in onnxruntime differ from the policy's by at most {error:.1g}."
