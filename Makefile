@@ -2,10 +2,11 @@
 PYTHON ?= python3
 JOBS ?= 2
 VENV := .venv
+OLDEST := .venv-oldest
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark docs wheel clean
+.PHONY: setup demo circle animation compare test test-oldest test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
@@ -43,6 +44,16 @@ compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suit
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
 
+test-oldest: $(OLDEST)/.tester  ## golden flights and interfaces with the oldest versions admitted
+	$(OLDEST)/bin/python -m pytest -q tests/contract/test_golden.py tests/contract/test_checkers.py \
+		tests/contract/test_sb3_env.py tests/unit/test_ukf.py -m "not slow"
+
+$(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet --constraint constraints-oldest.txt \
+		--editable ".[train,plot]" pytest hypothesis
+	touch $@
+
 test-slow: setup  ## the slow statistical and soak tests
 	$(BIN)/python -m pytest -m slow
 
@@ -73,4 +84,4 @@ wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they ho
 	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
-	rm -rf $(VENV) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -127,7 +127,7 @@ def check_options(args: Args) -> None:
 
     Raises:
         ValueError: If one does.
-        ImportError: If a library that writes a file is not installed.
+        ImportError: If a library that draws or writes a file is not installed.
     """
     for name in ("speed", "fps"):
         value = getattr(args, name)
@@ -148,7 +148,8 @@ def check_options(args: Args) -> None:
         if args.output.suffix.lower() == ".rrd":
             load_rerun()
         require_writable("--output", args.output.parent)
-    Renderer(args.view, args.size)
+    if args.output is None or args.output.suffix.lower() in VIDEO_ENDINGS:
+        Renderer(args.view, args.size)
 
 
 def faults_of_args(args: Args) -> tuple[Fault, ...]:
