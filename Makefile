@@ -2,10 +2,11 @@
 PYTHON ?= python3
 JOBS ?= 2
 VENV := .venv
+OLDEST := .venv-oldest
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark docs wheel clean
+.PHONY: setup demo circle animation compare test test-oldest test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
@@ -19,7 +20,7 @@ $(VENV)/.trainer: $(VENV)/.user
 	touch $@
 
 $(VENV)/.developer: $(VENV)/.user
-	$(INSTALL) ".[train,plot,render,pandas,rerun,dev]"
+	$(INSTALL) ".[train,plot,render,pandas,rerun,export,dev]"
 	touch $@
 
 $(VENV)/.writer: $(VENV)/.user
@@ -34,7 +35,7 @@ circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures 
 
 animation: setup  ## the animation of README
 	$(BIN)/quad-gym fly --task circle --no-camera --seed 1 \
-		--fault gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
+		--faults gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
 	rm .github/images/outage.npz
 
 compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
@@ -42,6 +43,16 @@ compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suit
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
+
+test-oldest: $(OLDEST)/.tester  ## golden flights and interfaces with the oldest versions admitted
+	$(OLDEST)/bin/python -m pytest -q tests/contract/test_golden.py tests/contract/test_checkers.py \
+		tests/contract/test_sb3_env.py tests/unit/test_ukf.py -m "not slow"
+
+$(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet --constraint constraints-oldest.txt \
+		--editable ".[train,plot]" pytest hypothesis
+	touch $@
 
 test-slow: setup  ## the slow statistical and soak tests
 	$(BIN)/python -m pytest -m slow
@@ -73,4 +84,4 @@ wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they ho
 	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
-	rm -rf $(VENV) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis

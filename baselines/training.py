@@ -9,7 +9,7 @@ The folder holds
 - or, from the compiled engine, `last.npz` and `best.npz` of the same kind, as `MlpPolicy` loads
   them;
 - `training.json`: the plan, versions, seeds, wall time; `evaluations.csv`: errors while training;
-- TensorBoard's files, from Stable-Baselines3.
+- TensorBoard's files.
 
 A run that is resumed goes on exactly where the last evaluation left it.
 """
@@ -55,7 +55,7 @@ def train(
         plan: What to train.
         folder: Where the run is kept; made if missing.
         resume: Go on from the folder's last checkpoint; without one, begin.
-        tensorboard: Whether Stable-Baselines3 is to write TensorBoard's files.
+        tensorboard: Whether to write TensorBoard's files.
         quiet: Whether to leave out the progress bar.
 
     Returns:
@@ -65,6 +65,7 @@ def train(
         ValueError: If the plan is invalid, the folder holds a run and `resume` is not set, or
             holds the run of another plan.
         OSError: If nothing can be written to the folder.
+        ImportError: If TensorBoard's files are wanted and it is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     described = description(plan)
@@ -93,7 +94,7 @@ def train(
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import run as run_compiled
 
-        keeper: RunKeeper = run_compiled(plan, folder, judge, quiet=quiet)
+        keeper: RunKeeper = run_compiled(plan, folder, judge, tensorboard=tensorboard, quiet=quiet)
     else:
         from baselines.checkpoints import run
 

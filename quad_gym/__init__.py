@@ -4,7 +4,7 @@ Importing the package registers its environments with Gymnasium. The kernels are
 compiled or loaded from their cache, when the first environment is made.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from quad_gym import faults
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
@@ -23,6 +23,21 @@ from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import BatteryParams, WorldParams, world_params
+
+if TYPE_CHECKING:  # what _LAZY imports on first use
+    from quad_gym.batch.flight_batch import FlightBatch as FlightBatch
+    from quad_gym.envs.single import QuadEnv as QuadEnv
+    from quad_gym.envs.spaces import observation_layout as observation_layout
+    from quad_gym.envs.vector import QuadVectorEnv as QuadVectorEnv
+    from quad_gym.estimation import ExtendedKalmanFilter as ExtendedKalmanFilter
+    from quad_gym.estimation import UnscentedKalmanFilter as UnscentedKalmanFilter
+    from quad_gym.flights.record import Flight as Flight
+    from quad_gym.flights.record import FlightRecorder as FlightRecorder
+    from quad_gym.tasks import Observed as Observed
+    from quad_gym.tasks import Task as Task
+    from quad_gym.tasks import TaskError as TaskError
+    from quad_gym.tasks import rewards as rewards
+    from quad_gym.tasks.view import View as View
 
 __version__ = "0.1.0"
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 
+from baselines.compiled_ppo.events import Events
 from baselines.compiled_ppo.ppo import CompiledPPO
 from baselines.keeping import STATE, RunError, RunKeeper, best_file, last_file, replace_file
 from baselines.plans import Plan, description
@@ -18,12 +19,19 @@ from baselines.seeds import first_seed
 class CompiledKeeper(RunKeeper):
     """Keeps a training with the compiled PPO."""
 
+    events: Events | None = None
+    """TensorBoard's files, if they are wanted"""
+
     def _training_return(self, model: CompiledPPO) -> float:
         return model.training_return
 
     def _save(self, model: CompiledPPO, *, best: bool) -> None:
         content = io.BytesIO()
         record = {"plan": description(self._plan), "interface": interface_of(self._judge)}
+        if self.events is not None:
+            row = {f"evaluation/{name}": value for name, value in self.rows[-1].items()}
+            losses = {f"train/{name}": value for name, value in model.losses.items()}
+            self.events.add(model.num_timesteps, row | losses)
         model.policy(record).save(content)
         if best:
             replace_file(best_file(self._plan, self._folder), content.getvalue())
@@ -49,7 +57,12 @@ def make_compiled(plan: Plan) -> CompiledPPO:
 
 
 def run(
-    plan: Plan, folder: Path, judge: gymnasium.vector.VectorEnv[Any, Any, Any], *, quiet: bool
+    plan: Plan,
+    folder: Path,
+    judge: gymnasium.vector.VectorEnv[Any, Any, Any],
+    *,
+    tensorboard: bool,
+    quiet: bool,
 ) -> CompiledKeeper:
     """Train, or go on from the folder's checkpoint; see `baselines.training.train`."""
     model, keeper = make_compiled(plan), CompiledKeeper(plan, folder, judge, quiet=quiet)
@@ -62,6 +75,9 @@ def run(
         model.restore(state)
         keeper.restore(kept, model.num_timesteps)
 
+    if tensorboard:
+        keeper.events = Events(folder / "tensorboard" / "run")
+
     def watch(model: CompiledPPO) -> bool:
         keeper.watch(model, model.num_timesteps)
         return not keeper.stopping
@@ -71,5 +87,7 @@ def run(
         keeper.begin(model.num_timesteps)
         model.learn(plan.recipe.steps, watch)
         keeper.finish(model, model.num_timesteps)
+    if keeper.events is not None:
+        keeper.events.close()
     model.env.close()
     return keeper

@@ -19,6 +19,7 @@ from sphinx.pycode import ModuleAnalyzer
 
 import quad_gym
 from quad_gym.envs.configuration import (
+    KEYWORDS_WITHOUT_EFFECT,
     ONE_TASK_KEYWORDS,
     TASK_DEFAULTS,
     TASK_KEYWORDS,
@@ -170,6 +171,7 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         (f"`{key}`", _value(getattr(defaults, key)), docs[key])
         for key in TASK_KEYWORDS
         if ONE_TASK_KEYWORDS.get(key, kind) == kind
+        and key not in KEYWORDS_WITHOUT_EFFECT.get(kind, ())
     ]
     observation = _observation_rows(
         quad_gym.observation_layout(), _meanings(sections["Observation space"])

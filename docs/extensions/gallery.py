@@ -13,9 +13,8 @@ LESSONS = (
     "wind.py",
     "moving_target.py",
     "look_at_markers.py",
-    "moving_target.py",
-    "look_at_markers.py",
     "filter_alone.py",
+    "deploy.py",
 )
 """The order in which to read them; others follow by name."""
 

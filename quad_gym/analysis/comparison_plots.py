@@ -20,6 +20,7 @@ from quad_gym.analysis.plots import (
     Trace,
     draw_path,
     house_style,
+    path_handles,
 )
 
 Floats = NDArray[np.float64]
@@ -59,7 +60,7 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
         axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
         axes.set_xlabel("time [s]")
         axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
-        axes.legend(loc="upper right", ncols=1 + (len(curves) > 4))
+        _legend_below(figure, axes)
     return figure
 
 
@@ -105,7 +106,7 @@ def learning_figure(
         axes.set_xlim(left=0.0)
         axes.set_xlabel(f"training [{unit}]")
         axes.set_ylabel("mean position error [m]")
-        axes.legend(loc="upper right")
+        _legend_below(figure, axes)
     return figure
 
 
@@ -166,10 +167,14 @@ def paths_figure(traces: Mapping[str, Trace], title: str = "") -> Any:
         figure.suptitle(title)
         for k, (label, trace) in enumerate(traces.items()):
             axes: Any = figure.add_subplot(rows, columns, k + 1)
-            draw_path(axes, trace)
+            draw_path(axes, trace, legend=False)
             axes.set_title(label)
-            if k:
-                axes.get_legend().remove()
+        for axis in ("x", "y"):
+            limits = np.array([getattr(a, f"get_{axis}lim")() for a in figure.axes])
+            for a in figure.axes:
+                getattr(a, f"set_{axis}lim")(limits[:, 0].min(), limits[:, 1].max())
+        handles = path_handles(next(iter(traces.values())))
+        figure.legend(handles=handles, loc="outside lower center", ncols=2 * min(columns, 2))
     return figure
 
 
@@ -180,6 +185,13 @@ def _figure(size: tuple[float, float], title: str) -> tuple[Any, Any]:
     axes = figure.add_subplot()
     axes.set_title(title)
     return figure, axes
+
+
+def _legend_below(figure: Any, axes: Any) -> None:
+    """The legend of a picture under it, where no curve can be."""
+    handles, labels = axes.get_legend_handles_labels()
+    ncols = 2 if len(labels) == 4 or max(map(len, labels)) > 30 else min(len(labels), 3)
+    figure.legend(handles, labels, loc="outside lower center", ncols=ncols)
 
 
 def _cycle(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:

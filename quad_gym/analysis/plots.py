@@ -55,6 +55,7 @@ _STYLE = {
 }
 
 _REFERENCE: dict[str, Any] = {"color": INK, "linestyle": (0, (4, 3)), "linewidth": 1.0}
+_REST: dict[str, Any] = {"marker": "+", "markersize": 9.0, "linestyle": "none", "zorder": 4}
 _START: dict[str, Any] = {
     "color": BLUE,
     "marker": "o",
@@ -145,13 +146,14 @@ def heading_ticks(
     return np.stack([here[chosen], here[chosen] + length * unit], axis=1)
 
 
-def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5) -> None:
+def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True) -> None:
     """The flight from above, with the heading as ticks; both axes have one scale.
 
     Args:
         axes: matplotlib Axes.
         trace: The flight.
         tick_every: Time between heading ticks [s].
+        legend: Whether to explain it, where there is most room.
     """
     from matplotlib.collections import LineCollection
 
@@ -163,7 +165,7 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5) -> None:
     )
     axes.add_collection(LineCollection(list(ticks), colors=VERMILLION, linewidths=1.3))
     axes.plot(*trace.position[:, :2].T, color=BLUE, linewidth=2.2)
-    axes.plot(*trace.reference[:, :2].T, **_REFERENCE)
+    axes.plot(*trace.reference[:, :2].T, **_reference_style(trace))
     axes.plot(*trace.position[0, :2], **_START)
     margin = 0.09 * extent
     axes.set_xlim(low[0] - margin, high[0] + margin)
@@ -171,15 +173,29 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5) -> None:
     axes.set_aspect("equal")
     axes.set_xlabel("x, east [m]")
     axes.set_ylabel("y, north [m]")
-    axes.legend(
-        handles=[
-            _line("flown", BLUE, width=2.2),
-            _sample("reference", _REFERENCE),
-            _line(f"body x axis every {tick_every:g} s", VERMILLION, width=1.3),
-            _sample("start", _START),
-        ],
-        loc="center",
-    )
+    if legend:
+        axes.legend(handles=path_handles(trace, tick_every=tick_every), loc="best")
+
+
+def path_handles(trace: Trace, *, tick_every: float = 0.5) -> list[Any]:
+    """What a legend of `draw_path` shows.
+
+    Args:
+        trace: A flight.
+        tick_every: Time between heading ticks [s].
+    """
+    return [
+        _line("flown", BLUE, width=2.2),
+        _sample("reference", _reference_style(trace)),
+        _line(f"body x axis every {tick_every:g} s", VERMILLION, width=1.3),
+        _sample("start", _START),
+    ]
+
+
+def _reference_style(trace: Trace) -> dict[str, Any]:
+    """Of a reference from above; one that rests has a marker, as its line has no length."""
+    rests = float(np.ptp(trace.reference[:, :2], axis=0).max()) < 1e-6
+    return {**_REFERENCE, **(_REST if rests else {})}
 
 
 def draw_height(axes: Any, trace: Trace) -> None:

@@ -12,10 +12,10 @@ Prints the table and writes it with the whole configuration to TABLE.json.
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -25,7 +25,7 @@ from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, measure_consistency
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import SuiteName, usage_errors
+from quad_gym.commands.options import Episodes, FilterStart, Seed, SuiteName, usage_errors
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.checks import Vector
 from quad_gym.params.world import world_params
@@ -38,16 +38,22 @@ SETTLED = 1.0
 class Args:
     """Options of the tables."""
 
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {
+        "--flights": "--episodes",
+        "--first-seed": "--seed",
+        "--start": "--filter-start",
+    }
+
     table: Positional[Literal["models", "filters"]] = "models"
     """which table"""
     sensors: SuiteName = "rtk"
-    flights: int = 1000
+    flights: Episodes = 1000
     """flights in each case"""
-    first_seed: int = 0
-    """seed of the first flight; the others follow it"""
+    first_seed: Seed = 0
+    """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
-    start: Literal["cold", "warm"] = "cold"
+    start: Annotated[Literal["cold", "warm"], FilterStart] = "cold"
     """the filter's start"""
     output: Path = Path("results/ablation")
     """folder for the numbers; made if missing"""
@@ -57,7 +63,7 @@ class Args:
     def __post_init__(self) -> None:
         """Check the numbers."""
         if self.flights < 2:
-            raise ValueError(f"--flights must be at least 2, got {self.flights}")
+            raise ValueError(f"--episodes must be at least 2, got {self.flights}")
         least = SETTLED + 0.1
         if not (math.isfinite(self.duration) and self.duration >= least):
             raise ValueError(f"--duration must be at least {least:g} s, got {self.duration:g}")

@@ -13,9 +13,10 @@ summary with the whole configuration (summary.json).
 import math
 import textwrap
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ from quad_gym.analysis.metrics import (
 from quad_gym.analysis.recording import Recording, record_flights
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import usage_errors
+from quad_gym.commands.options import Episodes, Seed, usage_errors
 from quad_gym.records import Source
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
@@ -45,10 +46,12 @@ NEES_TAIL = 0.001  # share of a consistent filter's NEES beyond the bound in the
 class Args:
     """Options of the experiment."""
 
-    seeds: int = 1000
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--seeds": "--episodes", "--first-seed": "--seed"}
+
+    seeds: Episodes = 1000
     """flights in each case"""
-    first_seed: int = 0
-    """seed of the first flight; the others follow it"""
+    first_seed: Seed = 0
+    """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
     output: Path = Path("results/circle")
@@ -108,10 +111,10 @@ def configure(args: Args) -> Setup:
         OSError: If nothing can be written to the output folder.
         ImportError: If matplotlib or tqdm is missing.
     """
-    for name, least in (("seeds", 1), ("first_seed", 0), ("threads", 1)):
-        value = getattr(args, name)
+    checked = (("episodes", args.seeds, 1), ("seed", args.first_seed, 0))
+    for name, value, least in (*checked, ("threads", args.threads, 1)):
         if value is not None and value < least:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
+            raise ValueError(f"--{name} must be at least {least}, got {value}")
     if args.camera_rate is not None and not args.camera:
         raise ValueError("--camera-rate has no meaning with --no-camera")
     task = TaskParams(

@@ -309,11 +309,13 @@ def write_page(
 
 def _table(comparison: Comparison, suite: str) -> str:
     headings = ["policy"]
-    headings += [f"{what} on {on}" for what in ("error", "crashed") for on in ("truth", "estimate")]
+    shown = ("error", "second half", "crashed")
+    headings += [f"{what} on {on}" for what in shown for on in ("truth", "estimate")]
     lines = []
     for source in rows_of(comparison):
         cells = [comparison.cell(suite, source, on) for on in ("truth", "estimate")]
         texts = [NAMES[source], *[f"{cell.text()} mm" for cell in cells]]
+        texts += [f"{1e3 * float(np.mean(cell.late_errors)):.1f} mm" for cell in cells]
         texts += [f"{float(np.mean(cell.crash_rates)):.1%}" for cell in cells]
         lines.append("".join(f"<td>{html.escape(text)}</td>" for text in texts))
     head = "".join(f"<th>{html.escape(text)}</th>" for text in headings)

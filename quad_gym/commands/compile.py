@@ -16,9 +16,11 @@ The exit code is 1 if the code cannot be kept.
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
+
+from tyro.conf import arg
 
 Kind = Literal["plain", "truth", "single", "all"]
 
@@ -27,11 +29,13 @@ Kind = Literal["plain", "truth", "single", "all"]
 class Args:
     """What to compile."""
 
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--processes": "--jobs"}
+
     stages: tuple[Kind, ...] = ("all",)
     """truth (an environment that observes the truth), plain (the default environment, with
     sensors and filter), single (the classes for one vehicle, such as UnscentedKalmanFilter), all
     (these, and every option of the environments)"""
-    processes: int | None = None
+    processes: Annotated[int | None, arg(name="jobs")] = None
     """processes that compile; if not given, one per core"""
 
     def __post_init__(self) -> None:
@@ -39,7 +43,7 @@ class Args:
         if not self.stages:
             raise ValueError("--stages must name at least one, got none")
         if self.processes is not None and self.processes < 1:
-            raise ValueError(f"--processes must be at least 1, got {self.processes}")
+            raise ValueError(f"--jobs must be at least 1, got {self.processes}")
 
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ Prints tables and a verdict, and writes figures (PNG and SVG) and all numbers wi
 configuration and the seeds (consistency.json). For example:
 
   quad-gym consistency                             the suite "rtk"
-  quad-gym consistency --sensors indoor --start warm
+  quad-gym consistency --sensors indoor --filter-start warm
   quad-gym consistency --sensors lab                 the report's filter
   quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
   quad-gym consistency --estimator ekf             an extended Kalman filter
@@ -27,9 +27,12 @@ A run that was interrupted goes on where it was when it is started again.
 import math
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
+
+from tyro.conf import arg
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
 from quad_gym.analysis.consistency import CONSISTENT_SHARE, MeanSquare
@@ -48,7 +51,7 @@ from quad_gym.analysis.reports import (
     write_json,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import SuiteName, usage_errors
+from quad_gym.commands.options import FilterStart, Seed, SuiteName, usage_errors
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
@@ -58,17 +61,24 @@ from quad_gym.records import Source
 class Args:
     """Options of the experiment."""
 
-    flights: int | None = None
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {
+        "--flights": "--episodes",
+        "--first-seed": "--seed",
+        "--start": "--filter-start",
+        "--fly-on": "--observation",
+    }
+
+    flights: Annotated[int | None, arg(name="episodes")] = None
     """flights; if not given, 4000, or 400 in each cell of a matrix"""
-    first_seed: int = 0
-    """seed of the first flight; the others follow it"""
+    first_seed: Seed = 0
+    """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
     task: Literal["random_trajectory", "hover", "circle", "lemniscate"] = "random_trajectory"
     """what is flown"""
-    fly_on: Literal["estimate", "truth"] = "estimate"
+    fly_on: Annotated[Literal["estimate", "truth"], arg(name="observation")] = "estimate"
     """what the controller sees"""
-    start: Literal["cold", "warm", "matched"] = "cold"
+    start: Annotated[Literal["cold", "warm", "matched"], FilterStart] = "cold"
     """the filter's start: from its first fix; after some seconds of hovering; or with errors
     drawn from its own covariance, which tests the filter apart from its start"""
     every: float = 0.05
@@ -79,7 +89,7 @@ class Args:
     """folder for figures and numbers, made if it is missing; if not given, results/consistency, or
     results/consistency_matrix"""
     matrix: bool = False
-    """fly the matrix of configurations; of the other options only flights, first-seed, duration,
+    """fly the matrix of configurations; of the other options only episodes, seed, duration,
     output and threads concern it"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
@@ -128,7 +138,7 @@ class Args:
             folder = "consistency_matrix" if self.matrix else "consistency"
             object.__setattr__(self, "output", Path("results") / folder)
         if self.count < 2:
-            raise ValueError(f"--flights must be at least 2, got {self.flights}")
+            raise ValueError(f"--episodes must be at least 2, got {self.flights}")
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):

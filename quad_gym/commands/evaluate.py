@@ -23,7 +23,14 @@ from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_fig
 from quad_gym.analysis.metrics import bootstrap_interval
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, usage_errors
+from quad_gym.commands.options import (
+    EnvId,
+    Keywords,
+    SuiteName,
+    leave,
+    refuse_overwriting,
+    usage_errors,
+)
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params.suites import sensor_suite
@@ -53,6 +60,8 @@ class Args:
     """also write a video of the first episode of each case, of this kind"""
     output: Path | None = None
     """folder for figures and numbers; if not given, results/evaluate/TASK"""
+    overwrite: bool = False
+    """replace the results in the folder, if there are any"""
 
 
 Case = tuple[str, str]
@@ -75,6 +84,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
+    refuse_overwriting(folder / "summary.json", args.overwrite)
     cases: dict[Case, tuple[Policy, Any]] = {}
     for observation in args.observation:
         for name in args.policy:

@@ -1,8 +1,8 @@
 """Watch a flight: live in a window, as a video, or in the Rerun viewer; and keep its numbers.
 
     quad-gym fly --task lemniscate
-    quad-gym fly --task circle --no-camera --fault gnss_outage --fault-time 4 7
-    quad-gym fly --task circle --fault rotor_loss --output results/outage.mp4
+    quad-gym fly --task circle --no-camera --faults gnss_outage --fault-time 4 7
+    quad-gym fly --task circle --faults rotor_loss --output results/outage.mp4
     quad-gym fly --replay results/outage.npz --view chase
     quad-gym fly --replay results/outage.npz --output results/outage.rrd
 
@@ -10,16 +10,16 @@ The blue vehicle is the truth. The orange ghost is where the filter believes it 
 ellipsoid that holds it with 3 sigma; the controller flies on that belief, unless --observation says
 otherwise.
 
-In the window: C and G switch camera and GNSS off and on, F makes the faults of --fault come and go,
+In the window: C and G switch camera and GNSS off and on, F makes the --faults come and go,
 V changes the view, the space bar stops time, R begins the next episode, and Q or Escape ends the
 program.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
@@ -47,6 +47,8 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 class Args:
     """Options of the flight."""
 
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults"}
+
     task: Literal["hover", "circle", "lemniscate", "random_trajectory", "waypoints"] = "circle"
     """what to fly"""
     policy: str = "pd"
@@ -70,7 +72,13 @@ class Args:
     """GNSS fixes per second [Hz]; if not given, the suite's"""
     camera_rate: float | None = None
     """images per second [Hz]; if not given, the suite's"""
-    fault: Annotated[tuple[str, ...], arg(help=f"what goes wrong: {', '.join(FAULTS)}")] = ()
+    fault: Annotated[
+        tuple[str, ...],
+        arg(
+            name="faults",
+            help=f"what goes wrong, one or several (also joined by +): {', '.join(FAULTS)}",
+        ),
+    ] = ()
     fault_time: tuple[float, float] | None = None
     """when it comes and when it goes [s]; if not given, as each fault has it"""
 
@@ -119,7 +127,7 @@ def check_options(args: Args) -> None:
 
     Raises:
         ValueError: If one does.
-        ImportError: If a library that writes a file is not installed.
+        ImportError: If a library that draws or writes a file is not installed.
     """
     for name in ("speed", "fps"):
         value = getattr(args, name)
@@ -130,7 +138,7 @@ def check_options(args: Args) -> None:
         if not 0.0 <= start < end:
             raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
         if not args.fault:
-            raise ValueError("--fault-time needs a --fault")
+            raise ValueError("--fault-time needs --faults")
     if args.output is not None:
         if args.output.suffix.lower() not in VIDEO_ENDINGS + OTHER_ENDINGS:
             endings = ", ".join(VIDEO_ENDINGS + OTHER_ENDINGS)
@@ -140,7 +148,8 @@ def check_options(args: Args) -> None:
         if args.output.suffix.lower() == ".rrd":
             load_rerun()
         require_writable("--output", args.output.parent)
-    Renderer(args.view, args.size)
+    if args.output is None or args.output.suffix.lower() in VIDEO_ENDINGS:
+        Renderer(args.view, args.size)
 
 
 def faults_of_args(args: Args) -> tuple[Fault, ...]:
@@ -165,7 +174,7 @@ def make_env(args: Args) -> Any:
     """
     options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
-    keywords = leave(args.env, {**named, "faults": "--fault"})
+    keywords = leave(args.env, {**named, "faults": "--faults"})
     return gymnasium.make_vec(
         ID_OF_TASK[args.task],
         num_envs=1,

@@ -16,6 +16,7 @@ COMMANDS = {
     "consistency": "is the filter's covariance right? NEES and NIS over many flights",
     "ablation": "what each correction of the filter is worth, and what wrong models cost",
     "benchmark": "measure the speed of everything",
+    "export": "take a trained policy, or a filter's parameters, to an autopilot: C or ONNX",
     "compile": "compile the kernels ahead of their first use, into the cache",
     "version": "print the version",
 }

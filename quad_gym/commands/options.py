@@ -10,6 +10,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -32,7 +33,8 @@ def parse(
 ) -> _Args:
     """Options from the command line as an instance of a dataclass.
 
-    A ValueError of the dataclass's own checks ends the program as a wrong option does.
+    A ValueError of the dataclass's own checks ends the program as a wrong option does. Options that
+    had other names once, in `FORMER_NAMES` of the dataclass, are understood by them, too.
 
     Args:
         kind: Dataclass whose fields are the options.
@@ -40,7 +42,12 @@ def parse(
         description: Text above the options in the help.
         program: Name of the program in its messages; None: that of the process.
     """
-    return tyro.cli(kind, args=argv, description=description, prog=program)
+    former: Mapping[str, str] = getattr(kind, "FORMER_NAMES", {})
+    words = []
+    for word in sys.argv[1:] if argv is None else argv:
+        option, equals, value = word.partition("=")
+        words.append(former.get(option, option) + equals + value)
+    return tyro.cli(kind, args=words, description=description, prog=program)
 
 
 @contextmanager
@@ -73,6 +80,20 @@ def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[st
         if name in keywords:
             raise ValueError(f"--env must leave {name} to {instead}")
     return keywords
+
+
+def refuse_overwriting(file: Path, overwrite: bool) -> None:
+    """Refuse to replace the results of an earlier run unless it is told.
+
+    Args:
+        file: One of the results.
+        overwrite: Whether it is told, by `--overwrite`.
+
+    Raises:
+        ValueError: If the file is there.
+    """
+    if file.exists() and not overwrite:
+        raise ValueError(f"{file} exists: give --overwrite to replace it, or another --output")
 
 
 def flying_options(keywords: Mapping[str, Any]) -> str:
@@ -117,8 +138,37 @@ Keywords = Annotated[
 ]
 """Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
 
-EnvId = tyro.conf.Positional[Annotated[str, tyro.conf.arg(help=f"what to fly: {', '.join(IDS)}")]]
-"""The id of an environment, given without the option's name."""
+_ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
+
+
+def full_id(name: str) -> str:
+    """The id of a task that is given by its short name, such as "circle"; else as it is."""
+    return _ID_OF_TASK.get(name, name)
+
+
+EnvId = tyro.conf.Positional[
+    Annotated[
+        str,
+        tyro.constructors.PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="ENV_ID",
+            instance_from_str=lambda words: full_id(words[0]),
+            is_instance=lambda value: isinstance(value, str),
+            str_from_instance=lambda value: [value],
+        ),
+        tyro.conf.arg(help=f"what to fly: {', '.join(IDS)}, or short: {', '.join(_ID_OF_TASK)}"),
+    ]
+]
+"""The id of an environment, or its task, given without the option's name."""
+
+Episodes = Annotated[int, tyro.conf.arg(name="episodes")]
+"""How many are flown."""
+
+Seed = Annotated[int, tyro.conf.arg(name="seed")]
+"""Of the first episode."""
+
+FilterStart = tyro.conf.arg(name="filter-start")
+"""How the filter starts, as the keyword of environments."""
 
 SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(SUITES)}")]
 """The name of a sensor suite."""

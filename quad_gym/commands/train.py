@@ -10,6 +10,7 @@ and best.zip (.npz with --engine compiled), which quad-gym evaluate flies, with 
 stopped, by Ctrl-C or otherwise, goes on with --resume, exactly where its last evaluation left it.
 """
 
+import importlib.util
 import sys
 import time
 from dataclasses import dataclass, field
@@ -53,7 +54,7 @@ class Args:
     threads: int | None = None
     """threads of the flights; if not given, one per core; no result depends on them"""
     tensorboard: bool = True
-    """let Stable-Baselines3 write files for TensorBoard"""
+    """write files for TensorBoard, if it is installed"""
     progress: bool = True
     """show a progress bar"""
     export: Path | None = None
@@ -125,12 +126,15 @@ def main(args: Args) -> None:
         f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
         f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
     )
+    tensorboard = args.tensorboard and importlib.util.find_spec("tensorboard") is not None
+    if args.tensorboard and not tensorboard:
+        print("TensorBoard is not installed: no files for it; evaluations.csv has the errors.")
     with usage_errors((RunError,)):
         done = train(
             plan,
             folder,
             resume=args.resume,
-            tensorboard=args.tensorboard,
+            tensorboard=tensorboard,
             quiet=not args.progress,
         )
     total = time.perf_counter() - from_start

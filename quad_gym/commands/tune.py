@@ -1,6 +1,6 @@
 """Tune the gains of PD control on what it sees: the estimate, the truth, any sensors.
 
-    quad-gym tune                                         # the four tracking tasks, lab
+    quad-gym tune                                         # the four tracking tasks
     quad-gym tune --tasks QuadGym/Circle-v0 --sensors consumer
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pd:results/tune/gains.json
 
@@ -13,9 +13,11 @@ and writes gains.json and search.csv.
 
 import math
 import time
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
@@ -27,7 +29,15 @@ from baselines.seeds import first_seed
 from quad_gym import IDS, PDGains, pd_gains
 from quad_gym.analysis.metrics import paired_difference
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.commands.options import Keywords, SuiteName, flying_options, leave, usage_errors
+from quad_gym.commands.options import (
+    Keywords,
+    SuiteName,
+    flying_options,
+    full_id,
+    leave,
+    refuse_overwriting,
+    usage_errors,
+)
 from quad_gym.evaluation import roll_out
 
 Floats = NDArray[np.float64]
@@ -45,16 +55,18 @@ POPULATION = 8
 class Args:
     """Options of the search."""
 
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--start": "--gains"}
+
     tasks: Annotated[tuple[str, ...], arg(help=f"what to fly: {', '.join(TRACKING)}")] = TRACKING
     observation: Literal["estimate", "truth", "noisy"] = "estimate"
     """what control sees"""
     sensors: SuiteName = "standard"
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as action=wrench control_rate=200"""
-    start: Literal["lab", "tuned"] = "lab"
+    start: Annotated[Literal["lab", "tuned"], arg(name="gains")] = "lab"
     """gains to start from"""
     candidates: int = 400
-    """gains to try, at least"""
+    """gains to fly, those at the start among them"""
     episodes: int = 32
     """that each candidate flies on each task"""
     fresh_episodes: int = 500
@@ -65,6 +77,8 @@ class Args:
     """threads; if not given, one per core"""
     output: Path = Path("results/tune")
     """folder for gains and numbers"""
+    overwrite: bool = False
+    """replace the gains in the folder, if there are any"""
 
 
 @dataclass(frozen=True)
@@ -102,6 +116,8 @@ class Search:
     first_seed: int
     """of the episodes that every candidate flies"""
     rows: list[dict[str, Any]] = field(default_factory=list)
+    flown: list[PDGains] = field(default_factory=list)
+    """the gains of each row"""
     yardstick: dict[str, float] = field(default_factory=dict)
     """mean error of each task with the gains at the start [m]"""
 
@@ -114,7 +130,9 @@ class Search:
             fine = np.where(episodes.crashed, np.nan, episodes.mean_error)
             if env_id not in self.yardstick:  # the first candidate is the start itself
                 if episodes.crashed.all():
-                    raise ValueError(f"every episode of {env_id} crashes with the gains at --start")
+                    raise ValueError(
+                        f"every episode of {env_id} crashes with the gains at the start"
+                    )
                 self.yardstick[env_id] = float(np.nanmean(fine))
             scale = self.yardstick[env_id]
             logs.append(
@@ -122,7 +140,21 @@ class Search:
             )
         cost = float(np.mean(logs))
         self.rows.append({"relative_error": math.exp(cost), **_flat(gains)})
+        self.flown.append(gains)
         return cost
+
+    @property
+    def best(self) -> PDGains:
+        """The gains with the smallest error so far."""
+        return min(zip(self.rows, self.flown, strict=True), key=_error_of_row)[1]
+
+
+def _error_of_row(candidate: tuple[dict[str, Any], PDGains]) -> float:
+    return float(candidate[0]["relative_error"])
+
+
+class _AllFlownError(Exception):
+    """As many candidates as were asked for."""
 
 
 def _flat(gains: PDGains) -> dict[str, float]:
@@ -149,7 +181,7 @@ def make_envs(args: Args, episodes: int) -> dict[str, Any]:
             threads=args.threads,
             **args.env,
         )
-        for env_id in args.tasks
+        for env_id in map(full_id, args.tasks)
     }
 
 
@@ -160,7 +192,7 @@ def configure(args: Args) -> Search:
         ValueError: If an option is invalid.
         OSError: If nothing can be written to the folder.
     """
-    for env_id in args.tasks:
+    for env_id in map(full_id, args.tasks):
         if env_id not in TRACKING:
             raise ValueError(f"--tasks must be among {', '.join(TRACKING)}, got {env_id!r}")
     for name, least in (("candidates", 1), ("episodes", 1), ("fresh_episodes", 2), ("seed", 0)):
@@ -169,6 +201,7 @@ def configure(args: Args) -> Search:
             raise ValueError(f"--{option_name} must be at least {least}, got {getattr(args, name)}")
     names = ("observation", "sensors", "threads")
     leave(args.env, {name: f"--{name}" for name in names})
+    refuse_overwriting(args.output / "gains.json", args.overwrite)
     envs = make_envs(args, args.episodes)
     for env in envs.values():
         PDPolicy(env, gains=args.start)  # refuses actions and layouts that do not admit it
@@ -180,34 +213,36 @@ def configure(args: Args) -> Search:
 
 
 def search(args: Args, found: Search) -> PDGains:
-    """The best gains that differential evolution finds."""
+    """The best gains that differential evolution finds with `--candidates` of them."""
     from scipy.optimize import differential_evolution
     from tqdm import tqdm
 
     n = len(found.knobs.names)
-    found.cost(np.zeros(n))  # the yardstick
-    generations = max(1, math.ceil(args.candidates / (POPULATION * n)) - 1)
-    bounds = [(-math.log(RANGE), math.log(RANGE))] * n
-    total = POPULATION * n * (generations + 1)
-    with tqdm(total=total, desc="tuning", unit=" candidates") as bar:
+    at_start = found.cost(np.zeros(n))  # the yardstick
+    with tqdm(total=args.candidates, initial=1, desc="tuning", unit=" candidates") as bar:
 
         def cost(x: Floats) -> float:
+            if not x.any():
+                return at_start
+            if len(found.rows) == args.candidates:
+                raise _AllFlownError
             value = found.cost(x)
             bar.update()
             bar.set_postfix(error=f"{min(row['relative_error'] for row in found.rows):.1%}")
             return value
 
-        best = differential_evolution(
-            cost,
-            bounds,
-            x0=np.zeros(n),
-            popsize=POPULATION,
-            maxiter=generations,
-            rng=args.seed,
-            polish=False,
-            tol=0.0,
-        )
-    return found.knobs.gains(best.x)
+        with suppress(_AllFlownError):
+            differential_evolution(
+                cost,
+                [(-math.log(RANGE), math.log(RANGE))] * n,
+                x0=np.zeros(n),
+                popsize=POPULATION,
+                maxiter=args.candidates,
+                rng=args.seed,
+                polish=False,
+                tol=0.0,
+            )
+    return found.best
 
 
 def judge(args: Args, gains: dict[str, PDGains]) -> tuple[str, dict[str, Any]]:
@@ -263,4 +298,4 @@ def main(args: Args) -> None:
     seconds = time.perf_counter() - began
     print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")
     same = flying_options({"sensors": args.sensors, **args.env})
-    print(f"quad-gym evaluate {args.tasks[0]} --policy pd pd:{written[0]}{same}")
+    print(f"quad-gym evaluate {full_id(args.tasks[0])} --policy pd pd:{written[0]}{same}")

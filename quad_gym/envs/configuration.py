@@ -59,6 +59,9 @@ ONE_TASK_KEYWORDS = {
 }
 """Those that mean something to a single task."""
 
+KEYWORDS_WITHOUT_EFFECT = {"hover": ("period",), "waypoints": ("period", "preview")}
+"""Those that mean something to most tasks, by the tasks to which they mean nothing."""
+
 INTERFACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
 """Keywords that the interfaces take themselves."""
 
@@ -97,6 +100,8 @@ class Flights:
                     f"{name} belongs to the task {ONE_TASK_KEYWORDS[name]}, and must not be given "
                     f"for {task}"
                 )
+            if name in KEYWORDS_WITHOUT_EFFECT.get(task, ()):
+                raise ValueError(f"{name} means nothing to the task {task}, and must not be given")
         self.task: TaskParams = TASK_DEFAULTS[task].replace(**given)
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:

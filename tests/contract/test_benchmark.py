@@ -167,7 +167,7 @@ def test_all_sections_are_those_that_do_not_compile():
     [
         ["--batch", "12"],
         ["--batch", "0"],
-        ["--envs", "0"],
+        ["--n-envs", "0"],
         ["--repeats", "0"],
         ["--seconds", "0"],
         ["--seconds", "nan"],

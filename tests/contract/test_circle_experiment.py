@@ -162,8 +162,8 @@ def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("--seeds 0", "--seeds must be at least 1"),
-        ("--first-seed -1", "--first-seed must be at least 0"),
+        ("--seeds 0", "--episodes must be at least 1"),
+        ("--first-seed -1", "--seed must be at least 0"),
         ("--threads 0", "--threads must be at least 1"),
         ("--gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),
         ("--camera-rate 400", "camera_rate must divide the IMU rate"),

@@ -16,10 +16,12 @@ import platform
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
+
+from tyro.conf import arg
 
 from quad_gym.analysis.reports import text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
@@ -45,13 +47,15 @@ Section = Literal[
 class Args:
     """Options of the benchmark."""
 
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--envs": "--n-envs"}
+
     only: Section = "all"
     """section to run; all: every one but compile, minutes"""
     against: Path | None = None
     """folder of another checkout to compare the environments with, instead of the sections"""
     batch: int = 256
     """flights in the batches of filter, tick and options, in eights"""
-    envs: int = 1024
+    envs: Annotated[int, arg(name="n-envs")] = 1024
     """environments in the interfaces' batches"""
     threads: int | None = None
     """most threads to use; if not given, one per core"""
@@ -69,7 +73,8 @@ class Args:
         for name in ("batch", "envs", "repeats", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise ValueError(f"--{name} must be at least 1, got {value}")
+                option = {"envs": "n-envs"}.get(name, name)
+                raise ValueError(f"--{option} must be at least 1, got {value}")
         if self.batch % WIDTH:
             raise ValueError(f"--batch must be a multiple of {WIDTH}, got {self.batch}")
         if self.against is not None and not (self.against / "quad_gym" / "__init__.py").is_file():

@@ -1,0 +1,141 @@
+"""`Controller`: a trained network with everything that whoever runs it elsewhere has to know."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from baselines.exporting.actions import ActionField, action_fields
+from baselines.mlp import MlpPolicy, mlp_of
+from baselines.policies import load_policy, pretrained_file
+from quad_gym.envs import keywords_of
+from quad_gym.envs.spaces import ObservationField, layout_bounds
+from quad_gym.packing.flight import params_record
+
+_AGREEMENT = 1e-4
+"""Largest difference between a network and the policy that it was taken from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Controller:
+    """A network, the table of its observations and the meaning of its actions."""
+
+    policy: MlpPolicy
+    source: str
+    """the name or file that it was taken from"""
+    env_id: str
+    keywords: Mapping[str, Any]
+    """of the environment that it was trained for"""
+    table: tuple[ObservationField, ...]
+    action: str
+    """the environment's `action`"""
+    action_fields: tuple[ActionField, ...]
+    control_rate: float
+    """[Hz]"""
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(low, high) that each number of an observation is held to, (n,) float32 each."""
+        low, high = layout_bounds(self.table)
+        return low.astype(np.float32), high.astype(np.float32)
+
+    def act(self, observations: Any) -> NDArray[np.float32]:
+        """What an exported controller has to answer: the policy on observations within bounds.
+
+        Args:
+            observations: (..., n) as `table` describes them.
+
+        Returns:
+            Actions (..., 4) in [-1, 1].
+        """
+        within = np.clip(np.asarray(observations, np.float32), *self.bounds)
+        return self.policy.predict(within)[0]
+
+    def samples(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Observations (count, n) to compare controllers on.
+
+        Half of them are of the size of those in flight, the others reach beyond the bounds.
+        """
+        low, high = self.bounds
+        near = rng.standard_normal((count - count // 2, len(low)))
+        far = rng.uniform(1.2 * low, 1.2 * high, (count // 2, len(low)))
+        return np.concatenate([near, far]).astype(np.float32)
+
+
+def controller_of(
+    policy: str, env_id: str | None = None, keywords: Mapping[str, Any] | None = None
+) -> Controller:
+    """A trained policy with the meaning of its observations and actions.
+
+    Args:
+        policy: "pretrained", or a file: `.npz` (of the compiled engine, or `quad-gym train
+            --export`) or `.zip` of Stable-Baselines3, which can run code while it is loaded.
+        env_id: What it flies; None: as its training record says.
+        keywords: Of the environment; None: as its training record says.
+
+    Raises:
+        ValueError: If there is no such policy, it is no plain network, it has no training record
+            and `env_id` is None, or it does not fit the environment.
+        ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
+    """
+    if policy == "pd" or policy.startswith("pd:"):
+        raise ValueError(f"policy must be a trained network, got {policy!r}")
+    if policy == "pretrained" and env_id is None:
+        raise ValueError("policy pretrained needs an ENV_ID: one ships for each of several tasks")
+    if env_id is not None:
+        keywords_of(env_id)  # refuses unknown ids
+    file = pretrained_file(env_id) if policy == "pretrained" and env_id else Path(policy)
+    record = _record_of(file)
+    plan = record.get("plan", {})
+    if env_id is None:
+        if "env_id" not in plan:
+            raise ValueError(f"{file} has no training record that names an ENV_ID: give it")
+        env_id = plan["env_id"]
+    if keywords is None:
+        keywords = plan.get("environment", {}) if plan.get("env_id") == env_id else {}
+    env = gymnasium.make_vec(env_id, num_envs=1, threads=1, **keywords)
+    try:
+        found: Any = load_policy(str(file), env)
+        flights = env.unwrapped.flights  # type: ignore[attr-defined]
+        if not isinstance(env.single_observation_space, gymnasium.spaces.Box):
+            raise ValueError(f"{file} sees the truth (privileged=True), which no vehicle has")
+        batch = flights.batch
+        params = params_record(batch.vehicle, batch.sensors, actions=batch.actions)[0]
+        controller = Controller(
+            policy=found if isinstance(found, MlpPolicy) else mlp_of(found, record),
+            source=policy if policy == "pretrained" else file.name,
+            env_id=env_id,
+            keywords=dict(keywords),
+            table=flights.table,
+            action=flights.action,
+            action_fields=action_fields(flights.action, params),
+            control_rate=flights.control_rate,
+        )
+    finally:
+        env.close()
+    _require_same(controller, found, file)
+    return controller
+
+
+def _record_of(file: Path) -> dict[str, Any]:
+    """The training record of a policy: in a `.npz`, beside a `.zip`; empty where there is none."""
+    if file.suffix == ".npz":
+        return MlpPolicy.load(file).record
+    record = file.parent / "training.json"
+    if file.suffix == ".zip" and record.exists():
+        return dict(json.loads(record.read_text(encoding="utf-8")))
+    return {}
+
+
+def _require_same(controller: Controller, model: Any, file: Path) -> None:
+    """Refuse a network that is not all of the policy, as with an extractor of features."""
+    low, high = controller.bounds
+    seen = np.clip(controller.samples(256, np.random.default_rng(0)), low, high)
+    error = np.abs(controller.policy.predict(seen)[0] - model.predict(seen, deterministic=True)[0])
+    if not error.max() <= _AGREEMENT:
+        raise ValueError(f"{file} is no plain network: without the rest it acts differently")

@@ -1,0 +1,143 @@
+"""The numbers that a suite's filter is computed with, as JSON or a header of C."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+import quad_gym
+from quad_gym.analysis.reports import as_json
+from quad_gym.packing.flight import params_record
+from quad_gym.params.filter import FilterParams
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import vehicle_params
+from quad_gym.records.params import PARAMS_FIELDS
+
+_FIELDS = {
+    "any": (
+        *("gravity", "dt", "accel_noise", "gyro_noise", "accel_bias_decay", "gyro_bias_decay"),
+        *("accel_bias_drive", "gyro_bias_drive", "accel_bias_sigma", "gyro_bias_sigma"),
+        *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
+        *("gnss_sigma", "baseline_noise", "first_baseline_sigma", "heading_sigma"),
+        *("baseline", "baseline_length", "R_IG", "antenna", "velocity_sigma"),
+        *("drift_tick_decay", "drift_tick_drive"),
+        *("initial_velocity_variance", "initial_scale", "initial_tilt_sigma"),
+        *("gate_position", "gate_direction", "gate_uncertainty", "gate_patience"),
+    ),
+    "camera": (
+        *("camera", "R_CB", "pixel_size", "focal_length", "half_image", "pixel_sigma"),
+        *("blur", "features", "noise_at_prediction", "noise_projected", "gradual_above"),
+    ),
+}
+"""What the filter's kernels read of the parameters: of any suite, and of one with a camera."""
+
+_MEANINGS = {
+    "gyro_noise": "noise of a sample that the filter takes for white",
+    "accel_bias_decay": "of the bias over a tick: exp(-dt/tau)",
+    "gyro_bias_decay": "of the bias over a tick: exp(-dt/tau)",
+    "accel_bias_drive": "standard deviation of the bias's driving noise over a tick",
+    "gyro_bias_drive": "standard deviation of the bias's driving noise over a tick",
+    "accel_bias_sigma": "standard deviation of the bias at the start",
+    "gyro_bias_sigma": "standard deviation of the bias at the start",
+    "baseline_length": "length of the baseline",
+    "first_baseline_sigma": "direction noise of the first baseline",
+    "heading_sigma": "of the heading where the place of the start tells it",
+    "velocity_sigma": "noise of a GNSS velocity per axis; 0: not measured",
+    "drift_tick_decay": "of the slow GNSS position error over a tick",
+    "drift_tick_drive": "standard deviation of its driving noise; next to 0 where there is none",
+    "camera": "projection center of the camera in B",
+    "pixel_size": "size of a pixel",
+    "pixel_sigma": "noise of a pixel per axis",
+    "blur": "noise of a pixel per body rate",
+    "initial_velocity_variance": "of the velocity at the start",
+    "initial_scale": "factor on the first fix's covariance at the start",
+    "initial_tilt_sigma": "of roll and pitch at the start; 0: attitude by Wahba's problem",
+}
+"""Words for those that `PARAMS_FIELDS` explains by what stands beside them."""
+
+_CHOICES = ("kind", "integration", "covariance_reset", "feature_noise_across", "late_measurements")
+"""Words among the parameters of a filter."""
+
+
+def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
+    """All that the filter of a suite is computed with, in the types of JSON.
+
+    Args:
+        suite: The sensors, with the filter that fuses them.
+
+    Returns:
+        "choices", words; "rates", Hz; "latencies", s; "numbers", each with "value", "unit" and
+        "meaning", in the form in which the equations take them (noise of a sample, not a density).
+    """
+    record = params_record(vehicle_params("lab"), suite)[0]
+    names = _FIELDS["any"] + (_FIELDS["camera"] if suite.camera is not None else ())
+    about = {field.name: field for field in PARAMS_FIELDS}
+    numbers = {}
+    for name in names:
+        value = record[name]
+        if name == "gravity":  # a filter that works by itself has its own
+            value = np.float64(suite.estimator.gravity)
+        if name == "features" and suite.camera is not None:
+            value = value[: len(suite.camera.features_I)]
+        if not np.isfinite(value).all():  # gates that are open, the range of cameras
+            continue
+        numbers[name] = {
+            "value": as_json(value),
+            "unit": about[name].unit,
+            "meaning": _MEANINGS.get(name, about[name].meaning),
+        }
+    estimator: FilterParams = suite.estimator
+    sensors = {"gnss": suite.gnss, "camera": suite.camera}
+    present = {name: sensor for name, sensor in sensors.items() if sensor is not None}
+    return {
+        "quad_gym": quad_gym.__version__,
+        "choices": {name: getattr(estimator, name) for name in _CHOICES}
+        | {
+            "imu_samples": suite.imu.samples,
+            "reuse_first_fix": estimator.reuse_first_fix,
+            "estimates_gnss_drift": suite.drifts,
+        },
+        "rates": {"imu": suite.imu.rate, **{name: s.rate for name, s in present.items()}},
+        "latencies": {name: s.latency for name, s in present.items()},
+        "numbers": numbers,
+    }
+
+
+def filter_json(suite: SensorSuite) -> str:
+    """`filter_numbers` as text."""
+    return json.dumps(filter_numbers(suite), indent=2, allow_nan=False) + "\n"
+
+
+def filter_header(suite: SensorSuite, name: str) -> str:
+    """`filter_numbers` as a header of C99, each number a constant with its unit and meaning.
+
+    Args:
+        suite: The sensors, with the filter that fuses them.
+        name: Of the suite, for the comment and the guard.
+    """
+    found = filter_numbers(suite)
+    guard = f"QUAD_GYM_FILTER_{name.upper()}_H"
+    lines = [
+        f'/* The filter of the sensor suite "{name}"; quad_gym {quad_gym.__version__}.',
+        " * SI units; I: inertial, east, north, up; B: body, x ahead, y left, z up; C: camera.",
+        *(f" * {key}: {value}" for key, value in found["choices"].items()),
+        *(f" * {key}: latency {value:g} s" for key, value in found["latencies"].items()),
+        " */",
+        f"#ifndef {guard}",
+        f"#define {guard}",
+        "",
+    ]
+    for sensor, rate in found["rates"].items():
+        lines.append(f"static const double {sensor}_rate = {rate!r}; /* Hz */")
+    for key, number in found["numbers"].items():
+        value = np.array(number["value"], np.float64)
+        shape = "".join(f"[{n}]" for n in value.shape)
+        said = f"{number['meaning']} [{number['unit']}]"
+        lines.append(f"static const double {key}{shape} = {_braces(value.tolist())}; /* {said} */")
+    return "\n".join([*lines, "", "#endif", ""])
+
+
+def _braces(value: Any) -> str:
+    if isinstance(value, list):
+        return "{" + ", ".join(map(_braces, value)) + "}"
+    return repr(value)

@@ -1,0 +1,125 @@
+"""A controller as an ONNX model, checked with onnxruntime against the policy."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import quad_gym
+from baselines.exporting.controller import Controller
+
+OPSET = 17
+"""Version of the operators; old enough for the runtimes on companion computers."""
+_IR_VERSION = 8
+"""Version of the file format that belongs to it."""
+
+AGREEMENT = 1e-4
+"""Largest difference between actions of the model and of the policy that is accepted;
+saturated ones are differences of large sums."""
+
+_ACTIVATIONS = {"relu": "Relu", "tanh": "Tanh", "elu": "Elu"}
+
+
+def onnx_model(controller: Controller) -> Any:
+    """A controller as an `onnx.ModelProto`: `observation` (batch, n) to `action` (batch, 4).
+
+    What observation and actions are is in its metadata, as JSON.
+
+    Raises:
+        ImportError: If onnx is missing.
+    """
+    onnx = _require("onnx")
+    from onnx import TensorProto, helper, numpy_helper
+
+    low, high = controller.bounds
+    constants = {"low": low, "high": high, "least": np.float32(-1.0), "most": np.float32(1.0)}
+    nodes = [
+        helper.make_node("Max", ["observation", "low"], ["above"]),
+        helper.make_node("Min", ["above", "high"], ["x0"]),
+    ]
+    policy = controller.policy
+    layers = zip(policy.weights, policy.biases, policy.activations, strict=True)
+    for k, (W, b, activation) in enumerate(layers):
+        constants |= {f"W{k}": W, f"b{k}": b}
+        linear = f"x{k + 1}" if activation == "none" else f"z{k}"
+        nodes.append(helper.make_node("Gemm", [f"x{k}", f"W{k}", f"b{k}"], [linear], transB=1))
+        if activation != "none":
+            nodes.append(helper.make_node(_ACTIVATIONS[activation], [linear], [f"x{k + 1}"]))
+    last = f"x{len(policy.weights)}"
+    nodes.append(helper.make_node("Clip", [last, "least", "most"], ["action"]))
+    graph = helper.make_graph(
+        nodes,
+        "controller",
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", policy.inputs])],
+        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", 4])],
+        [
+            numpy_helper.from_array(np.asarray(value, np.float32), name)
+            for name, value in constants.items()
+        ],
+    )
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="quad_gym",
+        producer_version=quad_gym.__version__,
+    )
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in _metadata(controller).items()})
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def save_onnx(controller: Controller, file: Path) -> float:
+    """Write a controller as ONNX, after a comparison with the policy in onnxruntime.
+
+    Args:
+        controller: What to write.
+        file: Where.
+
+    Returns:
+        The largest difference of an action over 1,000 observations.
+
+    Raises:
+        ImportError: If onnx or onnxruntime is missing.
+        RuntimeError: If the model acts differently.
+    """
+    content = onnx_model(controller).SerializeToString()
+    runtime = _require("onnxruntime")
+    session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    seen = controller.samples(1000, np.random.default_rng(0))
+    (found,) = session.run(None, {"observation": seen})
+    error = float(np.abs(found - controller.act(seen)).max())
+    if not error <= AGREEMENT:
+        raise RuntimeError(f"the ONNX model's actions differ from the policy's by {error:.1e}")
+    file.write_bytes(content)
+    return error
+
+
+def _metadata(controller: Controller) -> dict[str, Any]:
+    return {
+        "source": controller.source,
+        "env_id": controller.env_id,
+        "control_rate_hz": controller.control_rate,
+        "action_kind": controller.action,
+        "observation": [
+            {
+                "name": f.name,
+                "first": f.slice.start,
+                "size": f.slice.stop - f.slice.start,
+                "unit": f.unit,
+                "frame": f.frame,
+            }
+            for f in controller.table
+        ],
+        "action": [field.formula(i) for i, field in enumerate(controller.action_fields)],
+    }
+
+
+def _require(package: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ImportError(f'ONNX needs {package}: pip install "quad-gym[export]"') from error

@@ -1,0 +1,61 @@
+"""The page on deployment is true: its tables and its C are those of the environments."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines.exporting import controller_of
+
+PAGE = (Path(__file__).parents[2] / "docs" / "deployment.md").read_text(encoding="utf-8")
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+
+def test_the_table_of_the_observation_is_the_layout():
+    rows = re.findall(r"^\| (\d+):(\d+) \| `(\w+)` \|.*\| (\S+) \| (\S+) \|$", PAGE, re.MULTILINE)
+    layout = quad_gym.observation_layout()
+    want = [(str(f.slice.start), str(f.slice.stop), f.name, f.unit, f.frame) for f in layout]
+    assert rows == want
+
+
+def test_the_numbers_of_the_action_are_the_default_ones():
+    fields = controller_of("pretrained", "QuadGym/Circle-v0").action_fields
+    assert "thrust 7.644 (1 + a[0]) N" in PAGE
+    assert fields[0].formula(0).startswith("thrust = 7.644 (1 + a[0]) N")
+    assert [field.scale for field in fields[1:]] == [6.0, 6.0, 3.0]
+
+
+@pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
+def test_its_c_observes_as_the_environment(tmp_path):
+    """On the state and the reference of the absolute layout, which the same flights show."""
+    (tmp_path / "it.c").write_text(re.search(r"```c\n(.*?)```", PAGE, re.DOTALL)[1])
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    library = tmp_path / "it.so"
+    subprocess.run([COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(library)], check=True)
+    observe = ctypes.CDLL(str(library)).observe
+
+    keywords = {"num_envs": 3, "start": "hover", "randomize": True}
+    absolute, relative = (
+        gymnasium.make_vec("QuadGym/Circle-v0", layout=layout, **keywords)
+        for layout in ("absolute", "relative")
+    )
+    places = {f.name: f.slice for f in quad_gym.observation_layout(layout="absolute")}
+    (seen, _), (want, _) = absolute.reset(seed=0), relative.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        for flight in range(3):
+            row, found = seen[flight], np.full(28, np.nan, np.float32)
+            state = [row[places[n]] for n in ("position", "velocity", "R_BI", "body_rates")]
+            start, stop = places["reference_position"].start, places["preview_2"].stop
+            # R_BI row by row; the reference lies in the order of the structure
+            inputs = (np.concatenate(state), row[start:stop].copy(), row[places["last_action"]])
+            observe(*(a.ctypes.data_as(ctypes.c_void_p) for a in (*map(np.copy, inputs), found)))
+            np.testing.assert_allclose(found, want[flight], rtol=0.0, atol=5e-6)
+        action = rng.uniform(-0.2, 0.2, (3, 4))
+        seen, want = absolute.step(action)[0], relative.step(action)[0]

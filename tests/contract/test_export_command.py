@@ -1,0 +1,87 @@
+"""`quad-gym export`: what it writes, what it says, what it refuses."""
+
+import json
+
+import pytest
+
+from quad_gym.commands.main import main
+from tests.console import plain
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def refused(line, capsys):
+    """The message of a command line that ends with a usage error."""
+    with pytest.raises(SystemExit) as end:
+        main(line.split())
+    assert end.value.code == 2
+    return plain(capsys.readouterr().err)
+
+
+def test_a_policy_becomes_a_c_file_named_after_its_task(tmp_path, capsys):
+    assert main(["export", "pretrained", "QuadGym/Hover-v0", "--to", "c"]) == 0
+    file = tmp_path / "results" / "export" / "hover.c"
+    assert "int hover(const float observation[28], float action[4])" in file.read_text()
+    told = capsys.readouterr().out
+    assert "results/export/hover.c" in told
+    assert "hover(observation, action) 50 times a second" in told
+
+
+def test_a_file_is_replaced_only_when_told(tmp_path, capsys):
+    line = "export pretrained QuadGym/Hover-v0 --output it.c"
+    assert main(line.split()) == 0
+    before = (tmp_path / "it.c").read_text()
+    (tmp_path / "it.c").write_text("mine")
+    assert "it.c exists: give --overwrite" in refused(line, capsys)
+    assert (tmp_path / "it.c").read_text() == "mine"
+    assert main([*line.split(), "--overwrite"]) == 0
+    assert (tmp_path / "it.c").read_text() == before
+
+
+def test_a_policy_becomes_an_onnx_model(tmp_path, capsys):
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    assert main(["export", "pretrained", "QuadGym/Waypoints-v0", "--to", "onnx"]) == 0
+    assert (tmp_path / "results" / "export" / "waypoints.onnx").stat().st_size > 10_000
+    assert "differ from the policy's by at most" in capsys.readouterr().out
+
+
+def test_names_of_files_become_names_of_functions(tmp_path):
+    main(["export", "pretrained", "QuadGym/Hover-v0", "--output", "2nd-try.c"])
+    assert "int policy_2nd_try(" in (tmp_path / "2nd-try.c").read_text()
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [("json", ".json"), ("header", ".h")])
+def test_a_filter_becomes_json_or_a_header(tmp_path, kind, suffix):
+    assert main(f"export filter --sensors indoor --to {kind}".split()) == 0
+    text = (tmp_path / "results" / "export" / f"filter_indoor{suffix}").read_text()
+    if kind == "json":
+        assert json.loads(text)["choices"]["kind"] == "ukf"
+    else:
+        assert "static const double dt = 0.005;" in text
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("export", "POLICY"),
+        ("export pretrained", "needs an ENV_ID"),
+        ("export pd QuadGym/Hover-v0", "must be a trained network"),
+        ("export pretrained QuadGym/Hover-v1", "must be one of"),
+        ("export pretrained QuadGym/Hover-v0 --to json", "--to must be c or onnx for a policy"),
+        ("export pretrained QuadGym/Hover-v0 --to ros", "invalid choice"),
+        ("export pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
+        ("export pretrained QuadGym/Hover-v0 --sensors rtk", "give --env sensors=rtk"),
+        ("export pretrained QuadGym/Hover-v0 --env action=motor", "trained with action ctbr"),
+        ("export filter --to c", "--to must be header or json for a filter"),
+        ("export filter QuadGym/Hover-v0 --to json", "takes no ENV_ID"),
+        ("export filter --sensors gps --to json", "sensors must be one of"),
+        ("export nothing.npz", "there is no policy"),
+        ("export pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
+    ],
+)
+def test_nonsense_is_refused(line, message, capsys):
+    assert message in refused(line, capsys)

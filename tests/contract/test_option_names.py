@@ -1,0 +1,68 @@
+"""The same option has the same name and kind in every command; former names are understood."""
+
+import importlib
+import re
+from collections import defaultdict
+
+import pytest
+
+from quad_gym.commands.main import COMMANDS, main
+from quad_gym.commands.options import parse
+
+FORMER = {"--flights", "--first-seed", "--fly-on", "--fault", "--processes", "--envs", "--start"}
+
+
+def args_of(command):
+    name = "benchmark.main" if command == "benchmark" else command
+    return importlib.import_module(f"quad_gym.commands.{name}").Args
+
+
+def options_of(command, capsys):
+    """Kinds of the options of a command, such as INT or {} for choices, by their names."""
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    found = {}
+    for line in capsys.readouterr().out.splitlines():
+        option = re.match(r"(?:│|  ?)(?: )?(--[a-z-]+)(?:, --no-[a-z-]+| (\S+))?", line)
+        if option:
+            kind = re.sub(r"\{None\}\||[\[\]]", "", option[2] or "FLAG")
+            found[option[1]] = "{}" if kind.startswith("{") else kind
+    return found
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_show_no_former_names(command, capsys):
+    assert not FORMER & set(options_of(command, capsys))
+
+
+def test_options_of_one_name_are_of_one_kind(capsys):
+    kinds = defaultdict(dict)
+    for command in COMMANDS:
+        for option, kind in options_of(command, capsys).items():
+            kinds[option][command] = kind
+    for option, found in kinds.items():
+        if option == "--observation":  # one, or several for a comparison
+            continue
+        values = list(found.values())
+        assert all(value == values[0] for value in values), (option, found)
+    assert len(kinds["--seed"]) >= 7
+    assert len(kinds["--episodes"]) >= 6
+
+
+def test_former_names_are_understood():
+    args = parse(args_of("consistency"), ["--flights", "8", "--first-seed", "3", "--start", "warm"])
+    assert (args.flights, args.first_seed, args.start) == (8, 3, "warm")
+    assert args == parse(
+        args_of("consistency"), ["--episodes", "8", "--seed=3", "--filter-start", "warm"]
+    )
+    assert parse(args_of("circle"), ["--seeds=5"]).seeds == 5
+    assert parse(args_of("fly"), ["--fault", "rotor_loss"]).fault == ("rotor_loss",)
+    assert parse(args_of("tune"), ["--start", "tuned"]).start == "tuned"
+    assert parse(args_of("compare"), ["--seeds", "2"]).seeds == 2  # of trainings
+
+
+def test_ids_may_be_short():
+    for command in ("train", "evaluate", "compare"):
+        assert parse(args_of(command), ["hover"]).env_id == "QuadGym/Hover-v0"
+        assert parse(args_of(command), ["QuadGym/Hover-v0"]).env_id == "QuadGym/Hover-v0"
+        assert parse(args_of(command), ["Mine/Task-v0"]).env_id == "Mine/Task-v0"

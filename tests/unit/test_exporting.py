@@ -1,0 +1,310 @@
+"""Exported controllers act as the policies they come from; exported numbers are the filter's."""
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines.exporting import c_source, controller_of, filter_header, filter_numbers, save_onnx
+from baselines.exporting.actions import action_fields
+from baselines.mlp import MlpPolicy
+from quad_gym.packing.flight import params_record
+from quad_gym.params.suites import SUITES
+from quad_gym.records import PARAMS
+
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror")
+CIRCLE = "QuadGym/Circle-v0"
+KERNELS = Path(quad_gym.__file__).parent / "kernels" / "filter"
+
+
+def compiled(controller, folder):
+    """The exported C function over rows of observations; NaN where it returns 1."""
+    (folder / "it.c").write_text(c_source(controller, "it"))
+    library = folder / "it.so"
+    line = [COMPILER, *FLAGS, "-shared", "-fPIC", str(folder / "it.c"), "-o", str(library), "-lm"]
+    subprocess.run(line, check=True, capture_output=True)
+    function = ctypes.CDLL(str(library)).it
+
+    def act(observations):
+        actions = np.full((len(observations), 4), np.nan, np.float32)
+        status = [
+            function(row.ctypes.data_as(ctypes.c_void_p), action.ctypes.data_as(ctypes.c_void_p))
+            for row, action in zip(np.ascontiguousarray(observations), actions, strict=True)
+        ]
+        return actions, np.array(status)
+
+    return act
+
+
+def exact(controller, observations):
+    """The network in double precision."""
+    x = observations.astype(float)
+    rules = {"none": lambda x: x, "relu": lambda x: np.maximum(x, 0.0), "tanh": np.tanh}
+    policy = controller.policy
+    for W, b, rule in zip(policy.weights, policy.biases, policy.activations, strict=True):
+        x = rules[rule](x @ W.T.astype(float) + b)
+    return x.clip(-1.0, 1.0)
+
+
+def observations_in_flight(controller, count):
+    """What a policy sees in flight, (count, n), with some noise on its actions."""
+    rng, seen = np.random.default_rng(0), []
+    env = gymnasium.make_vec(controller.env_id, num_envs=count // 100, **controller.keywords)
+    observation, _ = env.reset(seed=0)
+    for _ in range(100):
+        seen.append(observation.copy())
+        action = controller.policy.predict(observation)[0]
+        observation, *_ = env.step(action + 0.1 * rng.standard_normal(action.shape))
+    env.close()
+    return np.concatenate(seen)
+
+
+def stable_baselines_file(folder, algorithm, keywords=None):
+    """An untrained policy of Stable-Baselines3."""
+    pytest.importorskip("stable_baselines3")
+    from baselines.models import make_model
+    from baselines.plans import Plan
+    from baselines.recipes import recipe
+
+    chosen = recipe(CIRCLE, algorithm).replace(n_envs=2)
+    if algorithm == "ppo":
+        chosen = chosen.replace(
+            activation="tanh", parameters={**chosen.parameters, "batch_size": 64}
+        )
+    plan = Plan(recipe=chosen, environment=keywords or {}, threads=1)
+    model = make_model(plan, plan.make_flights())
+    let_act(model)
+    model.save(folder / "policy.zip")
+    return folder / "policy.zip"
+
+
+def let_act(model):
+    """So that an untrained policy does more than nothing."""
+    import torch
+
+    for name, parameter in model.policy.named_parameters():
+        if "bias" in name:
+            torch.nn.init.uniform_(parameter, -0.5, 0.5)
+        if name == "action_net.weight":
+            parameter.data *= 50.0
+
+
+def compiled_ppo_file(folder):
+    """An untrained policy of the compiled PPO, as a training keeps it."""
+    from baselines.compiled_ppo.run import make_compiled
+    from baselines.plans import Plan, description
+    from baselines.recipes import recipe
+
+    plan = Plan(recipe=recipe(CIRCLE).replace(n_envs=2), threads=1)
+    model = make_compiled(plan)
+    model.networks.layers(model.networks.actor)[-1][0][:] *= 50.0
+    model.policy({"plan": description(plan)}).save(folder / "policy.npz")
+    return folder / "policy.npz"
+
+
+SOURCES = {
+    **{
+        kind: partial(lambda folder, env_id: controller_of("pretrained", env_id), env_id=env_id)
+        for env_id, kind in quad_gym.IDS.items()
+        if (Path(__file__).parents[2] / "baselines" / "pretrained" / f"{kind}.npz").exists()
+    },
+    "ppo": lambda folder: controller_of(str(stable_baselines_file(folder, "ppo")), CIRCLE),
+    "sac": lambda folder: controller_of(str(stable_baselines_file(folder, "sac")), CIRCLE),
+    "compiled_ppo": lambda folder: controller_of(str(compiled_ppo_file(folder))),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("source", SOURCES)
+def test_c_acts_as_the_policy_over_10000_observations_of_flights(source, tmp_path):
+    controller = SOURCES[source](tmp_path)
+    seen = observations_in_flight(controller, 10_000)
+    actions, status = compiled(controller, tmp_path)(seen)
+    assert not status.any()
+    assert actions.std(axis=0).min() > 1e-2
+    np.testing.assert_allclose(actions, controller.policy.predict(seen)[0], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(actions, exact(controller, seen), rtol=0.0, atol=1e-6)
+
+
+@needs_compiler
+def test_c_holds_observations_within_their_bounds(tmp_path):
+    controller = controller_of("pretrained", CIRCLE)
+    act = compiled(controller, tmp_path)
+    low, high = controller.bounds
+    for beyond, within in ((1e4 * high, high), (1e4 * low, low)):
+        np.testing.assert_array_equal(act(beyond[None])[0], act(within[None])[0])
+
+
+@needs_compiler
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [0, 27])
+def test_c_refuses_what_is_not_finite(bad, place, tmp_path):
+    observation = np.zeros((1, 28), np.float32)
+    observation[0, place] = bad
+    actions, status = compiled(controller_of("pretrained", CIRCLE), tmp_path)(observation)
+    assert status[0] == 1
+    np.testing.assert_array_equal(actions, 0.0)
+
+
+@needs_compiler
+@pytest.mark.parametrize("activation", ["relu", "tanh", "elu", "none"])
+def test_c_has_every_activation_and_odd_sizes(activation, tmp_path):
+    """Layers of 28, 5, 3 and 4 numbers: the sums of four at a time have a rest of each length."""
+    rng = np.random.default_rng(0)
+    sizes = (28, 5, 3, 4)
+    shapes = [(outputs, inputs) for inputs, outputs in pairwise(sizes)]
+    weights = [rng.normal(0, 0.4, shape).astype(np.float32) for shape in shapes]
+    biases = [rng.normal(0, 0.4, o).astype(np.float32) for o in sizes[1:]]
+    policy = MlpPolicy(weights, biases, [activation] * 3, {})
+    policy.save(tmp_path / "policy.npz")
+    controller = controller_of(str(tmp_path / "policy.npz"), CIRCLE)
+    seen = rng.standard_normal((200, 28)).astype(np.float32).clip(*controller.bounds)
+    actions, _ = compiled(controller, tmp_path)(seen)
+    np.testing.assert_allclose(actions, policy.predict(seen)[0], rtol=0.0, atol=2e-6)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_onnx_acts_as_the_policy_over_10000_observations_of_flights(source, tmp_path):
+    pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    controller = SOURCES[source](tmp_path)
+    assert save_onnx(controller, tmp_path / "it.onnx") < 1e-4
+    session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
+    seen = observations_in_flight(controller, 10_000)
+    (actions,) = session.run(None, {"observation": seen})
+    np.testing.assert_allclose(actions, controller.policy.predict(seen)[0], rtol=0.0, atol=1e-6)
+
+
+def test_onnx_says_what_observation_and_action_are(tmp_path):
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    save_onnx(controller_of("pretrained", CIRCLE), tmp_path / "it.onnx")
+    model = onnx.load(tmp_path / "it.onnx")
+    said = {p.key: json.loads(p.value) for p in model.metadata_props}
+    assert said["env_id"] == CIRCLE
+    assert said["control_rate_hz"] == 50.0
+    layout = quad_gym.observation_layout()
+    assert [f["name"] for f in said["observation"]] == [f.name for f in layout]
+    assert said["observation"][1] == {
+        "name": "velocity_error",
+        "first": 3,
+        "size": 3,
+        "unit": "m/s",
+        "frame": "B",
+    }
+    assert said["action"][1] == "body rate x = 6 a[1] rad/s in B"
+
+
+def test_onnx_that_acts_differently_is_not_written(tmp_path, monkeypatch):
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    controller = controller_of("pretrained", CIRCLE)
+    other = controller_of("pretrained", "QuadGym/Hover-v0")
+    monkeypatch.setattr(type(controller), "act", lambda self, seen: other.policy.predict(seen)[0])
+    with pytest.raises(RuntimeError, match="differ"):
+        save_onnx(controller, tmp_path / "it.onnx")
+    assert not (tmp_path / "it.onnx").exists()
+
+
+@pytest.mark.parametrize("action", ["ctbr", "motor", "wrench", "attitude", "velocity"])
+def test_zeros_hover_in_every_action(action):
+    """Actions of zero carry the weight and turn nothing, m g = 0.78 kg 9.8 m/s^2."""
+    params = params_record(quad_gym.vehicle_params("lab"), quad_gym.sensor_suite("lab"))[0]
+    offsets = [field.offset for field in action_fields(action, params)]
+    if action == "motor":
+        speed = np.sqrt(0.78 * 9.8 / 4 / float(params["kF"]))
+        np.testing.assert_allclose(offsets, speed / float(params["motor_gain"]))
+    else:
+        hovering = 0.0 if action == "velocity" else 0.78 * 9.8
+        np.testing.assert_allclose(offsets, [hovering, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("policy", "env_id", "keywords", "message"),
+    [
+        ("pd", CIRCLE, None, "must be a trained network"),
+        ("pd:lab", CIRCLE, None, "must be a trained network"),
+        ("pretrained", None, None, "needs an ENV_ID"),
+        ("pretrained", CIRCLE, {"action": "motor"}, "was trained with action ctbr"),
+        ("nothing.npz", None, None, "there is no policy"),
+        ("nothing.zip", None, None, "no training record"),
+        ("nothing.zip", CIRCLE, None, "there is no policy"),
+        ("nothing.txt", CIRCLE, None, "policy must be"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(policy, env_id, keywords, message):
+    with pytest.raises(ValueError, match=message):
+        controller_of(policy, env_id, keywords)
+
+
+def test_a_policy_that_sees_the_truth_is_refused(tmp_path):
+    keywords = {"privileged": True}
+    file = stable_baselines_file(tmp_path, "ppo", keywords)
+    with pytest.raises(ValueError, match="sees the truth"):
+        controller_of(str(file), CIRCLE, keywords)
+
+
+def test_names_that_are_no_identifiers_are_refused():
+    controller = controller_of("pretrained", CIRCLE)
+    for name in ("", "1st", "a-b", "é"):
+        with pytest.raises(ValueError, match="identifier"):
+            c_source(controller, name)
+
+
+# ---- the filter ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
+    found = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
+    source = "".join(file.read_text(encoding="utf-8") for file in KERNELS.rglob("*.py"))
+    read = set(re.findall(r"(?<![\w.])(?:p|params|model)\.(\w+)", source)) & set(PARAMS.names)
+    camera = {"camera", "R_CB", "pixel_size", "focal_length", "features", "pixel_sigma", "blur"}
+    camera |= {"noise_at_prediction", "noise_projected", "gradual_above"}
+    gates = {"gate_position", "gate_direction", "gate_uncertainty"}  # open ones are left out
+    present = quad_gym.sensor_suite(suite).camera is not None
+    assert read - set(found) <= gates | (set() if present else camera)
+    assert len(read) > 40
+
+
+def test_a_filters_numbers_are_those_of_the_report():
+    """Sampled noise of the laboratory's IMU from its densities, over the tick of 5 ms."""
+    found = filter_numbers(quad_gym.sensor_suite("lab"))
+    numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
+    imu = quad_gym.sensor_suite("lab").imu
+    assert numbers["dt"] == 0.005
+    assert numbers["accel_noise"] == pytest.approx(imu.accel_noise_density / np.sqrt(0.005))
+    assert numbers["gyro_bias_decay"] == pytest.approx(np.exp(-0.005 / imu.gyro_bias_tau))
+    assert numbers["features"] == [list(p) for p in quad_gym.sensor_suite("lab").camera.features_I]
+    assert found["choices"]["integration"] == "euler"
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+@needs_compiler
+@pytest.mark.parametrize("suite", SUITES)
+def test_a_filters_header_is_c99_with_the_same_numbers(suite, tmp_path):
+    numbers = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
+    (tmp_path / "filter.h").write_text(filter_header(quad_gym.sensor_suite(suite), suite))
+    scalar = [name for name, entry in numbers.items() if not isinstance(entry["value"], list)]
+    prints = "".join(f'    printf("%.17g\\n", {name});\n' for name in scalar)
+    prints += '    printf("%.17g\\n", R_IG[2][1]);\n'
+    program = f'#include <stdio.h>\n#include "filter.h"\nint main(void)\n{{\n{prints}}}\n'
+    (tmp_path / "it.c").write_text(program)
+    flags = [flag for flag in FLAGS if flag != "-Wextra"] + ["-Wno-unused"]
+    subprocess.run(
+        [COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(tmp_path / "it")], check=True
+    )
+    told = subprocess.run([tmp_path / "it"], check=True, capture_output=True, text=True).stdout
+    want = [numbers[name]["value"] for name in scalar] + [numbers["R_IG"]["value"][2][1]]
+    assert [float(line) for line in told.split()] == want
