@@ -23,7 +23,7 @@ from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_fig
 from quad_gym.analysis.metrics import bootstrap_interval
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, sensors_of, usage_errors
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params.suites import sensor_suite
@@ -40,7 +40,8 @@ class Args:
     pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz)"""
     observation: tuple[str, ...] = ("truth", "estimate")
     """what to fly on: estimate, truth, noisy"""
-    sensors: SuiteName = "standard"
+    sensors: SuiteName | None = None
+    """if not given, the task's: standard, or one_wall for LookAround"""
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false gnss_rate=10"""
     episodes: int = 1000
@@ -91,12 +92,13 @@ def make_flights(args: Args, observation: str, count: int) -> Any:
     names = ("observation", "sensors", "threads")
     keywords = dict(leave(args.env, {name: f"--{name}" for name in names}))
     if observation in ("truth", "noisy") and "faults" in keywords:
-        keywords["faults"] = felt_without_sensors(keywords["faults"], sensor_suite(args.sensors))
+        suite = sensor_suite(sensors_of(args.env_id, args.sensors))
+        keywords["faults"] = felt_without_sensors(keywords["faults"], suite)
     return gymnasium.make_vec(
         args.env_id,
         num_envs=count,
         observation=observation,
-        sensors=args.sensors,
+        sensors=sensors_of(args.env_id, args.sensors),
         threads=args.threads,
         **keywords,
     )
@@ -217,8 +219,8 @@ def main(args: Args) -> None:
         tracers[case] = Tracer()
         results[case] = roll_out(policy, env, seed=args.seed, watch=tracers[case].add)
     print(
-        f"\n{args.env_id}, sensors {args.sensors}; {args.episodes:,} episodes in each case, "
-        f"from seed {args.seed}.\n"
+        f"\n{args.env_id}, sensors {sensors_of(args.env_id, args.sensors)}; "
+        f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"
     )
     print(table(results, next(iter(cases.values()))[1]))
     if args.episodes > 1:
