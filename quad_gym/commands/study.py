@@ -12,6 +12,7 @@ numbers and a report. Each training is a folder: a study that was stopped goes o
 and a folder that is deleted is made again, and nothing else.
 """
 
+import csv
 import runpy
 import time
 from dataclasses import dataclass, field
@@ -151,9 +152,7 @@ def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
 def test_flights(study: Study, arm: Arm, count: int) -> Any:
     """The environment of the test: on the estimate."""
     keywords = {**study.environment, **arm.environment, "observation": "estimate"}
-    return gymnasium.make_vec(
-        study.env_id, num_envs=count, threads=study.threads, autoreset_mode="Disabled", **keywords
-    )
+    return gymnasium.make_vec(study.env_id, num_envs=count, threads=study.threads, **keywords)
 
 
 def train_all(study: Study) -> None:
@@ -202,9 +201,10 @@ def curves_of(study: Study) -> dict[Any, Any]:
         for seed in study.seeds_of(arm):
             if arm.policy is None:
                 file = study.run_folder(arm, seed) / EVALUATIONS
-                rows: Any = np.genfromtxt(file, delimiter=",", names=True, dtype=np.float64)
-                rows = np.atleast_1d(rows)
-                found[arm.name, seed] = (rows["steps"] / 1e6, rows["return"])
+                with file.open(encoding="utf-8", newline="") as stream:
+                    rows = [(float(r["steps"]), float(r["return"])) for r in csv.DictReader(stream)]
+                steps, returns = np.array(rows).T
+                found[arm.name, seed] = (steps / 1e6, returns)
     return found
 
 

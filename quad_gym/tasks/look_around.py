@@ -21,7 +21,7 @@ HEADING_WEIGHT = 0.1
 with 0.2 one that never looks comes close to both (docs/where-it-matters.md)."""
 
 CRASH_COST = 2.0
-"""Once, as much as ten steps of perfect tracking; beside it, a crash costs the time that was left."""
+"""Once, as much as ten steps of perfect tracking; a crash also costs the time that was left."""
 
 
 class LookAround(Task):
