@@ -43,8 +43,7 @@ class Arm(Checked):
             raise ValueError(f"Arm {self.name} must not be trained, as its policy is {self.policy}")
 
 
-_SIGMA = {"include_covariance": True}
-_MEMORY = {"custom": "baselines.arm_tasks:Remembering"}
+_DOUBTING = {"custom": "baselines.arm_tasks:Doubting"}
 
 ARMS = (
     Arm(name="pd_reference", label="PD, facing as rewarded", policy="pd"),
@@ -53,21 +52,21 @@ ARMS = (
         name="pd_unsure",
         label="PD, facing the features when unsure",
         policy="pd:features_when_unsure",
-        environment=_SIGMA,
+        environment={"include_covariance": True},
     ),
     Arm(name="truth", label="truth", training={"observation": "truth"}),
     Arm(name="noisy", label="truth + independent noise", training={"observation": "noisy"}),
     Arm(name="estimate", label="estimate"),
-    Arm(name="sigma", label="estimate + standard deviations", environment=_SIGMA),
+    Arm(name="sigma", label="estimate + standard deviations", environment=_DOUBTING),
     Arm(
         name="memory",
         label="estimate + standard deviations + memory",
-        environment={**_SIGMA, **_MEMORY},
+        environment={"custom": "baselines.arm_tasks:Remembering"},
     ),
     Arm(
         name="sure",
         label="estimate + standard deviations, paid for being sure",
-        environment=_SIGMA,
+        environment=_DOUBTING,
         learning={"custom": "baselines.arm_tasks:Sure"},
     ),
 )

@@ -138,11 +138,11 @@ def configure(args: Args) -> Study:
 
 def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
     """How an arm is trained."""
-    learning = {**study.recipe.flights, **arm.learning}
     return Plan(
         env_id=study.env_id,
         environment={**study.environment, **arm.environment, **arm.training},
-        recipe=study.recipe.replace(flights=learning),
+        learning=arm.learning,
+        recipe=study.recipe,
         seed=seed,
         engine="compiled",
         threads=study.threads,

@@ -44,7 +44,9 @@ def test_the_interval_of_a_fixed_rule_is_that_of_a_mean_over_episodes():
     found = estimated([values])
     half = norm.ppf(0.975) * values.std() / np.sqrt(400)
     np.testing.assert_allclose(found.value, values.mean())
-    np.testing.assert_allclose([found.low, found.high], values.mean() + [-half, half], atol=0.03)
+    np.testing.assert_allclose(
+        [found.low, found.high], values.mean() + half * np.array([-1, 1]), atol=0.03
+    )
 
 
 def test_the_interval_holds_the_spread_of_trainings():
@@ -54,7 +56,9 @@ def test_the_interval_holds_the_spread_of_trainings():
     assert found.value == 2.0
     rng = np.random.default_rng(3)  # resampled without the code under test
     middle = [np.sort(rng.choice(levels, 5))[1:4].mean() for _ in range(20_000)]
-    np.testing.assert_allclose([found.low, found.high], np.percentile(middle, [2.5, 97.5]), atol=0.2)
+    np.testing.assert_allclose(
+        [found.low, found.high], np.percentile(middle, [2.5, 97.5]), atol=0.2
+    )
 
 
 def test_intervals_of_normal_samples_hold_their_mean_as_often_as_they_say():
