@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
 TYPICAL = np.repeat([0.03, 0.03, 0.01, 0.03, 0.001], 3)
-"""Standard deviations of position [m], velocity [m/s], attitude [rad] and biases [m/s^2], [rad/s] of
-a filter that sees markers."""
+"""Standard deviations of a filter that sees markers: of position [m], velocity [m/s], attitude
+[rad], and biases [m/s^2] and [rad/s]."""
 
 EVERY = 10
 """Steps between what is remembered: 0.2 s at 50 Hz."""
