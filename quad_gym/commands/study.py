@@ -103,6 +103,8 @@ def configure(args: Args) -> Study:
         OSError: If nothing can be written to the folder.
         ImportError: If matplotlib is missing.
     """
+    from baselines.compiled_ppo.run import make_compiled
+
     plots.require_matplotlib()
     if IDS.get(args.env_id) not in BENCHMARKS:
         known = ", ".join(env_id for env_id, task in IDS.items() if task in BENCHMARKS)
@@ -130,7 +132,9 @@ def configure(args: Args) -> Study:
     )
     for arm in study.arms:
         if arm.policy is None:
-            plan_of(study, arm, study.seeds[0]).make_judge().close()
+            plan = plan_of(study, arm, study.seeds[0])
+            make_compiled(plan).env.close()
+            plan.make_judge().close()
         test_flights(study, arm, 1).close()
     require_writable("--output", study.folder)
     return study
