@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     from quad_gym.tasks.draws import FlightRandom
     from quad_gym.tasks.view import View
 
-TYPICAL = np.repeat([0.03, 0.03, 0.01, 0.03, 0.001], 3)
-"""Standard deviations of a filter that sees markers: of position [m], velocity [m/s], attitude
-[rad], and biases [m/s^2] and [rad/s]."""
+TYPICAL = 0.03
+"""Standard deviation of the position of a filter that sees markers [m]."""
 
 EVERY = 10
 """Steps between what is remembered: 0.2 s at 50 Hz."""
@@ -31,20 +30,21 @@ Parts = dict[str, NDArray[np.float64]]
 
 
 class Doubting(LookAround):
-    """`LookAround` whose observation has the filter's standard deviations, as logarithms.
+    """`LookAround` whose observation also says how sure the filter is of its position.
 
-    log10(sigma / typical), so that a network sees a doubling alike whether it is of millimeters or
-    of meters; the 15 of `include_covariance=True` lie between 1e-4 and 10.
+    As log10(sigma / TYPICAL) of the largest standard deviation, so that a network sees a doubling
+    alike whether it is of millimeters or of meters.
     """
 
     observes: Mapping[str, Observed] = {
         **LookAround.observes,
-        "log_sigma": Observed("log10", "-", -6.0, 6.0),
+        "log_sigma": Observed("log10", "I", -6.0, 6.0),
     }
 
     def observe(self, view: "View") -> Parts:
-        """`features_direction` (n, 3), and `log_sigma` (n, 15)."""
-        return {**super().observe(view), "log_sigma": np.log10(view.estimate.sigma / TYPICAL)}
+        """`features_direction` (n, 3), and `log_sigma` (n,)."""
+        sigma = view.estimate.position_sigma.max(axis=1)
+        return {**super().observe(view), "log_sigma": np.log10(sigma / TYPICAL)}
 
 
 class Remembering(Doubting):

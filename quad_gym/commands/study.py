@@ -38,6 +38,8 @@ from quad_gym.commands.study_words import conclusions
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.params import checks as check
 
+EVALUATED = 9
+"""How often a policy is evaluated over its training, to keep the best one."""
 QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 
 
@@ -146,10 +148,11 @@ def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
         env_id=study.env_id,
         environment={**study.environment, **arm.environment, **arm.training},
         learning=arm.learning,
-        recipe=study.recipe,
+        recipe=study.recipe.replace(parameters={**study.recipe.parameters, **arm.parameters}),
         seed=seed,
         engine="compiled",
         threads=study.threads,
+        evaluations=EVALUATED,
     )
 
 

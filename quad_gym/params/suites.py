@@ -226,6 +226,10 @@ ONE_WALL = INDOOR.replace(
         focal_length=3325.0,  # 3840 pixels over 60 degrees: 1920 / tan(30 degrees)
         features_I=tuple((-8.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (0.8, 2.8)),
     ),
+    # as above, but of LookAround with PD control that faces the wall, 127 flights
+    noisy=NoisyObservationParams(
+        position=0.0079, velocity=0.0139, attitude=0.00089, body_rates=0.0107
+    ),
 )
 """For `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west wall."""
 
