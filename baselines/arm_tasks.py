@@ -38,13 +38,16 @@ class Doubting(LookAround):
 
     observes: Mapping[str, Observed] = {
         **LookAround.observes,
-        "log_sigma": Observed("log10", "I", -6.0, 6.0),
+        "log_sigma": Observed("log10", "I", -1.0, 6.0),
     }
 
     def observe(self, view: "View") -> Parts:
         """`features_direction` (n, 3), and `log_sigma` (n,)."""
-        sigma = view.estimate.position_sigma.max(axis=1)
-        return {**super().observe(view), "log_sigma": np.log10(sigma / TYPICAL)}
+        try:
+            sigma = view.estimate.position_sigma.max(axis=1)
+        except ValueError:  # no filter runs: who sees the truth has no doubt
+            sigma = np.zeros(view.count)
+        return {**super().observe(view), "log_sigma": np.log10(np.maximum(sigma, 1e-9) / TYPICAL)}
 
 
 class Remembering(Doubting):

@@ -74,6 +74,24 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     return _stable_baselines_policy(file, env)
 
 
+def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
+    """Keywords that make an environment show a policy what it needs, beyond what the id says.
+
+    Args:
+        name: As `load_policy` takes it.
+        env_id: One of `quad_gym.IDS`.
+
+    Raises:
+        ValueError: If no policy ships for the task and "pretrained" is asked for.
+    """
+    if name == "pd:features_when_unsure":
+        return {"include_covariance": True}
+    if name != "pretrained":
+        return {}
+    trained = MlpPolicy.load(pretrained_file(env_id)).record["plan"]["environment"]
+    return {key: trained[key] for key in ("custom", "include_covariance") if key in trained}
+
+
 def _gains_of(file: Path) -> PDGains:
     """PD gains as `scripts/tune.py` writes them."""
     if not file.exists():

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import gymnasium
 
-from baselines.policies import load_policy, task_of
+from baselines.policies import keywords_of_policy, load_policy, task_of
 from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
@@ -79,7 +79,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     cases: dict[Case, tuple[Policy, Any]] = {}
     for observation in args.observation:
         for name in args.policy:
-            env = make_flights(args, observation, args.episodes)
+            env = make_flights(args, observation, args.episodes, name)
             cases[name, observation] = (load_policy(name, env), env)
     require_writable("--output", folder)
     if args.video != "none":
@@ -87,10 +87,11 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     return cases, folder
 
 
-def make_flights(args: Args, observation: str, count: int) -> Any:
-    """The environment of an observation."""
+def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
+    """The environment of an observation, as a policy needs it."""
     names = ("observation", "sensors", "threads")
-    keywords = dict(leave(args.env, {name: f"--{name}" for name in names}))
+    given = leave(args.env, {name: f"--{name}" for name in names})
+    keywords = {**keywords_of_policy(policy, args.env_id), **given}
     if observation in ("truth", "noisy") and "faults" in keywords:
         suite = sensor_suite(sensors_of(args.env_id, args.sensors))
         keywords["faults"] = felt_without_sensors(keywords["faults"], suite)
@@ -110,7 +111,7 @@ def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path
 
     files = []
     for name, observation in tqdm(cases, desc="filming", unit=" videos"):
-        env = make_flights(args, observation, 1)
+        env = make_flights(args, observation, 1, name)
         about = {"env_id": args.env_id, "policy": name, "observation": observation}
         flight = flight_of(load_policy(name, env), env, seed=args.seed, about=about)
         stem = _short(name).replace("/", "_").replace(":", "_")

@@ -25,7 +25,7 @@ import gymnasium
 import numpy as np
 from tyro.conf import arg
 
-from baselines.policies import load_policy
+from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
@@ -168,7 +168,8 @@ def make_env(args: Args) -> Any:
     """
     options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
-    keywords = leave(args.env, {**named, "faults": "--fault"})
+    given = leave(args.env, {**named, "faults": "--fault"})
+    keywords = {**keywords_of_policy(args.policy, ID_OF_TASK[args.task]), **given}
     return gymnasium.make_vec(
         ID_OF_TASK[args.task],
         num_envs=1,

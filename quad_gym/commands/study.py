@@ -32,7 +32,7 @@ from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import EnvId, Keywords, leave, usage_errors
 from quad_gym.commands.study_flights import Flown, fly
-from quad_gym.commands.study_report import table_text, write_report
+from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
 from quad_gym.commands.study_words import conclusions
 from quad_gym.envs.benchmarks import BENCHMARKS
@@ -72,6 +72,9 @@ class Args:
     half is below this [m]"""
     threads: int | None = None
     """of flights and learning; if not given, one per core; no result depends on them"""
+    page: Path | None = None
+    """write table and conclusions into this page, too, between its marks for the task, and the
+    figures to the folder images beside it"""
     output: Path | None = None
     """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
 
@@ -138,6 +141,8 @@ def configure(args: Args) -> Study:
             make_compiled(plan).env.close()
             plan.make_judge().close()
         test_flights(study, arm, 1).close()
+    if args.page is not None:
+        marks_of(args.page, task)
     require_writable("--output", study.folder)
     return study
 
@@ -237,6 +242,8 @@ def main(args: Args) -> None:
     for sentence in conclusions(results):
         print(sentence)
     written = write_report(results)
+    if args.page is not None:
+        written = [*update_page(results, args.page), *written]
     print(
         f"\nWrote {len(written)} files to {study.folder} after "
         f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."

@@ -109,6 +109,68 @@ def write_report(results: Results) -> list[Path]:
     return [*written, _page(results, figures)]
 
 
+def marks_of(page: Path, task: str) -> tuple[str, str, str]:
+    """What a page holds before, between and after the marks of a study.
+
+    Raises:
+        ValueError: If there is no such page, or it lacks the marks.
+    """
+    first, last = f"<!-- study: {task} -->\n", f"<!-- /study: {task} -->"
+    text = page.read_text(encoding="utf-8") if page.is_file() else ""
+    before, found, rest = text.partition(first)
+    between, ended, after = rest.partition(last)
+    if not (found and ended):
+        raise ValueError(f"--page must be a page with the marks {first.strip()} {last}, got {page}")
+    return before + first, between, last + after
+
+
+def page_text(results: Results) -> str:
+    """What stands between the marks of a page: the setting, the table, and the conclusions."""
+    study = results.study
+    gains = [
+        f"{results.arm(name).label}: {number(results.improvement(name, 'truth'), 2)}"
+        for name in results.trained()
+        if name != "truth" and "truth" in results.trained()
+    ]
+    return "\n".join(
+        [
+            f"{len(study.seeds)} training seeds of {study.recipe.steps:,} steps, "
+            f"{study.episodes:,} test episodes with each policy. Success: flown to the end, with a "
+            f"mean position error below {study.within:g} m in the second half.",
+            "",
+            table_markdown(results),
+            "",
+            *(f"- {sentence}" for sentence in conclusions(results)),
+            *(
+                [
+                    "- Probability that a training returns more than one on truth: "
+                    + "; ".join(gains)
+                    + "."
+                ]
+                if gains
+                else []
+            ),
+            "",
+        ]
+    )
+
+
+def update_page(results: Results, page: Path) -> list[Path]:
+    """Write a study into a page, and its figures beside it; return what was written."""
+    from quad_gym import IDS
+
+    task = IDS[results.study.env_id]
+    before, _, after = marks_of(page, task)
+    page.write_text(before + page_text(results) + after, encoding="utf-8")
+    images = page.parent / "images"
+    images.mkdir(exist_ok=True)
+    written = [page]
+    for name, figure in _figures(results).items():
+        written.append(images / f"{task}_{name}.png")
+        figure.savefig(written[-1], dpi=130)
+    return written
+
+
 def _figures(results: Results) -> dict[str, Any]:
     study, found = results.study, {}
     curves = {
