@@ -1,6 +1,5 @@
 """State estimation for one vehicle: Wahba's problem, an unscented and an extended Kalman filter."""
 
-import functools
 import warnings
 from typing import Any
 
@@ -8,12 +7,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.kernels import single
-from quad_gym.kernels.compiling.workers import prepare
-from quad_gym.packing.flight import form_of, params_record
+from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.compiling.stages import Stage
+from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FEATURE_BLOCKS, FLIGHT, WORK, FilterForm, FilterStatus
+from quad_gym.records import (
+    FEATURE_BLOCKS,
+    FLIGHT_BLOCK,
+    SETTINGS,
+    WORK_BLOCK,
+    FilterForm,
+    FilterStatus,
+    aligned_zeros,
+)
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
@@ -54,12 +62,6 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
     return R_BI
 
 
-@functools.cache
-def _prepare(drifts: bool) -> None:
-    """Compile what a filter calls, side by side, unless this process has it."""
-    prepare(single.DRIFT_FILTER if drifts else single.FILTER)
-
-
 def _require_relative(position_G: NDArray[np.float64]) -> None:
     """Refuse a first fix that is no place near the reference antenna."""
     if np.abs(position_G).max() > FARTHEST_FIX:
@@ -71,7 +73,10 @@ def _require_relative(position_G: NDArray[np.float64]) -> None:
 
 
 class _KalmanFilter:
-    """What the filters have in common: their interface, and all but the kind of their kernels."""
+    """What the filters have in common: their interface, and all but the kind of their kernels.
+
+    They run the stages of flights on one block, all of whose lanes hold the same flight.
+    """
 
     _kind: str
 
@@ -81,15 +86,17 @@ class _KalmanFilter:
         sensors.require_filter()
         self.sensors = sensors
         self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-        self._params = params_record(VehicleParams(), sensors)
-        self._params["gravity"] = sensors.estimator.gravity
+        params = params_record(VehicleParams(), sensors)
+        params["gravity"] = sensors.estimator.gravity
+        self._params = params_block(params)
         lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
         estimator = sensors.estimator.replace(kind=self._kind)
         form = form_of(estimator, innovations=True, lever_arm=lever_arm)
-        self._form = int(form)
-        self._flight = np.zeros(1, FLIGHT)
-        self._flight["block_nis"] = self._flight["w_before"] = np.nan
-        self._work = np.zeros(1, WORK)
+        self._settings = np.zeros(1, SETTINGS)
+        self._settings["form"], self._settings["feature_count"] = int(form), self._features
+        self._flight = aligned_zeros(1, FLIGHT_BLOCK)
+        self._work = aligned_zeros(1, WORK_BLOCK)
+        self._work["mask"] = 1.0
         self._running = False
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -125,7 +132,8 @@ class _KalmanFilter:
         if heading is not None:
             angle = check.number("heading", heading)
             x_I[:2] = np.cos(angle), np.sin(angle)
-        self._flight["gnss_position"], self._flight["gnss_baseline"] = position, baseline
+        self._set("gnss_position", position)
+        self._set("gnss_baseline", baseline)
         self._start(x_I)
         self._running = True
 
@@ -171,17 +179,40 @@ class _KalmanFilter:
             check.array("gyro_bias", gyro_bias, (3,)),
         )
         self._start(np.zeros(3))  # what the filter remembers begins anew; the estimate is given
-        for name, value in zip(_STATE, values, strict=True):
-            self._flight[name] = value
-        self._flight["L"] = L
+        for name, value in zip((*_STATE, "L"), (*values, L), strict=True):
+            self._set(name, value)
         self._running = True
 
     def _start(self, x_I: NDArray[np.float64]) -> None:
         """Start from the fix in the record, with clocks at zero and nothing remembered."""
-        _prepare(self.sensors.drifts)
+        self._table()
         self._flight["tick"], self._flight["w_before"] = 0.0, np.nan
-        self._flight["rejected_in_row"] = self._flight["reopened"] = 0.0
-        single.ukf_initialize(self._flight, self._params, x_I)
+        single.start_filter(self._flight, self._params, self._settings, self._work, x_I)
+
+    def _table(self) -> NDArray[Any]:
+        """The table of the stages that the filter runs."""
+        drifts = self.sensors.drifts
+        stages = single.DRIFT_FILTER_STAGES if drifts else single.FILTER_STAGES
+        return linked_table(stages, single.FILTER_ENTRIES)
+
+    def _run(self, stage: Stage, with_drift: Stage) -> None:
+        """Run a stage, or the one of a filter that estimates the slow error of GNSS; warn of news.
+
+        News are what goes wrong in it.
+        """
+        chosen = with_drift if self.sensors.drifts else stage
+        before, p = self.status, self._params
+        others = (p, p, self._settings, self._work, self._table(), self._features)
+        single.run_stage(self._flight.ctypes.data, 0, 1, chosen, *others)
+        news = self.status & ~before
+        if news:
+            warnings.warn(
+                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
+            )
+
+    def _set(self, name: str, value: NDArray[Any]) -> None:
+        """Write a field of the flight."""
+        self._flight[name][0] = value[..., np.newaxis]
 
     def update(
         self,
@@ -226,19 +257,16 @@ class _KalmanFilter:
         f["velocity_valid"] = velocity is not None
         f["feature_valid"] = 0.0
         if position is not None:
-            f["gnss_position"] = position
+            self._set("gnss_position", position)
         if baseline is not None:
-            f["gnss_baseline"] = baseline
+            self._set("gnss_baseline", baseline)
         if velocity is not None:
-            f["gnss_velocity"] = velocity
+            self._set("gnss_velocity", velocity)
         if image is not None:
-            seen = np.asarray(~np.isnan(image).any(axis=1))
+            seen = np.asarray(~np.isnan(image).any(axis=1))[:, np.newaxis]
             f["feature_valid"][0, : self._features] = seen
-            f["pixels"][0, : self._features] = np.where(seen[:, np.newaxis], image, 0.0)
-        before = self.status
-        run = single.drift_update if self.sensors.drifts else single.ukf_update
-        run(f, self._params, self._work, self._features, self._form)
-        self._warn_of_news(before)
+            f["pixels"][0, : self._features] = np.where(seen, image, 0.0)[..., np.newaxis]
+        self._run(Stage.UPDATE, Stage.UPDATE_WITH_DRIFT)
 
     def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
         """Carry the estimate over one tick.
@@ -256,16 +284,15 @@ class _KalmanFilter:
         self._require_start()
         rates = check.array("gyro", gyro, (3,))
         force = check.array("accel", accel, (3,))
-        self._flight["gyro"], self._flight["accel"] = rates, force
+        f = self._flight
+        known = np.isfinite(f["w_before"]).all()
+        self._set("gyro", rates)
+        self._set("accel", force)
+        f["tick"] += 1.0
         # they turn the lever arms of a velocity and of the accelerometer
-        self._flight["tick"] += 1.0
-        known = np.isfinite(self._flight["w_before"]).all()
-        self._flight["w_before"] = self._flight["w_meas"] if known else rates
-        self._flight["w_meas"] = rates
-        before = self.status
-        run = single.drift_predict if self.sensors.drifts else single.ukf_predict
-        run(self._flight, self._params, self._work, self._form)
-        self._warn_of_news(before)
+        f["w_before"] = f["w_meas"] if known else f["gyro"]
+        f["w_meas"] = f["gyro"]
+        self._run(Stage.PREDICT, Stage.PREDICT_WITH_DRIFT)
 
     # ---- the estimate -------------------------------------------------------------------------
 
@@ -317,12 +344,12 @@ class _KalmanFilter:
     @property
     def status(self) -> FilterStatus:
         """What has gone wrong since the start; `FilterStatus(0)` when nothing has."""
-        return FilterStatus(int(self._flight["filter_status"][0]))
+        return FilterStatus(int(self._flight["filter_status"][0, 0]))
 
     @property
     def nis(self) -> tuple[float, int]:
         """Normalized innovation squared of the last update, and how many measurements it had."""
-        return float(self._flight["nis"][0]), int(self._flight["nis_dimension"][0])
+        return float(self._flight["nis"][0, 0]), int(self._flight["nis_dimension"][0, 0])
 
     @property
     def block_nis(self) -> NDArray[np.float64]:
@@ -340,7 +367,7 @@ class _KalmanFilter:
 
     def _read(self, name: str) -> NDArray[Any]:
         self._require_start()
-        return np.array(self._flight[name][0])
+        return np.array(self._flight[name][0, ..., 0])
 
     def _require_start(self) -> None:
         if not self._running:
@@ -357,13 +384,6 @@ class _KalmanFilter:
             raise ValueError("gnss_baseline_G must have a direction, got zeros")
         # its length does not count: by a power of two it comes near one, exactly
         return np.ldexp(baseline, -int(np.frexp(largest)[1]))
-
-    def _warn_of_news(self, before: FilterStatus) -> None:
-        news = self.status & ~before
-        if news:
-            warnings.warn(
-                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
-            )
 
 
 class UnscentedKalmanFilter(_KalmanFilter):

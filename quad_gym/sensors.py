@@ -169,8 +169,8 @@ class Imu(_Sensor):
             )
         if since is not None:
             self._set(self._start, checked_state(since, "since"))
-        self._place(s["position"], s["R_BI"])
         f = self._flight
+        f["instant"] += 1
         self._set(f, s)
         f["disturbance"] = force
         if self._averages:

@@ -1,10 +1,19 @@
-"""Settings of all tests: reproducible examples and no time limit, as the first one compiles."""
+"""Settings of all tests: reproducible examples, no time limit, and how many threads there are."""
+
+import os
 
 from hypothesis import HealthCheck, settings
 
+from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.kernels.compiling.linked import names_of
 from quad_gym.kernels.compiling.stages import SOURCES
 from quad_gym.kernels.compiling.workers import prepare
+from quad_gym.kernels.single import FILTER_ENTRIES, SENSORS_AND_VEHICLE
+
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # for this process and those that it starts
+    share = str(max(1, available_cores() // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))
+    for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, share)
 
 settings.register_profile(
     "quad_gym",
@@ -17,6 +26,6 @@ settings.load_profile("quad_gym")
 
 
 def pytest_sessionstart(session):
-    """Compile all stages first where tests run in several processes, which then only load them."""
+    """Compile what tests share where they run in several processes, which then only load it."""
     if getattr(session.config.option, "numprocesses", None):
-        prepare(names_of(frozenset(SOURCES)))
+        prepare([*names_of(frozenset(SOURCES)), *FILTER_ENTRIES, *SENSORS_AND_VEHICLE])

@@ -1,18 +1,16 @@
-"""The filter's kernels for blocks of flights, and how flights get into their blocks."""
+"""The filter's stages for blocks of flights, and how flights get into their blocks."""
 
 import numpy as np
 
-from quad_gym.kernels.compiling import entry
-from quad_gym.kernels.filter.align import initialize
-from quad_gym.kernels.filter.predict import predict
-from quad_gym.kernels.filter.update import update
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.compiling import Stage
+from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.single import FILTER_ENTRIES, FILTER_STAGES, run_stage, start_filter
 from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
-    FLIGHT,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
+    SETTINGS,
     WIDTH,
     WORK_BLOCK,
     aligned_zeros,
@@ -22,24 +20,6 @@ from quad_gym.records import (
 EIGHT = 8
 """Filters that fly together: one block or more, as lanes are 2, 4 or 8."""
 STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L")
-
-
-@entry
-def initialize_lanes(blocks, params, work):
-    begins, unknown = lanes_of(work[0]).begins > 0.0, (0.0, 0.0, 0.0)
-    initialize(lanes_of(blocks[0]), lanes_of(params[0]), begins, unknown)
-
-
-@entry
-def update_lanes(blocks, params, work, feature_count, form):
-    scratch = lanes_of(work[0])
-    chosen = scratch.begins > 0.0
-    update(lanes_of(blocks[0]), lanes_of(params[0]), scratch, feature_count, chosen, form)
-
-
-@entry
-def predict_lanes(blocks, params, work, form):
-    predict(lanes_of(blocks[0]), lanes_of(params[0]), lanes_of(work[0]), form)
 
 
 class LaneFilter:
@@ -52,6 +32,7 @@ class LaneFilter:
         self.params[:] = params_block(params_record(VehicleParams(), sensors))
         self.blocks = aligned_zeros(EIGHT // WIDTH, FLIGHT_BLOCK)
         self.work = aligned_zeros(1, WORK_BLOCK)
+        self.settings = np.zeros(1, SETTINGS)
 
     def put(self, number, **values):
         """Set fields of one flight."""
@@ -68,14 +49,6 @@ class LaneFilter:
     def get(self, name):
         """A field of all flights, (EIGHT, ...)."""
         return field_of_flights(self.blocks, name, EIGHT)
-
-    def flight(self, number):
-        """One flight as a scalar record."""
-        block, lane = divmod(number, WIDTH)
-        record = np.zeros(1, FLIGHT)
-        for name in FLIGHT.names:
-            record[name][0] = self.blocks[name][block, ..., lane]
-        return record
 
     def measure(self, number, recording, k, *, position=True, baseline=True, camera=True):
         """Hand one flight what a recording holds at tick k; what is not measured becomes NaN."""
@@ -96,19 +69,25 @@ class LaneFilter:
         self.blocks["pixels"][block, : self.features, :, lane] = shown
 
     def initialize(self, mask=(True,) * EIGHT):
-        for block, params in self._each(mask):
-            initialize_lanes(block, params, self.work)
+        for block, params, settings, work in self._each(mask):
+            start_filter(block, params, settings, work, np.zeros(3))
 
     def update(self, mask=(True,) * EIGHT):
-        for block, params in self._each(mask):
-            update_lanes(block, params, self.work, self.features, self.form)
+        self._run(Stage.UPDATE, mask)
 
     def predict(self):
-        for block, params in self._each((True,) * EIGHT):
-            predict_lanes(block, params, self.work, self.form)
+        self._run(Stage.PREDICT, (True,) * EIGHT)
+
+    def _run(self, stage, mask):
+        table = linked_table(FILTER_STAGES, FILTER_ENTRIES)
+        for block, params, settings, work in self._each(mask):
+            run_stage(
+                block.ctypes.data, 0, 1, stage, params, params, settings, work, table, self.features
+            )
 
     def _each(self, mask):
-        """Blocks and their parameters, one by one, the part of a mask that is theirs in force."""
-        for k, begins in enumerate(np.reshape(mask, (-1, WIDTH))):
-            self.work["begins"][0] = begins
-            yield self.blocks[k : k + 1], self.params[k : k + 1]
+        """Blocks and what they need, one by one, the part of a mask that is theirs in force."""
+        self.settings["form"], self.settings["feature_count"] = self.form, self.features
+        for k, chosen in enumerate(np.reshape(mask, (-1, WIDTH))):
+            self.work["mask"][0] = chosen
+            yield self.blocks[k : k + 1], self.params[k : k + 1], self.settings, self.work

@@ -30,6 +30,9 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.checks import Vector
 from quad_gym.params.world import world_params
 
+SETTLED = 1.0
+"""Errors count from here on [s]."""
+
 
 @dataclass(frozen=True)
 class Args:
@@ -55,8 +58,9 @@ class Args:
         """Check the numbers."""
         if self.flights < 2:
             raise ValueError(f"--flights must be at least 2, got {self.flights}")
-        if not (math.isfinite(self.duration) and self.duration > 0.0):
-            raise ValueError(f"--duration must be above 0, got {self.duration}")
+        least = SETTLED + 0.1
+        if not (math.isfinite(self.duration) and self.duration >= least):
+            raise ValueError(f"--duration must be at least {least:g} s, got {self.duration:g}")
 
 
 @dataclass(frozen=True)
@@ -220,7 +224,7 @@ def time_ticks(cases: list[Case], args: Args) -> list[float]:
 
 def row_of(findings: Findings) -> dict[str, float]:
     """The numbers of a case."""
-    squares = (findings.errors**2)[findings.nees["state"].time >= 1.0]
+    squares = (findings.errors**2)[findings.nees["state"].time >= SETTLED]
     rms = {
         f"rms_{name}": float(np.sqrt(squares[:, part].sum(axis=1).mean()))
         for name, part in PARTS.items()
@@ -281,7 +285,7 @@ def main(args: Args) -> None:
         f"{args.sensors}, {args.start} start.\n"
     )
     print(table_of(args, rows))
-    print(f"\nErrors are root mean squares after the first second; a flight {ASTRAY:g} m off its")
+    print(f"\nErrors are root mean squares after {SETTLED:g} s; a flight {ASTRAY:g} m off its")
     print("reference is astray, and its tracking error does not count.")
     found = {
         "rows": rows,

@@ -47,7 +47,12 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     from quad_gym.envs.configuration import Flights
     from quad_gym.kernels.compiling.linked import names_of
     from quad_gym.kernels.compiling.stages import Stage, needed_stages
-    from quad_gym.kernels.single import SINGLE
+    from quad_gym.kernels.single import (
+        DRIFT_FILTER_STAGES,
+        FILTER_ENTRIES,
+        FILTER_STAGES,
+        SENSORS_AND_VEHICLE,
+    )
     from quad_gym.records import Autoreset
 
     needed: frozenset[Stage] = frozenset()
@@ -58,9 +63,10 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     if "all" in kinds:
         needed = frozenset(Stage)
     names = names_of(needed) if needed else []
-    if {"single", "all"} & set(kinds):  # the scalar filter takes longest of all
-        names = [*SINGLE[:2], *names, *SINGLE[2:]]
-    return names
+    if {"single", "all"} & set(kinds):
+        filters = names_of(FILTER_STAGES | DRIFT_FILTER_STAGES, FILTER_ENTRIES)
+        names = [*filters, *names, *SENSORS_AND_VEHICLE]
+    return list(dict.fromkeys(names))
 
 
 def main(args: Args) -> int:

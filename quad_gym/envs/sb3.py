@@ -140,6 +140,7 @@ class QuadVecEnv(VecEnv):
             "terminal_observation": self.flights.split(final),
             "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > 0.0),
             "ending": ENDINGS[int(row[COLUMN["ending"]])],
+            "ending_code": int(row[COLUMN["ending"]]),
             "filter_status": int(row[COLUMN["filter_status"]]),
             "filter_lost": bool(row[COLUMN["filter_lost"]] > 0.0),
             "gates_passed": int(row[COLUMN["gates_passed"]]),

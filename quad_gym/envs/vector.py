@@ -138,6 +138,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "position_error": batch.read("position_error"),
             "estimation_error": batch.read("estimation_error"),
             "ending": np.full(self.num_envs, ENDINGS[0], object),
+            "ending_code": np.zeros(self.num_envs, np.int64),
             "filter_status": batch.read("filter_status").astype(np.int64),
             "filter_lost": batch.read("lost") > 0.0,
             "gates_passed": np.zeros(self.num_envs, np.int64),
@@ -227,6 +228,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "position_error": results[:, COLUMN["position_error"]].copy(),
             "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
             "ending": self._no_ending.copy(),
+            "ending_code": np.zeros(self.num_envs, np.int64),
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
             "filter_lost": results[:, COLUMN["filter_lost"]] > 0.0,
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
@@ -238,7 +240,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos |= flight_info(batch, results[:, COLUMN["faults"]])
         ended = np.flatnonzero(self._over)
         if ended.size:  # rare: looking up a name for every flight would cost more than the rest
-            infos["ending"][ended] = _ENDING_NAMES[results[ended, COLUMN["ending"]].astype(np.intp)]
+            codes = results[ended, COLUMN["ending"]].astype(np.int64)
+            infos["ending"][ended], infos["ending_code"][ended] = _ENDING_NAMES[codes], codes
         return infos
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
@@ -246,7 +249,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.read(name, began)
         infos["filter_lost"][began] = self.flights.batch.read("lost", began) > 0.0
-        infos["ending"][began] = ENDINGS[0]
+        infos["ending"][began], infos["ending_code"][began] = ENDINGS[0], 0
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)
 

@@ -1,18 +1,21 @@
-"""Entries for one flight: the scalar instances behind the friendly classes.
+"""Entries for one flight, behind the friendly classes: of sensors and vehicle the scalar instances.
 
-Each has a signature, so that it can be compiled ahead; arrays in another order of memory are taken,
-too, and compiled for when they come.
+A filter runs the stages of flights instead, on a block of its own: they take long to compile, and
+the scalar instances of them would take longer.
+
+Each entry has a signature, so that it can be compiled ahead; arrays in another order of memory are
+taken, too, and compiled for when they come.
 """
 
 import numpy as np
 from numba import types
 from numba.np.numpy_support import from_dtype
 
-from quad_gym.kernels.compiling import entry
+from quad_gym.kernels.compiling import Stage, call_stage, entry
+from quad_gym.kernels.compiling.stages import STAGE_TABLE
 from quad_gym.kernels.filter.align import initialize
 from quad_gym.kernels.filter.drift import begin_drift
-from quad_gym.kernels.filter.predict import predict
-from quad_gym.kernels.filter.update import update
+from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.wahba import wahba
 from quad_gym.kernels.maths.linalg import (
     add_outer,
@@ -32,79 +35,91 @@ from quad_gym.kernels.sensors.measure import (
     measure_imu,
     measure_imu_average,
 )
+from quad_gym.kernels.simd.addresses import lanes_at
+from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.air import accelerations_in_air
 from quad_gym.kernels.vehicle.dynamics import accelerations, integrate, load_state
-from quad_gym.records import FLIGHT, PARAMS, SETTINGS, WORK
+from quad_gym.records import (
+    FLIGHT,
+    FLIGHT_BLOCK,
+    PARAMS,
+    PARAMS_BLOCK,
+    SETTINGS,
+    WORK_BLOCK,
+)
 
-FILTER = tuple(f"{__name__}:{name}" for name in ("ukf_update", "ukf_predict", "ukf_initialize"))
-"""Names of the entries of a filter, the longest to compile first."""
-DRIFT_FILTER = tuple(
-    f"{__name__}:{name}" for name in ("drift_update", "drift_predict", "ukf_initialize")
-)
+FILTER_STAGES = frozenset({Stage.UPDATE, Stage.PREDICT})
+"""The stages that a filter runs."""
+DRIFT_FILTER_STAGES = frozenset({Stage.UPDATE_WITH_DRIFT, Stage.PREDICT_WITH_DRIFT})
 """Those of a filter that estimates the slow error of GNSS positions."""
-SINGLE = (
-    *FILTER,
-    *DRIFT_FILTER[:2],
-    *(
-        f"{__name__}:{name}"
-        for name in (
-            "sense_features",
-            "sense_gnss",
-            "body_accelerations_in_air",
-            "integrate_flight",
-            "sense_imu_average",
-            "sense_imu",
-            "body_accelerations",
-            "wahba_of_vectors",
-            "step_biases",
-            "step_gnss_drift",
-        )
-    ),
+FILTER_ENTRIES = tuple(f"{__name__}:{name}" for name in ("start_filter", "run_stage"))
+"""Names of the entries that it calls, the longest to compile first."""
+SENSORS_AND_VEHICLE = tuple(
+    f"{__name__}:{name}"
+    for name in (
+        "sense_features",
+        "sense_gnss",
+        "body_accelerations_in_air",
+        "integrate_flight",
+        "sense_imu_average",
+        "sense_imu",
+        "body_accelerations",
+        "wahba_of_vectors",
+        "step_biases",
+        "step_gnss_drift",
+    )
 )
-"""Names of all entries of this module, likewise."""
+"""Names of the other entries of this module, likewise."""
 
 
 def _array(kind, dimensions=1):
     return types.Array(from_dtype(np.dtype(kind)), dimensions, "C")
 
 
-_FLIGHT, _PARAMS, _WORK, _SETTINGS = map(_array, (FLIGHT, PARAMS, WORK, SETTINGS))
+_FLIGHT, _PARAMS, _SETTINGS = map(_array, (FLIGHT, PARAMS, SETTINGS))
+_BLOCK, _BLOCK_PARAMS, _BLOCK_WORK = map(_array, (FLIGHT_BLOCK, PARAMS_BLOCK, WORK_BLOCK))
 _VECTOR, _MATRIX = _array(np.float64), _array(np.float64, 2)
+_flight_at = lanes_at(FLIGHT_BLOCK)
 
 
 def _entry(*arguments, returns=types.none):
     return lambda function: entry(function, returns(*arguments))
 
 
-@_entry(_FLIGHT, _PARAMS, _VECTOR)
-def ukf_initialize(flights, params, x_I):
-    """Start the filter of flights[0] from its first fix; x_I is (3,), zero if it is not known."""
-    initialize(flights[0], params[0], True, load3(x_I))
-    begin_drift(flights[0], True)
+@_entry(_BLOCK, _BLOCK_PARAMS, _SETTINGS, _BLOCK_WORK, _VECTOR)
+def start_filter(blocks, params, settings, work, x_I):
+    """Start the filters of blocks[0] from their first fixes, where `work.mask`.
+
+    x_I is (3,), zero if it is not known.
+    """
+    flight, mask = lanes_of(blocks[0]), lanes_of(work[0]).mask > 0.0
+    forget_innovations(flight, settings[0].feature_count, mask)
+    initialize(flight, lanes_of(params[0]), mask, load3(x_I))
+    begin_drift(flight, mask)
 
 
-@_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64)
-def ukf_update(flights, params, work, feature_count, form):
-    """Condition the filter of flights[0] on its valid measurements."""
-    update(flights[0], params[0], work[0], feature_count, True, form)
+@_entry(
+    *[types.int64] * 4,
+    *map(_array, (PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)),
+    types.int64,
+)
+def run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
+    """Run a stage once for every block, where `work.mask`.
 
-
-@_entry(_FLIGHT, _PARAMS, _WORK, types.int64)
-def ukf_predict(flights, params, work, form):
-    """Carry the filter of flights[0] over one tick."""
-    predict(flights[0], params[0], work[0], form)
-
-
-@_entry(_FLIGHT, _PARAMS, _WORK, types.int64, types.int64)
-def drift_update(flights, params, work, feature_count, form):
-    """As `ukf_update`, of a filter that estimates the slow error of GNSS positions."""
-    update(flights[0], params[0], work[0], feature_count, True, form, flights[0].L_drift)
-
-
-@_entry(_FLIGHT, _PARAMS, _WORK, types.int64)
-def drift_predict(flights, params, work, form):
-    """As `ukf_predict`, likewise."""
-    predict(flights[0], params[0], work[0], form, flights[0].L_drift)
+    Args:
+        address, pitch: Of the first block, as of `Call`; bytes from one block to the next.
+        count: How many blocks there are.
+        number: A `Stage`.
+        world, model, settings, work, table: As for `fly`.
+        flag: What the stage is called with.
+    """
+    true, believed = lanes_of(world[0]), lanes_of(model[0])
+    scratch = lanes_of(work[0])
+    mask = scratch.mask
+    for index in range(count):
+        flight = _flight_at(address + index * pitch)
+        scratch.mask = mask
+        call_stage(table[0], number, flight, true, believed, settings[0], scratch, flag)
 
 
 @_entry(_FLIGHT, _PARAMS)

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
 
+MANEUVER = 1.0
+"""How long a quadrotor accelerates one way [s]; our judgment."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParams(Checked):
@@ -99,6 +102,17 @@ class ImuParams(Checked):
         leave: a thrust 10 % larger vibrates 10 % more.
         """
         return math.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
+
+    @property
+    def believed_accel_error(self) -> float:
+        """What the filter takes for white of errors of scale and alignment, per m/s^2 [-].
+
+        They are proportional to how much the specific force differs from that at rest, and last as
+        long as a maneuver: one of `MANEUVER` seconds moves the velocity as far as white noise does
+        whose samples are larger by the square root of their number.
+        """
+        error = max(self.accel_scale_sigma, self.accel_misalignment_sigma)
+        return error * math.sqrt(MANEUVER / self.dt)
 
     @property
     def believed_gyro_sigma(self) -> float:

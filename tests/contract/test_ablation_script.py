@@ -1,23 +1,15 @@
 """The script of tables about the filter: its cases, and what it writes."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "ablation.py"
+from tests import console_commands
 
 
 def run(output, *options):
-    common = ("--flights", "48", "--duration", "0.5", "--output", str(output))
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), *options, *common],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    common = ("--flights", "48", "--duration", "1.1", "--output", str(output))
+    done = console_commands.run("ablation", *options, *common)
     assert done.returncode == 0, done.stderr
     return done.stdout, json.loads((output / f"{options[0]}.json").read_text())
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import quad_gym
-from quad_gym.commands.benchmark import against, interfaces, stages
+from quad_gym.commands.benchmark import against, interfaces, rendering, stages
 from quad_gym.commands.benchmark import main as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
@@ -28,7 +28,8 @@ def test_the_filter_section_compares_all_filters(tmp_path, capsys):
     assert list(found["sections"]) == ["filter"]
     rows = found["sections"]["filter"]
     kinds = {(row["kind"], row["measurements"]) for row in rows}
-    assert {(kind, n) for kind in ("lanes", "scalar", "plain NumPy") for n in (6, 12)} <= kinds
+    expected = ("lanes", "UnscentedKalmanFilter", "plain NumPy")
+    assert {(kind, n) for kind in expected for n in (6, 12)} <= kinds
     for row in rows:
         more = {"kind", "measurements", "suite", "times_lanes"}
         assert set(row) == {"name", "seconds", "spread"} | more
@@ -74,8 +75,9 @@ def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
     assert batch.read("position_valid").mean() == pytest.approx(1 / 20, abs=0.02)
 
 
-def test_the_rendering_section_has_every_task_and_view(tmp_path, capsys):
+def test_the_rendering_section_has_every_task_and_view(tmp_path, capsys, monkeypatch):
     pytest.importorskip("pygame")
+    monkeypatch.setattr(rendering, "INSTANTS", 4)
     rows = run(tmp_path, "--only", "rendering")["sections"]["rendering"]
     assert len({(row["task"], row["view"]) for row in rows}) == len(rows) == 10
     assert "frames/s" in capsys.readouterr().out

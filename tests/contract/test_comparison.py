@@ -4,24 +4,17 @@ import csv
 import json
 import os
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests import console_commands
 from tests.console import plain
+from tests.console_commands import run
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def run(script, *more, where):
-    line = [sys.executable, str(ROOT / "scripts" / script), *map(str, more)]
-    return subprocess.run(line, cwd=where, capture_output=True, text=True, check=False)
 
 
 def read_csv(file):
@@ -31,7 +24,7 @@ def read_csv(file):
 
 def test_evaluate_writes_what_it_prints(tmp_path):
     done = run(
-        "evaluate.py",
+        "evaluate",
         *("--policy", "pd", "pd:lab", "pretrained", "--episodes", 20, "--output", tmp_path / "out"),
         where=tmp_path,
     )
@@ -70,7 +63,7 @@ def test_evaluate_writes_what_it_prints(tmp_path):
     ],
 )
 def test_evaluate_refuses_nonsense(tmp_path, more, message):
-    done = run("evaluate.py", *more, where=tmp_path)
+    done = run("evaluate", *more, where=tmp_path)
     assert done.returncode == 2
     assert message in plain(done.stderr)
     assert "Traceback" not in done.stderr
@@ -78,7 +71,7 @@ def test_evaluate_refuses_nonsense(tmp_path, more, message):
 
 def compare(where, *more):
     line = ["--quick", "--steps", 8192, "--output", where / "out", "--env", "duration=1.0"]
-    return run("compare.py", *line, *more, where=where)
+    return run("compare", *line, *more, where=where)
 
 
 def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
@@ -104,8 +97,8 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
 
 
 def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind(tmp_path):
-    line = [sys.executable, str(ROOT / "scripts/compare.py"), "--seeds", "1", "--jobs", "2"]
-    line += ["--steps", "1000000", "--env", "duration=1.0", "--output", str(tmp_path / "out")]
+    options = ["--steps", "300000", "--env", "duration=1.0", "--output", tmp_path / "out"]
+    line = console_commands.line("compare.py", "--seeds", "1", "--jobs", "2", *options)
     process = subprocess.Popen(
         line, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
@@ -144,6 +137,6 @@ def test_compare_refuses_nonsense(tmp_path):
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--env", "observation=truth"], "leave observation"),
     ):
-        done = run("compare.py", *more, "--output", tmp_path / "x", where=tmp_path)
+        done = run("compare", *more, "--output", tmp_path / "x", where=tmp_path)
         assert done.returncode == 2, more
         assert message in plain(done.stderr)

@@ -17,6 +17,7 @@ from baselines.plans import Plan
 from baselines.policies import load_policy
 from baselines.recipes import recipe
 from baselines.training import export, train
+from tests import console_commands
 
 ROOT = Path(__file__).resolve().parents[2]
 CIRCLE = "QuadGym/Circle-v0"
@@ -156,11 +157,10 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
 
 
 def command(tmp_path, *more):
-    line = [sys.executable, str(ROOT / "scripts/train.py"), CIRCLE, "--engine", "compiled"]
-    line += ["--output", str(tmp_path / "run")]
+    line = [CIRCLE, "--engine", "compiled", "--output", tmp_path / "run"]
     line += ["--no-progress", "--threads", "1", "--episodes", "4", "--env", "duration=1.0"]
     line += ["--n-envs", "16", "--steps", "1024", "--set", "n_steps=16", "batch_size=128"]
-    return subprocess.run([*line, *more], cwd=tmp_path, capture_output=True, text=True, check=False)
+    return console_commands.run("train", *line, *more, where=tmp_path)
 
 
 def test_the_command_trains_and_exports(tmp_path):

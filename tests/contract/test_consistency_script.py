@@ -1,15 +1,11 @@
 """The consistency script: what it writes, and that it finds fault where there is fault."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import quad_gym
 from quad_gym.commands import consistency as script
 from quad_gym.commands.options import parse
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "consistency.py"
+from tests import console_commands
 
 
 def run(output, *options):
@@ -26,12 +22,7 @@ def run(output, *options):
         "--output",
         str(output),
     )
-    return subprocess.run(
-        [sys.executable, str(SCRIPT), *common, *options],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return console_commands.run("consistency", *common, *options)
 
 
 def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 from quad_gym import Flight
 from quad_gym.commands import fly as script
+from tests import console_commands
 from tests.console import plain
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,8 +17,10 @@ pytest.importorskip("pygame")
 
 
 def fly(*options, cwd, **environment):
+    if not environment:
+        return console_commands.run("fly", *options, where=cwd)
     return subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "fly.py"), *map(str, options)],
+        console_commands.line("fly.py", *options),
         cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         capture_output=True,

@@ -20,6 +20,11 @@ def test_every_case_has_a_digest_and_every_digest_a_case():
     assert set(SOME) <= CASES.keys()
 
 
+def test_every_fault_changes_a_flight():
+    digests = [GOLDEN[name] for name in CASES if name.startswith("fault ")]  # and "fault none"
+    assert len(set(digests)) == len(digests)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_flights_are_what_they_were(name):
     assert fly(CASES[name]) == GOLDEN[name], "changed on purpose? see tests/golden/__init__.py"

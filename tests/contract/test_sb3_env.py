@@ -47,6 +47,7 @@ def test_it_does_what_a_dummy_vec_env_of_monitored_environments_does(privileged)
                 ended += 1
                 assert_same(info["terminal_observation"], expected["terminal_observation"])
                 assert info["ending"] == expected["ending"]
+                assert info["ending_code"] == expected["ending_code"]
                 assert info["episode"]["l"] == expected["episode"]["l"]
                 assert info["episode"]["r"] == pytest.approx(expected["episode"]["r"], abs=1e-6)
     assert ended > 10

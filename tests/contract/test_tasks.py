@@ -7,6 +7,7 @@ import pytest
 from baselines import PDPolicy
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Ending
 from tests.contract.comparing import actions_of
 
 SECONDS = 1 / 50
@@ -169,6 +170,7 @@ def test_farther_than_three_meters_from_the_reference_is_out_of_bounds(task):
         _, _, terminated, truncated, info = env.step(STILL)
         assert (terminated, truncated) == (over, False)
         assert info["ending"] == ("out_of_bounds" if over else "none")
+        assert info["ending_code"] == (Ending.OUT_OF_BOUNDS if over else Ending.NONE)
 
 
 def test_a_course_has_wider_bounds():

@@ -4,9 +4,7 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -24,8 +22,8 @@ from baselines.plans import Plan  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
 from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
 from baselines.training import train  # noqa: E402
+from tests import console_commands  # noqa: E402
 
-ROOT = Path(__file__).resolve().parents[2]
 CIRCLE = "QuadGym/Circle-v0"
 
 
@@ -123,11 +121,14 @@ def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, algorit
     assert_same(weights(tmp_path / "whole", algorithm), weights(tmp_path / "cut", algorithm))
 
 
+def options(folder, *more):
+    few = ["--no-progress", "--no-tensorboard", "--threads", "1", "--episodes", "4"]
+    few += ["--env", "duration=1.0", "--n-envs", "16", "--set", "n_steps=16", "batch_size=128"]
+    return [CIRCLE, "--output", str(folder), *few, *more]
+
+
 def script(folder, *more):
-    line = [sys.executable, str(ROOT / "scripts/train.py"), CIRCLE, "--output", str(folder)]
-    line += ["--no-progress", "--no-tensorboard", "--threads", "1", "--episodes", "4"]
-    line += ["--env", "duration=1.0", "--n-envs", "16", "--set", "n_steps=16", "batch_size=128"]
-    return [*line, *more]
+    return console_commands.line("train.py", *options(folder, *more))
 
 
 def rows(folder):
@@ -190,8 +191,7 @@ def train_again(folder, steps, where):
     ],
 )
 def test_nonsense_is_refused_before_anything_is_trained(tmp_path, more, message):
-    line = script(tmp_path / "run", *more)
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = console_commands.run("train", *options(tmp_path / "run", *more), where=tmp_path)
     assert done.returncode == 2
     assert message in plain(done.stderr)
     assert "Traceback" not in done.stderr

@@ -1,23 +1,18 @@
 """Tuning PD control from the command line."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium
 import pytest
 
 import quad_gym
 from baselines.policies import load_policy
+from tests import console_commands
 from tests.console import plain
-
-SCRIPT = Path(quad_gym.__file__).parents[1] / "scripts/tune.py"
 
 
 def tune(*options):
-    line = [sys.executable, str(SCRIPT), *map(str, options)]
-    return subprocess.run(line, capture_output=True, text=True)
+    return console_commands.run("tune", *options)
 
 
 def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):

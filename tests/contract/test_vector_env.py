@@ -8,6 +8,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Ending
 from tests.contract.comparing import actions_of, assert_same, state_of
 
 MODES = ("NextStep", "SameStep", "Disabled")
@@ -96,7 +97,14 @@ def test_spaces_hold_what_is_returned_with_the_stated_types(privileged):
     assert observation in env.observation_space
     assert (reward.dtype, reward.shape) == (np.float64, (6,))
     assert terminated.dtype == truncated.dtype == np.bool_
-    for name in ("position_error", "estimation_error", "ending", "filter_status", "gates_passed"):
+    for name in (
+        "position_error",
+        "estimation_error",
+        "ending",
+        "ending_code",
+        "filter_status",
+        "gates_passed",
+    ):
         assert info[name].shape == (6,)
         assert info[f"_{name}"].all()
 
@@ -150,7 +158,9 @@ def test_same_step_keeps_the_last_observation_and_info_of_the_environment_concer
     assert info["_final_obs"].all()
     assert info["_final_info"].all()
     assert (info["final_info"]["ending"] == "time_limit").all()
+    assert (info["final_info"]["ending_code"] == Ending.TIME_LIMIT).all()
     assert (info["ending"] == "none").all()
+    assert (info["ending_code"] == Ending.NONE).all()
     assert all((info["final_obs"][i] != observation[i]).any() for i in range(3))
 
 

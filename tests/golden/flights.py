@@ -38,6 +38,13 @@ def _late(suite, gnss=0.1, camera=0.06):
     return suite.replace(gnss=late, camera=suite.camera.replace(latency=camera))
 
 
+def _early(fault):
+    """The faults of a preset, those that come at a time before flights end in a crash."""
+    return [
+        single if single.start is None else single.replace(start=0.2) for single in PRESETS[fault]
+    ]
+
+
 def cases():
     """Keywords of the environments that fly, by name."""
     found = {}
@@ -55,7 +62,7 @@ def cases():
         found[f"action {action}"] = {"action": action}
     for fault in PRESETS:
         suite = "indoor" if "camera" in fault else "rtk"
-        found[f"fault {fault}"] = {"sensors": suite, "faults": [fault], "start": "hover"}
+        found[f"fault {fault}"] = {"sensors": suite, "faults": _early(fault), "start": "hover"}
     rtk = {"sensors": "rtk", "start": "hover"}
     return found | {
         "late": {"sensors": _late("rtk"), "start": "hover"},
@@ -72,7 +79,7 @@ def cases():
         "absolute": rtk | {"layout": "absolute"},
         "many options": {
             **{"sensors": _late("rtk"), "world": "fresh_breeze", "randomization": RANDOMIZATION},
-            **{"faults": ["gnss_outage", "wrong_associations"], "innovations": True},
+            **{"faults": [*_early("gnss_outage"), "wrong_associations"], "innovations": True},
         },
     }
 

@@ -304,3 +304,36 @@ def test_blur_grows_with_the_body_rate(rate):
 def test_values_that_cannot_be_are_refused(part, name, value):
     with pytest.raises(ValueError, match=name):
         getattr(LAB, part).replace(**{name: value})
+
+
+@pytest.mark.parametrize("kind", [quad_gym.UnscentedKalmanFilter, quad_gym.ExtendedKalmanFilter])
+def test_a_maneuver_costs_the_filter_what_errors_of_scale_and_alignment_may_do_in_it(kind):
+    """As so much more white noise: by that of a second of the same force, from the suite's own."""
+    accel, error = np.array([1.5, -0.7, 11.0]), 0.004
+    plain, dt = with_imu(STANDARD, accel_misalignment_sigma=0.0), STANDARD.imu.dt
+    excess = np.linalg.norm(accel - [0.0, 0.0, 9.8])
+    white = plain.imu.accel_noise_density**2 + (error * excess) ** 2  # over a second
+    suites = (
+        with_imu(STANDARD, accel_misalignment_sigma=error),
+        with_imu(STANDARD, accel_scale_sigma=error, accel_misalignment_sigma=0.5 * error),
+        with_imu(STANDARD, accel_noise_density=math.sqrt(white)),
+        plain,
+    )
+    covariances = []
+    for suite in suites:
+        ukf = kind(suite)
+        ukf.set_state(
+            position=np.zeros(3),
+            velocity=np.zeros(3),
+            R_BI=np.eye(3),
+            accel_bias=np.zeros(3),
+            gyro_bias=np.zeros(3),
+            covariance=np.diag(np.full(15, 1e-6)),
+        )
+        ukf.predict(np.array([0.1, 0.2, -0.3]), accel)
+        covariances.append(ukf.covariance)
+    aligned, scaled, noisy, exact = covariances
+    np.testing.assert_allclose(aligned, noisy, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(scaled, noisy, rtol=1e-12, atol=1e-18)
+    grown = np.diag(aligned - exact)[3:6]
+    np.testing.assert_allclose(grown, dt * (error * excess) ** 2, rtol=1e-6)

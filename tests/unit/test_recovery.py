@@ -17,7 +17,7 @@ STEP = GyroBiasStep(start=3.0, size=math.radians(1.0))
 
 
 def flown(name, fault, seconds, **choices):
-    suite = quad_gym.sensor_suite(name).simplified()
+    suite = quad_gym.sensor_suite(name)
     suite = suite.replace(estimator=suite.estimator.replace(**choices))
     batch = fly(suite, FLIGHTS, task="circle", start="hover", filter_start="warm", faults=fault)
     steps(batch, seconds)

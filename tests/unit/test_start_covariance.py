@@ -34,7 +34,7 @@ def worst(batch):
 @pytest.mark.parametrize("drawn", DRAWS)
 @pytest.mark.parametrize("name", SUITES)
 def test_a_start_that_is_drawn_leaves_the_filter_consistent(name, drawn):
-    suite = quad_gym.sensor_suite(name).simplified()
+    suite = quad_gym.sensor_suite(name)
     batch = fly(suite, FLIGHTS, task="circle", start="hover", randomization=DRAWS[drawn])
     assert worst(batch) < 15.0 + BAND
     assert not (batch.read("lost") > 0.0).any()

@@ -1,13 +1,11 @@
-"""Eight filters in lanes: each does what the scalar instance does, whatever its neighbors do."""
+"""Eight filters in lanes: each does what it does by itself, whatever its neighbors do."""
 
 import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.kernels import single
-from quad_gym.packing.flight import params_record
-from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FLIGHT, WORK, FilterStatus
+from quad_gym.estimation import UnscentedKalmanFilter
+from quad_gym.records import FLIGHT, FilterStatus
 from tests.circle_flight import record_circle
 from tests.lane_filter import EIGHT, STATE, LaneFilter
 
@@ -51,62 +49,65 @@ def calm():
     return fly(LaneFilter(LAB))
 
 
-def test_eight_different_flights_equal_the_scalar_filter_to_the_last_bits():
-    lanes, params = LaneFilter(LAB), params_record(VehicleParams(), LAB)
-    work, features = np.zeros(1, WORK), lanes.features
-    measure_all(lanes, 0, np.ones((1, EIGHT, 3), bool))
-    scalars = [lanes.flight(lane) for lane in range(EIGHT)]
-    lanes.initialize()
-    for lane, flight in enumerate(scalars):
-        single.ukf_initialize(flight, params, np.zeros(3))
-        assert_close(lanes, lane, flight)
+def alone(lane):
+    """A filter by itself that has met the first measurement of a lane."""
+    recording, ukf = RECORDINGS[lane], UnscentedKalmanFilter(LAB)
+    ukf.initialize(recording.gnss_position[0], recording.gnss_baseline[0])
+    return ukf
 
+
+def measure_alone(ukf, lane, k, position, baseline, camera):
+    recording = RECORDINGS[lane]
+    ukf.update(
+        recording.gnss_position[k] if position else None,
+        recording.gnss_baseline[k] if baseline else None,
+        recording.pixels[k] if camera else None,
+    )
+
+
+def assert_equal(filters, lane, ukf):
+    values = (ukf.position, ukf.velocity, ukf.R_BI, ukf.accel_bias, ukf.gyro_bias)
+    for name, value in zip(STATE, values, strict=False):
+        np.testing.assert_array_equal(filters.get(name)[lane], value, err_msg=name)
+    L = filters.get("L")[lane]
+    np.testing.assert_array_equal(L @ L.T, ukf.covariance)
+    assert filters.get("filter_status")[lane] == ukf.status == 0
+
+
+def test_eight_different_flights_are_what_each_is_by_itself():
+    """To the bit, whatever they measure."""
+    filters, alones = LaneFilter(LAB), [alone(lane) for lane in range(EIGHT)]
+    measure_all(filters, 0, np.ones((1, EIGHT, 3), bool))
+    filters.initialize()
     for k in range(TICKS):
-        measure_all(lanes, k)
-        scalars = [lanes.flight(lane) for lane in range(EIGHT)]  # both start each half-cycle alike
-        lanes.update()
-        for lane, flight in enumerate(scalars):
-            single.ukf_update(flight, params, work, features, 0)
-            assert_close(lanes, lane, flight)
-        scalars = [lanes.flight(lane) for lane in range(EIGHT)]
-        lanes.predict()
-        for lane, flight in enumerate(scalars):
-            single.ukf_predict(flight, params, work, 0)
-            assert_close(lanes, lane, flight)
-    assert (lanes.get("filter_status") == 0).all()
+        measure_all(filters, k)
+        filters.update()
+        for lane, ukf in enumerate(alones):
+            measure_alone(ukf, lane, k, *PRESENT[k, lane])
+            assert_equal(filters, lane, ukf)
+        filters.predict()
+        for lane, ukf in enumerate(alones):
+            ukf.predict(RECORDINGS[lane].gyro[k], RECORDINGS[lane].accel[k])
+            assert_equal(filters, lane, ukf)
 
 
-def assert_close(lanes, lane, flight):
-    """Equal to some units in the last place of the largest entry of each row."""
-    scales = {"r_hat": 4.0, "v_hat": 2.0, "R_hat": 1.0, "b_a_hat": 1.0, "b_g_hat": 1e-3}
-    for name, scale in scales.items():
-        gap = abs(lanes.get(name)[lane] - flight[name][0]).max()
-        largest = abs(flight[name][0]).max()  # at first biases of some m/s^2 are taken for possible
-        assert gap <= 1e-12 * max(scale, largest), (name, gap)
-    L, truth = lanes.get("L")[lane], flight["L"][0]
-    rows = np.linalg.norm(truth, axis=1, keepdims=True)
-    assert (abs(L - truth) / rows).max() < 1e-11
-
-
-def test_a_lane_that_misses_a_measurement_has_exactly_the_update_without_it():
-    params, work = params_record(VehicleParams(), LAB), np.zeros(1, WORK)
-    for position in (True, False):
-        for baseline in (True, False):
-            lanes = LaneFilter(LAB)
-            measure_all(lanes, 0, np.ones((1, EIGHT, 3), bool))
-            lanes.initialize()
-            for lane in range(EIGHT):
-                lanes.measure(lane, RECORDINGS[lane], 1)
-            lanes.measure(3, RECORDINGS[3], 1, position=position, baseline=baseline, camera=False)
-            flight = lanes.flight(3)
-            lanes.update()
-            single.ukf_update(flight, params, work, lanes.features, 0)
-            assert_close(lanes, 3, flight)
-            assert lanes.get("filter_status")[3] == 0
-            if not (position or baseline):
-                before = lanes.flight(3)
-                np.testing.assert_array_equal(before["r_hat"], flight["r_hat"])
-                np.testing.assert_array_equal(before["L"], flight["L"])
+@pytest.mark.parametrize("position", [True, False])
+@pytest.mark.parametrize("baseline", [True, False])
+def test_a_lane_that_misses_a_measurement_has_exactly_the_update_without_it(position, baseline):
+    """Exactly that of a filter none of whose lanes has it, which leaves it out."""
+    filters, ukf = LaneFilter(LAB), alone(3)
+    measure_all(filters, 0, np.ones((1, EIGHT, 3), bool))
+    filters.initialize()
+    for lane in range(EIGHT):
+        filters.measure(lane, RECORDINGS[lane], 1)
+    filters.measure(3, RECORDINGS[3], 1, position=position, baseline=baseline, camera=False)
+    before = {name: filters.get(name)[3] for name in STATE}
+    filters.update()
+    measure_alone(ukf, 3, 1, position, baseline, False)
+    assert_equal(filters, 3, ukf)
+    if not (position or baseline):
+        for name, value in before.items():
+            np.testing.assert_array_equal(filters.get(name)[3], value)
 
 
 def test_missing_measurements_of_neighbors_do_not_move_a_lane(calm):

@@ -1,4 +1,4 @@
-"""The filter's part of the benchmark: a cycle in lanes, scalar, in plain NumPy and in filterpy."""
+"""The filter's part of the benchmark: a cycle in lanes, alone, in plain NumPy and in filterpy."""
 
 import sys
 from typing import Any
@@ -8,13 +8,16 @@ import numpy as np
 import quad_gym
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.benchmark.peers import Measured, filterpy_cycles, plain_cycles
+from quad_gym.commands.benchmark.peers import (
+    Measured,
+    alone_cycles,
+    filterpy_cycles,
+    plain_cycles,
+)
 from quad_gym.commands.benchmark.stages import Staged, hovering
 from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 from quad_gym.kernels.compiling import Stage
-from quad_gym.kernels.parts import filter_cycle_of_flights
-from quad_gym.packing.flight import params_record
-from quad_gym.records import FLIGHT, FLIGHT_BLOCK, WIDTH, WORK, aligned_zeros
+from quad_gym.records import FLIGHT_BLOCK, WIDTH, aligned_zeros
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
@@ -30,12 +33,12 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
 
 
 def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
-    """Cycles of update and prediction on one core, in lanes, scalar and elsewhere.
+    """Cycles of update and prediction on one core, in lanes, alone and elsewhere.
 
     Args:
         count: Flights in a batch.
         effort: How long to measure.
-        recorded_ticks: Length of the flight that the filters elsewhere estimate.
+        recorded_ticks: Length of the flight that a filter alone and those elsewhere estimate.
     """
     rows: list[Row] = []
     with_camera = quad_gym.sensor_suite("lab")
@@ -43,41 +46,34 @@ def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
         features = (measurements - 6) // 3
         batch = hovering(count, sensors=sensors)
         seeing = np.flatnonzero(batch.read("feature_valid").sum(axis=1) == features)
-        flights = np.zeros(count, FLIGHT)
         blocks = aligned_zeros(count // WIDTH, FLIGHT_BLOCK)
-        for name in FLIGHT.names or ():  # the flights that see all features, over and over
-            flights[name] = batch.read(name)[np.resize(seeing, count)]
-            lanes = flights[name].reshape(-1, WIDTH, *FLIGHT[name].shape)
+        for name in FLIGHT_BLOCK.names or ():  # the flights that see all features, over and over
+            values = batch.read(name)[np.resize(seeing, count)]
+            lanes = values.reshape(-1, WIDTH, *values.shape[1:])
             blocks[name] = np.moveaxis(lanes, 1, -1)
-        model = params_record(batch.vehicle, sensors)
-        work = np.zeros(1, WORK)
-        form = int(batch._settings["form"][0])
         update, predict = Staged(batch, Stage.UPDATE, features), Staged(batch, Stage.PREDICT)
 
         def in_lanes(blocks: Any = blocks, update: Any = update, predict: Any = predict) -> None:
             update(blocks)
             predict(blocks)
 
-        def scalar(
-            flights: Any = flights,
-            others: tuple[Any, ...] = (model, work, features, form),
-        ) -> None:
-            filter_cycle_of_flights(flights, *others)
-
         def add(name: str, timing: Timing, n: int = measurements) -> None:
             what = {"kind": name, "measurements": n, "suite": "lab"}
             rows.append(report(f"{name}, {n} measurements, lab", timing, **what))
 
-        for name, cycle, states in (("lanes", in_lanes, blocks), ("scalar", scalar, flights)):
-            start = states.copy()
+        start = blocks.copy()
 
-            def again(states: Any = states, start: Any = start) -> None:
-                states[:] = start
+        def again(blocks: Any = blocks, start: Any = start) -> None:
+            blocks[:] = start
 
-            add(name, measure(cycle, effort, again).per(count))
+        add("lanes", measure(in_lanes, effort, again).per(count))
         recorded = record_one(batch, int(seeing[0]), recorded_ticks)
         recorded = [now for now in recorded if len(now.pixels) == features]
-        for name, make in (("plain NumPy", plain_cycles), ("filterpy", filterpy_cycles)):
+        for name, make in (
+            ("UnscentedKalmanFilter", alone_cycles),
+            ("plain NumPy", plain_cycles),
+            ("filterpy", filterpy_cycles),
+        ):
             run = make(sensors, recorded)
             if run is None:
                 print(f"  {name}: not installed", file=sys.stderr)

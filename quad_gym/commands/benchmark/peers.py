@@ -1,4 +1,4 @@
-"""What the benchmark is compared with: the plain NumPy filter of the tests, and filterpy's."""
+"""What the filter in lanes is compared with: alone, in plain NumPy by the tests, and filterpy's."""
 
 import importlib.util
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import SensorSuite
+from quad_gym.estimation import UnscentedKalmanFilter
 
 REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
 """The plain filter; where it is missing, nothing is compared with it."""
@@ -35,14 +36,20 @@ def load_reference() -> ModuleType | None:
     return module
 
 
-def plain_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None] | None:
-    """Cycles of the plain augmented filter over a flight, from its first fix on."""
-    module = load_reference()
-    if module is None:
-        return None
+def alone_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None]:
+    """Cycles of the package's filter for one vehicle over a flight, from its first fix on."""
+    return _cycles(UnscentedKalmanFilter, sensors, flight)
 
+
+def plain_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None] | None:
+    """Cycles of the plain augmented filter, likewise; None where the tests are not at hand."""
+    module = load_reference()
+    return None if module is None else _cycles(module.PlainUKF, sensors, flight)
+
+
+def _cycles(kind: Any, sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None]:
     def run() -> None:
-        ukf = module.PlainUKF(sensors)
+        ukf = kind(sensors)
         ukf.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
         for now in flight:
             ukf.update(now.gnss_position_G, now.gnss_baseline_G, now.pixels)
@@ -59,7 +66,7 @@ def filterpy_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[]
     two features). The attitude error is moved into the reference attitude after each half.
     """
     try:
-        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+        from filterpy import kalman
     except ImportError:
         return None
     module = load_reference()
@@ -100,8 +107,8 @@ def filterpy_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[]
 
     def run() -> None:
         plain.initialize(flight[0].gnss_position_G, flight[0].gnss_baseline_G)
-        points = MerweScaledSigmaPoints(15, choice.alpha, choice.beta, choice.kappa)
-        ukf = UnscentedKalmanFilter(15, 6 + 3 * features, dt, h, f, points)
+        points = kalman.MerweScaledSigmaPoints(15, choice.alpha, choice.beta, choice.kappa)
+        ukf = kalman.UnscentedKalmanFilter(15, 6 + 3 * features, dt, h, f, points)
         ukf.x, ukf.P, R = plain._state(), plain.P.copy(), plain.R
         spread = np.zeros((15, 12))  # from the noises (gyro, gyro bias, accel, accel bias)
         spread[0:3, 6:9], spread[3:6, 6:9] = -(dt**2) / 2 * R.T, -dt * R.T

@@ -14,7 +14,7 @@ from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
-from quad_gym.kernels.parts import run_stage
+from quad_gym.kernels.single import run_stage
 
 SUITES = ("standard", "lab")
 FILTER = (Stage.PREDICT, Stage.UPDATE, Stage.PREDICT_WITH_DRIFT, Stage.UPDATE_WITH_DRIFT)
@@ -60,6 +60,7 @@ class Staged:
     def __call__(self, blocks: NDArray[Any]) -> None:
         """Run the stage once for every block."""
         begin = blocks.ctypes.data - self._skipped
+        self._others[-1]["mask"] = 1.0
         run_stage(
             begin,
             blocks.strides[0],

@@ -1,6 +1,7 @@
 """The stages of this process, and a table of those that a batch needs: compiled or loaded then."""
 
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from quad_gym.kernels.compiling.stages import SIGNATURE, SOURCES, STAGE_TABLE, S
 from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
 
 FLY = "quad_gym.kernels.batch:fly"
+"""The entry that flies a batch."""
 _addresses: dict[Stage, int] = {}
 _lock = threading.Lock()
 
@@ -20,22 +22,31 @@ def name_of(stage: Stage) -> str:
     return f"quad_gym.kernels.{source.module}:{source.function}"
 
 
-def names_of(needed: frozenset[Stage]) -> list[str]:
-    """The compiled functions that flights through these stages take, the longest first."""
+def names_of(needed: frozenset[Stage], entries: Sequence[str] = (FLY,)) -> list[str]:
+    """The compiled functions of these stages and of the entries that call them, the longest first.
+
+    Args:
+        needed: The stages.
+        entries: Names of the entries, the longest to compile first.
+    """
     ordered = [name_of(stage) for stage in SOURCES if stage in needed]
-    return [*ordered[:2], FLY, *ordered[2:]]
+    return [*ordered[:2], *entries[:1], *ordered[2:], *entries[1:]]
 
 
-def linked_table(needed: frozenset[Stage]) -> NDArray[Any]:
+def linked_table(needed: frozenset[Stage], entries: Sequence[str] = (FLY,)) -> NDArray[Any]:
     """The table of addresses, (1,) STAGE_TABLE, of the stages that are needed and no others.
 
     A batch has memory for what these stages use, see `used_parts`: a stage that it calls without
     needing it must fail rather than find what another batch has linked.
+
+    Args:
+        needed: The stages.
+        entries: Names of the entries that call them, compiled with them.
     """
     with _lock:
         missing = needed - _addresses.keys()
         if missing:
-            prepare(names_of(needed))
+            prepare(names_of(needed, entries))
             _addresses.update((stage, _address(name_of(stage))) for stage in missing)
     table = np.zeros(1, STAGE_TABLE)
     for stage in needed:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from typing import IO, Any
 
-from quad_gym.kernels.compiling.cache import CodeCache, cache_of, where_cached
+from quad_gym.kernels.compiling.cache import CodeCache, where_cached
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.kernels.compiling.locks import locked, say
 
@@ -40,7 +40,7 @@ def prepare(names: Sequence[str], processes: int | None = None) -> None:
     """
     missing = _missing(names)
     if missing:
-        folder = cache_of(prepare).folder
+        folder = dispatcher_of(names[0])._cache.folder
         lock = None if folder is None else folder / "compiling.lock"
         with locked(lock, "quad_gym: waiting for another process, which compiles"):
             missing = _missing(names)

@@ -30,6 +30,7 @@ from quad_gym.kernels.filter.drift import keep_drift, predict_drift, turn_drift
 from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
+from quad_gym.kernels.filter.preintegration import accel_variance
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -214,7 +215,7 @@ def _add_second_order(work, p, mean_a, mean_e, midpoint):
 
 
 @kernel
-def _sum_moments(flight, p, work, mean_a, mean_e, form):
+def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
     """Fill the lower triangle of work.P from the propagated pairs and the process noise.
 
     The gyro's noise is added here only where it enters through the tick's start.
@@ -223,7 +224,7 @@ def _sum_moments(flight, p, work, mean_a, mean_e, form):
     dt = p.dt
     half_dt2 = 0.5 * dt * dt
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
-    accel_variance = p.accel_noise * p.accel_noise
+    variance = accel_variance(p, f_B)
     extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
     gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_noise) * (dt * p.gyro_noise)
 
@@ -234,9 +235,9 @@ def _sum_moments(flight, p, work, mean_a, mean_e, form):
     if not extended:
         _add_second_order(work, p, mean_a, mean_e, midpoint)
     for i in range(3):
-        P[R + i, R + i] += half_dt2 * half_dt2 * accel_variance
-        P[V + i, R + i] += half_dt2 * dt * accel_variance
-        P[V + i, V + i] += dt * dt * accel_variance
+        P[R + i, R + i] += half_dt2 * half_dt2 * variance
+        P[V + i, R + i] += half_dt2 * dt * variance
+        P[V + i, V + i] += dt * dt * variance
         P[E + i, E + i] += gyro_variance
 
     # the biases are linear: their rows of the propagated columns are those of L times the decay
@@ -293,7 +294,7 @@ def predict(flight, p, work, form=0, drift=None):
     states = 15 if drift is None else 18
     augmented = 27.0 if drift is None else 33.0  # with the noise
     mean_a, mean_e = _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented)
-    _sum_moments(flight, p, work, mean_a, mean_e, form)
+    _sum_moments(flight, p, work, mean_a, mean_e, f_B, form)
     if drift is not None:
         predict_drift(flight, drift, p, work)
     turn = add(scale(dt, w_B), mean_e)

@@ -33,6 +33,7 @@ from quad_gym.kernels.maths.linalg import (
     apply,
     apply_transposed,
     cross,
+    dot,
     keep3,
     keep33,
     load3,
@@ -47,6 +48,7 @@ from quad_gym.kernels.maths.linalg import (
     transpose,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm, vector_to_dcm
+from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm
 
 _MIDPOINT = int(FilterForm.MIDPOINT)
@@ -140,6 +142,13 @@ def take_mean(flight, p, work, back):
 
 
 @kernel
+def accel_variance(p, f_B):
+    """What the filter takes for white in a sample of the accelerometer, per axis [m^2/s^4]."""
+    d = (f_B[0], f_B[1], f_B[2] - p.gravity)
+    return p.accel_noise * p.accel_noise + p.accel_error_noise * p.accel_error_noise * dot(d, d)
+
+
+@kernel
 def put_noise(p, work, R_s, dR, dv):
     """Fill the columns of work.columns with the IMU's white noise since the kept instant.
 
@@ -148,7 +157,8 @@ def put_noise(p, work, R_s, dR, dv):
     """
     M, T = work.columns, work.since_time
     root = math.sqrt(p.dt * T)
-    a, g = root * p.accel_noise, root * p.gyro_noise
+    force = scale(select(T > 0.0, 1.0 / T, 0.0), dv)  # its mean
+    a, g = root * math.sqrt(accel_variance(p, force)), root * p.gyro_noise
     zero = 0.0 * T
     for k in range(6):
         for i in range(15):

@@ -27,7 +27,7 @@ def noting(name):
         if mood == "die" and in_worker:
             os.kill(os.getpid(), signal.SIGKILL)
         if mood == "dawdle" and in_worker:
-            time.sleep(120.0)
+            time.sleep(3600.0)
         if mood == "raise":
             raise RuntimeError("this part cannot be compiled")
 
@@ -117,7 +117,7 @@ class Parts:
     def run(self, code=PREPARE, processes=2, **environment):
         """Its output, when it has ended well, and what it said on standard error."""
         process = self.start(code, processes, **environment)
-        output, said = process.communicate(timeout=120)
+        output, said = process.communicate(timeout=600)
         assert process.returncode == 0, said
         return output.strip(), said
 
@@ -146,7 +146,7 @@ def alive(process):
     return state not in "ZX"
 
 
-def wait_until(true, seconds=30.0):
+def wait_until(true, seconds=600.0):
     """Wait until something is true; fail if it does not become so."""
     end = time.monotonic() + seconds
     while not true():

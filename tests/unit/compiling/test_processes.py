@@ -81,7 +81,7 @@ def test_what_killed_workers_have_not_compiled_the_parent_compiles(parts):
 
 def test_a_part_that_cannot_be_compiled_raises_in_the_parent(parts):
     process = parts.start(MOOD="raise")
-    _, said = process.communicate(timeout=120)
+    _, said = process.communicate(timeout=600)
     assert process.returncode == 1
     assert "this part cannot be compiled" in said
     assert not parts.files("code")
@@ -96,7 +96,7 @@ def test_no_worker_outlives_a_parent_that_is_told_to_end(parts, how):
     wait_until(lambda: len(parts.compilers()) == 2)
     workers = parts.compilers()
     process.send_signal(how)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=600)
     assert process.returncode != 0
     wait_until(lambda: not any(alive(worker) for worker in workers))
     if how == signal.SIGINT:
