@@ -1,5 +1,6 @@
 """Sensors of one vehicle: each turns a true state into one measurement."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,8 @@ class GnssReceiver(_Sensor):
     """Two GNSS antennas: noisy position of the primary one and noisy baseline of exact length.
 
     Args:
-        params: Geometry and noise; to delay measurements by `latency` is the caller's.
+        params: Geometry, noise, slow and constant errors; to delay measurements by `latency` is the
+            caller's.
         rng: Seeds the sensor's random stream.
 
     Source: report sections 2.1 and 3.1.
@@ -50,7 +52,9 @@ class GnssReceiver(_Sensor):
     def __init__(self, params: GnssParams, rng: np.random.Generator) -> None:
         imu = ImuParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
-        self._drifts = params.drifts
+        self._drifts, self._turns = params.drifts, params.heading_error_sigma > 0.0
+        if self._turns:
+            single.draw_sensor_errors(self._flight, self._params)
 
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike
@@ -71,14 +75,17 @@ class GnssReceiver(_Sensor):
         if self._drifts:
             single.step_gnss_drift(self._flight, self._params)
         single.sense_gnss(self._flight, self._params)
+        if self._turns:
+            single.turn_gnss_baseline(self._flight, self._params)
         return self._flight["gnss_position"][0].copy(), self._flight["gnss_baseline"][0].copy()
 
 
 class Camera(_Sensor):
-    """A pinhole camera that projects known features with pixel noise.
+    """A pinhole camera that projects known features with pixel noise, blur and a limited range.
 
     Args:
-        params: Geometry, noise and features; to delay images by `latency` is the caller's.
+        params: Geometry, noise, limits and features; to delay images by `latency` is the caller's.
+            The ground that hides features is that of `WorldParams()`.
         rng: Seeds the sensor's random stream.
 
     Source: report sections 2.2 and 3.2.
@@ -87,24 +94,36 @@ class Camera(_Sensor):
     def __init__(self, params: CameraParams, rng: np.random.Generator) -> None:
         imu, gnss = ImuParams(rate=params.rate), GnssParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=gnss, camera=params), rng)
-        self._features = len(params.features_I)
+        self._features, self._hides = len(params.features_I), params.ground_hides
+        self._blurs = params.blur > 0.0
+        self._limited = self._hides or self._blurs or math.isfinite(params.max_range)
 
-    def measure(self, position: ArrayLike, R_BI: ArrayLike) -> NDArray[np.float64]:
+    def measure(
+        self, position: ArrayLike, R_BI: ArrayLike, body_rates: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> NDArray[np.float64]:
         """One image.
 
         Args:
             position: (3,) true position of the center of mass in I [m].
             R_BI: (3, 3) true attitude.
+            body_rates: (3,) true angular rate in B, which blurs images where `exposure` is above 0
+                [rad/s].
 
         Returns:
             (n_features, 2) pixels from the image's center; NaN for a feature that is behind the
-            camera or whose noiseless projection lies outside the image.
+            camera, too far, hidden by the ground, or whose noiseless projection lies outside the
+            image.
 
         Raises:
             ValueError: If an argument has another shape or is not finite.
         """
+        rates = check.array("body_rates", body_rates, (3,))
         self._place(position, R_BI)
+        self._flight["w"] = rates
         single.sense_features(self._flight, self._params, self._features)
+        if self._limited:
+            limits = (self._blurs, self._hides, self._features)
+            single.limit_features(self._flight, self._params, *limits)
         seen = self._flight["feature_valid"][0, : self._features] > 0.0
         return np.where(seen[:, np.newaxis], self._flight["pixels"][0, : self._features], np.nan)
 
@@ -113,7 +132,8 @@ class Imu(_Sensor):
     """Accelerometer and gyro with white noise and Gauss-Markov biases, which drift between samples.
 
     Args:
-        params: Lever arm, noise and biases.
+        params: Lever arm, noise, biases, errors of scale and alignment, and vibration, which grows
+            with the rotor speeds.
         rng: Seeds the sensor's random stream.
         vehicle: The vehicle whose forces the accelerometer feels.
 
@@ -128,6 +148,9 @@ class Imu(_Sensor):
         self._averages, self._start = params.samples == "average", np.zeros(1, FLIGHT)
         self._flight["b_a"] = rng.normal(0.0, params.accel_bias_sigma, 3)
         self._flight["b_g"] = rng.normal(0.0, params.gyro_bias_sigma, 3)
+        self._disturbed = params.errs or params.vibrates
+        if params.errs:
+            single.draw_sensor_errors(self._flight, self._params)
 
     @property
     def accel_bias(self) -> NDArray[np.float64]:
@@ -177,6 +200,8 @@ class Imu(_Sensor):
             single.sense_imu_average(f, self._params, self._start)
         else:
             single.sense_imu(f, self._params)
+        if self._disturbed:
+            single.disturb_imu(f, self._params)
         gyro, accel = f["gyro"][0].copy(), f["accel"][0].copy()
         single.step_biases(f, self._params)
         return gyro, accel

@@ -27,6 +27,14 @@ from quad_gym.kernels.maths.linalg import (
     store3,
     store33,
 )
+from quad_gym.kernels.sensors.imperfect import (
+    draw_heading_error,
+    draw_imu_errors,
+    err_imu,
+    limit_camera,
+    turn_baseline,
+    vibrate_imu,
+)
 from quad_gym.kernels.sensors.measure import (
     drift_biases,
     drift_gnss,
@@ -67,6 +75,10 @@ SENSORS_AND_VEHICLE = tuple(
         "wahba_of_vectors",
         "step_biases",
         "step_gnss_drift",
+        "draw_sensor_errors",
+        "disturb_imu",
+        "turn_gnss_baseline",
+        "limit_features",
     )
 )
 """Names of the other entries of this module, likewise."""
@@ -138,6 +150,32 @@ def sense_imu_average(flights, params, starts):
 def sense_gnss(flights, params):
     """Measure flights[0] by GNSS."""
     measure_gnss(flights[0], params[0], True)
+
+
+@_entry(_FLIGHT, _PARAMS)
+def draw_sensor_errors(flights, params):
+    """Draw the errors of flights[0]'s sensors that stay as they are."""
+    draw_imu_errors(flights[0], params[0], True)
+    draw_heading_error(flights[0], params[0], True)
+
+
+@_entry(_FLIGHT, _PARAMS)
+def disturb_imu(flights, params):
+    """Err and vibrate with the sample just taken by the IMU of flights[0]."""
+    err_imu(flights[0], params[0], True)
+    vibrate_imu(flights[0], params[0], True)
+
+
+@_entry(_FLIGHT, _PARAMS)
+def turn_gnss_baseline(flights, params):
+    """Give the baseline just measured by flights[0] its constant error."""
+    turn_baseline(flights[0], params[0], True)
+
+
+@_entry(_FLIGHT, _PARAMS, types.boolean, types.boolean, types.int64)
+def limit_features(flights, params, blurs, ground_hides, feature_count):
+    """Blur the image just taken by flights[0], and lose what is too far or behind the ground."""
+    limit_camera(flights[0], params[0], blurs, ground_hides, feature_count, True)
 
 
 @_entry(_FLIGHT, _PARAMS)
