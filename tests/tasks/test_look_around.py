@@ -56,7 +56,7 @@ def test_the_reward_is_that_of_its_equation():
         w, x, y, z = batch.read("q").T
         forward = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply([1.0, 0.0, 0.0])
         h = (forward * view.reference_heading).sum(axis=1)
-        expected = 0.1 * np.exp(-e) + 0.1 * np.exp(-5.0 * e) + 0.1 * h - 2.0 * terminated
+        expected = 0.1 * np.exp(-e) + 0.1 * np.exp(-5.0 * e) + 0.15 * h - 2.0 * terminated
         np.testing.assert_allclose(reward[~over], expected[~over], atol=1e-12)
         crashes += terminated.sum()
         over = terminated | truncated
