@@ -17,8 +17,8 @@ WIDE_WEIGHT, NEAR_WEIGHT = 0.1, 0.1
 """Of exp(-e) and exp(-5 e): the first still pulls a vehicle back that has been lost for a while."""
 
 HEADING_WEIGHT = 0.15
-"""Of the heading. With 0.05 a rule that always faces the wall is as good as one that glances, with 0.2
-one that never looks is nearly as good as one that always does (docs/where-it-matters.md)."""
+"""Of the heading. With 0.05 a rule that always faces the wall is as good as one that glances, with
+0.2 a rule that never looks is nearly as good as one that always does."""
 
 CRASH_COST = 2.0
 """Once, as much as ten steps of perfect tracking; a crash also costs the time that was left."""
