@@ -16,7 +16,8 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from quad_gym.envs import IDS
-from quad_gym.params.suites import SUITES
+from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.params.suites import ALL_SUITES, SUITES
 
 USAGE_ERROR = 2
 """Exit code of a program that was called with invalid arguments."""
@@ -96,6 +97,12 @@ def refuse_overwriting(file: Path, overwrite: bool) -> None:
         raise ValueError(f"{file} exists: give --overwrite to replace it, or another --output")
 
 
+def sensors_of(env_id: str, given: str | None) -> str:
+    """The name of the sensor suite: what was given, or else the task's own."""
+    own = BENCHMARKS.get(IDS[env_id])
+    return given or ("standard" if own is None else own.keywords["sensors"])
+
+
 def flying_options(keywords: Mapping[str, Any]) -> str:
     """Options of `quad-gym evaluate` for keywords of an environment, each after a space."""
     rest = dict(keywords)
@@ -170,7 +177,7 @@ Seed = Annotated[int, tyro.conf.arg(name="seed")]
 FilterStart = tyro.conf.arg(name="filter-start")
 """How the filter starts, as the keyword of environments."""
 
-SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(SUITES)}")]
+SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(ALL_SUITES)}")]
 """The name of a sensor suite."""
 
 SuiteNames = Annotated[
