@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,13 @@ from quad_gym.faults import GnssJump, GnssOutage
 from quad_gym.params.distributions import Normal, Uniform
 from quad_gym.params.task import TASKS, TaskParams
 from quad_gym.records import (
+    AIDS,
     DRAW_FAULTS,
     DRAW_RANGES,
     DRAWS_OF_FAULT,
     FAULT_KINDS,
     MAX_FEATURES,
+    MAX_SLOW,
     FaultKind,
 )
 from quad_gym.records.streams import _claim
@@ -55,7 +58,11 @@ def test_a_draw_that_is_taken_is_refused(end):
 
 DRAWS_OF = {"uniform_pair": 1, "normal_pair": 1, "six_normals": 3, "_any_direction": 1}
 """How many draws a function takes from the one on that is its second argument."""
-LARGEST = {"feature_count": MAX_FEATURES, "settings.feature_count": MAX_FEATURES}
+LARGEST = {
+    "feature_count": MAX_FEATURES,
+    "settings.feature_count": MAX_FEATURES,
+    "slow.slow_states": MAX_SLOW,
+}
 """What kernels are told while they run, at its largest."""
 FAULTS = range(FAULT_KINDS)
 
@@ -90,9 +97,14 @@ def draws_of_call(name, function, call):
         values[variable] = range(LARGEST.get(end) or eval(end, scope))
     if "_draw_of(k)" in source:
         values["k"] = FAULTS
-    (variable, each) = next(iter(values.items()), ("_", [0]))
-    assert len(values) < 2
-    firsts = [int(eval(source, scope | {variable: value})) for value in each]
+        assert len(values) == 1  # so that the places of kinds are told apart
+    elif name.endswith("measurements.aid"):  # of sensor s, or of the slow state k
+        names = {node.id for node in ast.walk(call.args[1]) if isinstance(node, ast.Name)}
+        values |= {"s": range(AIDS)} if "s" in names else {}
+        values |= {"k": range(0, MAX_SLOW, 3)} if "k" in names else {}
+    assert len(values) < 3
+    scopes = [dict(zip(values, each, strict=True)) for each in itertools.product(*values.values())]
+    firsts = [int(eval(source, scope | each)) for each in scopes]
     return [set(range(first, first + DRAWS_OF[call.func.id])) for first in firsts]
 
 

@@ -147,12 +147,12 @@ def begin_aid(flight, p, settings, s, mask):
 @kernel
 def draw_matrix(flight, p, s, mask):
     """Draw the errors of scale and alignment of sensor s, where `mask`."""
-    stream, first = stream_of(flight), DRAW_AID_MATRIX + 5 * s
-    a, b = normal_pair(stream, first)
-    c, d = normal_pair(stream, first + 1)
-    e, f = normal_pair(stream, first + 2)
-    g, h = normal_pair(stream, first + 3)
-    i, _ = normal_pair(stream, first + 4)
+    stream = stream_of(flight)
+    a, b = normal_pair(stream, DRAW_AID_MATRIX + 5 * s)
+    c, d = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 1)
+    e, f = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 2)
+    g, h = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 3)
+    i, _ = normal_pair(stream, DRAW_AID_MATRIX + 5 * s + 4)
     z = p.aid_matrix_sigma[s]
     keep33(
         flight.aid_matrix[s],
@@ -168,7 +168,7 @@ def aid_due(flight, p, settings, s, mask, starting):
     wait = select(due, 1.0 * settings.aid_ticks[s], flight.aid_wait[s]) - 1.0
     flight.aid_wait[s] = select(mask, wait, flight.aid_wait[s])
     if not starting and any_of(due):
-        n, _ = normal_pair(stream_of(flight), DRAW_AID_DRIFT + 2 * s)
+        n, _ = normal_pair(stream_of(flight), DRAW_AID_DRIFT + s)
         error = p.aid_scalar_decay[s] * flight.aid_scalar[s] + p.aid_scalar_drive[s] * n
         flight.aid_scalar[s] = select(due, error, flight.aid_scalar[s])
     return due
