@@ -203,7 +203,7 @@ class _KalmanFilter:
         chosen = with_drift if self.sensors.drifts else stage
         before, p = self.status, self._params
         others = (p, p, self._settings, self._work, self._table(), self._features)
-        single.run_stage(self._flight.ctypes.data, 0, 1, chosen, *others)
+        single.run_stage(self._flight.ctypes.data, 0, 1, int(chosen), *others)
         news = self.status & ~before
         if news:
             warnings.warn(
