@@ -67,12 +67,16 @@ def test_evaluate_replaces_results_only_when_told(tmp_path, capsys):
         "duration=0.4",
     ]
     main(line)
-    file = tmp_path / "results" / "evaluate" / "hover" / "summary.json"
+    folder = tmp_path / "results" / "evaluate"
+    file = folder / "hover" / "summary.json"
     before = file.read_text()
-    assert "--overwrite" in refused([*line, "--seed", "5"], capsys)
+    main([*line, "--seed", "5"])
+    assert (folder / "hover_2" / "summary.json").exists()
+    assert "--overwrite" in refused([*line, "--output", str(file.parent)], capsys)
     assert file.read_text() == before
     main([*line, "--seed", "5", "--overwrite"])
     assert file.read_text() != before
+    assert not (folder / "hover_3").exists()
 
 
 def test_tune_replaces_gains_only_when_told(tmp_path, capsys):
