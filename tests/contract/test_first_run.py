@@ -152,3 +152,32 @@ def test_the_compiled_engine_writes_files_for_tensorboard(tmp_path):
     assert sorted(found.Tags()["scalars"]) == ["evaluation/mean_error", "train/loss"]
     errors = found.Scalars("evaluation/mean_error")
     assert [(e.step, e.value) for e in errors] == [(0, 0.5), (100, 100.5)]
+
+
+def test_the_bar_of_a_training_begins_after_compiling(tmp_path, monkeypatch, capsys):
+    """Its speed would count the time of compiling, and it would stand still for that long."""
+    from baselines.compiled_ppo.ppo import CompiledPPO
+    from baselines.compiled_ppo.run import run
+    from baselines.plans import Plan
+    from baselines.recipes import recipe
+
+    prepared = []
+    prepare = CompiledPPO.prepare
+
+    def watched(self):
+        prepare(self)
+        prepared.append(capsys.readouterr().err)
+
+    monkeypatch.setattr(CompiledPPO, "prepare", watched)
+    small = recipe("QuadGym/Hover-v0").replace(n_envs=2, steps=64)
+    plan = Plan(
+        env_id="QuadGym/Hover-v0",
+        environment={"duration": 0.2},
+        recipe=small.replace(parameters={**small.parameters, "batch_size": 64}),
+        threads=1,
+        evaluations=1,
+        episodes=2,
+    )
+    run(plan, tmp_path, plan.make_judge(), tensorboard=False, quiet=False)
+    assert "steps" not in prepared[0]
+    assert "64.0/64.0" in capsys.readouterr().err
