@@ -55,7 +55,7 @@ test-oldest: $(OLDEST)/.tester  ## golden flights and interfaces with the oldest
 $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 	$(PYTHON) -m venv $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --quiet --constraint constraints-oldest.txt \
-		--editable ".[train,plot]" pytest hypothesis
+		--editable ".[train,plot,render]" pytest hypothesis
 	touch $@
 
 test-slow: setup  ## the slow statistical and soak tests

@@ -118,7 +118,12 @@ class RunKeeper(ABC):
     # ---- between rollouts -----------------------------------------------------------------------
 
     def begin(self, steps: int) -> None:
-        """Start the clock of a training that has done `steps` steps."""
+        """Start clock and bar of a training that has done `steps` steps; all is compiled now."""
+        if not self._quiet:
+            from tqdm import tqdm
+
+            total = self._plan.recipe.steps
+            self._bar = tqdm(total=total, initial=steps, unit=" steps", unit_scale=True)
         self.steps, self._since = steps, time.perf_counter()
 
     def watch(self, model: Policy, steps: int) -> None:
@@ -138,14 +143,10 @@ class RunKeeper(ABC):
     # ---- the beginning and the end --------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        """Take over Ctrl-C and the request to terminate, and show the bar."""
+        """Take over Ctrl-C and the request to terminate."""
         if threading.current_thread() is threading.main_thread():  # else they are not ours to take
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
-        if not self._quiet:
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=self._plan.recipe.steps, unit=" steps", unit_scale=True)
         return self
 
     def __exit__(

@@ -81,9 +81,8 @@ class LaneFilter:
     def _run(self, stage, mask):
         table = linked_table(FILTER_STAGES, FILTER_ENTRIES)
         for block, params, settings, work in self._each(mask):
-            run_stage(
-                block.ctypes.data, 0, 1, stage, params, params, settings, work, table, self.features
-            )
+            others = (params, params, settings, work, table, self.features)
+            run_stage(block.ctypes.data, 0, 1, int(stage), *others)
 
     def _each(self, mask):
         """Blocks and what they need, one by one, the part of a mask that is theirs in force."""

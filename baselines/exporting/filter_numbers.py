@@ -15,8 +15,9 @@ from quad_gym.records.params import PARAMS_FIELDS
 
 _FIELDS = {
     "any": (
-        *("gravity", "dt", "accel_noise", "gyro_noise", "accel_bias_decay", "gyro_bias_decay"),
-        *("accel_bias_drive", "gyro_bias_drive", "accel_bias_sigma", "gyro_bias_sigma"),
+        *("gravity", "dt", "accel_noise", "accel_error_noise", "gyro_noise"),
+        *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
+        *("accel_bias_sigma", "gyro_bias_sigma"),
         *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
         *("gnss_sigma", "baseline_noise", "first_baseline_sigma", "heading_sigma"),
         *("baseline", "baseline_length", "R_IG", "antenna", "velocity_sigma"),
@@ -32,6 +33,7 @@ _FIELDS = {
 """What the filter's kernels read of the parameters: of any suite, and of one with a camera."""
 
 _MEANINGS = {
+    "accel_error_noise": "noise of a sample per m/s^2 of f_B - (0, 0, g), for scale and alignment",
     "gyro_noise": "noise of a sample that the filter takes for white",
     "accel_bias_decay": "of the bias over a tick: exp(-dt/tau)",
     "gyro_bias_decay": "of the bias over a tick: exp(-dt/tau)",

@@ -27,6 +27,7 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     SuiteName,
+    free_folder,
     leave,
     refuse_overwriting,
     sensors_of,
@@ -61,7 +62,8 @@ class Args:
     video: Literal["none", "mp4", "gif", "webp"] = "none"
     """also write a video of the first episode of each case, of this kind"""
     output: Path | None = None
-    """folder for figures and numbers; if not given, results/evaluate/TASK"""
+    """folder for figures and numbers; if not given, results/evaluate/TASK, or TASK_2 and so on
+    where there are results already"""
     overwrite: bool = False
     """replace the results in the folder, if there are any"""
 
@@ -86,6 +88,8 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
+    if args.output is None and not args.overwrite:
+        folder = free_folder(folder, "summary.json")
     refuse_overwriting(folder / "summary.json", args.overwrite)
     cases: dict[Case, tuple[Policy, Any]] = {}
     for observation in args.observation:

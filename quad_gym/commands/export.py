@@ -97,8 +97,8 @@ def _name(args: Args) -> str:
         return f"filter_{args.sensors}"
     if args.policy == "pretrained":
         return IDS.get(full_id(args.env_id or ""), "policy")
-    path = Path(args.policy)
-    return f"{path.parent.name}_{path.stem}" if path.parent.name else path.stem
+    path = Path(args.policy).with_suffix("")
+    return "_".join(part for part in path.parts[-3:] if part not in ("/", "..", "."))
 
 
 def function_name(file: Path) -> str:

@@ -103,6 +103,20 @@ def sensors_of(env_id: str, given: str | None) -> str:
     return given or ("standard" if own is None else own.keywords["sensors"])
 
 
+def free_folder(folder: Path, result: str) -> Path:
+    """A folder that holds no results yet: this one, or else FOLDER_2, FOLDER_3, ...
+
+    Args:
+        folder: The first to try.
+        result: Name of a file that is there where there are results.
+    """
+    number, found = 1, folder
+    while (found / result).exists():
+        number += 1
+        found = folder.with_name(f"{folder.name}_{number}")
+    return found
+
+
 def flying_options(keywords: Mapping[str, Any]) -> str:
     """Options of `quad-gym evaluate` for keywords of an environment, each after a space."""
     rest = dict(keywords)

@@ -152,3 +152,5 @@ def main(args: Args) -> None:
         print(f"Wrote {args.export}.")
     policy = f"--policy {done.best_policy}{flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
+    if plan.recipe.algorithm != "recurrent_ppo":
+        print(f"Export it: quad-gym export {done.best_policy} --to c")

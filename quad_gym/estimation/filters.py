@@ -174,7 +174,7 @@ class _KalmanFilter(Estimate):
         chosen = with_slow if self._slow else stage
         before, p = self.status, self._params
         others = (p, p, self._settings, self._work, self._table(), self._features)
-        single.run_stage(self._flight.ctypes.data, 0, 1, chosen, *others)
+        single.run_stage(self._flight.ctypes.data, 0, 1, int(chosen), *others)
         news = self.status & ~before
         if news:
             warnings.warn(

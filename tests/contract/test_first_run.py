@@ -67,12 +67,16 @@ def test_evaluate_replaces_results_only_when_told(tmp_path, capsys):
         "duration=0.4",
     ]
     main(line)
-    file = tmp_path / "results" / "evaluate" / "hover" / "summary.json"
+    folder = tmp_path / "results" / "evaluate"
+    file = folder / "hover" / "summary.json"
     before = file.read_text()
-    assert "--overwrite" in refused([*line, "--seed", "5"], capsys)
+    main([*line, "--seed", "5"])
+    assert (folder / "hover_2" / "summary.json").exists()
+    assert "--overwrite" in refused([*line, "--output", str(file.parent)], capsys)
     assert file.read_text() == before
     main([*line, "--seed", "5", "--overwrite"])
     assert file.read_text() != before
+    assert not (folder / "hover_3").exists()
 
 
 def test_tune_replaces_gains_only_when_told(tmp_path, capsys):
@@ -148,3 +152,32 @@ def test_the_compiled_engine_writes_files_for_tensorboard(tmp_path):
     assert sorted(found.Tags()["scalars"]) == ["evaluation/mean_error", "train/loss"]
     errors = found.Scalars("evaluation/mean_error")
     assert [(e.step, e.value) for e in errors] == [(0, 0.5), (100, 100.5)]
+
+
+def test_the_bar_of_a_training_begins_after_compiling(tmp_path, monkeypatch, capsys):
+    """Its speed would count the time of compiling, and it would stand still for that long."""
+    from baselines.compiled_ppo.ppo import CompiledPPO
+    from baselines.compiled_ppo.run import run
+    from baselines.plans import Plan
+    from baselines.recipes import recipe
+
+    prepared = []
+    prepare = CompiledPPO.prepare
+
+    def watched(self):
+        prepare(self)
+        prepared.append(capsys.readouterr().err)
+
+    monkeypatch.setattr(CompiledPPO, "prepare", watched)
+    small = recipe("QuadGym/Hover-v0").replace(n_envs=2, steps=64)
+    plan = Plan(
+        env_id="QuadGym/Hover-v0",
+        environment={"duration": 0.2},
+        recipe=small.replace(parameters={**small.parameters, "batch_size": 64}),
+        threads=1,
+        evaluations=1,
+        episodes=2,
+    )
+    run(plan, tmp_path, plan.make_judge(), tensorboard=False, quiet=False)
+    assert "steps" not in prepared[0]
+    assert "64.0/64.0" in capsys.readouterr().err
