@@ -130,11 +130,11 @@ def page_text(results: Results) -> str:
     gains = [
         f"{results.arm(name).label}: {number(results.improvement(name, 'truth'), 2)}"
         for name in results.trained()
-        if name != "truth" and "truth" in results.trained()
+        if name != "truth" and "truth" in results.trained() and len(study.seeds) > 1
     ]
     return "\n".join(
         [
-            f"{len(study.seeds)} training seeds of {study.recipe.steps:,} steps, "
+            f"Training seeds: {len(study.seeds)}, of {study.recipe.steps:,} steps each; "
             f"{study.episodes:,} test episodes with each policy. Success: flown to the end, with a "
             f"mean position error below {study.within:g} m in the second half.",
             "",
@@ -186,7 +186,7 @@ def _figures(results: Results) -> dict[str, Any]:
         k = _telling(pair[best])
         found["glance"] = glance_figure(
             {
-                f"trained on {results.arm(name).label}": _glance(flown, k)
+                f"trained on {results.arm(name).label}".replace(", ", ",\n"): _glance(flown, k)
                 for name, flown in pair.items()
             },
             half_view_of(study.env_id),

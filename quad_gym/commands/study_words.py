@@ -27,14 +27,15 @@ def conclusions(results: Results) -> list[str]:
         found += _against_truth(results, results.best(learned))
     if results.fixed() and results.trained():
         found.append(_against_rules(results, results.best(results.trained())))
-    if {"estimate", "sigma"} <= set(results.trained()):
+    several = len(results.study.seeds) > 1
+    if several and {"estimate", "sigma"} <= set(results.trained()):
         found.append(_of_pair(results, "sigma", "estimate"))
-    if {"memory", "sigma"} <= set(results.trained()):
+    if several and {"memory", "sigma"} <= set(results.trained()):
         found.append(_of_pair(results, "memory", "sigma"))
     if results.trained() and len(results.study.seeds) < FEW:
         found.append(
-            f"With {len(results.study.seeds)} training seeds the intervals say little: run with "
-            f"{FEW} or more."
+            f"Training seeds: {len(results.study.seeds)}, with which the intervals say little of "
+            f"other trainings: run with {FEW} or more."
         )
     return found
 
