@@ -179,7 +179,9 @@ def train_all(study: Study) -> None:
     wanted = [(seed, arm) for seed in study.seeds for arm in study.arms if arm.policy is None]
     for done, (seed, arm) in enumerate(wanted, 1):
         folder = study.run_folder(arm, seed)
-        training = train(plan_of(study, arm, seed), folder, resume=True, quiet=True)
+        training = train(
+            plan_of(study, arm, seed), folder, resume=True, tensorboard=False, quiet=True
+        )
         if not training.finished:
             raise KeyboardInterrupt
         print(
