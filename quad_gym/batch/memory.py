@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import named_faults
+from quad_gym.params import checks as check
 from quad_gym.params.randomization import Randomization
+from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import (
     COLUMNS,
     FLIGHT_BLOCK,
@@ -31,6 +33,7 @@ class FlightMemory:
     """The records of `count` flights, in blocks of WIDTH."""
 
     count: int
+    sensors: SensorSuite
     faults: tuple[Fault, ...]
     randomization: Randomization
 
@@ -129,3 +132,50 @@ class FlightMemory:
             raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset
+
+    # ---- switching ----------------------------------------------------------------------------
+
+    def switch_sensors(
+        self, *, gnss: bool | None = None, camera: bool | None = None, **aids: bool | None
+    ) -> None:
+        """Let sensors of all flights fail, or measure again, from the next tick on.
+
+        The filter goes on without them. A new episode begins with all sensors measuring.
+
+        Args:
+            gnss: Whether GNSS measures; None: as it does now.
+            camera: Likewise.
+            aids: Likewise `barometer` and `magnetometer`, where the suite has them.
+
+        Raises:
+            ValueError: If an aiding sensor is unknown, or the suite lacks it.
+        """
+        there = {aid.name.lower(): aid for aid in self.sensors.aids}
+        for name, measures in aids.items():
+            check.choice("switch_sensors", name, tuple(there))
+            self._switch(self._blocks["aid_wait"][:, there[name]], name, measures)
+        for sensor, measures in (("gnss", gnss), ("camera", camera)):
+            self._switch(self._blocks[f"{sensor}_wait"], sensor, measures)
+
+    @staticmethod
+    def _switch(waits: NDArray[Any], sensor: str, measures: bool | None) -> None:
+        """Let a sensor be due again, or never; None: as it is."""
+        if measures is not None and check.flag(sensor, measures):
+            waits[np.isinf(waits)] = 0.0
+        elif measures is not None:
+            waits[:] = np.inf
+
+    def switch_faults(self, active: bool) -> None:
+        """Let the faults of all flights come, or go, at the next tick, whatever their time is.
+
+        They stay so to the end of the episode, but for those that come at a rate.
+
+        Args:
+            active: Whether they come.
+        """
+        check.flag("active", active)
+        tick = self._blocks["tick"]
+        for fault in self.faults:
+            if active:
+                self._blocks["fault_from"][:, fault.kind] = tick
+            self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
