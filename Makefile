@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare test test-slow soak golden lint benchmark docs wheel clean
+.PHONY: setup demo circle animation compare study test test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
@@ -39,6 +39,10 @@ animation: setup  ## the animation of README
 
 compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
 	$(BIN)/quad-gym compare --sensors standard rtk --output results/compare/circle
+
+study: $(VENV)/.trainer  ## the study of docs/where-it-matters.md: LookAround, 5 training seeds
+	$(BIN)/quad-gym study --arms pd_reference pd_features pd_unsure truth sure \
+		--output results/study/look_around --page docs/where-it-matters.md
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"

@@ -57,7 +57,12 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def score(summary: dict[str, float], duration: float) -> float:
-    """What makes an evaluation the best: few crashes and small errors, or many gates and soon."""
+    """What makes an evaluation the best: few crashes and small errors, or many gates and soon.
+
+    Of a task with a reward of its own: the largest return.
+    """
+    if summary["own_reward"] > 0.0:
+        return summary["return"]
     if summary["gates_total"] > 0.0:
         return summary["gates_passed"] - summary["crash_rate"] - summary["seconds"] / duration
     return -summary["mean_error"] - 10.0 * summary["crash_rate"]
@@ -187,6 +192,7 @@ class RunKeeper(ABC):
         batch = self._judge.unwrapped.flights.batch  # type: ignore[attr-defined]
         summary = {
             **row,
+            "own_reward": float("reward" in getattr(batch, "methods", ())),
             "gates_total": float(batch.task.gate_count * (batch.task.kind == "waypoints")),
             "seconds": float(episodes.lengths.mean() / batch.clocks.control_rate),
         }

@@ -1,6 +1,7 @@
 """The report's PD controller, as a policy that computes its action from the observation alone."""
 
 import warnings
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.envs.spaces import policy_size
+from quad_gym.params import checks as check
 from quad_gym.params.control import PDGains, pd_gains
 
 Array = NDArray[np.float64]
@@ -15,6 +17,13 @@ Array = NDArray[np.float64]
 LEAST_LIFT, MOST_TILT = 0.3, 1.2
 """The wanted force keeps this share of the weight upward, and at most this ratio of its horizontal
 to its vertical part (50 degrees): no step of the reference turns the vehicle over."""
+
+
+FACES = ("reference", "features", "features_when_unsure")
+"""Where PD control points body x."""
+
+UNSURE = 0.1
+"""Largest standard deviation of the position beyond which it looks for features [m]."""
 
 
 class _Seen(NamedTuple):
@@ -84,6 +93,10 @@ class PDPolicy:
         gains: "lab" (the report's), "tuned", or `PDGains`.
         max_position_error: Position errors are shortened to this length [m]; None: 1 m on
             `Waypoints`, which are far apart, and unlimited elsewhere.
+        faces: Where body x points: in the direction of the "reference"; toward the "features" of
+            an environment that observes their direction, as LookAround does; or toward them
+            "features_when_unsure", while the filter's largest standard deviation of the position is
+            above UNSURE, which the environment must show (`include_covariance=True`).
 
     Raises:
         ValueError: If the environment's observation or action does not admit the controller, or a
@@ -91,7 +104,11 @@ class PDPolicy:
     """
 
     def __init__(
-        self, env: Any, gains: PDGains | str = "tuned", max_position_error: float | None = None
+        self,
+        env: Any,
+        gains: PDGains | str = "tuned",
+        max_position_error: float | None = None,
+        faces: str = "reference",
     ) -> None:
         flights = getattr(getattr(env, "unwrapped", env), "flights", None)
         if flights is None:
@@ -100,7 +117,20 @@ class PDPolicy:
         if flights.observation == "sensors":
             raise ValueError('env must observe a state: observation="sensors" holds none')
         needed = _ABSOLUTE_FIELDS if flights.layout == "absolute" else _RELATIVE_FIELDS
-        missing = sorted(set(needed) - {field.name for field in flights.table})
+        self._faces = check.choice("faces", faces, FACES)
+        wanted = {
+            "reference": (),
+            "features": ("features_direction",),
+            "features_when_unsure": ("features_direction", "position_sigma"),
+        }[faces]
+        shown = {field.name for field in flights.table}
+        lacking = [name for name in wanted if name not in shown]
+        if lacking:
+            raise ValueError(
+                f'env must observe {lacking[0]} for faces="{faces}"'
+                + (": make it with include_covariance=True" if "sigma" in lacking[0] else "")
+            )
+        missing = sorted(set(needed) - shown)
         if missing:
             raise ValueError(
                 f"env must observe {missing[0]}: its task replaces the observation that ships"
@@ -170,6 +200,18 @@ class PDPolicy:
 
     def _read(self, rows: Array) -> _Seen:
         part = {name: rows[:, where] for name, where in self._slices.items()}
+        seen = self._read_state(part)
+        if self._faces == "reference":
+            return seen
+        toward = part["features_direction"]
+        toward = toward - (toward * seen.up).sum(axis=1, keepdims=True) * seen.up
+        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+        if self._faces == "features":
+            return seen._replace(heading=toward)
+        unsure = part["position_sigma"].max(axis=1, keepdims=True) > UNSURE
+        return seen._replace(heading=np.where(unsure, toward, seen.heading))
+
+    def _read_state(self, part: Mapping[str, Array]) -> _Seen:
         if not self._absolute:
             return _Seen(**{name: part[name] for name in _RELATIVE_FIELDS}, velocity=None)
         R_BI = part["R_BI"].reshape(-1, 3, 3)

@@ -28,6 +28,8 @@ class Plan(Checked):
     """one of `quad_gym.IDS`"""
     environment: Any = field(default_factory=dict)
     """keywords of the environment, in training as in evaluation, before those of the recipe"""
+    learning: Any = field(default_factory=dict)
+    """keywords of the environment in training alone, before all others"""
     recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
     seed: int = 0
     """of the networks; the flights of training and validation have blocks of seeds that follow from
@@ -49,7 +51,8 @@ class Plan(Checked):
         if self.seed > MAX_SEED:
             raise ValueError(f"Plan.seed must be at most {MAX_SEED}, got {self.seed}")
         check.instance("Plan.recipe", self.recipe, Recipe)
-        self._set("environment", MappingProxyType(dict(self.environment)))
+        for name in ("environment", "learning"):
+            self._set(name, MappingProxyType(dict(getattr(self, name))))
 
     def __reduce__(self) -> Any:
         """Plans go to other processes."""
@@ -64,7 +67,7 @@ class Plan(Checked):
             n_envs=self.recipe.n_envs,
             seed=first_seed("training", self.seed, self.recipe.n_envs),
             threads=self.threads,
-            **{**self.recipe.flights, **self.environment},
+            **{**self.recipe.flights, **self.environment, **self.learning},
         )
         return ScaledReward(env, self.recipe.reward_scale)
 
@@ -74,7 +77,8 @@ class Plan(Checked):
             self.env_id,
             num_envs=self.recipe.n_envs,
             threads=self.threads,
-            **{**self.recipe.flights, **self.environment, "autoreset_mode": "SameStep"},
+            **{**self.recipe.flights, **self.environment, **self.learning},
+            autoreset_mode="SameStep",
         )
 
     def make_judge(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
@@ -100,6 +104,8 @@ def description(plan: Plan) -> dict[str, Any]:
     """A plan as JSON has it."""
     found: dict[str, Any] = as_json(plan)
     del found["threads"]  # changes no result
+    if not plan.learning:
+        del found["learning"]
     found["first_flights"] = {
         "training": first_seed("training", plan.seed, plan.recipe.n_envs),
         "validation": first_seed("validation", plan.seed, plan.episodes),

@@ -43,7 +43,8 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     """A policy, ready to fly in an environment.
 
     Args:
-        name: "pd" (tuned gains), "pd:lab" (the report's), "pd:FILE.json" (gains of
+        name: "pd" (tuned gains), "pd:lab" (the report's), "pd:features" and
+            "pd:features_when_unsure" (tuned gains, facing the features), "pd:FILE.json" (gains of
             `scripts/tune.py`), "pretrained" (the policy that ships for the environment's task), or
             a file: `.npz` as `MlpPolicy` saves it, or `.zip` as Stable-Baselines3 does. A `.zip`
             can run code while it is loaded: open only those that you trust.
@@ -55,6 +56,8 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     """
     if name in ("pd", "pd:tuned", "pd:lab"):
         return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
+    if name in ("pd:features", "pd:features_when_unsure"):
+        return PDPolicy(env, faces=name.removeprefix("pd:"))
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
@@ -69,6 +72,24 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
             f"got {name!r}"
         )
     return _stable_baselines_policy(file, env)
+
+
+def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
+    """Keywords that make an environment show a policy what it needs, beyond what the id says.
+
+    Args:
+        name: As `load_policy` takes it.
+        env_id: One of `quad_gym.IDS`.
+
+    Raises:
+        ValueError: If no policy ships for the task and "pretrained" is asked for.
+    """
+    if name == "pd:features_when_unsure":
+        return {"include_covariance": True}
+    if name != "pretrained":
+        return {}
+    trained = MlpPolicy.load(pretrained_file(env_id)).record["plan"]["environment"]
+    return {key: trained[key] for key in ("custom", "include_covariance") if key in trained}
 
 
 def _gains_of(file: Path) -> PDGains:
@@ -98,8 +119,8 @@ def pretrained_file(env_id: str) -> Path:
 
 def task_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> str:
     """The id of an environment."""
-    kind = env.unwrapped.flights.task.kind  # type: ignore[attr-defined]
-    return next(env_id for env_id, task in IDS.items() if task == kind)
+    name = env.unwrapped.flights.name  # type: ignore[attr-defined]
+    return next(env_id for env_id, task in IDS.items() if task == name)
 
 
 def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Policy:

@@ -139,6 +139,10 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
     ("QuadGym/Waypoints-v0", "ppo"): _PPO.replace(
         steps=3_000_000, parameters={**_PPO.parameters, "gamma": 0.99}
     ),
+    # closer bounds than the task's: who has lost himself need not be watched for long
+    ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
+        parameters={**_PPO.parameters, "gamma": 0.99}, flights={"out_of_bounds": 3.0}
+    ),
 }
 """Where a task needs another one, by id and algorithm."""
 

@@ -6,6 +6,7 @@ a keyword or of a part of an observation that the code has and the docstring lac
 """
 
 import dataclasses
+import importlib
 import inspect
 import re
 from collections.abc import Iterable, Sequence
@@ -18,6 +19,7 @@ from sphinx.errors import ExtensionError
 from sphinx.pycode import ModuleAnalyzer
 
 import quad_gym
+from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import (
     ONE_TASK_KEYWORDS,
     TASK_DEFAULTS,
@@ -27,7 +29,7 @@ from quad_gym.envs.configuration import (
 from quad_gym.envs.rendered import rendering_of
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights.record import COLUMNS, FEATURES
-from quad_gym.params.suites import SUITES
+from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import FLIGHT_FIELDS
 from quad_gym.tasks.fields import VIEW_FIELDS
 
@@ -158,6 +160,17 @@ def _keywords_page() -> str:
     )
 
 
+def _task_sections(name: str) -> dict[str, str]:
+    """What the docstring of a task says, by its headings; "About" is what stands before them."""
+    module, attribute = name.split(":")
+    text = inspect.getdoc(getattr(importlib.import_module(module), attribute)) or ""
+    parts = re.split(r"^## (.+)$", text.split("\nArgs:")[0], flags=re.MULTILINE)
+    about = "\n".join(parts[0].splitlines()[1:]).strip()
+    return {"About": about} | {
+        heading: body.strip() for heading, body in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
 def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str]) -> str:
     kind = quad_gym.IDS[env_id]
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", env_id.split("/")[1].removesuffix("-v0"))
@@ -165,31 +178,37 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
     if row is None:
         raise ExtensionError(f"the table of environments lacks {env_id}")
     reference, start, limit = (cell.strip() for cell in row[1].split("|"))
-    defaults = TASK_DEFAULTS[kind]
+    own = BENCHMARKS.get(kind)
+    defaults = TASK_DEFAULTS[kind] if own is None else own.task
+    spec = sections if own is None else sections | _task_sections(own.keywords["custom"])
+    settings = {} if own is None else dict(own.keywords)
     rows = [
         (f"`{key}`", _value(getattr(defaults, key)), docs[key])
         for key in TASK_KEYWORDS
-        if ONE_TASK_KEYWORDS.get(key, kind) == kind
+        if ONE_TASK_KEYWORDS.get(key, defaults.kind) == defaults.kind
     ]
+    rows += [(f"`{key}`", _value(value), "of every environment") for key, value in settings.items()]
     observation = _observation_rows(
         quad_gym.observation_layout(), _meanings(sections["Observation space"])
     )
     head = ("slice", "name", "meaning", "unit", "frame", "bounds")
     parts = [
         f"# {name}\n\n`{env_id}`\n",
+        f"{spec['About']}\n" if own else "",
         f"- **Reference**: {reference}\n- **Start**: {start}\n- **Time limit**: {limit}\n",
         "```python\nimport gymnasium\n\nimport quad_gym\n\n"
         f'env = gymnasium.make("{env_id}")\n```\n',
         "Reward, start, endings and `info` below are those of the specification that all "
         "environments share, `help(quad_gym.QuadEnv)`.\n",
         f"## Observation\n\n{_table(head, observation)}",
+        f"{spec['Observation']}\n" if own else "",
         "The other layouts are under [Observations](../observations.md).\n",
         f"## Action\n\n{sections['Action space']}\n",
         f"## Keywords of the task\n\n{_table(('keyword', 'default here', 'meaning'), rows)}",
         "All others are under [Keywords of every environment](../keywords.md).\n",
-        f"## Reward\n\n{sections['Reward']}\n",
+        f"## Reward\n\n{spec['Reward']}\n",
         f"## Start\n\n{sections['Start']}\n",
-        f"## Endings\n\n{sections['Episode end']}\n",
+        f"## Endings\n\n{sections['Episode end']}\n\n{spec['Endings'] if own else ''}\n",
         f"## Info\n\n{sections['Info']}\n",
     ]
     return "\n".join(parts)
@@ -197,7 +216,7 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
 
 def _suites_page() -> str:
     """The numbers of every suite side by side."""
-    suites = {name: quad_gym.sensor_suite(name) for name in SUITES}
+    suites = {name: quad_gym.sensor_suite(name) for name in ALL_SUITES}
     text = "# Sensor suites in numbers\n\nThe fields of `quad_gym.SensorSuite`. Where they come "
     text += "from is written beside them, in `quad_gym/params/`.\n"
     for part, kind in {

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import gymnasium
 
-from baselines.policies import load_policy, task_of
+from baselines.policies import keywords_of_policy, load_policy, task_of
 from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
@@ -23,7 +23,7 @@ from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_fig
 from quad_gym.analysis.metrics import bootstrap_interval
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
-from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, SuiteName, leave, sensors_of, usage_errors
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params.suites import sensor_suite
@@ -40,7 +40,8 @@ class Args:
     pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz)"""
     observation: tuple[str, ...] = ("truth", "estimate")
     """what to fly on: estimate, truth, noisy"""
-    sensors: SuiteName = "standard"
+    sensors: SuiteName | None = None
+    """if not given, the task's: standard, or one_wall for LookAround"""
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false gnss_rate=10"""
     episodes: int = 1000
@@ -78,7 +79,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     cases: dict[Case, tuple[Policy, Any]] = {}
     for observation in args.observation:
         for name in args.policy:
-            env = make_flights(args, observation, args.episodes)
+            env = make_flights(args, observation, args.episodes, name)
             cases[name, observation] = (load_policy(name, env), env)
     require_writable("--output", folder)
     if args.video != "none":
@@ -86,17 +87,19 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
     return cases, folder
 
 
-def make_flights(args: Args, observation: str, count: int) -> Any:
-    """The environment of an observation."""
+def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
+    """The environment of an observation, as a policy needs it."""
     names = ("observation", "sensors", "threads")
-    keywords = dict(leave(args.env, {name: f"--{name}" for name in names}))
+    given = leave(args.env, {name: f"--{name}" for name in names})
+    keywords = {**keywords_of_policy(policy, args.env_id), **given}
     if observation in ("truth", "noisy") and "faults" in keywords:
-        keywords["faults"] = felt_without_sensors(keywords["faults"], sensor_suite(args.sensors))
+        suite = sensor_suite(sensors_of(args.env_id, args.sensors))
+        keywords["faults"] = felt_without_sensors(keywords["faults"], suite)
     return gymnasium.make_vec(
         args.env_id,
         num_envs=count,
         observation=observation,
-        sensors=args.sensors,
+        sensors=sensors_of(args.env_id, args.sensors),
         threads=args.threads,
         **keywords,
     )
@@ -108,7 +111,7 @@ def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path
 
     files = []
     for name, observation in tqdm(cases, desc="filming", unit=" videos"):
-        env = make_flights(args, observation, 1)
+        env = make_flights(args, observation, 1, name)
         about = {"env_id": args.env_id, "policy": name, "observation": observation}
         flight = flight_of(load_policy(name, env), env, seed=args.seed, about=about)
         stem = _short(name).replace("/", "_").replace(":", "_")
@@ -217,8 +220,8 @@ def main(args: Args) -> None:
         tracers[case] = Tracer()
         results[case] = roll_out(policy, env, seed=args.seed, watch=tracers[case].add)
     print(
-        f"\n{args.env_id}, sensors {args.sensors}; {args.episodes:,} episodes in each case, "
-        f"from seed {args.seed}.\n"
+        f"\n{args.env_id}, sensors {sensors_of(args.env_id, args.sensors)}; "
+        f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"
     )
     print(table(results, next(iter(cases.values()))[1]))
     if args.episodes > 1:

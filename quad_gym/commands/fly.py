@@ -25,11 +25,11 @@ import gymnasium
 import numpy as np
 from tyro.conf import arg
 
-from baselines.policies import load_policy
+from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import Keywords, SuiteName, leave, usage_errors
+from quad_gym.commands.options import Keywords, SuiteName, leave, sensors_of, usage_errors
 from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import PRESETS, faults_of
@@ -47,7 +47,9 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 class Args:
     """Options of the flight."""
 
-    task: Literal["hover", "circle", "lemniscate", "random_trajectory", "waypoints"] = "circle"
+    task: Literal[
+        "hover", "circle", "lemniscate", "random_trajectory", "waypoints", "look_around"
+    ] = "circle"
     """what to fly"""
     policy: str = "pd"
     """who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for the
@@ -63,7 +65,8 @@ class Args:
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as control_rate=100 estimator=ekf"""
 
-    sensors: SuiteName = "standard"
+    sensors: SuiteName | None = None
+    """if not given, the task's: standard, or one_wall for look_around"""
     camera: bool = True
     """measure with the camera"""
     gnss_rate: float | None = None
@@ -149,7 +152,7 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
     Raises:
         ValueError: If there is no such fault, or the sensors lack what it concerns.
     """
-    sensors = sensor_suite(args.sensors)
+    sensors = sensor_suite(sensors_of(ID_OF_TASK[args.task], args.sensors))
     faults = faults_of(args.fault, sensors if args.camera else sensors.replace(camera=None))
     if args.fault_time is None:
         return faults
@@ -165,14 +168,15 @@ def make_env(args: Args) -> Any:
     """
     options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
-    keywords = leave(args.env, {**named, "faults": "--fault"})
+    given = leave(args.env, {**named, "faults": "--fault"})
+    keywords = {**keywords_of_policy(args.policy, ID_OF_TASK[args.task]), **given}
     return gymnasium.make_vec(
         ID_OF_TASK[args.task],
         num_envs=1,
         autoreset_mode="Disabled",
         observation=args.observation,
         action=args.action,
-        sensors=args.sensors,
+        sensors=sensors_of(ID_OF_TASK[args.task], args.sensors),
         camera=args.camera,
         gnss_rate=args.gnss_rate,
         camera_rate=args.camera_rate,
@@ -295,7 +299,8 @@ def main(args: Args) -> None:
         if env is not None and args.output and not env.unwrapped.flights.batch.max_steps:
             raise ValueError("--output needs a flight with an end: a --duration above 0")
         policy = None if env is None else load_policy(args.policy, env)
-    about = {"task": args.task, "policy": args.policy, "sensors": args.sensors, "fault": args.fault}
+    sensors = sensors_of(ID_OF_TASK[args.task], args.sensors)
+    about = {"task": args.task, "policy": args.policy, "sensors": sensors, "fault": args.fault}
 
     def flights(seed: int, switches: Switches) -> Iterator[Flight]:
         if saved is not None:

@@ -15,7 +15,8 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from quad_gym.envs import IDS
-from quad_gym.params.suites import SUITES
+from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.params.suites import ALL_SUITES, SUITES
 
 USAGE_ERROR = 2
 """Exit code of a program that was called with invalid arguments."""
@@ -75,6 +76,12 @@ def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[st
     return keywords
 
 
+def sensors_of(env_id: str, given: str | None) -> str:
+    """The name of the sensor suite: what was given, or else the task's own."""
+    own = BENCHMARKS.get(IDS[env_id])
+    return given or ("standard" if own is None else own.keywords["sensors"])
+
+
 def flying_options(keywords: Mapping[str, Any]) -> str:
     """Options of `quad-gym evaluate` for keywords of an environment, each after a space."""
     rest = dict(keywords)
@@ -120,7 +127,7 @@ Keywords = Annotated[
 EnvId = tyro.conf.Positional[Annotated[str, tyro.conf.arg(help=f"what to fly: {', '.join(IDS)}")]]
 """The id of an environment, given without the option's name."""
 
-SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(SUITES)}")]
+SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(ALL_SUITES)}")]
 """The name of a sensor suite."""
 
 SuiteNames = Annotated[

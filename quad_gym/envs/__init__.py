@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
 
+from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS
 
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from quad_gym.envs.sb3 import QuadVecEnv
     from quad_gym.tasks import Task
 
-IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in TASKS}
+IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in (*TASKS, *BENCHMARKS)}
 """The registered environments and their tasks."""
 
 _ENTRY_POINTS = {

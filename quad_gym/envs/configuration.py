@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.starts import checked_start
+from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.spaces import (
     ACTIONS,
     LAYOUTS,
@@ -74,7 +75,7 @@ class Flights:
     """The flights behind an environment, with its observation's table.
 
     Args:
-        task: The kind of task.
+        task: One of TASK_DEFAULTS or BENCHMARKS.
         count: Number of flights.
         autoreset: When a flight whose episode is over begins the next one.
         keywords: The environment's keywords; see `QuadEnv`.
@@ -85,19 +86,22 @@ class Flights:
     """
 
     def __init__(self, task: str, count: int, autoreset: Autoreset, **keywords: Any) -> None:
-        check.choice("task", task, tuple(TASK_DEFAULTS))
+        check.choice("task", task, (*TASK_DEFAULTS, *BENCHMARKS))
+        self.name = task
+        defaults, own = BENCHMARKS.get(task) or (TASK_DEFAULTS[task], {})
         check.keywords(
             keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *INTERFACE_KEYWORDS), "environments"
         )
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
         for name in given:
-            if ONE_TASK_KEYWORDS.get(name, task) != task:
+            if ONE_TASK_KEYWORDS.get(name, defaults.kind) != defaults.kind:
                 raise ValueError(
                     f"{name} belongs to the task {ONE_TASK_KEYWORDS[name]}, and must not be given "
                     f"for {task}"
                 )
-        self.task: TaskParams = TASK_DEFAULTS[task].replace(**given)
+        self.task: TaskParams = defaults.replace(**given)
+        keywords = {**own, **keywords}
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)

@@ -48,6 +48,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
+    | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a price for looking at them | hovering near it | 15 s |
+
+    Reward and further observation of `LookAround` are specified in its own class,
+    `quad_gym.tasks.look_around.LookAround`.
 
     ## Observation space
     A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and
@@ -97,8 +101,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     depend on the control rate: 16 for a perfect circle.
 
     ## Episode end
-    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m), tipped by more than 100
-    degrees, below -0.5 m, or through the last gate. Truncated: at the time limit, when the
+    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m, `LookAround`: 8 m), tipped by more than 100
+    degrees, below -0.5 m (`LookAround`: -5 m), or through the last gate. Truncated: at the time limit, when the
     filter has failed (`info["filter_status"]`), or with `end_when_lost=True` when it finds that it is
     lost. `info["ending"]` says which.
 
@@ -138,8 +142,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "standard", "lab", "rtk", "consumer" or "indoor" (see `quad_gym.params.suites`), or
-            a `SensorSuite`. "standard" has the laboratory's sensors and a consistent filter; "lab"
+        sensors: "standard", "lab", "rtk", "consumer", "indoor" or "one_wall" (see
+            `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is "one_wall". "standard" has the laboratory's sensors and a consistent filter; "lab"
             is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
             block by block; a suite whose filter gates keeps them for the latter anyway.
@@ -170,7 +174,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize, duration,
             out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration, gate_count,
             gate_radius, preview; see `quad_gym.TaskParams`.
-        custom: A task of your own, laid over that of the id: a `quad_gym.Task`, its class, or
+        custom: A task of your own, laid over that of the id (in place of `LookAround`'s): a `quad_gym.Task`, its class, or
             "module:name" of either.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.

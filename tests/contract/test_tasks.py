@@ -325,4 +325,4 @@ def test_gates_lie_within_the_radius_and_apart():
 
 def test_the_registered_names_are_the_tasks():
     for env_id, task in (("QuadGym/Circle-v0", "circle"), ("QuadGym/Waypoints-v0", "waypoints")):
-        assert gymnasium.make(env_id).unwrapped.flights.task.kind == task
+        assert gymnasium.make(env_id).unwrapped.flights.name == task

@@ -1,0 +1,84 @@
+"""Arms of a study: what a controller is trained on, as data.
+
+A study trains each arm with several seeds, and flies every policy on the estimate in the same
+episodes. To add arms of your own, write a file like this one, with a tuple `ARMS`, and name it to
+`quad-gym study --arms-file`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm(Checked):
+    """A way to get a controller."""
+
+    name: str
+    """short, for folders"""
+    label: str
+    """for people"""
+    policy: str | None = None
+    """by name (`baselines.policies.load_policy`), one that is not trained; None: trained"""
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    """keywords of the environment in which it flies the test, such as what is observed"""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """keywords that hold in place of these while it is trained and its best policy is chosen"""
+    learning: Mapping[str, Any] = field(default_factory=dict)
+    """keywords that hold in place of these while it is trained, but not where its best policy is
+    chosen, such as a reward of its own"""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """of the algorithm, in place of the recipe's"""
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and self.name.isidentifier()):
+            raise ValueError(f"Arm.name must be a word of letters and digits, got {self.name!r}")
+        check.instance("Arm.label", self.label, str)
+        for name in ("environment", "training", "learning", "parameters"):
+            check.instance(f"Arm.{name}", getattr(self, name), Mapping)
+            self._set(name, MappingProxyType(dict(getattr(self, name))))
+        if self.policy is not None and (self.training or self.learning or self.parameters):
+            raise ValueError(f"Arm {self.name} must not be trained, as its policy is {self.policy}")
+
+
+_FAR_SIGHTED = {"gamma": 0.995}
+"""Without a reward for being sure, what a look is worth comes seconds later: with the recipe's 0.99
+a third of the flights crashed in pilots."""
+_DOUBTING = {"custom": "baselines.arm_tasks:Doubting"}
+
+ARMS = (
+    Arm(name="pd_reference", label="PD, facing as rewarded", policy="pd"),
+    Arm(name="pd_features", label="PD, facing the features", policy="pd:features"),
+    Arm(
+        name="pd_unsure",
+        label="PD, facing the features when unsure",
+        policy="pd:features_when_unsure",
+        environment={"include_covariance": True},
+    ),
+    Arm(name="truth", label="truth", training={"observation": "truth"}),
+    Arm(name="noisy", label="truth + independent noise", training={"observation": "noisy"}),
+    Arm(name="estimate", label="estimate", parameters=_FAR_SIGHTED),
+    Arm(
+        name="sigma",
+        label="estimate + standard deviation",
+        environment=_DOUBTING,
+        parameters=_FAR_SIGHTED,
+    ),
+    Arm(
+        name="memory",
+        label="estimate + standard deviation + memory",
+        environment={"custom": "baselines.arm_tasks:Remembering"},
+        parameters=_FAR_SIGHTED,
+    ),
+    Arm(
+        name="sure",
+        label="estimate + standard deviation, paid for being sure",
+        environment=_DOUBTING,
+        learning={"custom": "baselines.arm_tasks:Sure"},
+    ),
+)
+"""Those of `QuadGym/LookAround-v0`."""

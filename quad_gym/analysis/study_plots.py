@@ -1,0 +1,150 @@
+"""Figures of a study: returns while learning, and where policies look in one episode."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.analysis.comparison_plots import _cycle
+from quad_gym.analysis.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PALE,
+    VERMILLION,
+    house_style,
+)
+
+Floats = NDArray[np.float64]
+
+
+class Glance(NamedTuple):
+    """One episode of one policy, (t,) each."""
+
+    time: Floats
+    """[s]"""
+    off_wall: Floats
+    """angle of body x from the direction of the features [rad]"""
+    off_reward: Floats
+    """angle of body x from the wanted heading [rad]"""
+    sigma: Floats
+    """largest standard deviation of the position that the filter states [m]"""
+    estimation_error: Floats
+    """[m]"""
+    position_error: Floats
+    """[m]"""
+
+
+def returns_figure(
+    curves: Mapping[str, Sequence[tuple[Floats, Floats]]], levels: Mapping[str, float]
+) -> Any:
+    """How returns on the estimate or the truth rise while training: each arm on what it learns on.
+
+    Args:
+        curves: Million steps (k,) and mean returns (k,) of every seed, by label.
+        levels: Horizontal lines to compare with, by label.
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+        axes: Any = figure.add_subplot()
+        for (label, seeds), (color, dashes) in zip(
+            curves.items(), _cycle(len(curves), skip=1), strict=True
+        ):
+            for x, y in seeds:
+                axes.plot(x, y, color=color, alpha=0.3, linewidth=0.7)
+            shortest = min(len(x) for x, _ in seeds)
+            middle = np.median([y[:shortest] for _, y in seeds], axis=0)
+            axes.plot(
+                seeds[0][0][:shortest], middle, color=color, linestyle=dashes, linewidth=2.0,
+                label=label,
+            )  # fmt: skip
+        for k, (label, level) in enumerate(levels.items()):
+            dashes = [(0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2))][k % 3]
+            axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)
+        axes.set_xlim(left=0.0)
+        axes.set_xlabel("training [million steps]")
+        axes.set_ylabel("return of an episode")
+        figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def glance_figure(episodes: Mapping[str, Glance], half_view: float) -> Any:
+    """Where policies look in the same episode, and what that does to the filter and the flight.
+
+    Args:
+        episodes: By the label of the policy.
+        half_view: Half of the camera's horizontal angle of view [rad].
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(4.3 * len(episodes), 5.4), layout="constrained")
+        grid = figure.subplots(
+            2, len(episodes), sharex=True, sharey="row", squeeze=False, height_ratios=(1.0, 1.15)
+        )
+        for column, (label, episode) in enumerate(episodes.items()):
+            _draw_angles(grid[0, column], episode, half_view)
+            _draw_errors(grid[1, column], episode)
+            grid[0, column].set_title(label)
+        last = max(float(e.time[np.isfinite(e.position_error)][-1]) for e in episodes.values())
+        grid[0, 0].set_xlim(0.0, last)
+        grid[0, 0].set_ylabel("body x, from the direction\nof the features [deg]")
+        grid[1, 0].set_ylabel("[m]")
+        for axes in grid[:, 0]:
+            axes.yaxis.set_tick_params(labelleft=True)
+        for row in grid:
+            handles, labels = row[0].get_legend_handles_labels()
+            row[-1].legend(handles, labels, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _draw_angles(axes: Any, episode: Glance, half_view: float) -> None:
+    """Where body x points, and where it should for the reward, as seen from the features."""
+    span = math.degrees(half_view)
+    axes.axhspan(-span, span, color=ORANGE, alpha=0.25, linewidth=0, label="features in view")
+    wanted = _unbroken(np.degrees(episode.off_wall - episode.off_reward))
+    axes.plot(episode.time, wanted, color=GREY, linestyle=(0, (4, 3)), label="rewarded")
+    axes.plot(episode.time, _unbroken(np.degrees(episode.off_wall)), color=BLUE, label="body x")
+    axes.set_ylim(-180.0, 180.0)
+    axes.set_yticks([-180, -90, 0, 90, 180])
+
+
+def _draw_errors(axes: Any, episode: Glance) -> None:
+    """What the filter states, what is so, and how far off the vehicle is."""
+    axes.plot(episode.time, 3.0 * episode.sigma, color=PALE, label="_")
+    axes.fill_between(
+        episode.time, 1e-3, 3.0 * episode.sigma, color=GREEN, alpha=0.2, linewidth=0,
+        label="filter: 3 sigma",
+    )  # fmt: skip
+    axes.plot(episode.time, episode.estimation_error, color=GREEN, label="error of the estimate")
+    axes.plot(episode.time, episode.position_error, color=VERMILLION, label="error of the position")
+    over = ~np.isfinite(episode.position_error)
+    if over.any():
+        end = episode.time[int(np.argmax(over))]
+        axes.axvline(end, color=INK, linewidth=1.0)
+        axes.annotate(
+            "crash", (end, 0.03), xytext=(4, 0), textcoords="offset points",
+            xycoords=("data", "axes fraction"), color=INK,
+        )  # fmt: skip
+    axes.set_yscale("log")
+    axes.set_ylim(3e-3, 10.0)
+    axes.set_xlabel("time [s]")
+
+
+def _unbroken(degrees: Floats) -> Floats:
+    """Angles in (-180, 180], with a gap where they pass from one end to the other."""
+    wrapped = (degrees + 180.0) % 360.0 - 180.0
+    jumps = np.abs(np.diff(wrapped, append=wrapped[-1:])) > 180.0
+    return np.where(jumps, np.nan, wrapped)

@@ -1,0 +1,250 @@
+"""Where does the estimate decide? Train arms with several seeds, and fly the same episodes.
+
+    quad-gym study                                   # LookAround, all arms, 5 seeds
+    quad-gym study --arms truth sigma --seeds 10
+    quad-gym study --quick                           # minutes: shows that it works, proves nothing
+    quad-gym study --arms-file my_arms.py --arms truth mine
+
+Every arm of baselines/arms.py (or of a file like it) is trained with the compiled PPO, and every
+policy flies the same test episodes on the estimate. Prints a table with interquartile means over
+the seeds and bootstrap 95 % intervals, says what they allow one to conclude, and writes figures,
+numbers and a report. Each training is a folder: a study that was stopped goes on where it stopped,
+and a folder that is deleted is made again, and nothing else.
+"""
+
+import csv
+import runpy
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from baselines.arms import ARMS, Arm
+from baselines.keeping import EVALUATIONS, RunError
+from baselines.plans import Plan
+from baselines.recipes import recipe
+from baselines.seeds import first_seed
+from quad_gym import IDS
+from quad_gym.analysis import plots
+from quad_gym.analysis.reports import require_writable
+from quad_gym.commands.options import EnvId, Keywords, leave, usage_errors
+from quad_gym.commands.study_flights import Flown, fly
+from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
+from quad_gym.commands.study_results import Study
+from quad_gym.commands.study_words import conclusions
+from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.params import checks as check
+
+EVALUATED = 9
+"""How often a policy is evaluated over its training, to keep the best one."""
+QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the study."""
+
+    env_id: EnvId = "QuadGym/LookAround-v0"
+    arms: tuple[str, ...] = ()
+    """names of arms; if not given, all of the file"""
+    arms_file: Path | None = None
+    """a file with a tuple ARMS, as baselines/arms.py has; if not given, that one"""
+    seeds: int = 5
+    """training seeds"""
+    steps: int | None = None
+    """environment steps of each training; if not given, the recipe's"""
+    set: Keywords = field(default_factory=dict)
+    """parameters of the algorithm in place of the recipe's, such as gamma=0.99"""
+    env: Keywords = field(default_factory=dict)
+    """keywords of the environment, such as duration=30.0"""
+    quick: bool = False
+    """two seeds of 300,000 steps and 100 episodes: shows that it works, proves nothing"""
+
+    episodes: int = 1000
+    """of the test, the same for every policy"""
+    seed: int = 0
+    """of the first test episode, and of the first training"""
+    success_within: float = 0.5
+    """an episode is a success if it is flown to the end, and its mean position error in the second
+    half is below this [m]"""
+    threads: int | None = None
+    """of flights and learning; if not given, one per core; no result depends on them"""
+    page: Path | None = None
+    """write table and conclusions into this page, too, between its marks for the task, and the
+    figures to the folder images beside it"""
+    output: Path | None = None
+    """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
+
+
+def arms_of(args: Args) -> tuple[Arm, ...]:
+    """The arms that are asked for, in the order of their file.
+
+    Raises:
+        ValueError: If there is no such file or arm.
+    """
+    known: Any = ARMS
+    if args.arms_file is not None:
+        if not args.arms_file.is_file():
+            raise ValueError(f"--arms-file must be a Python file, got {args.arms_file}")
+        known = runpy.run_path(str(args.arms_file)).get("ARMS")
+        if not (isinstance(known, tuple) and all(isinstance(arm, Arm) for arm in known)):
+            raise ValueError(f"--arms-file {args.arms_file} must have a tuple ARMS of Arm")
+    names = [arm.name for arm in known]
+    if len(set(names)) != len(names):
+        raise ValueError(f"arms must have different names, got {', '.join(names)}")
+    for name in args.arms:
+        check.choice("--arms", name, tuple(names))
+    return tuple(arm for arm in known if not args.arms or arm.name in args.arms)
+
+
+def configure(args: Args) -> Study:
+    """Check all options before anything is trained.
+
+    Raises:
+        ValueError: If an option is invalid, or the folder holds another study.
+        OSError: If nothing can be written to the folder.
+        ImportError: If matplotlib is missing.
+    """
+    from baselines.compiled_ppo.run import make_compiled
+
+    plots.require_matplotlib()
+    if IDS.get(args.env_id) not in BENCHMARKS:
+        known = ", ".join(env_id for env_id, task in IDS.items() if task in BENCHMARKS)
+        raise ValueError(f"ENV_ID must be one of {known}, got {args.env_id!r}")
+    for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
+        if getattr(args, name) < least:
+            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    check.positive("--success-within", args.success_within)
+    leave(args.env, {"observation": "--arms", "threads": "--threads"})
+    chosen = recipe(args.env_id)
+    steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
+    chosen = chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
+    task = IDS[args.env_id]
+    study = Study(
+        env_id=args.env_id,
+        arms=arms_of(args),
+        seeds=tuple(range(args.seed, args.seed + (QUICK_SEEDS if args.quick else args.seeds))),
+        recipe=chosen,
+        environment=dict(args.env),
+        episodes=QUICK_EPISODES if args.quick else args.episodes,
+        first_episode=first_seed("test", args.seed, args.episodes),
+        within=args.success_within,
+        folder=args.output or Path("results/study") / (f"{task}_quick" if args.quick else task),
+        threads=args.threads,
+    )
+    for arm in study.arms:
+        if arm.policy is None:
+            plan = plan_of(study, arm, study.seeds[0])
+            make_compiled(plan).env.close()
+            plan.make_judge().close()
+        test_flights(study, arm, 1).close()
+    if args.page is not None:
+        marks_of(args.page, task)
+    require_writable("--output", study.folder)
+    return study
+
+
+def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
+    """How an arm is trained."""
+    return Plan(
+        env_id=study.env_id,
+        environment={**study.environment, **arm.environment, **arm.training},
+        learning=arm.learning,
+        recipe=study.recipe.replace(parameters={**study.recipe.parameters, **arm.parameters}),
+        seed=seed,
+        engine="compiled",
+        threads=study.threads,
+        evaluations=EVALUATED,
+    )
+
+
+def test_flights(study: Study, arm: Arm, count: int) -> Any:
+    """The environment of the test: on the estimate."""
+    keywords = {**study.environment, **arm.environment, "observation": "estimate"}
+    return gymnasium.make_vec(study.env_id, num_envs=count, threads=study.threads, **keywords)
+
+
+def train_all(study: Study) -> None:
+    """Train every policy that is not trained yet, seed by seed.
+
+    Raises:
+        KeyboardInterrupt: If a training was stopped; it is kept, and goes on the next time.
+        ValueError: If a folder holds another training.
+    """
+    from baselines.training import train
+
+    wanted = [(seed, arm) for seed in study.seeds for arm in study.arms if arm.policy is None]
+    for done, (seed, arm) in enumerate(wanted, 1):
+        folder = study.run_folder(arm, seed)
+        training = train(plan_of(study, arm, seed), folder, resume=True, quiet=True)
+        if not training.finished:
+            raise KeyboardInterrupt
+        print(
+            f"[{done}/{len(wanted)}] {arm.label}, seed {seed}: {training.seconds:.0f} s, "
+            f"best return {training.best['return']:.1f}",
+            flush=True,
+        )
+
+
+def fly_all(study: Study) -> dict[Any, Flown]:
+    """Fly every policy in the test, unless it was flown before; by arm and seed."""
+    from baselines.policies import load_policy
+
+    flown = {}
+    for arm in study.arms:
+        env: Any = None
+        for seed in study.seeds_of(arm):
+            file = study.run_folder(arm, seed) / f"flown_{study.test_digest(arm)}.npz"
+            if not file.exists():
+                env = env or test_flights(study, arm, study.episodes)
+                name = arm.policy or str(study.run_folder(arm, seed) / "best.npz")
+                fly(load_policy(name, env), env, study.first_episode).save(file)
+            flown[arm.name, seed] = Flown.load(file)
+    return flown
+
+
+def curves_of(study: Study) -> dict[Any, Any]:
+    """Million steps, and mean returns, of the evaluations while training; by arm and seed."""
+    found = {}
+    for arm in study.arms:
+        for seed in study.seeds_of(arm):
+            if arm.policy is None:
+                file = study.run_folder(arm, seed) / EVALUATIONS
+                with file.open(encoding="utf-8", newline="") as stream:
+                    rows = [(float(r["steps"]), float(r["return"])) for r in csv.DictReader(stream)]
+                steps, returns = np.array(rows).T
+                found[arm.name, seed] = (steps / 1e6, returns)
+    return found
+
+
+def main(args: Args) -> None:
+    """Study."""
+    began = time.perf_counter()
+    with usage_errors():
+        study = configure(args)
+    trained = sum(arm.policy is None for arm in study.arms)
+    print(
+        f"{study.env_id}: {len(study.arms)} arms, {trained * len(study.seeds)} trainings of "
+        f"{study.recipe.steps:,} steps, {study.episodes:,} episodes with each policy; into "
+        f"{study.folder}."
+    )
+    try:
+        with usage_errors((RunError,)):
+            train_all(study)
+    except KeyboardInterrupt:
+        print("\nStopped. Start the same command again to go on from here.")
+        raise SystemExit(130) from None
+    results = study.results(fly_all(study), curves_of(study))
+    print(f"\n{table_text(results)}\n")
+    for sentence in conclusions(results):
+        print(sentence)
+    written = write_report(results)
+    if args.page is not None:
+        written = [*update_page(results, args.page), *written]
+    print(
+        f"\nWrote {len(written)} files to {study.folder} after "
+        f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."
+    )

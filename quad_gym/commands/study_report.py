@@ -1,0 +1,253 @@
+"""What a study leaves behind: tables, figures, numbers, and a page."""
+
+import base64
+import html
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quad_gym.analysis import plots
+from quad_gym.analysis.reports import text_table, versions, write_csv, write_json
+from quad_gym.analysis.study_plots import Glance, glance_figure, returns_figure
+from quad_gym.commands.study_flights import Flown
+from quad_gym.commands.study_results import Results
+from quad_gym.commands.study_words import conclusions, number, share
+
+HEADINGS = (
+    "arm",
+    "return",
+    "worst tenth",
+    "success",
+    "crashed",
+    "position error [m]",
+    "features in view",
+)
+CAPTIONS = {
+    "learning": "Return of the evaluations while training, each arm on what it is trained on; "
+    "thin lines are single seeds, bold ones their median.",
+    "glance": "The same episode, flown on the estimate. Above, where the vehicle looks; below, "
+    "what the filter states and what is so.",
+}
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 64rem; margin: 2rem auto;
+  padding: 0 1rem; }
+table { border-collapse: collapse; margin: 1rem 0; font-size: 14px; }
+th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #ddd; }
+th:first-child, td:first-child { text-align: left; }
+figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #666; }
+"""
+
+
+def cells(results: Results) -> list[list[str]]:
+    """The table's rows, for people."""
+    found = []
+    for arm in results.study.arms:
+        row = results.rows[arm.name]
+        found.append(
+            [
+                arm.label,
+                number(row["return"], 1),
+                number(row["worst"], 1),
+                share(row["success"]),
+                share(row["crashed"]),
+                number(row["error"], 3),
+                share(row["in_view"]),
+            ]
+        )
+    return found
+
+
+def table_text(results: Results) -> str:
+    """The table for the screen."""
+    return text_table({"": HEADINGS[:1], "flown on the estimate": HEADINGS[1:]}, cells(results))
+
+
+def table_markdown(results: Results) -> str:
+    """The table for a page."""
+    lines = [HEADINGS, ("---", *["---:"] * (len(HEADINGS) - 1)), *cells(results)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def write_report(results: Results) -> list[Path]:
+    """Write figures, numbers and pages; the last file is the page to open."""
+    folder, arms = results.study.folder, results.study.arms
+    columns: dict[str, list[Any]] = {}
+    for arm in arms:
+        for seed in results.study.seeds_of(arm):
+            flown = results.flown[arm.name, seed]
+            block: dict[str, Any] = {
+                "arm": [arm.name] * len(flown.returns),
+                "training_seed": [seed] * len(flown.returns),
+                "episode": results.study.first_episode + np.arange(len(flown.returns)),
+                "return": flown.returns,
+                "crashed": flown.crashed,
+                "position_error": flown.error,
+                "late_error": flown.late_error,
+                "features_in_view": flown.in_view,
+            }
+            for name, values in block.items():
+                columns.setdefault(name, []).extend(values)
+    written = [
+        write_csv(folder / "episodes.csv", columns),
+        write_json(
+            folder / "summary.json",
+            {
+                **results.description(),
+                "conclusions": conclusions(results),
+                "versions": versions("numpy", "numba", "scipy"),
+            },
+        ),
+    ]
+    text = [table_markdown(results), "", *(f"- {s}" for s in conclusions(results)), ""]
+    (folder / "table.md").write_text("\n".join(text), encoding="utf-8")
+    written.append(folder / "table.md")
+    figures = {name: plots.save_figure(f, folder / name) for name, f in _figures(results).items()}
+    for files in figures.values():
+        written += files
+    return [*written, _page(results, figures)]
+
+
+def marks_of(page: Path, task: str) -> tuple[str, str, str]:
+    """What a page holds before, between and after the marks of a study.
+
+    Raises:
+        ValueError: If there is no such page, or it lacks the marks.
+    """
+    first, last = f"<!-- study: {task} -->\n", f"<!-- /study: {task} -->"
+    text = page.read_text(encoding="utf-8") if page.is_file() else ""
+    before, found, rest = text.partition(first)
+    between, ended, after = rest.partition(last)
+    if not (found and ended):
+        raise ValueError(f"--page must be a page with the marks {first.strip()} {last}, got {page}")
+    return before + first, between, last + after
+
+
+def page_text(results: Results) -> str:
+    """What stands between the marks of a page: the setting, the table, and the conclusions."""
+    study = results.study
+    gains = [
+        f"{results.arm(name).label}: {number(results.improvement(name, 'truth'), 2)}"
+        for name in results.trained()
+        if name != "truth" and "truth" in results.trained()
+    ]
+    return "\n".join(
+        [
+            f"{len(study.seeds)} training seeds of {study.recipe.steps:,} steps, "
+            f"{study.episodes:,} test episodes with each policy. Success: flown to the end, with a "
+            f"mean position error below {study.within:g} m in the second half.",
+            "",
+            table_markdown(results),
+            "",
+            *(f"- {sentence}" for sentence in conclusions(results)),
+            *(
+                [
+                    "- Probability that a training returns more than one on truth: "
+                    + "; ".join(gains)
+                    + "."
+                ]
+                if gains
+                else []
+            ),
+            "",
+        ]
+    )
+
+
+def update_page(results: Results, page: Path) -> list[Path]:
+    """Write a study into a page, and its figures beside it; return what was written."""
+    from quad_gym import IDS
+
+    task = IDS[results.study.env_id]
+    before, _, after = marks_of(page, task)
+    page.write_text(before + page_text(results) + after, encoding="utf-8")
+    images = page.parent / "images"
+    images.mkdir(exist_ok=True)
+    written = [page]
+    for name, figure in _figures(results).items():
+        written.append(images / f"{task}_{name}.png")
+        figure.savefig(written[-1], dpi=130)
+    return written
+
+
+def _figures(results: Results) -> dict[str, Any]:
+    study, found = results.study, {}
+    curves = {
+        results.arm(name).label: [results.curves[name, seed] for seed in study.seeds]
+        for name in results.trained()
+    }
+    levels = {results.arm(n).label: results.rows[n]["return"].value for n in results.fixed()}
+    if curves:
+        found["learning"] = returns_figure(curves, levels)
+    if "truth" in results.trained() and len(results.trained()) > 1:
+        best = results.best([name for name in results.trained() if name != "truth"])
+        pair = {name: results.flown[name, study.seeds[0]] for name in ("truth", best)}
+        k = _telling(pair[best])
+        found["glance"] = glance_figure(
+            {
+                f"trained on {results.arm(name).label}": _glance(flown, k)
+                for name, flown in pair.items()
+            },
+            half_view_of(study.env_id),
+        )
+    return found
+
+
+def half_view_of(env_id: str) -> float:
+    """Half of the horizontal angle of view of a task's own camera [rad]."""
+    from quad_gym import IDS, sensor_suite
+    from quad_gym.envs.benchmarks import BENCHMARKS
+
+    camera = sensor_suite(BENCHMARKS[IDS[env_id]].keywords["sensors"]).camera
+    assert camera is not None
+    return math.atan(0.5 * camera.image_size[0] / camera.focal_length)
+
+
+def _telling(flown: Flown) -> int:
+    """The first traced episode in which the rewarded heading is well away from the features.
+
+    Elsewhere there is nothing to see: a policy that looks where it is paid sees them anyway.
+    """
+    off = np.abs(np.angle(np.exp(1j * (flown.off_wall - flown.off_reward))))
+    away = np.nanmean(off, axis=0)
+    return int(np.argmax(away > math.radians(100.0)))
+
+
+def _glance(flown: Flown, k: int) -> Glance:
+    names = Glance._fields[1:]
+    return Glance(flown.time, *(getattr(flown, name)[:, k] for name in names))
+
+
+def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
+    study = results.study
+    rows = [f"<tr>{''.join(f'<th>{html.escape(h)}</th>' for h in HEADINGS)}</tr>"]
+    rows += [
+        f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in line)}</tr>" for line in cells(results)
+    ]
+    parts = [
+        f"<h1>{html.escape(study.env_id)}</h1>",
+        f"<p>{len(study.seeds)} training seeds of {study.recipe.steps:,} steps, {study.episodes:,} "
+        "episodes with each policy, flown on the estimate. Interquartile means over seeds; in "
+        "brackets bootstrap 95 % intervals over seeds and episodes. Success: flown to the end, "
+        f"with a mean position error below {study.within:g} m in the second half.</p>",
+        f"<table>{''.join(rows)}</table><ul>",
+        *[f"<li>{html.escape(sentence)}</li>" for sentence in conclusions(results)],
+        "</ul>",
+    ]
+    for name, files in figures.items():
+        data = base64.b64encode(files[0].read_bytes()).decode()
+        caption = html.escape(CAPTIONS[name])
+        parts.append(
+            f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+    file = study.folder / "report.html"
+    file.write_text(
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f"<title>{html.escape(study.env_id)}</title><style>{_STYLE}</style></head><body>"
+        + "\n".join(parts)
+        + "</body></html>\n",
+        encoding="utf-8",
+    )
+    return file

@@ -1,0 +1,139 @@
+"""A study: what belongs to it, and its numbers."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baselines.arms import Arm
+from baselines.recipes import Recipe
+from quad_gym.analysis.reports import as_json
+from quad_gym.analysis.robust import (
+    Estimated,
+    estimated,
+    mean,
+    probability_of_improvement,
+    worst_tenth,
+)
+from quad_gym.commands.study_flights import Flown
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What is trained and flown."""
+
+    env_id: str
+    arms: tuple[Arm, ...]
+    seeds: tuple[int, ...]
+    recipe: Recipe
+    environment: Mapping[str, Any]
+    episodes: int
+    first_episode: int
+    within: float
+    """mean position error in the second half that is a success [m]"""
+    folder: Path
+    threads: int | None
+
+    def seeds_of(self, arm: Arm) -> tuple[int | None, ...]:
+        """The seeds of its trainings; a single None where it is not trained."""
+        return self.seeds if arm.policy is None else (None,)
+
+    def run_folder(self, arm: Arm, seed: int | None) -> Path:
+        """Where a training, or a fixed rule, is kept."""
+        place = self.folder / "runs" / arm.name
+        return place if seed is None else place / f"seed_{seed}"
+
+    def test_digest(self, arm: Arm) -> str:
+        """Of what the test of an arm depends on, beside its policy."""
+        about = {**self.environment, **arm.environment}
+        given = as_json([self.env_id, about, self.episodes, self.first_episode, arm.policy])
+        return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
+
+    def description(self) -> dict[str, Any]:
+        """Everything that the results depend on, as JSON has it."""
+        names = ("env_id", "arms", "seeds", "recipe", "environment", "episodes")
+        about = {name: getattr(self, name) for name in (*names, "first_episode", "within")}
+        return as_json(about)  # type: ignore[no-any-return]
+
+    def results(self, flown: Mapping[Any, Flown], curves: Mapping[Any, Any]) -> "Results":
+        """The numbers that come of flights."""
+        return Results(self, flown, curves, {arm.name: self._row(arm, flown) for arm in self.arms})
+
+    def _row(self, arm: Arm, flown: Mapping[Any, Flown]) -> dict[str, Estimated]:
+        """Every column of the table."""
+        runs = [flown[arm.name, seed] for seed in self.seeds_of(arm)]
+
+        def of(number: Any, score: Any = mean) -> Estimated:
+            return estimated([number(run) for run in runs], score)
+
+        return {
+            "return": of(lambda run: run.returns),
+            "worst": of(lambda run: run.returns, worst_tenth),
+            "success": of(lambda run: run.succeeded(self.within)),
+            "crashed": of(lambda run: run.crashed),
+            "error": of(lambda run: run.error),
+            "in_view": of(lambda run: run.in_view),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """The numbers of a study."""
+
+    study: Study
+    flown: Mapping[Any, Flown]
+    """by the name of the arm and the seed"""
+    curves: Mapping[Any, tuple[Floats, Floats]]
+    """steps and mean returns of the evaluations while training, by the same"""
+    rows: Mapping[str, Mapping[str, Estimated]]
+    """by the name of the arm and the column"""
+
+    def arm(self, name: str) -> Arm:
+        """The arm of a name."""
+        return next(arm for arm in self.study.arms if arm.name == name)
+
+    def mean_returns(self, name: str) -> list[float]:
+        """One per training."""
+        seeds = self.study.seeds_of(self.arm(name))
+        return [float(self.flown[name, seed].returns.mean()) for seed in seeds]
+
+    def improvement(self, first: str, second: str) -> Estimated:
+        """How probable it is that a training of one arm returns more than one of another."""
+        return probability_of_improvement(self.mean_returns(first), self.mean_returns(second))
+
+    def fixed(self) -> list[str]:
+        """Names of the arms that are not trained."""
+        return [arm.name for arm in self.study.arms if arm.policy is not None]
+
+    def trained(self) -> list[str]:
+        """Names of the others."""
+        return [arm.name for arm in self.study.arms if arm.policy is None]
+
+    def best(self, names: list[str]) -> str:
+        """The arm of the largest return."""
+        return max(names, key=lambda name: self.rows[name]["return"].value)
+
+    def description(self) -> dict[str, Any]:
+        """For JSON."""
+        trained = self.trained()
+        return {
+            "study": self.study.description(),
+            "rows": {
+                name: {column: found._asdict() for column, found in row.items()}
+                for name, row in self.rows.items()
+            },
+            "return_of_each_seed": {name: self.mean_returns(name) for name in self.rows},
+            "probability_of_improvement": {
+                f"{a} over {b}": self.improvement(a, b)._asdict()
+                for a in trained
+                for b in trained
+                if a != b
+            },
+        }

@@ -1,0 +1,84 @@
+"""What a study allows one to conclude, in words that are computed from its numbers."""
+
+from quad_gym.analysis.robust import Estimated
+from quad_gym.commands.study_results import Results
+
+FEW = 5
+"""Seeds below which intervals over trainings mean little."""
+
+
+def number(found: Estimated, digits: int) -> str:
+    """A number with its interval."""
+    low, high = f"{found.low:.{digits}f}", f"{found.high:.{digits}f}"
+    return f"{found.value:.{digits}f} [{low}, {high}]"
+
+
+def share(found: Estimated) -> str:
+    """A share with its interval, in percent."""
+    scaled = Estimated(*(100.0 * value for value in found))
+    return number(scaled, 1 if scaled.value < 10.0 else 0) + " %"
+
+
+def conclusions(results: Results) -> list[str]:
+    """Sentences, each true of the numbers."""
+    found = []
+    learned = [name for name in results.trained() if name != "truth"]
+    if "truth" in results.trained() and learned:
+        found += _against_truth(results, results.best(learned))
+    if results.fixed() and results.trained():
+        found.append(_against_rules(results, results.best(results.trained())))
+    if {"estimate", "sigma"} <= set(results.trained()):
+        found.append(_of_pair(results, "sigma", "estimate"))
+    if {"memory", "sigma"} <= set(results.trained()):
+        found.append(_of_pair(results, "memory", "sigma"))
+    if results.trained() and len(results.study.seeds) < FEW:
+        found.append(
+            f"With {len(results.study.seeds)} training seeds the intervals say little: run with "
+            f"{FEW} or more."
+        )
+    return found
+
+
+def _label(results: Results, name: str) -> str:
+    arm = results.arm(name)
+    return arm.label if arm.policy is not None else f"training on {arm.label}"
+
+
+def _against_truth(results: Results, best: str) -> list[str]:
+    label = _label(results, best)
+    ours, truth = results.rows[best], results.rows["truth"]
+    apart = ours["success"].apart(truth["success"])
+    verdict = "the intervals are apart" if apart else "the intervals overlap"
+    ratio = truth["error"].value / ours["error"].value
+    return [
+        f"Flown on the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
+        f"training on truth in {share(truth['success'])}: {verdict}.",
+        f"It crashes in {share(ours['crashed'])} against {share(truth['crashed'])}, and its mean "
+        f"position error is {ours['error'].value:.3f} m against {truth['error'].value:.3f} m, "
+        f"{ratio:.1f} times smaller."
+        if ratio > 1.0
+        else f"Its mean position error is {ours['error'].value:.3f} m, not smaller than "
+        f"{truth['error'].value:.3f} m.",
+    ]
+
+
+def _against_rules(results: Results, best: str) -> str:
+    rule = results.best(results.fixed())
+    a, b = results.rows[best]["return"], results.rows[rule]["return"]
+    if a.apart(b):
+        verdict = "above" if a.value > b.value else "below"
+        end = "and the intervals are apart"
+    else:
+        verdict, end = "not clearly different from", "as the intervals overlap"
+    return (
+        f"{_label(results, best)[0].upper()}{_label(results, best)[1:]} returns {number(a, 1)}, "
+        f"{verdict} the best fixed rule ({_label(results, rule)}, {number(b, 1)}), {end}."
+    )
+
+
+def _of_pair(results: Results, first: str, second: str) -> str:
+    chance = results.improvement(first, second)
+    a, b = _label(results, first), _label(results, second)
+    return f"A {a} returns more than a {b} with probability {number(chance, 2)}" + (
+        ", which decides nothing." if chance.low <= 0.5 <= chance.high else "."
+    )

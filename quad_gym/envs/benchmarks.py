@@ -1,0 +1,34 @@
+"""Tasks made of the general ones: a reference that ships, with sensors and a `Task` of its own."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from quad_gym.params.task import TaskParams
+
+
+class Benchmark(NamedTuple):
+    """What a task is unless keywords say otherwise."""
+
+    task: TaskParams
+    """its reference and its bounds"""
+    keywords: Mapping[str, Any]
+    """of the environment"""
+
+
+BENCHMARKS = {
+    "look_around": Benchmark(
+        TaskParams(
+            kind="random_trajectory",
+            start="hover",
+            radius=2.5,
+            height=2.0,
+            period=12.0,
+            randomize=True,
+            duration=15.0,  # a vehicle that never looks is lost by then
+            out_of_bounds=8.0,  # room to be mistaken, and to find oneself again
+            ground=-5.0,
+        ),
+        {"sensors": "one_wall", "custom": "quad_gym.tasks.look_around:LookAround"},
+    ),
+}
+"""By name."""

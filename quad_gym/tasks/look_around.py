@@ -1,0 +1,82 @@
+"""`LookAround`: a task in which a controller decides by looking what it knows."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.tasks.rewards import Crash, Heading, Piece, Tracking
+from quad_gym.tasks.task import Observed, Task
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.view import View
+
+WIDE_WEIGHT, NEAR_WEIGHT = 0.1, 0.1
+"""Of exp(-e) and exp(-5 e): the first still pulls a vehicle back that has been lost for a while."""
+
+HEADING_WEIGHT = 0.1
+"""Of the heading. With 0.05 a controller that always faces the wall is as good as one that glances;
+with 0.2 one that never looks comes close to both (docs/where-it-matters.md)."""
+
+CRASH_COST = 2.0
+"""Once, as much as ten steps of perfect tracking; a crash also costs the time that was left."""
+
+
+class LookAround(Task):
+    """Follow a random trajectory, and look where it is paid for, without losing oneself.
+
+    There is no GNSS. All eight markers hang on one wall, 8 m west of the origin, the camera sees 60
+    degrees, and the IMU is a cheap one: within seconds of looking away, the filter's position is
+    off by decimeters, and after ten by meters. The reward has a price for looking: it pays for a
+    heading that is drawn for each episode. What a controller does decides what it knows.
+
+    ## Reward
+    In each step, with the true position error e [m] and the alignment h of body x with the wanted
+    heading (1: aligned, -1: opposite)
+
+        0.1 exp(-e) + 0.1 exp(-5 e) + 0.1 h - 2 (crashed)
+
+    At most 0.3 a step, so 225 in an episode of 750 steps.
+
+    ## Observation
+    What ships, and then `features_direction` (3): the unit vector from the vehicle to the middle of
+    the markers in the body frame, both as the controller's source believes.
+
+    ## Endings
+    Those of `QuadEnv`, with 8 m to the reference as the bound: a controller that is mistaken about
+    its position gets the time to find it again. There is no ground above -5 m.
+
+    What ignores the question fails: PD control of the wanted heading loses itself in two thirds of
+    the episodes, and PD control that faces the wall gives up what the heading pays.
+
+    Args:
+        heading_weight: Of h in the reward.
+        crash_cost: What a crash costs, once.
+
+    Raises:
+        ValueError: If a number is negative or not finite.
+    """
+
+    observes: Mapping[str, Observed] = {"features_direction": Observed("-", "B", -1.0, 1.0)}
+
+    def __init__(
+        self, heading_weight: float = HEADING_WEIGHT, crash_cost: float = CRASH_COST
+    ) -> None:
+        self.pieces: Piece = (
+            WIDE_WEIGHT * Tracking(1.0)
+            + NEAR_WEIGHT * Tracking(5.0)
+            + check.number("heading_weight", heading_weight, least=0.0) * Heading()
+            - check.number("crash_cost", crash_cost, least=0.0) * Crash()
+        )
+
+    def reward(self, view: "View") -> NDArray[np.float64]:
+        """(n,) see the class."""
+        return self.pieces(view)
+
+    def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
+        """`features_direction`: (n, 3) unit vector to the middle of the markers, in B."""
+        gap = view.features.mean(axis=0) - view.seen.position
+        gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
+        return {"features_direction": (view.seen.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}

@@ -1,0 +1,144 @@
+"""`quad-gym study` from its arms to its report, resumed, with arms of a user's own."""
+
+import json
+
+import numpy as np
+import pytest
+
+from baselines.arms import ARMS, Arm
+from baselines.recipes import recipe
+from quad_gym.commands import study as command
+from quad_gym.commands.main import main
+from quad_gym.commands.study_flights import Flown
+from quad_gym.commands.study_results import Study
+from quad_gym.commands.study_words import conclusions
+
+QUICK = ["study", "--quick", "--steps", "4096", "--env", "duration=0.6"]
+MINE = """
+from baselines.arms import Arm
+ARMS = (
+    Arm(name="facing", label="PD, facing the features", policy="pd:features"),
+    Arm(name="truth", label="truth", training={"observation": "truth"}),
+    Arm(name="mine", label="mine", environment={"include_covariance": True}),
+)
+"""
+
+
+def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
+    (tmp_path / "mine.py").write_text(MINE)
+    folder = tmp_path / "out"
+    words = [*QUICK, "--arms-file", str(tmp_path / "mine.py"), "--output", str(folder)]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "PD, facing the features" in text
+    assert "training seeds the intervals say little" in text
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(summary["rows"]) == {"facing", "truth", "mine"}
+    assert len(summary["return_of_each_seed"]["mine"]) == 2
+    for name in ("learning.png", "glance.png", "report.html", "episodes.csv", "table.md"):
+        assert (folder / name).stat().st_size > 100
+
+    kept = folder / "runs/truth/seed_1/best.npz"
+    gone = folder / "runs/mine/seed_0"
+    before = kept.stat().st_mtime_ns, (gone / "best.npz").read_bytes()
+    for file in gone.iterdir():
+        file.unlink()
+    assert main(words) == 0
+    assert kept.stat().st_mtime_ns == before[0]
+    again = json.loads((folder / "summary.json").read_text())
+    assert again["rows"] == summary["rows"]  # the same training, bit for bit
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--arms", "nobody"], "--arms must be one of"),
+        (["--arms-file", "nowhere.py"], "--arms-file must be a Python file"),
+        (["--seeds", "0"], "--seeds must be at least 1"),
+        (["--episodes", "1"], "--episodes must be at least 2"),
+        (["--success-within", "-1"], "--success-within must be"),
+        (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
+        (["--env", "observation=truth"], "--env must leave observation to --arms"),
+        (["--set", "gammma=0.9"], "gammma"),
+    ],
+)
+def test_wrong_options_end_the_study_before_it_begins(words, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["study", *words, "--output", str(tmp_path / "none")])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_wrong_arms_are_refused():
+    with pytest.raises(ValueError, match=r"Arm.name must be a word"):
+        Arm(name="a b", label="x")
+    with pytest.raises(ValueError, match="must not be trained"):
+        Arm(name="a", label="x", policy="pd", training={"observation": "truth"})
+    with pytest.raises(ValueError, match=r"Arm.environment must be a"):
+        Arm(name="a", label="x", environment=3)
+
+
+def test_a_reward_of_an_arm_holds_in_training_alone():
+    args = command.Args(arms=("sure",))
+    setting = command.configure(args)
+    plan = command.plan_of(setting, setting.arms[0], 0)
+    learned = plan.make_vector_flights().unwrapped.flights.batch
+    judged = plan.make_judge().unwrapped.flights.batch
+    assert type(learned.custom).__name__ == "Sure"
+    assert type(judged.custom).__name__ == "Doubting"
+    assert judged.task.out_of_bounds == 8.0
+
+
+def flown(returns, crashed, error):
+    count = len(returns)
+    return Flown(
+        np.array(returns, float),
+        np.array(crashed, bool),
+        np.full(count, error),
+        np.where(crashed, np.nan, error),
+        np.full(count, 0.5),
+        *[np.zeros((1, 1))] * 6,
+    )
+
+
+def results(tmp_path, numbers):
+    arms = tuple(arm for arm in ARMS if arm.name in numbers)
+    study = Study(
+        *("QuadGym/LookAround-v0", arms, (0, 1, 2, 3, 4), recipe("QuadGym/LookAround-v0")),
+        *({}, 40, 0, 0.5, tmp_path, None),
+    )
+    rng = np.random.default_rng(0)
+    found = {}
+    for arm in arms:
+        level, crashes, error = numbers[arm.name]
+        for seed in study.seeds_of(arm):
+            wrong = np.arange(40) < 40 * crashes
+            found[arm.name, seed] = flown(rng.normal(level, 3.0, 40), wrong, error)
+    return study.results(found, {})
+
+
+def test_success_is_to_fly_to_the_end_near_the_reference():
+    some = flown([1.0, 1.0, 1.0], [False, True, False], 0.3)
+    np.testing.assert_array_equal(some.succeeded(0.5), [True, False, True])
+    np.testing.assert_array_equal(some.succeeded(0.3), [False, False, False])
+
+
+def test_words_say_what_the_numbers_say(tmp_path):
+    clear = {"pd_features": (130, 0.0, 0.05), "truth": (60, 0.6, 1.2), "sigma": (150, 0.0, 0.1)}
+    words = " ".join(conclusions(results(tmp_path, clear)))
+    assert "the intervals are apart" in words
+    assert "12.0 times smaller" in words
+    assert "above the best fixed rule (PD, facing the features" in words
+
+    refuted = {"pd_features": (150, 0.0, 0.05), "truth": (99, 0.0, 0.1), "sigma": (99, 0.0, 0.2)}
+    words = " ".join(conclusions(results(tmp_path, refuted)))
+    assert "the intervals overlap" in words
+    assert "0.200 m, not smaller than 0.100 m" in words
+    assert "below the best fixed rule" in words
+    assert "seeds the intervals say little" not in words
+
+
+def test_words_compare_arms_by_the_probability_of_improvement(tmp_path):
+    words = " ".join(conclusions(results(tmp_path, {"estimate": (9, 0, 1), "sigma": (99, 0, 1)})))
+    assert "with probability 1.00 [1.00, 1.00]." in words

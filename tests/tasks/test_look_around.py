@@ -1,0 +1,170 @@
+"""`LookAround`: reward, observation and features in view recomputed, and what fixed rules reach."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from baselines import PDPolicy
+from baselines.pd import UNSURE
+from quad_gym.commands.study_flights import fly
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.tasks.look_around import LookAround
+
+ID = "QuadGym/LookAround-v0"
+WALL = np.array([(-8.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (0.8, 2.8)])
+
+
+def make(count=20, **keywords):
+    return gymnasium.make_vec(ID, num_envs=count, autoreset_mode="Disabled", **keywords)
+
+
+def actions(rng, count):
+    return np.clip(rng.normal(0.0, 0.15, (count, 4)), -1.0, 1.0).astype(np.float32)
+
+
+def part(env, observations, name):
+    field = next(f for f in env.unwrapped.flights.table if f.name == name)
+    return observations[:, field.slice]
+
+
+def test_what_the_task_is_by_default():
+    flights = make(1).unwrapped.flights
+    assert flights.name == "look_around"
+    assert flights.task.kind == "random_trajectory"
+    assert flights.batch.max_steps == 750
+    suite = flights.batch.sensors
+    assert suite.gnss is None
+    np.testing.assert_array_equal(suite.camera.features_I, WALL)
+    width = 2.0 * np.degrees(np.arctan(0.5 * 3840.0 / suite.camera.focal_length))
+    assert abs(width - 60.0) < 0.01
+
+
+def test_the_reward_is_that_of_its_equation():
+    env, rng = make(), np.random.default_rng(0)
+    env.reset(seed=0)
+    batch, crashes = env.unwrapped.flights.batch, 0
+    over = np.zeros(20, bool)
+    for _ in range(200):
+        _, reward, terminated, truncated, _ = env.step(actions(rng, 20) + 0.1)
+        view = batch.view
+        e = np.linalg.norm(batch.read("r") - view.reference_position, axis=1)
+        w, x, y, z = batch.read("q").T
+        forward = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply([1.0, 0.0, 0.0])
+        h = (forward * view.reference_heading).sum(axis=1)
+        expected = 0.1 * np.exp(-e) + 0.1 * np.exp(-5.0 * e) + 0.1 * h - 2.0 * terminated
+        np.testing.assert_allclose(reward[~over], expected[~over], atol=1e-12)
+        crashes += terminated.sum()
+        over = terminated | truncated
+        if over.any():
+            env.reset(options={"reset_mask": over})
+            over[:] = False
+    assert crashes > 5  # the cost of a crash has been compared, too
+
+
+@pytest.mark.parametrize("observation", ["estimate", "truth", "noisy"])
+def test_the_direction_of_the_features_is_what_the_source_believes(observation):
+    env, rng = make(observation=observation), np.random.default_rng(1)
+    observed, _ = env.reset(seed=5)
+    batch = env.unwrapped.flights.batch
+    for _ in range(60):
+        gap = WALL.mean(axis=0) - batch.read("r_seen")
+        turned = Rotation.from_matrix(batch.read("R_seen")).apply(gap)
+        expected = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        np.testing.assert_allclose(part(env, observed, "features_direction"), expected, atol=1e-6)
+        observed, *_ = env.step(actions(rng, 20))
+
+
+def test_features_in_view_are_those_within_the_angles_of_the_camera():
+    env, rng = make(60), np.random.default_rng(2)
+    env.reset(seed=9)
+    batch, camera = env.unwrapped.flights.batch, quad_gym.sensor_suite("one_wall").camera
+    half = np.arctan(np.array([1920.0, 1080.0]) / camera.focal_length)
+    seen = 0
+    for _ in range(50):
+        env.step(actions(rng, 60))
+        w, x, y, z = batch.read("q").T
+        body = Rotation.from_quat(np.stack([x, y, z, w], axis=1))  # body to inertial
+        eye = batch.read("r") + body.apply(camera.position_B)
+        for k, point in enumerate(WALL):
+            ahead, left, up = body.inv().apply(point - eye).T  # the camera looks along body x
+            azimuth, elevation = np.arctan2(left, ahead), np.arctan2(up, ahead)
+            expected = (ahead > 0) & (np.abs(azimuth) < half[0]) & (np.abs(elevation) < half[1])
+            np.testing.assert_array_equal(batch.view.truth.features_in_view[:, k], expected)
+            seen += expected.sum()
+    assert 0 < seen < 60 * 50 * 8
+
+
+def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not():
+    env = gymnasium.make_vec(ID, num_envs=60)
+    blind = fly(PDPolicy(env), env, 0)
+    facing = fly(PDPolicy(env, faces="features"), env, 0)
+    # 64 % of 500 crash: of 60 at most 24 with a probability below 1e-4
+    assert blind.crashed.mean() > 0.4
+    assert not facing.crashed.any()
+    assert facing.in_view.mean() > 0.9 > 0.7 > blind.in_view.mean()
+    assert facing.returns.mean() > blind.returns.mean()
+    assert facing.error.mean() < 0.1
+
+
+def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading():
+    env = gymnasium.make_vec(ID, num_envs=60, include_covariance=True)
+    facing = fly(PDPolicy(env, faces="features"), env, 0)
+    rule = fly(PDPolicy(env, faces="features_when_unsure"), env, 0)
+    assert rule.returns.mean() > facing.returns.mean()
+    assert UNSURE < np.nanmax(rule.sigma) < 3.0
+    assert rule.crashed.mean() < 0.1
+
+
+def test_the_features_must_be_observed_to_be_faced():
+    circle = gymnasium.make("QuadGym/Circle-v0")
+    with pytest.raises(ValueError, match='must observe features_direction for faces="features"'):
+        PDPolicy(circle, faces="features")
+    with pytest.raises(ValueError, match="include_covariance=True"):
+        PDPolicy(make(1), faces="features_when_unsure")
+    with pytest.raises(ValueError, match="faces must be one of"):
+        PDPolicy(circle, faces="north")
+
+
+def test_it_takes_other_weights_sensors_and_tasks():
+    for weight in (0.0, 0.3):
+        env = gymnasium.make(ID, custom=LookAround(heading_weight=weight), sensors="indoor")
+        env.reset(seed=0)
+        e, view = env.unwrapped, env.unwrapped.flights.batch.view
+        _, reward, *_ = env.step(np.zeros(4, np.float32))
+        view = e.flights.batch.view
+        error = view.position_error[0]
+        h = (view.truth.forward[0] * view.reference_heading[0]).sum()
+        expected = 0.1 * (np.exp(-error) + np.exp(-5.0 * error)) + weight * h
+        np.testing.assert_allclose(reward, expected, atol=1e-12)
+    for bad in (-1.0, np.nan, "much"):
+        with pytest.raises(ValueError, match="heading_weight must be"):
+            LookAround(heading_weight=bad)
+        with pytest.raises(ValueError, match="crash_cost must be"):
+            LookAround(crash_cost=bad)
+
+
+def test_a_task_of_ones_own_can_be_laid_over_it():
+    quad_gym.register_task("Test/LookMore-v0", LookAround(heading_weight=0.2), ID)
+    env = gymnasium.make_vec("Test/LookMore-v0", num_envs=2)
+    assert env.unwrapped.flights.name == "look_around"
+    assert env.unwrapped.flights.task.duration == 15.0
+
+
+def test_keywords_of_another_task_are_refused():
+    with pytest.raises(ValueError, match="gate_count belongs to the task waypoints"):
+        QuadVectorEnv(1, "look_around", gate_count=3)
+    assert QuadVectorEnv(1, "look_around", max_speed=2.0).flights.task.max_speed == 2.0
+
+
+def test_who_does_not_use_it_does_not_import_it():
+    code = (
+        "import sys, gymnasium, quad_gym; gymnasium.make('QuadGym/Circle-v0'); "
+        "print([m for m in sys.modules if m.startswith('quad_gym.tasks') or 'baselines' in m])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
