@@ -161,8 +161,8 @@ def _products(spec: Spec) -> Iterator[dict[tuple[str, str], Any]]:
     for (table, key), values in axes.items():
         if not values:
             raise ValueError(f"{table}.{key} must have at least one value")
-    for values in itertools.product(*axes.values()):
-        yield dict(zip(axes, values, strict=True))
+    for combination in itertools.product(*axes.values()):
+        yield dict(zip(axes, combination, strict=True))
 
 
 def _plan(
