@@ -178,7 +178,7 @@ class SubmititExecutor:
         try:
             self._executor = submitit.AutoExecutor(folder=logs.absolute(), cluster=cluster)
             self._executor.update_parameters(**given)
-        except (NameError, RuntimeError, TypeError) as error:  # as submitit has them
+        except (NameError, RuntimeError, TypeError, ValueError) as error:  # as submitit has them
             raise ValueError(f"--options do not fit submitit: {error}") from None
 
     def start(self, training: Training) -> Job:

@@ -373,19 +373,17 @@ def test_a_full_disk_stops_one_training_and_a_signal_stops_all(tmp_path, undistu
     process.send_signal(signal.SIGTERM)
     said, err = end(process, 130)
     assert f"{GROUP.format(0.97)}/seed_0: OSError: [Errno 28] No space left on device" in said
-    assert "goes on" not in err
     assert "start the same command again to go on" in err.lower()
     stopped = runs / GROUP.format(0.9) / "seed_0"
     assert not is_locked(stopped)
     assert not json.loads((stopped / "training.json").read_text())["finished"]
-    said, _ = end(start(tmp_path), 1)
-    assert f"  {full.relative_to(tmp_path)}: OSError" in said
-    assert "3/4" not in said
+    assert f"  {full.relative_to(tmp_path)}: OSError" in said  # again at the end
     (full / "evaluations.csv.part").unlink()
     end(start(tmp_path))
     assert tables(tmp_path) == undisturbed
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="needs submitit")
 def test_jobs_of_submitit_may_be_killed(tmp_path, undisturbed):
     options = ["--executor", "slurm", "--options", "cluster=local", "--jobs", "1"]
@@ -406,3 +404,33 @@ def test_parameters_that_submitit_does_not_know_are_refused(tmp_path):
         sweep_executors.SubmititExecutor(tmp_path, 1, {"cluster": "local", "cores": 3})
     with pytest.raises(ValueError, match="--options do not fit submitit"):
         sweep_executors.SubmititExecutor(tmp_path, 1, {"cluster": "moon"})
+
+
+@pytest.fixture
+def nodes(monkeypatch):
+    """A cluster of Ray with two nodes on this machine, and the second one."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    yield cluster, cluster.add_node(num_cpus=1)
+    cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_workers_of_ray_may_be_killed_and_so_may_a_node(tmp_path, undisturbed, nodes):
+    cluster, second = nodes
+    options = ["--executor", "ray", "--options", f"address={cluster.address}"]
+    runs = tmp_path / "out/runs"
+    process = start(tmp_path, *options, "--jobs", "1")
+    os.kill(worker_at(process, runs / GROUP.format(0.97) / "seed_0"), signal.SIGKILL)
+    worker_at(process, runs / GROUP.format(0.9) / "seed_0")
+    process.kill()
+    said, _ = process.communicate()
+    assert "starts again from its checkpoint (1 of 2)" in said
+    process = start(tmp_path, *options)
+    worker_at(process, runs / GROUP.format(0.97) / "seed_1")
+    cluster.remove_node(second, allow_graceful=False)
+    end(process)
+    assert tables(tmp_path) == undisturbed
