@@ -75,6 +75,11 @@ ARMS = (
         parameters=_FAR_SIGHTED,
     ),
     Arm(
+        name="paid",
+        label="estimate, paid for being sure",
+        learning={"custom": "baselines.arm_tasks:Paid"},
+    ),
+    Arm(
         name="sure",
         label="estimate + standard deviation, paid for being sure",
         environment=_DOUBTING,

@@ -113,7 +113,7 @@ def glance_figure(episodes: Mapping[str, Glance], half_view: float) -> Any:
 def _draw_angles(axes: Any, episode: Glance, half_view: float) -> None:
     """Where body x points, and where it should for the reward, as seen from the features."""
     span = math.degrees(half_view)
-    axes.axhspan(-span, span, color=ORANGE, alpha=0.25, linewidth=0, label="features in view")
+    axes.axhspan(-span, span, color=ORANGE, alpha=0.25, linewidth=0, label="markers in view")
     wanted = _unbroken(np.degrees(episode.off_wall - episode.off_reward))
     axes.plot(episode.time, wanted, color=GREY, linestyle=(0, (4, 3)), label="rewarded")
     axes.plot(episode.time, _unbroken(np.degrees(episode.off_wall)), color=BLUE, label="body x")

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 WIDE_WEIGHT, NEAR_WEIGHT = 0.1, 0.1
 """Of exp(-e) and exp(-5 e): the first still pulls a vehicle back that has been lost for a while."""
 
-HEADING_WEIGHT = 0.1
-"""Of the heading. With 0.05 a controller that always faces the wall is as good as one that glances;
-with 0.2 one that never looks comes close to both (docs/where-it-matters.md)."""
+HEADING_WEIGHT = 0.15
+"""Of the heading. With 0.05 a rule that always faces the wall is as good as one that glances, with
+0.2 a rule that never looks is nearly as good as one that always does."""
 
 CRASH_COST = 2.0
 """Once, as much as ten steps of perfect tracking; a crash also costs the time that was left."""
@@ -36,9 +36,9 @@ class LookAround(Task):
     In each step, with the true position error e [m] and the alignment h of body x with the wanted
     heading (1: aligned, -1: opposite)
 
-        0.1 exp(-e) + 0.1 exp(-5 e) + 0.1 h - 2 (crashed)
+        0.1 exp(-e) + 0.1 exp(-5 e) + 0.15 h - 2 (crashed)
 
-    At most 0.3 a step, so 225 in an episode of 750 steps.
+    At most 0.35 a step, so 262.5 in an episode of 750 steps.
 
     ## Observation
     What ships, and then `features_direction` (3): the unit vector from the vehicle to the middle of

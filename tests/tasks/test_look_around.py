@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from baselines import PDPolicy
 from baselines.pd import UNSURE
+from baselines.policies import keywords_of_policy, load_policy
+from quad_gym.commands.main import main
 from quad_gym.commands.study_flights import fly
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.tasks.look_around import LookAround
@@ -56,7 +58,7 @@ def test_the_reward_is_that_of_its_equation():
         w, x, y, z = batch.read("q").T
         forward = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply([1.0, 0.0, 0.0])
         h = (forward * view.reference_heading).sum(axis=1)
-        expected = 0.1 * np.exp(-e) + 0.1 * np.exp(-5.0 * e) + 0.1 * h - 2.0 * terminated
+        expected = 0.1 * np.exp(-e) + 0.1 * np.exp(-5.0 * e) + 0.15 * h - 2.0 * terminated
         np.testing.assert_allclose(reward[~over], expected[~over], atol=1e-12)
         crashes += terminated.sum()
         over = terminated | truncated
@@ -168,3 +170,25 @@ def test_who_does_not_use_it_does_not_import_it():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_faces_the_wall():
+    shown = keywords_of_policy("pretrained", ID)
+    env = gymnasium.make_vec(ID, num_envs=60, **shown)
+    learned = fly(load_policy("pretrained", env), env, 0)
+    plain = gymnasium.make_vec(ID, num_envs=60)
+    facing = fly(PDPolicy(plain, faces="features"), plain, 0)
+    assert learned.crashed.mean() < 0.1
+    assert learned.returns.mean() > facing.returns.mean()
+    assert learned.error.mean() < 0.25
+
+
+@pytest.mark.parametrize("observation", ["truth", "estimate"])
+def test_the_policy_that_ships_flies_by_command(observation, tmp_path, capsys):
+    words = ["evaluate", ID, "--policy", "pd", "pretrained", "--observation", observation]
+    assert main([*words, "--episodes", "3", "--output", str(tmp_path)]) == 0
+    assert "sensors one_wall" in capsys.readouterr().out
+    flown = tmp_path / "flight.npz"
+    words = ["fly", "--task", "look_around", "--policy", "pretrained", "--duration", "0.5"]
+    assert main([*words, "--observation", observation, "--output", str(flown)]) == 0
+    assert quad_gym.Flight.load(flown).stage.observation == observation
