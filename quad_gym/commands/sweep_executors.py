@@ -237,7 +237,8 @@ class _RayJob:
         try:
             return Ended(*self._ray.get(self._task))
         except self._ray.exceptions.RayError as error:  # worker or node lost
-            return Ended("died", str(error).strip().splitlines()[0])
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            return Ended("died", lines[0])
 
     def stop(self) -> None:
         self._ray.cancel(self._task)  # as Ctrl-C in its process
