@@ -9,6 +9,7 @@ The folder holds
 - or, from the compiled engine, `last.npz` and `best.npz` of the same kind, as `MlpPolicy` loads
   them;
 - `training.json`: the plan, versions, seeds, wall time; `evaluations.csv`: errors while training;
+- `training.lock`: which process trains in it, or did last;
 - TensorBoard's files.
 
 A run that is resumed goes on exactly where the last evaluation left it.
@@ -18,8 +19,10 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from baselines.keeping import RunError, RunKeeper, best_file, has_checkpoint
+from baselines.locks import locked
 from baselines.mlp import MlpPolicy, mlp_of
 from baselines.plans import Plan, description
 from baselines.policies import interface_of
@@ -49,7 +52,8 @@ def train(
 ) -> Training:
     """Train a policy, or go on with a training that was stopped.
 
-    Ctrl-C, or a request to terminate, ends the run at the next step; it can be resumed then.
+    Ctrl-C, or a request to terminate, ends the run at the next step; it can be resumed then. While
+    it runs, its folder is locked (`baselines.locks`).
 
     Args:
         plan: What to train.
@@ -63,11 +67,16 @@ def train(
 
     Raises:
         ValueError: If the plan is invalid, the folder holds a run and `resume` is not set, or
-            holds the run of another plan.
+            holds the run of another plan, or another process trains in it.
         OSError: If nothing can be written to the folder.
         ImportError: If TensorBoard's files are wanted and it is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        return _train(plan, folder, resume=resume, tensorboard=tensorboard, quiet=quiet)
+
+
+def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool) -> Training:
     described = description(plan)
     if has_checkpoint(folder):
         if not resume:
@@ -90,7 +99,7 @@ def train(
     judge = plan.make_judge()
     if not has_checkpoint(folder):
         begun = {"plan": described, "interface": interface_of(judge), "finished": False}
-        write_json(folder / "training.json", begun)
+        _write_record(folder, begun)
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import run as run_compiled
 
@@ -112,11 +121,16 @@ def train(
         "ended": time.strftime("%Y-%m-%d %H:%M:%S"),
         "versions": versions("numpy", "numba", "torch", "stable_baselines3", "sb3_contrib"),
     }
-    write_json(folder / "training.json", record)
+    _write_record(folder, record)
     judge.close()
     return Training(
         folder, keeper.steps, keeper.seconds, keeper.finished, keeper.best, best_file(plan, folder)
     )
+
+
+def _write_record(folder: Path, record: Any) -> None:
+    """Write `training.json`; at any moment there is the old or the new one, whole."""
+    write_json(folder / "training.json.part", record).replace(folder / "training.json")
 
 
 def export(training: Training, file: Path) -> None:

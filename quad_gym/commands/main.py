@@ -12,6 +12,7 @@ COMMANDS = {
     "evaluate": "fly policies over many episodes: errors, crashes, films",
     "compare": "train on truth, noise and the estimate with several seeds, and compare",
     "study": "where the estimate decides: train arms with several seeds, and compare",
+    "sweep": "any set of trainings: on this machine, a cluster with Slurm, or Ray",
     "tune": "tune the gains of the PD controller",
     "fly": "watch one flight in a window, or film it",
     "consistency": "is the filter's covariance right? NEES and NIS over many flights",

@@ -129,6 +129,14 @@ def flying_options(keywords: Mapping[str, Any]) -> str:
 _WORDS = {"true": "True", "false": "False", "none": "None"}
 
 
+def value_of(word: str) -> Any:
+    """A value as Python writes numbers, tuples, True and None; else the word itself."""
+    try:
+        return ast.literal_eval(_WORDS.get(word, word))
+    except (ValueError, SyntaxError):
+        return word
+
+
 def _pairs(words: Sequence[str]) -> dict[str, Any]:
     """`key=value` pairs, values as Python writes numbers, tuples, True and None; else texts.
 
@@ -140,10 +148,7 @@ def _pairs(words: Sequence[str]) -> dict[str, Any]:
         key, equals, value = word.partition("=")
         if not (equals and key.isidentifier()):
             raise ValueError(f"expected KEY=VALUE, got {word!r}")
-        try:
-            found[key] = ast.literal_eval(_WORDS.get(value, value))
-        except (ValueError, SyntaxError):
-            found[key] = value
+        found[key] = value_of(value)
     return found
 
 

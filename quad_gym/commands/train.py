@@ -87,7 +87,7 @@ def configure(args: Args) -> tuple[Any, Path]:
         evaluations=args.evaluations,
         episodes=args.episodes,
     )
-    _require_model(plan)
+    require_model(plan)
     plan.make_judge().close()
     task = IDS[args.env_id]
     name = "compiled_ppo" if args.engine == "compiled" else args.algorithm
@@ -100,7 +100,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     return plan, folder
 
 
-def _require_model(plan: Any) -> None:
+def require_model(plan: Any) -> None:
     """Make the untrained model once, which checks what the plan says of it."""
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import make_compiled

@@ -1,0 +1,119 @@
+"""The table of a sweep, made from its folders alone: the same however they came to be.
+
+Nothing in it is a time or a place. A training that is not finished has its steps, and nothing else.
+"""
+
+import csv
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.keeping import EVALUATIONS
+from quad_gym.analysis.metrics import bootstrap_interval
+from quad_gym.analysis.reports import text_table, write_csv
+from quad_gym.commands.sweep_plan import Training
+
+SCORES = ("mean_error", "late_error", "crash_rate", "return", "gates_passed")
+"""Of the best evaluation of a training."""
+
+FILES = ("trainings.csv", "groups.csv", "table.txt")
+
+
+def steps_done(folder: Path) -> int:
+    """Environment steps at the last evaluation of a training."""
+    try:
+        with (folder / EVALUATIONS).open(encoding="utf-8", newline="") as stream:
+            *_, last = csv.DictReader(stream)
+        return int(float(last["steps"]))
+    except (OSError, ValueError, KeyError):  # not begun
+        return 0
+
+
+def row_of(training: Training) -> dict[str, Any]:
+    """One training as its folder has it."""
+    record = training.record()
+    finished = bool(record.get("finished"))
+    best = record["best"] if finished else {}
+    return {
+        "group": training.group,
+        "seed": training.plan.seed,
+        "finished": finished,
+        "steps": record["steps"] if finished else steps_done(training.folder),
+        "best_steps": best.get("steps"),
+        **{name: best.get(name) for name in SCORES},
+    }
+
+
+def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean and bootstrap 95 % interval of each score over the finished seeds of each group."""
+    found = []
+    for group in dict.fromkeys(row["group"] for row in rows):
+        those = [row for row in rows if row["group"] == group]
+        summary = {
+            "group": group,
+            "trainings": len(those),
+            "finished": sum(row["finished"] for row in those),
+        }
+        for name in SCORES:
+            values = np.array([row[name] for row in those if row[name] is not None])
+            between = bootstrap_interval(values) if values.size > 1 else None
+            summary[name] = float(values.mean()) if values.size else None
+            summary[f"{name}_low"] = None if between is None else between.low
+            summary[f"{name}_high"] = None if between is None else between.high
+        found.append(summary)
+    return found
+
+
+def table_text(rows: Sequence[dict[str, Any]]) -> str:
+    """The table for people: groups, then trainings."""
+
+    def cell(row: dict[str, Any], name: str, form: str) -> str:
+        if row[name] is None:
+            return "-"
+        if row.get(f"{name}_low") is None:
+            return format(row[name], form)
+        return f"{row[name]:{form}} [{row[f'{name}_low']:{form}}, {row[f'{name}_high']:{form}}]"
+
+    def cells(row: dict[str, Any]) -> list[str]:
+        shown = (("mean_error", ".4f"), ("crash_rate", ".1%"), ("return", ".1f"))
+        return [cell(row, name, form) for name, form in shown]
+
+    headings = ("error [m]", "crashed", "return")
+    groups = [
+        [row["group"], f"{row['finished']}/{row['trainings']}", *cells(row)]
+        for row in groups_of(rows)
+    ]
+    single = [
+        [
+            f"{row['group']}/seed_{row['seed']}",
+            "yes" if row["finished"] else "no",
+            f"{row['steps']:,}",
+            *cells(row),
+        ]
+        for row in rows
+    ]
+    mean = "best evaluation: mean over finished seeds [95 % interval]"
+    return "\n\n".join(
+        [
+            text_table({"": ("group", "finished"), mean: headings}, groups),
+            text_table({"": ("training", "finished", "steps"), "best evaluation": headings}, single)
+            + "\n",
+        ]
+    )
+
+
+def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Write FILES; at any moment there is the old or the new one of each, whole.
+
+    Raises:
+        OSError: If they cannot be written.
+    """
+    parts = [folder / f"{name}.{os.getpid()}.part" for name in FILES]  # of this sweep alone
+    for part, table in zip(parts, (rows, groups_of(rows)), strict=False):
+        write_csv(part, {name: [row[name] for row in table] for name in table[0]})
+    parts[-1].write_text(table_text(rows), encoding="utf-8")
+    for part, name in zip(parts, FILES, strict=True):
+        part.replace(folder / name)

@@ -1,0 +1,290 @@
+"""Sweeps: what a file means, tables from folders, and trainings that survive any death."""
+
+import csv
+import json
+import os
+import time
+
+import numpy as np
+import pytest
+
+from baselines.arms import ARMS
+from baselines.locks import BusyError, holder, is_locked, locked
+from baselines.plans import description
+from quad_gym.commands.sweep_driver import Driver
+from quad_gym.commands.sweep_executors import Ended, work
+from quad_gym.commands.sweep_plan import expand, read
+from quad_gym.commands.sweep_table import FILES, groups_of, row_of, write_tables
+from tests import console_commands
+
+TRUTH = {"duration": 1.0, "observation": "truth"}
+SMALL = """
+engine = "compiled"
+evaluations = 40
+episodes = 4
+env = {duration = 1.0, observation = "truth"}
+set = {n_steps = 16, batch_size = 128, n_epochs = 1, gamma = [0.97, 0.9, 0.8]}
+recipe = {steps = 40960, n_envs = 16}
+"""
+
+
+# ---- what a file means ---------------------------------------------------------------------------
+
+
+def test_every_combination_has_a_folder_the_first_seed_first(tmp_path):
+    given = {
+        "envs": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
+        "seeds": [3, 1],
+        "env": {"sensors": ["lab", "rtk"], "duration": 2.0},
+        "recipe": {"layers": [[32, 32]]},
+        "set": {"gamma": [0.9, 0.99]},
+    }
+    found = expand(given, {}, tmp_path, threads=2)
+    assert len(found) == len({t.folder for t in found}) == 2 * 2 * 2 * 2
+    first = found[0]
+    assert first.folder == tmp_path / "runs/hover,ppo,sensors=lab,gamma=0.9,layers=32x32/seed_3"
+    assert [t.plan.seed for t in found] == 8 * [3] + 8 * [1]
+    assert dict(first.plan.environment) == {"sensors": "lab", "duration": 2.0}
+    assert first.plan.recipe.layers == (32, 32)
+    assert first.plan.recipe.parameters["gamma"] == 0.9
+    assert first.plan.recipe.parameters["n_epochs"] == 5  # the recipe's
+    assert (first.plan.engine, first.plan.threads) == ("sb3", 2)
+
+
+def test_values_that_are_added_leave_the_other_folders_in_place(tmp_path):
+    def folders(**more):
+        return {t.folder for t in expand({"seeds": 1, **more}, {}, tmp_path)}
+
+    assert folders(set={"gamma": [0.9]}) < folders(set={"gamma": [0.9, 0.99]}, seeds=2)
+
+
+def test_arms_bring_what_they_are_trained_on(tmp_path):
+    arms = {arm.name: arm for arm in ARMS}
+    given = {"envs": ["QuadGym/LookAround-v0"], "arms": ["truth", "sure"], "engine": "compiled"}
+    truth, sure = expand(given, arms, tmp_path)
+    assert truth.group == "look_around,compiled_ppo,truth"
+    assert truth.plan.environment["observation"] == "truth"
+    assert sure.plan.learning == arms["sure"].learning
+    with pytest.raises(ValueError, match="arms must be trained, got pd_reference"):
+        expand({**given, "arms": ["pd_reference"]}, arms, tmp_path)
+
+
+def test_options_replace_what_the_file_has(tmp_path):
+    (tmp_path / "mine.toml").write_text(SMALL)
+    options = [
+        "mine.toml",
+        "--dry-run",
+        "--set",
+        "gamma=0.9,0.95,0.99",
+        "--env",
+        "camera=true,false",
+    ]
+    done = console_commands.run("sweep", *options, "--seeds", "1", where=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    want = "results/sweep/mine/runs/circle,compiled_ppo,camera=true,gamma=0.9/seed_0"
+    assert lines[0] == want
+    assert lines[-1] == "6 trainings, 245,760 steps."
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seeds = [", "is no valid TOML"),
+        ("sedes = 3", "must be one of envs, arms"),
+        ("env = 3", "env in bad.toml must be a table, got 3"),
+        ("seeds = 0", "seeds must be at least 1, got 0"),
+        ("seeds = []", "seeds must not be empty"),
+        ("seeds = [1, 1]", "every value of a sweep must be given once"),
+        ('envs = "QuadGym/Hover-v0"', "envs must be a list of names"),
+        ('envs = ["QuadGym/Howver-v0"]', "envs must be one of QuadGym/"),
+        ('arms = ["nobody"]', "--arms must be one of"),
+        ('engine = "torch"', "engine must be one of sb3, compiled"),
+        ('algorithm = ["alphago"]', "algorithm must be one of ppo"),
+        ("episodes = 1.5", "episodes must be a whole number"),
+        ("set = {gamma = []}", "set.gamma must have at least one value"),
+        ("recipe = {parameters = {gamma = 1}}", "recipe must be one of steps"),
+        ('engine = "compiled"\nset = {gama = 0.9}', "circle,compiled_ppo: "),
+        ('engine = "compiled"\nenv = {radius = -1}', "radius must be greater than 0"),
+        ("env = {threads = 1}", "--env must leave threads to --threads"),
+    ],
+)
+def test_an_invalid_file_gets_one_clear_line(tmp_path, text, message):
+    (tmp_path / "bad.toml").write_text(text)
+    done = console_commands.run("sweep", "bad.toml", where=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "results/sweep/bad/runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--jobs", "0"], "--jobs must be at least 1"),
+        (["--retries", "-1"], "--retries must be at least 0"),
+        (["--threads", "0"], "threads must be at least 1"),
+        (["--options", "mem_gb=4"], "--options are of slurm and ray"),
+        (["nowhere.toml"], "No such file"),
+    ],
+)
+def test_wrong_options_end_the_sweep_before_it_begins(tmp_path, options, message):
+    done = console_commands.run("sweep", "--engine", "compiled", *options, where=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+@pytest.mark.parametrize("executor", ["slurm", "ray"])
+def test_a_missing_package_is_named(tmp_path, monkeypatch, executor):
+    package = {"slurm": "submitit", "ray": "ray"}[executor]
+    monkeypatch.setitem(__import__("sys").modules, package, None)
+    options = ["--engine", "compiled", "--executor", executor]
+    done = console_commands.run("sweep", *options, where=tmp_path)
+    assert done.returncode == 2
+    assert f'needs {package}: pip install "quad-gym[sweep]"' in done.stderr
+
+
+# ---- tables --------------------------------------------------------------------------------------
+
+
+def pretend(training, error):
+    """A folder as a training leaves it; without an error, one that is not finished."""
+    training.folder.mkdir(parents=True)
+    (training.folder / "last.npz").touch()
+    best = {"steps": 96.0, "mean_error": error, "crash_rate": 0.25, "return": 7.0}
+    record = {"plan": description(training.plan), "finished": error is not None}
+    record |= {} if error is None else {"steps": 128, "best": best, "training_seconds": time.time()}
+    (training.folder / "training.json").write_text(json.dumps(record))
+    (training.folder / "evaluations.csv").write_text("steps,mean_error\n0,1\n64,0.5\n")
+
+
+def test_the_table_is_made_from_the_folders(tmp_path):
+    trainings = expand({"seeds": 5, "env": TRUTH}, {}, tmp_path)
+    for training, error in zip(trainings, (0.1, 0.2, 0.6, None), strict=False):
+        pretend(training, error)
+    rows = [row_of(training) for training in trainings]
+    assert [row["finished"] for row in rows] == [True, True, True, False, False]
+    assert [row["steps"] for row in rows] == [128, 128, 128, 64, 0]
+    assert [row["mean_error"] for row in rows] == [0.1, 0.2, 0.6, None, None]
+    (group,) = groups_of(rows)
+    assert (group["trainings"], group["finished"]) == (5, 3)
+    np.testing.assert_allclose(group["mean_error"], 0.3)
+    assert 0.1 <= group["mean_error_low"] < 0.3 < group["mean_error_high"] <= 0.6
+    assert group["crash_rate_low"] == group["crash_rate_high"] == 0.25
+    write_tables(rows, tmp_path)
+    with (tmp_path / "trainings.csv").open(newline="") as stream:
+        written = list(csv.DictReader(stream))
+    assert [row["mean_error"] for row in written] == ["0.1", "0.2", "0.6", "", ""]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FILES, "runs"])
+
+
+def test_a_folder_with_another_training_is_refused(tmp_path):
+    (training,) = expand({"env": TRUTH}, {}, tmp_path / "out")
+    pretend(training, 0.1)
+    options = ["--env", "duration=2.0", "--output", "out"]
+    done = console_commands.run("sweep", *options, where=tmp_path)
+    assert done.returncode == 2
+    assert "holds another training (different: environment)" in done.stderr
+
+
+# ---- locks ---------------------------------------------------------------------------------------
+
+
+def small(tmp_path, **more):
+    (tmp_path / "small.toml").write_text(SMALL)
+    return expand({**read(tmp_path / "small.toml"), **more}, {}, tmp_path / "out")
+
+
+def test_nobody_trains_in_a_folder_that_is_locked(tmp_path):
+    training = small(tmp_path)[0]
+    training.folder.mkdir(parents=True)
+    assert not is_locked(training.folder)
+    with locked(training.folder):
+        assert is_locked(training.folder)
+        assert f"process {os.getpid()} on " in holder(training.folder)
+        with pytest.raises(BusyError, match="is in use by process"), locked(training.folder):
+            pass
+        ended = work(training.plan, training.folder)
+        assert ended.kind == "busy"
+        assert [path.name for path in training.folder.iterdir()] == ["training.lock"]
+    assert not is_locked(training.folder)
+
+
+# ---- the driver, with jobs that end as they are told ---------------------------------------------
+
+
+class Silent:
+    """A progress bar."""
+
+    n, total = 0, 10**9
+
+    def set_postfix_str(self, text):
+        self.text = text
+
+
+class Told:
+    """An executor whose jobs end as a script says, training by training."""
+
+    pause = 0.0
+
+    def __init__(self, script):
+        self.script, self.started, self.most, self.now = script, [], 0, 0
+
+    def start(self, training):
+        self.started.append(training.name)
+        self.now += 1
+        self.most = max(self.most, self.now)
+        end = self.script[training.name].pop(0)
+        if isinstance(end, Exception):
+            self.now -= 1
+            raise end
+        return ToldJob(self, end)
+
+
+class ToldJob:
+    def __init__(self, executor, end):
+        self.executor, self.end = executor, end
+
+    def ended(self):
+        self.executor.now -= 1
+        return self.end
+
+    def stop(self):
+        raise AssertionError
+
+    kill = stop
+
+
+def test_what_dies_starts_again_what_fails_does_not_and_the_others_go_on(tmp_path):
+    trainings = expand({"seeds": 6, "env": TRUTH}, {}, tmp_path)
+    fine, died = Ended("finished"), Ended("died", "signal 9")
+    ends = [
+        [fine],
+        [died, Ended("stopped", "asked to end"), fine],
+        [died, died, died],
+        [Ended("failed", "OSError: no space")],
+        [Ended("busy"), Ended("busy"), Ended("busy"), Ended("busy"), fine],
+        [OSError("no processes")],
+    ]
+    executor = Told({t.name: end for t, end in zip(trainings, ends, strict=True)})
+    said = []
+    driver = Driver(trainings, executor, 2, 2, said.append, Silent())
+    assert driver.run()
+    names = [t.name for t in trainings]
+    assert [executor.started.count(name) for name in names] == [1, 3, 3, 1, 5, 1]
+    assert executor.most == 2
+    assert driver.failed == {
+        names[2]: "died 3 times, lastly: signal 9",
+        names[3]: "OSError: no space",
+        names[5]: "no processes",
+    }
+    assert f"{names[1]}: died (signal 9); starts again from its checkpoint (1 of 2)" in said
+
+
+def test_what_is_finished_is_not_started(tmp_path):
+    trainings = expand({"seeds": 2, "env": TRUTH}, {}, tmp_path)
+    pretend(trainings[0], 0.1)
+    executor = Told({trainings[1].name: [Ended("finished")]})
+    assert Driver(trainings, executor, None, 0, print, Silent()).run()
+    assert executor.started == [trainings[1].name]
