@@ -76,12 +76,14 @@ def test_workers_and_the_sweep_itself_may_be_killed(tmp_path, undisturbed):
     assert tables(tmp_path) == undisturbed
 
 
+@pytest.mark.slow  # a sweep of processes each
 def test_two_sweeps_in_one_folder_share_the_work(tmp_path, undisturbed):
     for process in [start(tmp_path, "--jobs", "1") for _ in range(2)]:
         end(process)
     assert tables(tmp_path) == undisturbed
 
 
+@pytest.mark.slow  # a sweep of processes each
 def test_a_full_disk_stops_one_training_and_a_signal_stops_all(tmp_path, undisturbed):
     runs = tmp_path / "out/runs"
     full = runs / GROUP.format(0.97) / "seed_0"
