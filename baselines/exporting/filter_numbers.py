@@ -7,6 +7,7 @@ import numpy as np
 
 import quad_gym
 from quad_gym.analysis.reports import as_json
+from quad_gym.packing.aids import slow_states
 from quad_gym.packing.flight import params_record
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.sensors import SensorSuite
@@ -21,7 +22,6 @@ _FIELDS = {
         *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
         *("gnss_sigma", "baseline_noise", "first_baseline_sigma", "heading_sigma"),
         *("baseline", "baseline_length", "R_IG", "antenna", "velocity_sigma"),
-        *("drift_tick_decay", "drift_tick_drive"),
         *("initial_velocity_variance", "initial_scale", "initial_tilt_sigma"),
         *("gate_position", "gate_direction", "gate_uncertainty", "gate_patience"),
     ),
@@ -31,6 +31,10 @@ _FIELDS = {
     ),
 }
 """What the filter's kernels read of the parameters: of any suite, and of one with a camera."""
+
+_SLOW = ("slow_sigma", "slow_decay", "slow_drive")
+_AIDS = ("aid_sigma", "aid_gate", "aid_numbers")
+"""Of suites with slow errors among the states, and with aiding sensors, in the order of `Aid`."""
 
 _MEANINGS = {
     "accel_error_noise": "noise of a sample per m/s^2 of f_B - (0, 0, g), for scale and alignment",
@@ -45,8 +49,10 @@ _MEANINGS = {
     "first_baseline_sigma": "direction noise of the first baseline",
     "heading_sigma": "of the heading where the place of the start tells it",
     "velocity_sigma": "noise of a GNSS velocity per axis; 0: not measured",
-    "drift_tick_decay": "of the slow GNSS position error over a tick",
-    "drift_tick_drive": "standard deviation of its driving noise; next to 0 where there is none",
+    "slow_sigma": "standard deviation at the start, of each slow error among the states",
+    "slow_decay": "of each slow error over a tick",
+    "slow_drive": "standard deviation of its driving noise over a tick",
+    "aid_numbers": "further numbers of each sensor; of the magnetometer: the field in I [T]",
     "camera": "projection center of the camera in B",
     "pixel_size": "size of a pixel",
     "pixel_sigma": "noise of a pixel per axis",
@@ -73,12 +79,15 @@ def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
     """
     record = params_record(vehicle_params("lab"), suite)[0]
     names = _FIELDS["any"] + (_FIELDS["camera"] if suite.camera is not None else ())
+    names += (_SLOW if slow_states(suite).errors else ()) + (_AIDS if suite.aids else ())
     about = {field.name: field for field in PARAMS_FIELDS}
     numbers = {}
     for name in names:
         value = record[name]
         if name == "gravity":  # a filter that works by itself has its own
             value = np.float64(suite.estimator.gravity)
+        if name in _SLOW:
+            value = value[: slow_states(suite).estimated]
         if name == "features" and suite.camera is not None:
             value = value[: len(suite.camera.features_I)]
         if not np.isfinite(value).all():  # gates that are open, the range of cameras
@@ -89,7 +98,8 @@ def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
             "meaning": _MEANINGS.get(name, about[name].meaning),
         }
     estimator: FilterParams = suite.estimator
-    sensors = {"gnss": suite.gnss, "camera": suite.camera}
+    sensors: dict[str, Any] = {"gnss": suite.gnss, "camera": suite.camera}
+    sensors |= {aid.name.lower(): params for aid, params in suite.aids.items()}
     present = {name: sensor for name, sensor in sensors.items() if sensor is not None}
     return {
         "quad_gym": quad_gym.__version__,

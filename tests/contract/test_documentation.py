@@ -161,6 +161,7 @@ def in_interface():
         for module in map(importlib.import_module, modules)
         for name, value in vars(module).items()
         if getattr(value, "__module__", None) == module.__name__
+        or name in getattr(module, "__all__", ())
     }, modules
 
 

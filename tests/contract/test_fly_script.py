@@ -80,7 +80,7 @@ def test_faults_come_and_go_at_the_given_time(tmp_path):
         (("--fault-time", 2, 3), "--fault-time"),
         (("--fault", "gremlins"), "gremlins"),
         (("--fault", "camera_occlusion", "--no-camera"), "CameraOcclusion"),
-        (("--size", 10, 10), "render_size"),
+        (("--size", 10, 10, "--output", "a.gif"), "render_size"),
         (("--replay", "nowhere.npz"), "nowhere.npz"),
         (("--policy", "me"), "policy must be"),
         (("--gnss-rate", 77), "gnss_rate"),

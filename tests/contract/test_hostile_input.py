@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import FlightBatch, TaskParams
+from quad_gym import BarometerParams, FlightBatch, TaskParams
 from quad_gym import faults as fault_kinds
 from quad_gym.faults.base import DirectedFault
 from quad_gym.records import Autoreset, Control
@@ -271,9 +271,12 @@ FAULTS = [
 
 @pytest.mark.parametrize(("kind", "name"), FAULTS, ids=lambda part: getattr(part, "__name__", part))
 def test_fields_of_faults(kind, name):
+    needed, sensors = {}, RTK
+    if kind is fault_kinds.SensorLoss:
+        needed, sensors = {"sensor": "barometer"}, RTK.replace(barometer=BarometerParams())
     for value in [*NUMBERS, *OTHERS, *vectors(2), *vectors(3), (0.2, 0.1)]:
         assert_refused_or_flown(
-            lambda v: fly_batch(sensors=RTK, faults=kind(**{name: v})), name, value
+            lambda v: fly_batch(sensors=sensors, faults=kind(**{**needed, name: v})), name, value
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.sb3 import QuadVecEnv
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
@@ -67,7 +68,7 @@ def fly(env, seeds):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("task", list(quad_gym.IDS.values()))
+@pytest.mark.parametrize("task", TASK_DEFAULTS)
 def test_a_task_that_changes_nothing_flies_what_ships(task, mode):
     plain = fly(QuadVectorEnv(FLIGHTS, task, autoreset_mode=mode, **SHORT), range(FLIGHTS))
     for custom in (Empty(), Shipped(), Repeated()):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from tests.field_flights import fly, nees, steps
 
 FLIGHTS = 256
@@ -12,7 +13,7 @@ BAND = 5 * np.sqrt(2 * 15 / FLIGHTS)
 
 
 @pytest.mark.parametrize("filter_start", ["cold", "warm"])
-@pytest.mark.parametrize("task", quad_gym.IDS.values())
+@pytest.mark.parametrize("task", TASK_DEFAULTS)
 def test_the_default_filter_is_consistent(task, filter_start):
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=1)
     suite = env.unwrapped.flights.batch.sensors

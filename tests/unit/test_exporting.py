@@ -273,9 +273,26 @@ def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
     camera = {"camera", "R_CB", "pixel_size", "focal_length", "features", "pixel_sigma", "blur"}
     camera |= {"noise_at_prediction", "noise_projected", "gradual_above"}
     gates = {"gate_position", "gate_direction", "gate_uncertainty"}  # open ones are left out
-    present = quad_gym.sensor_suite(suite).camera is not None
-    assert read - set(found) <= gates | (set() if present else camera)
+    present = quad_gym.sensor_suite(suite)
+    absent = set() if present.camera is not None else camera
+    if not present.drifts:
+        absent |= {"slow_sigma", "slow_decay", "slow_drive"}
+    assert read - set(found) <= gates | absent
     assert len(read) > 40
+
+
+def test_a_filters_numbers_hold_those_of_aiding_sensors():
+    suite = quad_gym.sensor_suite("consumer")
+    suite = suite.replace(
+        barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
+    )
+    found = filter_numbers(suite)
+    numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
+    assert len(numbers["slow_sigma"]) == 3 + 1 + 4  # drift; bias; hard iron and declination
+    assert numbers["aid_sigma"] == [suite.barometer.noise_sigma, suite.magnetometer.noise_sigma]
+    np.testing.assert_allclose(numbers["aid_numbers"][1], suite.magnetometer.field_I)
+    assert found["rates"]["magnetometer"] == suite.magnetometer.rate
+    assert "aid_numbers" in filter_header(suite, "aided")
 
 
 def test_a_filters_numbers_are_those_of_the_report():
