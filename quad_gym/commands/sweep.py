@@ -31,7 +31,7 @@ class Args:
     file: tyro.conf.Positional[
         Annotated[Path | None, tyro.conf.arg(help="what to train, in TOML: see docs/sweeps.md")]
     ] = None
-    envs: tuple[str, ...] = ()
+    env_ids: tuple[str, ...] = ()
     """ids of environments; if not given, QuadGym/Circle-v0"""
     arms: tuple[str, ...] = ()
     """names of arms, as quad-gym study has them; if not given, the environment as --env has it"""
@@ -39,7 +39,7 @@ class Args:
     """a file with a tuple ARMS; if not given, baselines/arms.py"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=standard,rtk"""
-    algorithm: tuple[str, ...] = ()
+    algorithm: tuple[Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"], ...] = ()
     """how to learn; if not given, ppo"""
     engine: Literal["sb3", "compiled"] | None = None
     """what trains; if not given, sb3"""
@@ -89,7 +89,7 @@ def configure(args: Args) -> tuple[list[Any], Path]:
         check.whole("--jobs", args.jobs)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], {"threads": "--threads"})
-    name = IDS.get(given["envs"][0], "") if given.get("envs") else "circle"
+    name = IDS.get(given["env_ids"][0], "") if given.get("env_ids") else "circle"
     name = name if args.file is None else args.file.stem
     folder = args.output or Path("results/sweep") / name
     trainings = expand(given, _arms(given, args), folder, threads=args.threads)
@@ -99,7 +99,7 @@ def configure(args: Args) -> tuple[list[Any], Path]:
 
 def _given(args: Args, found: dict[str, Any]) -> dict[str, Any]:
     """What the file has, and the options in its place."""
-    for name in ("envs", "arms", "algorithm"):
+    for name in ("env_ids", "arms", "algorithm"):
         if values := getattr(args, name):
             found[name] = list(values)
     for name in ("engine", "seeds", "evaluations", "episodes"):

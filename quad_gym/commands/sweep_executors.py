@@ -59,7 +59,7 @@ class Executor(Protocol):
 def work(plan: Plan, folder: Path) -> Ended:
     """Train in a folder, from its checkpoint if it has one; in a process of its own."""
     try:
-        done = train(plan, folder, resume=True, quiet=True)
+        done = train(plan, folder, resume=True, tensorboard=False, quiet=True)
     except BusyError as error:
         return Ended("busy", str(error))
     except Exception as error:  # whatever a user's task or a file system may raise

@@ -25,7 +25,7 @@ _ALONE = {"algorithm": "algorithm", "parameters": "set", "flights": None, "polic
 class Spec:
     """A sweep as a file has it; where a list is given, its values are tried one by one."""
 
-    envs: list[str] = field(default_factory=lambda: ["QuadGym/Circle-v0"])
+    env_ids: list[str] = field(default_factory=lambda: ["QuadGym/Circle-v0"])
     """ids of environments"""
     arms: list[str] = field(default_factory=list)
     """names of arms of a study; none: environments as `env` has them"""
@@ -120,14 +120,14 @@ def expand(
     spec = Spec(**given)
     groups = [
         (env_id, arm, dict(axes))
-        for env_id in _listed("envs", spec.envs)
+        for env_id in _listed("env_ids", spec.env_ids)
         for arm in _listed("arms", spec.arms) or [None]
         for axes in _products(spec)
     ]
     found = []
     for seed in _seeds(spec.seeds):
         for env_id, arm, axes in groups:
-            check.choice("envs", env_id, tuple(IDS))
+            check.choice("env_ids", env_id, tuple(IDS))
             plan = _plan(spec, env_id, None if arm is None else arms[arm], axes, seed, threads)
             name = _name(spec, env_id, arm, axes)
             found.append(Training(name, plan, folder / "runs" / name / f"seed_{seed}"))

@@ -33,7 +33,7 @@ recipe = {steps = 40960, n_envs = 16}
 
 def test_every_combination_has_a_folder_the_first_seed_first(tmp_path):
     given = {
-        "envs": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
+        "env_ids": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
         "seeds": [3, 1],
         "env": {"sensors": ["lab", "rtk"], "duration": 2.0},
         "recipe": {"layers": [[32, 32]]},
@@ -60,7 +60,7 @@ def test_values_that_are_added_leave_the_other_folders_in_place(tmp_path):
 
 def test_arms_bring_what_they_are_trained_on(tmp_path):
     arms = {arm.name: arm for arm in ARMS}
-    given = {"envs": ["QuadGym/LookAround-v0"], "arms": ["truth", "sure"], "engine": "compiled"}
+    given = {"env_ids": ["QuadGym/LookAround-v0"], "arms": ["truth", "sure"], "engine": "compiled"}
     truth, sure = expand(given, arms, tmp_path)
     assert truth.group == "look_around,compiled_ppo,truth"
     assert truth.plan.environment["observation"] == "truth"
@@ -92,13 +92,13 @@ def test_options_replace_what_the_file_has(tmp_path):
     ("text", "message"),
     [
         ("seeds = [", "is no valid TOML"),
-        ("sedes = 3", "must be one of envs, arms"),
+        ("sedes = 3", "must be one of env_ids, arms"),
         ("env = 3", "env in bad.toml must be a table, got 3"),
         ("seeds = 0", "seeds must be at least 1, got 0"),
         ("seeds = []", "seeds must not be empty"),
         ("seeds = [1, 1]", "every value of a sweep must be given once"),
-        ('envs = "QuadGym/Hover-v0"', "envs must be a list of names"),
-        ('envs = ["QuadGym/Howver-v0"]', "envs must be one of QuadGym/"),
+        ('env_ids = "QuadGym/Hover-v0"', "env_ids must be a list of names"),
+        ('env_ids = ["QuadGym/Howver-v0"]', "env_ids must be one of QuadGym/"),
         ('arms = ["nobody"]', "--arms must be one of"),
         ('engine = "torch"', "engine must be one of sb3, compiled"),
         ('algorithm = ["alphago"]', "algorithm must be one of ppo"),
