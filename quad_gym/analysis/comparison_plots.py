@@ -64,6 +64,21 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
     return figure
 
 
+def draw_seeds(axes: Any, seeds: Sequence[tuple[Floats, Floats]], **style: Any) -> None:
+    """Draw one thin line a seed, and their median bold.
+
+    Args:
+        axes: Where.
+        seeds: Abscissae (k,) and values (k,) of every seed; the median ends with the shortest.
+        style: Of the median, as matplotlib's `plot` takes it: color, linestyle, label.
+    """
+    for x, y in seeds:
+        axes.plot(x, y, color=style["color"], alpha=0.35, linewidth=0.8)
+    shortest = min(len(x) for x, _ in seeds)
+    middle = np.median([y[:shortest] for _, y in seeds], axis=0)
+    axes.plot(seeds[0][0][:shortest], middle, linewidth=2.0, **style)
+
+
 def learning_figure(
     curves: Mapping[str, Sequence[tuple[Floats, Floats]]],
     levels: Mapping[str, float],
@@ -87,18 +102,9 @@ def learning_figure(
         for (label, seeds), (color, dashes) in zip(
             curves.items(), _cycle(len(curves), skip=1), strict=True
         ):
-            for x, y in seeds:
-                axes.plot(x, y, color=color, alpha=0.35, linewidth=0.8)
-            shortest = min(len(x) for x, _ in seeds)
-            middle = np.median([y[:shortest] for _, y in seeds], axis=0)
-            axes.plot(
-                seeds[0][0][:shortest],
-                middle,
-                color=color,
-                linestyle=dashes,
-                linewidth=2.0,
-                label=f"{label} (median of {len(seeds)})" if len(seeds) > 1 else label,
-            )
+            if len(seeds) > 1:
+                label = f"{label} (median of {len(seeds)})"
+            draw_seeds(axes, seeds, color=color, linestyle=dashes, label=label)
         for label, level in levels.items():
             axes.axhline(level, color=INK, linewidth=1.0, linestyle=(0, (4, 3)), label=label)
         axes.set_yscale("log")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.comparison_plots import _cycle
+from quad_gym.analysis.comparison_plots import _cycle, draw_seeds
 from quad_gym.analysis.plots import (
     BLUE,
     GREEN,
@@ -59,14 +59,7 @@ def returns_figure(
         for (label, seeds), (color, dashes) in zip(
             curves.items(), _cycle(len(curves), skip=1), strict=True
         ):
-            for x, y in seeds:
-                axes.plot(x, y, color=color, alpha=0.3, linewidth=0.7)
-            shortest = min(len(x) for x, _ in seeds)
-            middle = np.median([y[:shortest] for _, y in seeds], axis=0)
-            axes.plot(
-                seeds[0][0][:shortest], middle, color=color, linestyle=dashes, linewidth=2.0,
-                label=label,
-            )  # fmt: skip
+            draw_seeds(axes, seeds, color=color, linestyle=dashes, label=label)
         for k, (label, level) in enumerate(levels.items()):
             dashes = [(0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2))][k % 3]
             axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)
