@@ -34,7 +34,7 @@ circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures 
 	$(BIN)/quad-gym circle --output results/circle
 
 animation: setup  ## the animation of README
-	$(BIN)/quad-gym fly --task circle --no-camera --seed 1 \
+	$(BIN)/quad-gym fly circle --no-camera --seed 1 \
 		--faults gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
 	rm .github/images/outage.npz
 

@@ -51,7 +51,7 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
     with house_style():
         figure, axes = _figure((7.0, 3.8), title)
         for (label, (time, (low, middle, high))), (color, dashes) in zip(
-            curves.items(), _cycle(len(curves)), strict=True
+            curves.items(), line_styles(len(curves)), strict=True
         ):
             axes.fill_between(time, low, high, color=color, alpha=0.15, linewidth=0)
             axes.plot(time, middle, color=color, linestyle=dashes, label=label)
@@ -100,7 +100,7 @@ def learning_figure(
     with house_style():
         figure, axes = _figure((7.0, 3.8), title)
         for (label, seeds), (color, dashes) in zip(
-            curves.items(), _cycle(len(curves), skip=1), strict=True
+            curves.items(), line_styles(len(curves), skip=1), strict=True
         ):
             if len(seeds) > 1:
                 label = f"{label} (median of {len(seeds)})"
@@ -200,7 +200,8 @@ def _legend_below(figure: Any, axes: Any) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=ncols)
 
 
-def _cycle(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:
+def line_styles(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:
+    """Colors and dashes of curves that stay apart, the first `skip` of them left out."""
     return [_STYLES[(k + skip) % len(_STYLES)] for k in range(count)]
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.comparison_plots import _cycle, draw_seeds
+from quad_gym.analysis.comparison_plots import draw_seeds, line_styles
 from quad_gym.analysis.plots import (
     BLUE,
     GREEN,
@@ -57,7 +57,7 @@ def returns_figure(
         figure = Figure(figsize=(7.0, 4.2), layout="constrained")
         axes: Any = figure.add_subplot()
         for (label, seeds), (color, dashes) in zip(
-            curves.items(), _cycle(len(curves), skip=1), strict=True
+            curves.items(), line_styles(len(curves), skip=1), strict=True
         ):
             draw_seeds(axes, seeds, color=color, linestyle=dashes, label=label)
         for k, (label, level) in enumerate(levels.items()):

@@ -9,7 +9,7 @@ Prints tables and a verdict, and writes figures (PNG and SVG) and all numbers wi
 configuration and the seeds (consistency.json). For example:
 
   quad-gym consistency                             the suite "rtk"
-  quad-gym consistency --sensors indoor --filter-start warm
+  quad-gym consistency circle --sensors indoor --filter-start warm
   quad-gym consistency --sensors lab                 the report's filter
   quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
   quad-gym consistency --estimator ekf             an extended Kalman filter
@@ -51,7 +51,8 @@ from quad_gym.analysis.reports import (
     write_json,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import FilterStart, Seed, SuiteName, usage_errors
+from quad_gym.commands.options import EnvId, FilterStart, Seed, SuiteName, usage_errors
+from quad_gym.envs import IDS
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
@@ -66,7 +67,10 @@ class Args:
         "--first-seed": "--seed",
         "--start": "--filter-start",
         "--fly-on": "--observation",
+        "--task": "",
     }
+
+    env_id: EnvId = "QuadGym/RandomTrajectory-v0"
 
     flights: Annotated[int | None, arg(name="episodes")] = None
     """flights; if not given, 4000, or 400 in each cell of a matrix"""
@@ -74,8 +78,6 @@ class Args:
     """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
-    task: Literal["random_trajectory", "hover", "circle", "lemniscate"] = "random_trajectory"
-    """what is flown"""
     fly_on: Annotated[Literal["estimate", "truth"], arg(name="observation")] = "estimate"
     """what the controller sees"""
     start: Annotated[Literal["cold", "warm", "matched"], FilterStart] = "cold"
@@ -139,6 +141,8 @@ class Args:
             object.__setattr__(self, "output", Path("results") / folder)
         if self.count < 2:
             raise ValueError(f"--episodes must be at least 2, got {self.flights}")
+        if self.env_id not in IDS or self.task not in TASK_DEFAULTS or self.task == "waypoints":
+            raise ValueError(f"ENV_ID must be a task of tracking, got {self.env_id!r}")
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
@@ -147,6 +151,11 @@ class Args:
                 raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value}")
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
+
+    @property
+    def task(self) -> str:
+        """The short name of what is flown."""
+        return IDS[self.env_id]
 
     @property
     def count(self) -> int:

@@ -1,8 +1,8 @@
 """Watch a flight: live in a window, as a video, or in the Rerun viewer; and keep its numbers.
 
-    quad-gym fly --task lemniscate
-    quad-gym fly --task circle --no-camera --faults gnss_outage --fault-time 4 7
-    quad-gym fly --task circle --faults rotor_loss --output results/outage.mp4
+    quad-gym fly lemniscate
+    quad-gym fly circle --no-camera --faults gnss_outage --fault-time 4 7
+    quad-gym fly circle --faults rotor_loss --output results/outage.mp4
     quad-gym fly --replay results/outage.npz --view chase
     quad-gym fly --replay results/outage.npz --output results/outage.rrd
 
@@ -29,7 +29,14 @@ from baselines.policies import keywords_of_policy, load_policy
 from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import Keywords, SuiteName, leave, sensors_of, usage_errors
+from quad_gym.commands.options import (
+    EnvId,
+    Keywords,
+    SuiteName,
+    leave,
+    sensors_of,
+    usage_errors,
+)
 from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import PRESETS, faults_of
@@ -38,7 +45,6 @@ from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
 
-ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
 FAULTS = tuple(name for name in PRESETS if name != "none")
 OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 
@@ -47,12 +53,9 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 class Args:
     """Options of the flight."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults"}
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults", "--task": ""}
 
-    task: Literal[
-        "hover", "circle", "lemniscate", "random_trajectory", "waypoints", "look_around"
-    ] = "circle"
-    """what to fly"""
+    env_id: EnvId = "QuadGym/Circle-v0"
     policy: str = "pd"
     """who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for the
     task), or a file of quad-gym train (.zip or .npz)"""
@@ -132,6 +135,8 @@ def check_options(args: Args) -> None:
         ValueError: If one does.
         ImportError: If a library that draws or writes a file is not installed.
     """
+    if args.env_id not in IDS:
+        raise ValueError(f"ENV_ID must be one of {', '.join(IDS)}, got {args.env_id!r}")
     for name in ("speed", "fps"):
         value = getattr(args, name)
         if not (math.isfinite(value) and value > 0.0):
@@ -161,7 +166,7 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
     Raises:
         ValueError: If there is no such fault, or the sensors lack what it concerns.
     """
-    sensors = sensor_suite(sensors_of(ID_OF_TASK[args.task], args.sensors))
+    sensors = sensor_suite(sensors_of(args.env_id, args.sensors))
     faults = faults_of(args.fault, sensors if args.camera else sensors.replace(camera=None))
     if args.fault_time is None:
         return faults
@@ -178,14 +183,14 @@ def make_env(args: Args) -> Any:
     options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
     given = leave(args.env, {**named, "faults": "--faults"})
-    keywords = {**keywords_of_policy(args.policy, ID_OF_TASK[args.task]), **given}
+    keywords = {**keywords_of_policy(args.policy, args.env_id), **given}
     return gymnasium.make_vec(
-        ID_OF_TASK[args.task],
+        args.env_id,
         num_envs=1,
         autoreset_mode="Disabled",
         observation=args.observation,
         action=args.action,
-        sensors=sensors_of(ID_OF_TASK[args.task], args.sensors),
+        sensors=sensors_of(args.env_id, args.sensors),
         camera=args.camera,
         gnss_rate=args.gnss_rate,
         camera_rate=args.camera_rate,
@@ -268,7 +273,7 @@ def open_window(args: Args) -> Window:
         OSError: If there is no screen.
     """
     try:
-        return Window(args.size, f"quad_gym: {args.task}", watched=True)
+        return Window(args.size, f"quad_gym: {IDS[args.env_id]}", watched=True)
     except RuntimeError as error:
         raise OSError(f"{error}; --output writes a video instead") from None
 
@@ -308,8 +313,13 @@ def main(args: Args) -> None:
         if env is not None and args.output and not env.unwrapped.flights.batch.max_steps:
             raise ValueError("--output needs a flight with an end: a --duration above 0")
         policy = None if env is None else load_policy(args.policy, env)
-    sensors = sensors_of(ID_OF_TASK[args.task], args.sensors)
-    about = {"task": args.task, "policy": args.policy, "sensors": sensors, "fault": args.fault}
+    sensors = sensors_of(args.env_id, args.sensors)
+    about = {
+        "task": IDS[args.env_id],
+        "policy": args.policy,
+        "sensors": sensors,
+        "fault": args.fault,
+    }
 
     def flights(seed: int, switches: Switches) -> Iterator[Flight]:
         if saved is not None:

@@ -35,7 +35,8 @@ def parse(
     """Options from the command line as an instance of a dataclass.
 
     A ValueError of the dataclass's own checks ends the program as a wrong option does. Options that
-    had other names once, in `FORMER_NAMES` of the dataclass, are understood by them, too.
+    had other names once, in `FORMER_NAMES` of the dataclass, are understood by them, too; one whose
+    name is now "" is given without a name.
 
     Args:
         kind: Dataclass whose fields are the options.
@@ -44,10 +45,15 @@ def parse(
         program: Name of the program in its messages; None: that of the process.
     """
     former: Mapping[str, str] = getattr(kind, "FORMER_NAMES", {})
-    words = []
-    for word in sys.argv[1:] if argv is None else argv:
-        option, equals, value = word.partition("=")
-        words.append(former.get(option, option) + equals + value)
+    given = list(sys.argv[1:] if argv is None else argv)
+    words, unnamed = [], []
+    while given:
+        option, equals, value = given.pop(0).partition("=")
+        if former.get(option) != "":
+            words.append(former.get(option, option) + equals + value)
+        elif equals or given:
+            unnamed.append(value if equals else given.pop(0))
+    words = unnamed + words  # first, as an option before them may take any number of words
     return tyro.cli(kind, args=words, description=description, prog=program)
 
 

@@ -1,7 +1,7 @@
 """Tune the gains of PD control on what it sees: the estimate, the truth, any sensors.
 
     quad-gym tune                                         # the four tracking tasks
-    quad-gym tune --tasks QuadGym/Circle-v0 --sensors consumer
+    quad-gym tune --env-ids circle --sensors consumer
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pd:results/tune/gains.json
 
 Differential evolution (scipy.optimize) searches gains between a third and three times those it
@@ -38,11 +38,14 @@ from quad_gym.commands.options import (
     refuse_overwriting,
     usage_errors,
 )
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
 
 Floats = NDArray[np.float64]
 
-TRACKING = tuple(env_id for env_id, task in IDS.items() if task != "waypoints")
+TRACKING = tuple(
+    env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"
+)
 CRASH_FACTOR = 10.0
 """An episode that crashed counts as this many times the error at the start."""
 RANGE = 3.0
@@ -55,9 +58,11 @@ POPULATION = 8
 class Args:
     """Options of the search."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--start": "--gains"}
+    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--start": "--gains", "--tasks": "--env-ids"}
 
-    tasks: Annotated[tuple[str, ...], arg(help=f"what to fly: {', '.join(TRACKING)}")] = TRACKING
+    env_ids: Annotated[
+        tuple[str, ...], arg(help=f"what to fly: {', '.join(TRACKING)}, or short, as circle")
+    ] = TRACKING
     observation: Literal["estimate", "truth", "noisy"] = "estimate"
     """what control sees"""
     sensors: SuiteName = "standard"
@@ -181,7 +186,7 @@ def make_envs(args: Args, episodes: int) -> dict[str, Any]:
             threads=args.threads,
             **args.env,
         )
-        for env_id in map(full_id, args.tasks)
+        for env_id in map(full_id, args.env_ids)
     }
 
 
@@ -192,9 +197,9 @@ def configure(args: Args) -> Search:
         ValueError: If an option is invalid.
         OSError: If nothing can be written to the folder.
     """
-    for env_id in map(full_id, args.tasks):
+    for env_id in map(full_id, args.env_ids):
         if env_id not in TRACKING:
-            raise ValueError(f"--tasks must be among {', '.join(TRACKING)}, got {env_id!r}")
+            raise ValueError(f"--env-ids must be among {', '.join(TRACKING)}, got {env_id!r}")
     for name, least in (("candidates", 1), ("episodes", 1), ("fresh_episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             option_name = name.replace("_", "-")
@@ -298,4 +303,4 @@ def main(args: Args) -> None:
     seconds = time.perf_counter() - began
     print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")
     same = flying_options({"sensors": args.sensors, **args.env})
-    print(f"quad-gym evaluate {full_id(args.tasks[0])} --policy pd pd:{written[0]}{same}")
+    print(f"quad-gym evaluate {full_id(args.env_ids[0])} --policy pd pd:{written[0]}{same}")

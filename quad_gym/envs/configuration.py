@@ -106,6 +106,8 @@ class Flights:
             if name in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ()):
                 raise ValueError(f"{name} means nothing to the task {task}, and must not be given")
         self.task: TaskParams = defaults.replace(**given)
+        if "pad" in given and self.task.start == "hover":
+            raise ValueError('pad means nothing with start="hover", and must not be given')
         keywords = {**own, **keywords}
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:

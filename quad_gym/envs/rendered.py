@@ -26,8 +26,8 @@ def rendering_of(
     flights: Flights,
     render_mode: str | None,
     *,
-    render_view: str = "fixed",
-    render_size: tuple[int, int] = (640, 480),
+    render_view: str | None = None,
+    render_size: tuple[int, int] | None = None,
     render_flights: Sequence[int] | None = None,
 ) -> "Rendering | None":
     """What an environment renders with; None where it does not render.
@@ -36,10 +36,12 @@ def rendering_of(
         ValueError: If an argument is invalid.
         ImportError: If it is to render and pygame is not installed.
     """
+    given: dict[str, Any] = {"view": render_view, "size": render_size, "flights": render_flights}
+    given = {name: value for name, value in given.items() if value is not None}
     if render_mode is None:
+        if given:
+            raise ValueError(f"render_{next(iter(given))} needs a render_mode, got None")
         return None
     from quad_gym.rendering.live import Rendering
 
-    return Rendering(
-        flights.batch, render_mode, flights=render_flights, view=render_view, size=render_size
-    )
+    return Rendering(flights.batch, render_mode, **given)

@@ -72,7 +72,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     The body frame is the one that the controller's source believes in. `layout="absolute"` gives
     position, velocity, rotation matrix, biases and reference in the inertial frame;
     `observation="sensors"` gives the raw measurements of the step with flags (a measurement that
-    was not taken is zero, its flag too), and has that layout only.
+    was not taken is zero, its flag too), of the IMU the last sample and the mean over the step, and
+    has that layout only.
     `quad_gym.observation_layout(...)` returns any of these tables, with bounds; observations are
     held within them.
 

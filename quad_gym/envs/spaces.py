@@ -93,6 +93,8 @@ def _sensor_fields(
     fields = [
         ("gyro", 3, "rad/s", "B", 200.0),
         ("accel", 3, "m/s^2", "B", 1000.0),
+        ("gyro_mean", 3, "rad/s", "B", 200.0),
+        ("accel_mean", 3, "m/s^2", "B", 1000.0),
         ("gnss_position", 3, "m", "I", 1000.0),
         ("gnss_position_valid", 1, "0 or 1", "-", _FLAG),
         ("gnss_baseline", 3, "-", "I", 1.0),

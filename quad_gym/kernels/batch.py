@@ -27,6 +27,7 @@ from quad_gym.records import (
     Autoreset,
     Call,
     Command,
+    Layout,
     Result,
     offset_of,
 )
@@ -167,6 +168,9 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
     if settings.run_filter and settings.aids > 0:
         for s in range(AIDS):
             flight.aid_fresh[s] = 0.0
+    if settings.run_filter and settings.layout == Layout.SENSORS:
+        for i in range(3):
+            flight.gyro_sum[i] = flight.accel_sum[i] = 0.0
     instant = flight.instant
     for left in range(settings.ticks_per_step - 1, -1, -1):
         _fetch_ahead(call, index, settings, left)

@@ -14,7 +14,7 @@ from quad_gym.kernels.maths.linalg import load3, load4, norm, sub
 from quad_gym.kernels.measurements.aid import ACTS, call_aids
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import Act, Start, Supply
+from quad_gym.records import Act, Layout, Start, Supply
 
 _DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
 _DELAY_ACTION = int(Stage.DELAY_ACTION)
@@ -22,6 +22,7 @@ _CONTROL, _SUPPLY = int(Stage.CONTROL), int(Stage.SUPPLY)
 _MOVE, _MOVE_IN_AIR = int(Stage.MOVE), int(Stage.MOVE_IN_AIR)
 _REST_ON_PAD = int(Stage.REST_ON_PAD)
 _AVERAGE_IMU, _SATURATE_IMU = int(Stage.AVERAGE_IMU), int(Stage.SATURATE_IMU)
+_SUM_IMU = int(Stage.SUM_IMU)
 _PREDICT, _INCREMENT, _UPDATE = int(Stage.PREDICT), int(Stage.INCREMENT), int(Stage.UPDATE)
 _DRIFT_BIASES, _ADVANCE_FAULTS = int(Stage.DRIFT_BIASES), int(Stage.ADVANCE_FAULTS)
 _SET_ASIDE, _SAMPLE, _LOOK = int(Stage.SET_ASIDE), int(Stage.SAMPLE), int(Stage.LOOK)
@@ -127,6 +128,9 @@ def tick(flight, world, model, settings, work, stages, last):
     if settings.faults:
         call_stage(stages, _ADVANCE_FAULTS, flight, world, model, settings, work, 0)
     sense(flight, world, model, settings, work, stages, everyone, 0, 0 if last else 1)
+    if settings.run_filter and settings.layout == Layout.SENSORS:
+        work.mask = 1.0
+        call_stage(stages, _SUM_IMU, flight, world, model, settings, work, 0)
 
 
 @kernel

@@ -42,6 +42,11 @@ _ACTION_FIELDS = (
     Field("past_actions", (MAX_ACTION_DELAY + 1, 4), "-", "the present action and those before it, the latest first"),
     Field("delayed_action", (4,), "-", "the action that the vehicle carries out"),
 )
+_RAW_FIELDS = (
+    # raw measurements as observations
+    Field("gyro_sum", (3,), "rad/s", "gyro, summed over the samples since the last step"),
+    Field("accel_sum", (3,), "m/s^2", "accel, likewise"),
+)
 _CORE_FIELDS = (
     # what every tick reads and writes: the truth, clocks, the random stream
     Field("r", (3,), "m", "position r_I of the center of mass"),
@@ -199,6 +204,7 @@ PARTS = (
     ("faults", _FAULT_FIELDS),
     ("draws", _DRAW_FIELDS),
     ("actions", _ACTION_FIELDS),
+    ("raw", _RAW_FIELDS),
     ("core", _CORE_FIELDS),
     ("filter", _FILTER_FIELDS),
     ("errors", _ERROR_FIELDS),

@@ -32,7 +32,7 @@ def fly(*options, cwd, **environment):
 def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
     size = ("--size", 320, 240, "--fps", 5)
     done = fly(
-        *("--task", "hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"),
+        *("hover", "--duration", 1, "--seed", 4, *size, "--output", "new/hover.gif"),
         cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
@@ -48,7 +48,7 @@ def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
 
 def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
     pytest.importorskip("rerun")
-    options = ("--task", "hover", "--duration", 0.1, "--output", "new/hover.rrd")
+    options = ("hover", "--duration", 0.1, "--output", "new/hover.rrd")
     done = fly(*options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Wrote new/hover.rrd" in done.stdout
@@ -56,7 +56,7 @@ def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
 
 
 def test_faults_come_and_go_at_the_given_time(tmp_path):
-    options = ("--task", "hover", "--duration", 3, "--fault", "gnss_outage", "--fault-time", 1, 2)
+    options = ("hover", "--duration", 3, "--fault", "gnss_outage", "--fault-time", 1, 2)
     done = fly(*options, "--no-camera", "--output", "flight.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     flight = Flight.load(tmp_path / "flight.npz")
@@ -96,7 +96,7 @@ def test_wrong_options_are_one_line_and_write_nothing(tmp_path, options, message
 
 
 def test_without_a_screen_the_window_is_a_clear_error(tmp_path):
-    done = fly("--task", "hover", cwd=tmp_path, SDL_VIDEODRIVER="x11")
+    done = fly("hover", cwd=tmp_path, SDL_VIDEODRIVER="x11")
     assert done.returncode == 2
     assert "--output writes a video instead" in done.stderr
 
@@ -115,7 +115,9 @@ def test_keys_change_the_flight_while_one_watches():
             return self.presses.pop(self.shown, [])
 
     fault = {"fault": ("imu_bias_step",), "fault_time": (90.0, 99.0)}
-    args = script.Args(task="hover", duration=2.0, camera=False, size=(320, 240), **fault)
+    args = script.Args(
+        env_id="QuadGym/Hover-v0", duration=2.0, camera=False, size=(320, 240), **fault
+    )
     env = script.make_env(args)
     policy = script.load_policy("pd", env)
 

@@ -11,6 +11,15 @@ from tests.reference_ukf import east_north_up, rotation_312
 
 OMEGA = 2 * np.pi / 10
 
+SHOWN_BY = {
+    name: {
+        "feature_count": len(quad_gym.sensor_suite(name).camera.features_I),
+        "gnss_velocity": quad_gym.sensor_suite(name).gnss.velocity_sigma is not None,
+    }
+    for name in ("lab", "rtk")
+}
+"""What the observation of raw measurements depends on."""
+
 
 def on_circle(t):
     """r*, v*, a* and x* of the circle at the time t."""
@@ -170,6 +179,41 @@ def test_a_slow_controller_hears_of_every_fix_since_its_last_step():
     for _ in range(5):
         seen = parts_of(env.step(np.zeros((2, 4)))[0], observation="sensors")
         assert seen["gnss_position_valid"].all()
+
+
+@pytest.mark.parametrize("suite", ["lab", "rtk"])  # instant samples; averages with vibration
+def test_the_mean_of_imu_samples_is_that_of_all_samples_since_the_last_step(suite):
+    given = {"observation": "sensors", "action": "motor", "sensors": suite, "start": "hover"}
+    slow = QuadVectorEnv(3, "circle", **given)
+    fast = QuadVectorEnv(3, "circle", **given, control_rate=200)  # shows every sample
+    observation, _ = slow.reset(seed=4)
+    fast.reset(seed=4)
+    seen = parts_of(observation, observation="sensors", **SHOWN_BY[suite])
+    np.testing.assert_array_equal(seen["gyro_mean"], seen["gyro"])
+    np.testing.assert_array_equal(seen["accel_mean"], seen["accel"])
+    for k in range(5):
+        actions = 0.2 * np.stack([actions_of(i, 5)[k] for i in range(3)])
+        seen = parts_of(slow.step(actions)[0], observation="sensors", **SHOWN_BY[suite])
+        each = [
+            parts_of(fast.step(actions)[0], observation="sensors", **SHOWN_BY[suite])
+            for _ in range(4)
+        ]
+        for name in ("gyro", "accel"):
+            np.testing.assert_array_equal(seen[name], each[-1][name])
+            mean = np.mean([sample[name] for sample in each], axis=0)
+            np.testing.assert_allclose(seen[f"{name}_mean"], mean, rtol=1e-5, atol=1e-6)
+
+
+def test_an_episode_that_begins_in_a_step_shows_no_sample_of_the_one_before():
+    env = QuadVectorEnv(2, "hover", observation="sensors", duration=0.04, autoreset_mode="SameStep")
+    env.reset(seed=1)
+    env.step(np.ones((2, 4)))
+    observation, _, _, truncated, info = env.step(np.ones((2, 4)))
+    assert truncated.all()
+    first = parts_of(observation, observation="sensors")
+    np.testing.assert_array_equal(first["gyro_mean"], first["gyro"])
+    last = parts_of(np.stack(info["final_obs"]), observation="sensors")
+    assert (last["gyro_mean"] != last["gyro"]).all()
 
 
 def test_measurements_scatter_about_what_the_true_state_implies():

@@ -9,7 +9,17 @@ import pytest
 from quad_gym.commands.main import COMMANDS, main
 from quad_gym.commands.options import parse
 
-FORMER = {"--flights", "--first-seed", "--fly-on", "--fault", "--processes", "--envs", "--start"}
+FORMER = {
+    "--task",
+    "--tasks",
+    "--flights",
+    "--first-seed",
+    "--fly-on",
+    "--fault",
+    "--processes",
+    "--envs",
+    "--start",
+}
 
 
 def args_of(command):
@@ -57,6 +67,12 @@ def test_former_names_are_understood():
     )
     assert parse(args_of("circle"), ["--seeds=5"]).seeds == 5
     assert parse(args_of("fly"), ["--fault", "rotor_loss"]).fault == ("rotor_loss",)
+    flight = ["--fault", "rotor_loss", "gnss_outage", "--task", "hover"]
+    flight = parse(args_of("fly"), flight)
+    assert flight.env_id == parse(args_of("fly"), ["hover"]).env_id == "QuadGym/Hover-v0"
+    assert flight.fault == ("rotor_loss", "gnss_outage")
+    assert parse(args_of("consistency"), ["--task=circle"]).env_id == "QuadGym/Circle-v0"
+    assert parse(args_of("tune"), ["--tasks", "circle"]).env_ids == ("circle",)
     assert parse(args_of("tune"), ["--start", "tuned"]).start == "tuned"
     assert parse(args_of("compare"), ["--seeds", "2"]).seeds == 2  # of trainings
 

@@ -120,6 +120,17 @@ def test_nonsense_is_refused_by_name(name, value):
         QuadVectorEnv(2, "hover", **keywords)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("render_view", "chase"), ("render_size", (320, 240)), ("render_flights", (0,))],
+)
+def test_options_of_rendering_need_a_mode(name, value):
+    with pytest.raises(ValueError, match=f"{name} needs a render_mode"):
+        QuadEnv("hover", **{name: value})
+    with pytest.raises(ValueError, match=f"{name} needs a render_mode"):
+        QuadVectorEnv(2, "hover", **{name: value})
+
+
 @pytest.mark.parametrize("flights", [(2,), (-1,), (), (0.5,)])
 def test_flights_that_are_not_there_are_refused(flights):
     with pytest.raises(ValueError, match="flight"):
@@ -144,7 +155,8 @@ def test_rendering_never_changes_a_flight(env_id):
 def test_rendering_chosen_flights_changes_no_flight():
     batches = []
     for mode in (None, "rgb_array"):
-        env = QuadVectorEnv(9, "hover", render_mode=mode, render_flights=(1, 8), **SMALL)
+        look = {"render_mode": mode, "render_flights": (1, 8), **SMALL} if mode else {}
+        env = QuadVectorEnv(9, "hover", **look)
         env.reset(seed=3)
         for k in range(30):
             env.step(np.stack([actions_of(i, 30)[k] for i in range(9)]))

@@ -17,7 +17,7 @@ def tune(*options):
 
 def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
     tiny = ["--candidates", 128, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
-    done = tune("--tasks", "QuadGym/Hover-v0", *tiny, "--output", tmp_path)
+    done = tune("--env-ids", "hover", *tiny, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "gains.json").read_text())
     rows = (tmp_path / "search.csv").read_text().splitlines()
@@ -37,7 +37,7 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--tasks", "QuadGym/Waypoints-v0"], "--tasks must be among"),
+        (["--env-ids", "QuadGym/Waypoints-v0"], "--env-ids must be among"),
         (["--candidates", "0"], "--candidates must be at least 1"),
         (["--env", "sensors=rtk"], "leave sensors to --sensors"),
         (["--sensors", "sonar"], "sensors must be one of"),

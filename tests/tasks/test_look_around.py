@@ -189,6 +189,6 @@ def test_the_policy_that_ships_flies_by_command(observation, tmp_path, capsys):
     assert main([*words, "--episodes", "3", "--output", str(tmp_path)]) == 0
     assert "sensors one_wall" in capsys.readouterr().out
     flown = tmp_path / "flight.npz"
-    words = ["fly", "--task", "look_around", "--policy", "pretrained", "--duration", "0.5"]
+    words = ["fly", "look_around", "--policy", "pretrained", "--duration", "0.5"]
     assert main([*words, "--observation", observation, "--output", str(flown)]) == 0
     assert quad_gym.Flight.load(flown).stage.observation == observation

@@ -157,7 +157,7 @@ def test_what_is_seen_relative_to_the_reference_is_the_shipped_observation():
 
 def test_the_features_in_view_are_those_that_the_camera_has_seen():
     seen = np.zeros(2, int)
-    env = QuadVectorEnv(FLIGHTS, "hover", custom=Nothing(), start="hover", pad=False)
+    env = QuadVectorEnv(FLIGHTS, "hover", custom=Nothing(), start="hover")
     env.reset(seed=1)
     view = env.flights.batch.view
     rng = np.random.default_rng(3)

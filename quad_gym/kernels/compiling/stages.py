@@ -29,6 +29,7 @@ from quad_gym.records import (
     WORK_BLOCK,
     Aid,
     FilterForm,
+    Layout,
     Start,
     Supply,
 )
@@ -55,6 +56,7 @@ class Stage(IntEnum):
     ADVANCE_FAULTS = auto()
     MEET_ROTORS = auto()
     SATURATE_IMU = auto()
+    SUM_IMU = auto()
     CORRUPT_GNSS = auto()
     CORRUPT_FEATURES = auto()
     PREDICT = auto()
@@ -138,6 +140,10 @@ def _aid(aid: Aid) -> Callable[[Any], bool]:
     return lambda s: bool(s["run_filter"] and s["aid_on"][aid] > 0)
 
 
+def _raw(s: Any) -> bool:
+    return bool(s["run_filter"] and s["layout"] == Layout.SENSORS)
+
+
 def _pad(s: Any) -> bool:
     return bool(s["pad"] and s["start"] != Start.HOVER)
 
@@ -207,6 +213,7 @@ SOURCES = {
     ),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
+    Stage.SUM_IMU: Source("sensors.sample", "sum_imu_stage", _raw),
 }
 """Every stage; those that take longest to compile come first."""
 
@@ -227,6 +234,7 @@ def used_parts(settings: Any) -> frozenset[str]:
         "draws": _drawn(settings),
         "filter": _filter(settings),
         "actions": bool(settings["action_delays"] > 0),
+        "raw": _raw(settings),
         "errors": _lasting(settings),
         "watch": _filter(settings) and bool(watches),
         "late": _late(settings),

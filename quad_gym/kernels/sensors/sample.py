@@ -2,7 +2,7 @@
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import keep3, load3
+from quad_gym.kernels.maths.linalg import add, keep3, load3, store3
 from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.measure import (
     drift_gnss,
@@ -104,3 +104,11 @@ def sample_stage(flight, world, model, settings, work, stages, flag):
     if settings.camera_ticks > 0:
         _sample_camera(flying, true, settings, scratch, stages, mask)
     scratch.mask = select(mask, 1.0, 0.0)
+
+
+@stage
+def sum_imu_stage(flight, world, model, settings, work, stages, flag):
+    """Add the newest IMU sample to the sum since the last step."""
+    here = lanes_of(flight)
+    store3(here.gyro_sum, add(load3(here.gyro_sum), load3(here.gyro)))
+    store3(here.accel_sum, add(load3(here.accel_sum), load3(here.accel)))

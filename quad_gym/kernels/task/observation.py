@@ -3,7 +3,7 @@
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import apply, load3, load4, load33, scale, sub
+from quad_gym.kernels.maths.linalg import apply, load3, load4, load33, scale, select3, sub
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
@@ -111,10 +111,18 @@ def _put_aids(flight, p, settings, row, k):
 
 @kernel
 def _put_sensors(flight, p, settings, row):
-    """The last IMU sample; GNSS and camera where they measured since the last step, else zeros."""
+    """The IMU; GNSS and camera where they measured since the last step, else zeros.
+
+    Of the IMU the last sample, and the mean of all samples since the last step (at the start of an
+    episode there is one).
+    """
     R_IG = load33(p.R_IG)
-    k = _put3(row, 0, load3(flight.gyro))
-    k = _put3(row, k, load3(flight.accel))
+    gyro, accel = load3(flight.gyro), load3(flight.accel)
+    k = _put3(row, 0, gyro)
+    k = _put3(row, k, accel)
+    starts, share = flight.tick == 0.0, 1.0 / settings.ticks_per_step
+    k = _put3(row, k, select3(starts, gyro, scale(share, load3(flight.gyro_sum))))
+    k = _put3(row, k, select3(starts, accel, scale(share, load3(flight.accel_sum))))
     fresh = flight.position_fresh
     k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_position))))
     row[k] = fresh
