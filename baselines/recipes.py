@@ -139,6 +139,9 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
     ("QuadGym/Waypoints-v0", "ppo"): _PPO.replace(
         steps=3_000_000, parameters={**_PPO.parameters, "gamma": 0.99}
     ),
+    ("QuadGym/StaleRace-v0", "ppo"): _PPO.replace(
+        steps=4_000_000, reward_scale=1.0, parameters={**_PPO.parameters, "gamma": 0.99}
+    ),
     # closer bounds than the task's: who has lost himself need not be watched for long
     ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
         steps=4_000_000,

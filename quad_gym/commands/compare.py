@@ -38,7 +38,7 @@ from quad_gym.commands.compare_report import (
     write_figures,
     write_page,
 )
-from quad_gym.commands.options import EnvId, Keywords, SuiteNames, leave, usage_errors
+from quad_gym.commands.options import TRACKING, EnvId, Keywords, SuiteNames, leave, usage_errors
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
@@ -96,7 +96,7 @@ def configure(args: Args) -> Setting:
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     plots.require_matplotlib()
-    if args.env_id not in IDS or IDS[args.env_id] == "waypoints":
+    if args.env_id not in TRACKING:
         raise ValueError(f"ENV_ID must be a task of tracking, got {args.env_id!r}")
     for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:

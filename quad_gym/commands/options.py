@@ -17,6 +17,7 @@ import tyro
 
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
 USAGE_ERROR = 2
@@ -169,6 +170,11 @@ Keywords = Annotated[
     ),
 ]
 """Keywords given as `key=value` pairs, such as `--env observation=truth camera=false`."""
+
+TRACKING = tuple(
+    env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"
+)
+"""The ids of the general tasks in which a reference is followed."""
 
 _ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
 

@@ -26,10 +26,11 @@ from tyro.conf import arg
 
 from baselines.pd import PDPolicy
 from baselines.seeds import first_seed
-from quad_gym import IDS, PDGains, pd_gains
+from quad_gym import PDGains, pd_gains
 from quad_gym.analysis.metrics import paired_difference
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.commands.options import (
+    TRACKING,
     Keywords,
     SuiteName,
     flying_options,
@@ -38,14 +39,10 @@ from quad_gym.commands.options import (
     refuse_overwriting,
     usage_errors,
 )
-from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.evaluation import roll_out
 
 Floats = NDArray[np.float64]
 
-TRACKING = tuple(
-    env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"
-)
 CRASH_FACTOR = 10.0
 """An episode that crashed counts as this many times the error at the start."""
 RANGE = 3.0

@@ -30,5 +30,18 @@ BENCHMARKS = {
         ),
         {"sensors": "one_wall", "custom": "quad_gym.tasks.look_around:LookAround"},
     ),
+    "stale_race": Benchmark(
+        TaskParams(
+            kind="waypoints",
+            start="hover",
+            radius=3.5,
+            height=1.5,
+            duration=20.0,
+            out_of_bounds=12.0,
+            gate_count=8,
+            gate_radius=0.6,  # some times what the measurements are off by at racing speed
+        ),
+        {"sensors": "stale", "custom": "quad_gym.tasks.stale_race:StaleRace"},
+    ),
 }
 """By name."""

@@ -44,14 +44,15 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | id | reference | start | time limit |
     |---|---|---|---|
     | `QuadGym/Hover-v0` | a point 4 m from the origin, 1 m high, looking at the origin | hovering near it | 10 s |
-    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | on a launch pad below it, rotors stopped | 10 s |
+    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | on a launch pad below it, rotors stopped, or hovering (`start="mixed"`) | 10 s |
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a price for looking at them | hovering near it | 15 s |
+    | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
 
-    Reward and further observation of `LookAround` are specified in its own class,
-    `quad_gym.tasks.look_around.LookAround`.
+    Reward and further observation of the last two are specified in classes of their own,
+    `quad_gym.tasks.look_around.LookAround` and `quad_gym.tasks.stale_race.StaleRace`.
 
     ## Observation space
     A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and
@@ -143,8 +144,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "standard", "lab", "rtk", "consumer", "indoor" or "one_wall" (see
-            `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is "one_wall". "standard" has the laboratory's sensors and a consistent filter; "lab"
+        sensors: "standard", "lab", "rtk", "consumer", "indoor", "one_wall" or "stale" (see
+            `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is "one_wall", that of `StaleRace` "stale". "standard" has the laboratory's sensors and a consistent filter; "lab"
             is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
             block by block; a suite whose filter gates keeps them for the latter anyway.

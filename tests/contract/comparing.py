@@ -9,6 +9,7 @@ IDS = (
     "QuadGym/RandomTrajectory-v0",
     "QuadGym/Waypoints-v0",
     "QuadGym/LookAround-v0",
+    "QuadGym/StaleRace-v0",
 )
 OBSERVATIONS = ("estimate", "truth", "noisy", "sensors")
 ACTIONS = ("ctbr", "motor", "wrench", "attitude", "velocity")

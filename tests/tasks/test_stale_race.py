@@ -1,0 +1,64 @@
+"""`StaleRace`: its reward recomputed, and what its late measurements cost."""
+
+import gymnasium
+import numpy as np
+
+import quad_gym
+from baselines import PDPolicy
+
+ID = "QuadGym/StaleRace-v0"
+
+
+def make(count=16, **keywords):
+    return gymnasium.make_vec(ID, num_envs=count, **keywords)
+
+
+def test_what_the_task_is_by_default():
+    flights = make(1).unwrapped.flights
+    assert flights.task.kind == "waypoints"
+    assert (flights.task.gate_count, flights.task.gate_radius) == (8, 0.6)
+    suite = flights.batch.sensors
+    assert (suite.gnss.latency, suite.camera.latency) == (0.04, 0.01)
+    assert suite.estimator.late_measurements == "as_fresh"
+
+
+def test_the_reward_is_that_of_its_equation():
+    env, rng = make(observation="truth"), np.random.default_rng(1)
+    observation, _ = env.reset(seed=0)
+    policy, batch = PDPolicy(env), env.unwrapped.flights.batch
+    gates, last = np.zeros(16), np.zeros((16, 4))
+    target, before = batch.read("ref_center"), batch.read("r")
+    began, passed_in_all = np.zeros(16, bool), 0
+    for _ in range(300):
+        actions = policy.predict(observation)[0] + rng.normal(0.0, 0.02, (16, 4))
+        actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(actions)
+        far, near = (np.linalg.norm(target - r, axis=1) for r in (before, batch.read("r")))
+        passed = info["gates_passed"] > gates
+        crashed = terminated & (info["gates_passed"] < 8)
+        change = ((actions - last) ** 2).sum(axis=1)
+        costs = 0.02 * change + 0.002 * (batch.read("w") ** 2).sum(axis=1)
+        expected = 0.1 * (far - near) * 50.0 - costs + passed - 5.0 * crashed
+        np.testing.assert_allclose(reward[~began], expected[~began], atol=1e-6)
+        passed_in_all += passed[~began].sum()
+        began, gates, last = terminated | truncated, info["gates_passed"], actions
+        last = np.where(began[:, np.newaxis], batch.read("action"), last)
+        target, before = batch.read("ref_center"), batch.read("r")
+    assert passed_in_all > 20
+
+
+def test_time_stamps_make_the_race_easy():
+    """The control: the same sensors, and a filter that knows how old their measurements are."""
+    stale = quad_gym.sensor_suite("stale")
+    told = stale.replace(estimator=stale.estimator.replace(late_measurements="rewind"))
+    errors = {}
+    for name, suite in (("stale", stale), ("told", told)):
+        env = make(64, sensors=suite)
+        observation, _ = env.reset(seed=3)
+        policy, worst = PDPolicy(env), np.zeros(64)
+        for _ in range(150):
+            observation, _, _, _, info = env.step(policy.predict(observation)[0])
+            worst = np.maximum(worst, info["estimation_error"])
+        errors[name] = np.median(worst)
+    assert errors["told"] < 0.05
+    assert errors["stale"] > 3.0 * errors["told"]
