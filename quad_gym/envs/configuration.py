@@ -239,7 +239,7 @@ class Flights:
         """
         chosen = start_options(options)
         position, velocity, yaw = (chosen.get(name) for name in ("position", "velocity", "yaw"))
-        checked_start(self.batch.count, position, velocity, yaw, self.task)
+        checked_start(self.batch.count, position, velocity, yaw, self.task, self.batch.world)
         return chosen
 
     def split(self, observations: NDArray[np.float32]) -> Any:

@@ -1,7 +1,8 @@
-"""The world around a vehicle: wind and gusts, drag of rotors, ground effect, battery.
+"""The world around a vehicle: air, ground, battery, and what stands in the way.
 
 As in `params`: frozen, keyword-only, SI units, the source with every number. By default the air is
-still, the ground far away and the battery never empty, as in the laboratory's model.
+still, the ground far away, the battery never empty and the room without walls, as in the
+laboratory's model.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.obstacles import Obstacle, check_obstacles
+from quad_gym.records import MAX_OBSTACLES
 
 MAX_WIND = 200.0
 """The strongest tornadoes blow at some 135 m/s."""
@@ -47,7 +50,7 @@ class BatteryParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldParams(Checked):
-    """What the air, the ground and the battery do to a vehicle.
+    """What the air, the ground and the battery do to a vehicle, and what stands in its way.
 
     Drag of the disc and of the rotors is that of the vehicle's velocity relative to the air. The
     filter and the controller know nothing of this world.
@@ -78,6 +81,15 @@ class WorldParams(Checked):
     that stands on its legs is at height 0"""
     battery: BatteryParams | None = None
     """None: always full voltage"""
+    obstacles: tuple[Obstacle, ...] = ()
+    """walls and cylinders, at most MAX_OBSTACLES: who touches one has collided, which ends the
+    episode, and the camera sees nothing behind one"""
+    vehicle_radius: float = 0.42
+    """distance of the center of mass from an obstacle at which the vehicle touches it [m]; the
+    laboratory's rotor hubs are 0.30 m from there, and its propellers reach 0.13 m beyond"""
+    geofence: Matrix | None = None
+    """(2, 3) lowest and highest corner in I of the box that the center of mass must not leave [m];
+    who does ends the episode; None: there is none"""
 
     def __post_init__(self) -> None:
         self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)
@@ -96,6 +108,29 @@ class WorldParams(Checked):
                 )
         if self.battery is not None:
             check.instance("WorldParams.battery", self.battery, BatteryParams)
+        self._check_room()
+
+    def _check_room(self) -> None:
+        """Check obstacles and geofence."""
+        if not isinstance(self.obstacles, (tuple, list)):
+            raise ValueError(
+                "WorldParams.obstacles must be a tuple of Wall and Cylinder, got "
+                f"{self.obstacles!r}"
+            )
+        self._set("obstacles", tuple(self.obstacles))
+        check_obstacles("WorldParams.obstacles", self.obstacles)
+        if len(self.obstacles) > MAX_OBSTACLES:
+            raise ValueError(
+                f"WorldParams.obstacles must be at most {MAX_OBSTACLES}, got {len(self.obstacles)}"
+            )
+        self._check(check.positive, "vehicle_radius", most=100.0)
+        if self.geofence is not None:
+            self._check(check.matrix, "geofence", rows=2, columns=3)
+            low, high = self.geofence
+            if not all(a < b for a, b in zip(low, high, strict=True)):
+                raise ValueError(
+                    f"WorldParams.geofence must be a lower and a higher corner, got {self.geofence}"
+                )
 
 
 _LAB_ROTOR_DRAG = (0.78 * 0.544, 0.78 * 0.386, 0.0)  # Faessler et al., for the laboratory's mass

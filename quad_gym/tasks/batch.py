@@ -184,7 +184,7 @@ class TaskBatch(ReadableBatch):
             start = answers.ask(self.custom, "reset", self.view, rng)
         if start is not None:
             shipped = self._begin_again(
-                chosen, starts(self.custom, start, chosen, given, self.task)
+                chosen, starts(self.custom, start, chosen, given, self.task, self.world)
             )
         return shipped
 
