@@ -50,7 +50,8 @@ class Args:
     FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults"}
 
     task: Literal[
-        "hover", "circle", "lemniscate", "random_trajectory", "waypoints", "look_around"
+        *("hover", "circle", "lemniscate", "random_trajectory", "waypoints"),
+        *("look_around", "outage_dash"),
     ] = "circle"
     """what to fly"""
     policy: str = "pd"
@@ -68,7 +69,7 @@ class Args:
     """further keywords of the environment, such as control_rate=100 estimator=ekf"""
 
     sensors: SuiteName | None = None
-    """if not given, the task's: standard, or one_wall for look_around"""
+    """if not given, the task's own, which for most is standard"""
     camera: bool = True
     """measure with the camera"""
     gnss_rate: float | None = None

@@ -107,6 +107,8 @@ class Flights:
                 raise ValueError(f"{name} means nothing to the task {task}, and must not be given")
         self.task: TaskParams = defaults.replace(**given)
         keywords = {**own, **keywords}
+        if "faults" in own and keywords["faults"] is own["faults"] and _runs_no_sensor(keywords):
+            del keywords["faults"]  # the task's own, which nobody would notice
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
@@ -174,7 +176,13 @@ class Flights:
         if true_sensors is not None:
             check.instance("true_sensors", true_sensors, SensorSuite)
         befall = faults_of(faults, suite if true_sensors is None else true_sensors)
-        idle = observation in ("truth", "noisy") and not (include_covariance or innovations)
+        idle = _runs_no_sensor(
+            {
+                "observation": observation,
+                "include_covariance": include_covariance,
+                "innovations": innovations,
+            }
+        )
         felt = [fault for fault in befall if needs_sensors(fault)]
         if idle and felt:
             raise ValueError(
@@ -261,6 +269,13 @@ _BUILT_WITH = (
     "max_episode_steps",
 )
 """Keywords of all tasks."""
+
+
+def _runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
+    """Whether an environment of these keywords simulates no sensor."""
+    asked = any(keywords.get(name) is True for name in ("include_covariance", "innovations"))
+    return keywords.get("observation") in ("truth", "noisy") and not asked
+
 
 COLUMN = {name: column for column, name in enumerate(RESULTS)}
 """Columns of a batch's `results`, by name."""

@@ -8,9 +8,11 @@
 | `consumer` | single frequency, and a compass, 10 Hz; its drift is a state | none | cheap MEMS |
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
+| `consumer_barometer` | as `consumer`, and a barometer | none | cheap MEMS |
 
-The last one belongs to `QuadGym/LookAround-v0`: nobody would choose sensors that see the way
-home in one direction alone, and it is not among SUITES, on which results for all tasks are based.
+`one_wall` belongs to `QuadGym/LookAround-v0`: nobody would choose sensors that see the way home in
+one direction alone; `consumer_barometer` belongs to `QuadGym/OutageDash-v0`. They are not among
+SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so that cameras of 30 Hz run at 25 Hz, a whole division of it. Outside `lab`
 the phases of GNSS and camera are drawn anew in each episode, the fix that starts the filter is
@@ -33,6 +35,7 @@ import math
 import numpy as np
 
 from quad_gym.params import checks as check
+from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
@@ -233,6 +236,10 @@ ONE_WALL = INDOOR.replace(
 )
 """For `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west wall."""
 
+CONSUMER_BAROMETER = CONSUMER.replace(barometer=BarometerParams())
+"""For `OutageDash`: `consumer` with the barometer that every hobby vehicle has, so that an outage of
+GNSS costs the position in the plane, and not the height."""
+
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
     # the laboratory's pixels are coarse, so that images need not be processed in steps, and no
@@ -255,7 +262,7 @@ _SUITES = {
 SUITES = tuple(_SUITES)
 """Names of the sensor suites for all tasks."""
 
-_ALL = {**_SUITES, "one_wall": ONE_WALL}
+_ALL = {**_SUITES, "one_wall": ONE_WALL, "consumer_barometer": CONSUMER_BAROMETER}
 
 ALL_SUITES = tuple(_ALL)
 """The same, and those that belong to one task."""

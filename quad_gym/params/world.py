@@ -11,7 +11,7 @@ import numpy as np
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Matrix, Vector
-from quad_gym.params.obstacles import Obstacle, check_obstacles
+from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
 from quad_gym.records import MAX_OBSTACLES
 
 MAX_WIND = 200.0
@@ -133,6 +133,22 @@ class WorldParams(Checked):
                 )
 
 
+def _slalom(first: float = 72.0, spacing: float = 12.0, gaps: int = 14) -> tuple[Wall, ...]:
+    """Walls from the north and from the south, each pair with a gap of 3 to 6 m.
+
+    The northern edge of a gap is drawn within 1.5 m of its middle place, and its width by itself;
+    gaps are alternately to the north and to the south, so that none leads straight to the next.
+    """
+    walls, size = [], (0.3, 30.0, 12.0)
+    for k in range(gaps):
+        x, edge = first - spacing * k, (3.75 if k % 2 else 0.75)
+        north = Wall(center_I=(x, edge + 15.0, 6.0), size=size, shift_I=(0.0, 1.5, 0.0))
+        south = (x, edge - 4.5 - 15.0, 6.0)
+        walls.append(north)
+        walls.append(Wall(center_I=south, size=size, shift_I=(0.0, 1.5, 0.0), follows=2 * k))
+    return tuple(walls)
+
+
 _LAB_ROTOR_DRAG = (0.78 * 0.544, 0.78 * 0.386, 0.0)  # Faessler et al., for the laboratory's mass
 
 _WORLDS = {
@@ -153,9 +169,17 @@ _WORLDS = {
         ground_effect=True,
         battery=BatteryParams(),
     ),
+    # that of OutageDash: 14 walls, 12 m apart, from east to west, each with a gap somewhere else
+    "slalom": WorldParams(
+        obstacles=_slalom(), geofence=((-250.0, -14.0, -1.0), (96.0, 14.0, 12.0))
+    ),
 }
 
 
 def world_params(name: str) -> WorldParams:
-    """The world called `name`: "calm" (the report's), "breeze" (4 m/s), "fresh_breeze" (8 m/s)."""
+    """The world called `name`.
+
+    "calm" is the report's, "breeze" has wind of 4 m/s, "fresh_breeze" of 8 m/s, and "slalom" walls
+    with gaps.
+    """
     return _WORLDS[check.choice("world", name, tuple(_WORLDS))]

@@ -12,6 +12,7 @@ from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
 
 if TYPE_CHECKING:
+    from quad_gym.params.world import WorldParams
     from quad_gym.tasks.batch import TaskBatch
 
 Floats = NDArray[np.float64]
@@ -231,6 +232,11 @@ class View(Group):
     def features(self) -> Floats:
         """(m, 3) markers that the camera sees, in I [m]."""
         return self._flights.features  # type: ignore[no-any-return]
+
+    @property
+    def world(self) -> "WorldParams":
+        """The world, without draws and shifts."""
+        return self._flights.world  # type: ignore[no-any-return]
 
     @Lazy
     def obstacles(self) -> Floats:
