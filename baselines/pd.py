@@ -19,6 +19,19 @@ LEAST_LIFT, MOST_TILT = 0.3, 1.2
 to its vertical part (50 degrees): no step of the reference turns the vehicle over."""
 
 
+PACES = ("steady", "waiting")
+"""How PD control flies through gaps."""
+
+REACH_OF_GAPS = 1.5
+"""Position errors are shortened to this where there are gaps, so that it flies 4.7 m/s [m]."""
+
+WAITS_BEFORE = 6.0
+"""How far before a gap it waits: halfway from the one before, on OutageDash [m]."""
+
+SIGMAS, MARGIN = 2.0, 0.5
+"""It waits where so many standard deviations of the position reach from the middle of the next gap
+to within this of its edge, which is the vehicle's radius and a little more [m]."""
+
 FACES = ("reference", "features", "features_when_unsure")
 """Where PD control points body x."""
 
@@ -91,12 +104,15 @@ class PDPolicy:
         env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be
             "estimate", "truth" or "noisy".
         gains: "lab" (the report's), "tuned", or `PDGains`.
-        max_position_error: Position errors are shortened to this length [m]; None: 1 m on
-            `Waypoints`, which are far apart, and unlimited elsewhere.
+        max_position_error: Position errors are shortened to this length [m], which sets the speed;
+            None: 1 m on `Waypoints`, which are far apart, REACH_OF_GAPS where the environment
+            observes gaps, as OutageDash does, and unlimited elsewhere.
         faces: Where body x points: in the direction of the "reference"; toward the "features" of
             an environment that observes their direction, as LookAround does; or toward them
             "features_when_unsure", while the filter's largest standard deviation of the position is
             above UNSURE, which the environment must show (`include_covariance=True`).
+        pace: "steady", or "waiting": WAITS_BEFORE a gap that is too narrow for how sure the filter
+            is, which the environment must show (`include_covariance=True`).
 
     Raises:
         ValueError: If the environment's observation or action does not admit the controller, or a
@@ -109,6 +125,7 @@ class PDPolicy:
         gains: PDGains | str = "tuned",
         max_position_error: float | None = None,
         faces: str = "reference",
+        pace: str = "steady",
     ) -> None:
         flights = getattr(getattr(env, "unwrapped", env), "flights", None)
         if flights is None:
@@ -130,7 +147,18 @@ class PDPolicy:
                 f'env must observe {lacking[0]} for faces="{faces}"'
                 + (": make it with include_covariance=True" if "sigma" in lacking[0] else "")
             )
-        missing = sorted(set(needed) - shown)
+        self._waits = check.choice("pace", pace, PACES) == "waiting"
+        if self._waits:
+            for name in ("gap_width", "position_sigma"):
+                if name not in shown:
+                    raise ValueError(
+                        f'env must observe {name} for pace="waiting", as OutageDash does with '
+                        "include_covariance=True"
+                    )
+        # a task's own observation of a reference at rest has no use for its acceleration
+        self._gaps = "gap_width" in shown
+        spared = {"reference_acceleration"} if self._gaps else set()
+        missing = sorted(set(needed) - shown - spared)
         if missing:
             raise ValueError(
                 f"env must observe {missing[0]}: its task replaces the observation that ships"
@@ -149,9 +177,8 @@ class PDPolicy:
         self._slices = {field.name: field.slice for field in flights.table}
         self._widths = policy_size(flights.table), flights.table[-1].slice.stop
         on_course = flights.task.kind == "waypoints"
-        self._reach = (
-            (1.0 if on_course else np.inf) if max_position_error is None else max_position_error
-        )
+        usual = 1.0 if on_course else REACH_OF_GAPS if self._gaps else np.inf
+        self._reach = usual if max_position_error is None else max_position_error
 
     def predict(
         self,
@@ -201,6 +228,16 @@ class PDPolicy:
     def _read(self, rows: Array) -> _Seen:
         part = {name: rows[:, where] for name, where in self._slices.items()}
         seen = self._read_state(part)
+        if self._gaps:  # through them, not just to their middle
+            ahead = (seen.position_error * seen.heading).sum(axis=1, keepdims=True)
+            beyond = np.maximum(REACH_OF_GAPS - ahead, 0.0) * seen.heading
+            seen = seen._replace(position_error=seen.position_error + beyond)
+        if self._waits:
+            sigma = part["position_sigma"].max(axis=1, keepdims=True)
+            unsure = SIGMAS * sigma > 0.5 * part["gap_width"] - MARGIN
+            before = part["position_error"] - WAITS_BEFORE * seen.heading
+            error = np.where(unsure, before, seen.position_error)
+            seen = seen._replace(position_error=error)
         if self._faces == "reference":
             return seen
         toward = part["features_direction"]
@@ -213,7 +250,9 @@ class PDPolicy:
 
     def _read_state(self, part: Mapping[str, Array]) -> _Seen:
         if not self._absolute:
-            return _Seen(**{name: part[name] for name in _RELATIVE_FIELDS}, velocity=None)
+            at_rest = {"reference_acceleration": np.zeros_like(part["up"])}
+            parts = {**at_rest, **part}
+            return _Seen(**{name: parts[name] for name in _RELATIVE_FIELDS}, velocity=None)
         R_BI = part["R_BI"].reshape(-1, 3, 3)
 
         def in_body(v_I: Array) -> Array:

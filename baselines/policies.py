@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 
 from baselines.mlp import MlpPolicy
-from baselines.pd import PDPolicy
+from baselines.pd import REACH_OF_GAPS, PDPolicy
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
 
@@ -44,7 +44,8 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
 
     Args:
         name: "pd" (tuned gains), "pd:lab" (the report's), "pd:features" and
-            "pd:features_when_unsure" (tuned gains, facing the features), "pd:FILE.json" (gains of
+            "pd:features_when_unsure" (tuned gains, facing the features), "pd:slow" and "pd:waiting"
+            (through gaps, at half the speed, or waiting when unsure), "pd:FILE.json" (gains of
             `scripts/tune.py`), "pretrained" (the policy that ships for the environment's task), or
             a file: `.npz` as `MlpPolicy` saves it, or `.zip` as Stable-Baselines3 does. A `.zip`
             can run code while it is loaded: open only those that you trust.
@@ -58,6 +59,10 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
         return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
     if name in ("pd:features", "pd:features_when_unsure"):
         return PDPolicy(env, faces=name.removeprefix("pd:"))
+    if name in ("pd:slow", "pd:waiting"):
+        slow = 0.5 * REACH_OF_GAPS if name == "pd:slow" else None
+        pace = "steady" if name == "pd:slow" else "waiting"
+        return PDPolicy(env, max_position_error=slow, pace=pace)
     if name.startswith("pd:"):
         return PDPolicy(env, gains=_gains_of(Path(name.removeprefix("pd:"))))
     file = pretrained_file(task_of(env)) if name == "pretrained" else Path(name)
@@ -84,7 +89,7 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
     Raises:
         ValueError: If no policy ships for the task and "pretrained" is asked for.
     """
-    if name == "pd:features_when_unsure":
+    if name in ("pd:features_when_unsure", "pd:waiting"):
         return {"include_covariance": True}
     if name != "pretrained":
         return {}

@@ -148,6 +148,13 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),
+    # what a crash costs comes seconds after the decision; its start is never on the ground
+    ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
+        steps=4_000_000,
+        reward_scale=0.1,
+        parameters={**_PPO.parameters, "gamma": 0.99},
+        flights={},
+    ),
 }
 """Where a task needs another one, by id and algorithm."""
 

@@ -17,6 +17,7 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
+from quad_gym.params.obstacles import Cylinder, Wall
 from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -76,6 +77,7 @@ __all__ = [
     "BatteryParams",
     "CameraParams",
     "Clocks",
+    "Cylinder",
     "FilterParams",
     "GnssParams",
     "ImuParams",
@@ -90,6 +92,7 @@ __all__ = [
     "TaskParams",
     "Uniform",
     "VehicleParams",
+    "Wall",
     "WorldParams",
     "__version__",
     "faults",

@@ -91,7 +91,7 @@ class FlightBatch(FlightMemory):
         true_vehicle: The vehicle as it is, where it differs from the nominal one that the
             controller knows.
         true_sensors: The sensors as they are, where they differ from what the filter believes.
-        world: Wind, gusts, drag, ground and battery, or the name of a preset.
+        world: Wind, gusts, drag, ground, battery, obstacles and geofence, or the name of a preset.
         randomization: What is drawn anew for every episode, around `true_vehicle`, `true_sensors`
             and `world`: a `Randomization`, or distributions by name.
         faults: What goes wrong: faults, or names of presets, see `quad_gym.faults`.
@@ -267,7 +267,7 @@ class FlightBatch(FlightMemory):
             ValueError: If the arguments do not fit the number of flights; nothing has changed then.
         """
         chosen = checked_mask(self.count, mask)
-        given = checked_start(self.count, position, velocity, yaw, self.task)
+        given = checked_start(self.count, position, velocity, yaw, self.task, self.world, chosen)
         words = checked_keys(self.count, seeds, keys)
         if words is not None:
             for flight in np.flatnonzero(chosen):

@@ -19,7 +19,7 @@ from quad_gym.records import (
     field_of_flights,
 )
 
-_UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis")
+_UNKNOWN = ("start_given", "innovation", "innovation_sigma", "block_nis", "obstacle_distance")
 """Fields that are NaN until they are measured or given."""
 
 _PARTS_OF = {

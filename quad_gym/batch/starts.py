@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.surroundings import require_room
 from quad_gym.params import checks as check
 from quad_gym.params.task import TaskParams
+from quad_gym.params.world import WorldParams
 
 MAX_SPEED = 1e4
 """Fastest start [m/s]: some times faster than any bullet, and the drag still integrable."""
@@ -52,13 +54,24 @@ def checked_start(
     velocity: ArrayLike | None,
     yaw: ArrayLike | None,
     task: TaskParams,
+    world: WorldParams | None = None,
+    chosen: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64] | None:
     """(count, 7) start values, NaN where they are to be drawn; None if all are.
 
+    Args:
+        count: Of flights.
+        position: (3,) or (count, 3) in I [m], or None.
+        velocity: Likewise [m/s].
+        yaw: Scalar or (count,) [rad], or None.
+        task: Says how far away a start may be.
+        world: Says what stands in the way; None: nothing.
+        chosen: (count,) flights that begin, whose positions have to be free; None: all.
+
     Raises:
         ValueError: If one has another shape, is not finite, or no flight can begin there: farther
-            from the origin than the task's bounds around any of its references, faster than
-            MAX_SPEED, or turned by more than MAX_YAW.
+            from the origin than the task's bounds around any of its references, in an obstacle,
+            beyond the geofence, faster than MAX_SPEED, or turned by more than MAX_YAW.
     """
     if position is None and velocity is None and yaw is None:
         return None
@@ -95,6 +108,8 @@ def checked_start(
             f"position must be within {farthest:g} m of the origin: farther, a start is beyond "
             f"out_of_bounds={task.out_of_bounds:g} m of the reference, got {distance:g} m"
         )
+    if world is not None and position is not None:
+        require_room("position", given[:, :3] if chosen is None else given[chosen, :3], world)
     if speed > MAX_SPEED:
         raise ValueError(f"velocity must be at most {MAX_SPEED:g} m/s, got {speed:g} m/s")
     if np.abs(given[:, 6]).max() > MAX_YAW:

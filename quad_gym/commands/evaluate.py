@@ -50,7 +50,7 @@ class Args:
     observation: tuple[str, ...] = ("truth", "estimate")
     """what to fly on: estimate, truth, noisy"""
     sensors: SuiteName | None = None
-    """if not given, the task's: standard, or that of a benchmark, as one_wall of LookAround"""
+    """if not given, the task's own, which for most is standard"""
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false gnss_rate=10"""
     episodes: int = 1000

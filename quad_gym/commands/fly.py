@@ -71,7 +71,7 @@ class Args:
     """further keywords of the environment, such as control_rate=100 estimator=ekf"""
 
     sensors: SuiteName | None = None
-    """if not given, the task's: standard, or that of a benchmark, as one_wall of LookAround"""
+    """if not given, the task's own, which for most is standard"""
     camera: bool = True
     """measure with the camera"""
     gnss_rate: float | None = None

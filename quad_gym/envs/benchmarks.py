@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from quad_gym.faults import GnssOutage
 from quad_gym.params.task import TaskParams
 
 
@@ -42,6 +43,23 @@ BENCHMARKS = {
             gate_radius=0.6,  # some times what the measurements are off by at racing speed
         ),
         {"sensors": "stale", "custom": "quad_gym.tasks.stale_race:StaleRace"},
+    ),
+    "outage_dash": Benchmark(
+        TaskParams(
+            kind="hover",
+            start="hover",
+            radius=84.0,  # the start of the course, which leads through the origin
+            height=4.0,
+            duration=20.0,  # 9 m/s take a vehicle to the finish
+            out_of_bounds=350.0,
+            ground=0.0,
+        ),
+        {
+            "sensors": "consumer_barometer",
+            "world": "slalom",
+            "faults": (GnssOutage(start=(2.0, 8.0), duration=(5.0, 15.0)),),
+            "custom": "quad_gym.tasks.outage_dash:OutageDash",
+        },
     ),
 }
 """By name."""

@@ -110,6 +110,8 @@ class Flights:
         if "pad" in given and self.task.start == "hover":
             raise ValueError('pad means nothing with start="hover", and must not be given')
         keywords = {**own, **keywords}
+        if "faults" in own and keywords["faults"] is own["faults"] and _runs_no_sensor(keywords):
+            del keywords["faults"]  # the task's own, which nobody would notice
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
@@ -177,7 +179,13 @@ class Flights:
         if true_sensors is not None:
             check.instance("true_sensors", true_sensors, SensorSuite)
         befall = faults_of(faults, suite if true_sensors is None else true_sensors)
-        idle = observation in ("truth", "noisy") and not (include_covariance or innovations)
+        idle = _runs_no_sensor(
+            {
+                "observation": observation,
+                "include_covariance": include_covariance,
+                "innovations": innovations,
+            }
+        )
         felt = [fault for fault in befall if needs_sensors(fault)]
         if idle and felt:
             raise ValueError(
@@ -242,7 +250,7 @@ class Flights:
         """
         chosen = start_options(options)
         position, velocity, yaw = (chosen.get(name) for name in ("position", "velocity", "yaw"))
-        checked_start(self.batch.count, position, velocity, yaw, self.task)
+        checked_start(self.batch.count, position, velocity, yaw, self.task, self.batch.world)
         return chosen
 
     def split(self, observations: NDArray[np.float32]) -> Any:
@@ -264,6 +272,13 @@ _BUILT_WITH = (
     "max_episode_steps",
 )
 """Keywords of all tasks."""
+
+
+def _runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
+    """Whether an environment of these keywords simulates no sensor."""
+    asked = any(keywords.get(name) is True for name in ("include_covariance", "innovations"))
+    return keywords.get("observation") in ("truth", "noisy") and not asked
+
 
 COLUMN = {name: column for column, name in enumerate(RESULTS)}
 """Columns of a batch's `results`, by name."""

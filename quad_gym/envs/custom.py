@@ -41,7 +41,11 @@ def with_task(
     unknown = sorted(set(task.observes) - set(sizes))
     if unknown:
         raise ValueError(f"observes has {unknown[0]!r}, which observe does not return")
-    kept = () if task.replaces_observation else tuple(f for f in table if f.slice.stop <= split)
+    kept = tuple(
+        field
+        for field in table
+        if field.slice.stop <= split and (not task.replaces_observation or field.name in task.keeps)
+    )
     rest = tuple(f for f in table if f.slice.start >= split)
     taken = {field.name for field in (*kept, *rest)} & set(sizes)
     if taken:
@@ -56,4 +60,5 @@ def with_task(
         place += size
     if not new:
         raise ValueError("observe must return something where it replaces the observation")
-    return partial(under, parts=parts), tuple(new)  # type: ignore[return-value]
+    columns = [k for field in kept for k in range(field.slice.start, field.slice.stop)]
+    return partial(under, parts=parts, kept=columns), tuple(new)  # type: ignore[return-value]

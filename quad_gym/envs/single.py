@@ -50,9 +50,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a price for looking at them | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
+    | `QuadGym/OutageDash-v0` | a course of 14 gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 20 s |
 
-    Reward and further observation of the last two are specified in classes of their own,
-    `quad_gym.tasks.look_around.LookAround` and `quad_gym.tasks.stale_race.StaleRace`.
+    Reward and observation of the last three are specified in classes of their own:
+    `quad_gym.tasks.look_around.LookAround`, `stale_race.StaleRace` and `outage_dash.OutageDash`.
 
     ## Observation space
     A `Box` of float32. With `observation="estimate"`, `"truth"` or `"noisy"` and
@@ -104,7 +105,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Episode end
     Terminated: farther than 3 m from the reference (`Waypoints`: 12 m, `LookAround`: 8 m), tipped by more than 100
-    degrees, below -0.5 m (`LookAround`: -5 m), or through the last gate. Truncated: at the time limit, when the
+    degrees, below -0.5 m (`LookAround`: -5 m), through the last gate, or, in a world that has any, where
+    the vehicle touches an obstacle or leaves the geofence. Truncated: at the time limit, when the
     filter has failed (`info["filter_status"]`), or with `end_when_lost=True` when it finds that it is
     lost. `info["ending"]` says which.
 
@@ -129,7 +131,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     ## World
     By default the air is still and every episode flies the same vehicle with the same sensors.
     `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C), linear
-    rotor drag, ground effect and a battery; `randomization={"mass": Uniform(0.8, 1.2,
+    rotor drag, ground effect and a battery, walls, cylinders and a geofence; `randomization={"mass": Uniform(0.8, 1.2,
     relative=True), "wind_speed": Uniform(0.0, 5.0)}` draws parameters anew for every episode. What
     can be drawn is listed in `quad_gym.params.randomization.DRAWABLES`. The filter and the controller know
     of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
@@ -144,8 +146,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "standard", "lab", "rtk", "consumer", "indoor", "one_wall" or "stale" (see
-            `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is "one_wall", that of `StaleRace` "stale". "standard" has the laboratory's sensors and a consistent filter; "lab"
+        sensors: "standard", "lab", "rtk", "consumer", "indoor", or a suite that belongs to one task
+            (see `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is
+            "one_wall", that of `StaleRace` "stale", and that of `OutageDash` "consumer_barometer".
+            "standard" has the laboratory's sensors and a consistent filter; "lab"
             is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
             block by block; a suite whose filter gates keeps them for the latter anyway.
@@ -169,7 +173,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             with a `duration` given, too, the earlier of both holds.
         true_vehicle: What really flies, where the controller believes in `vehicle`.
         true_sensors: What really measures, where the filter believes in `sensors`.
-        world: "calm", "breeze", "fresh_breeze", or `WorldParams`.
+        world: "calm", "breeze", "fresh_breeze", "slalom" (of `OutageDash`), or `WorldParams`.
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
         faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as "gnss_outage" or
             "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.

@@ -113,10 +113,13 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def _stage(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> Stage:
-    names = [field.name for field in dataclasses.fields(Stage)]
+    fields = {field.name: field for field in dataclasses.fields(Stage)}
     values: dict[str, Any] = {
-        name: entries.get(f"stage/{name}", header.get(name)) for name in names
+        name: entries.get(f"stage/{name}", header.get(name)) for name in fields
     }
+    # files that were written before there were obstacles have none
+    later = {n for n, f in fields.items() if f.default_factory is not dataclasses.MISSING}
+    values = {n: v for n, v in values.items() if v is not None or n not in later}
     missing = [name for name, value in values.items() if value is None]
     if missing:
         raise ValueError(f"it lacks {missing[0]}")

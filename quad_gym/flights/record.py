@@ -341,7 +341,18 @@ class FlightRecorder:
             reference_center=self._read("ref_center"),
             reference_cos=self._read("ref_cos"),
             reference_sin=self._read("ref_sin"),
+            obstacles=self._obstacles(),
+            geofence_I=np.array(batch.world.geofence or np.zeros((0, 3))),
         )
+
+    def _obstacles(self) -> Floats:
+        """(n, 9) those of the present episode, see `Stage`."""
+        obstacles, centers = self._batch.world.obstacles, self._read("obstacle_center")
+        rows = [
+            (float(o.shape), *center, *o.half_size, *o.axis)
+            for o, center in zip(obstacles, centers, strict=False)
+        ]
+        return np.array(rows).reshape(-1, 9)
 
 
 def _quaternion(R_BI: Floats) -> Floats:

@@ -3,6 +3,7 @@
 | entity | what |
 |---|---|
 | `world/reference`, `world/gates`, `world/features` | the path, the course, the features |
+| `world/walls`, `world/cylinders`, `world/geofence` | what stands in the way |
 | `world/truth`, `world/estimate` | the vehicle where it is and where the filter believes it to be |
 | `world/truth/camera/image` | the image plane: features as measured, and as the estimate predicts |
 | `world/ellipsoid` | where the filter expects the position with 3 sigma, at its true size |
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
 from quad_gym.flights.record import Flight
-from quad_gym.records import Gate
+from quad_gym.records import Gate, Shape
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 Floats = NDArray[np.float64]
@@ -116,6 +117,7 @@ class _Log:
                     labels=_numbers(len(stage.gates_I)),
                 ),
             )
+        self._obstacles()
         if stage.has_camera:
             self._static(
                 "world/features",
@@ -126,6 +128,39 @@ class _Log:
                     labels=_numbers(len(stage.features_I)),
                 ),
             )
+
+    def _obstacles(self) -> None:
+        """Walls as boxes, cylinders as such, and the geofence as edges."""
+        rr, stage = self._rr, self._stage
+        is_wall = stage.obstacles[:, 0] == Shape.WALL
+        walls, cylinders = stage.obstacles[is_wall], stage.obstacles[~is_wall]
+        if len(walls):
+            yaw = np.arctan2(walls[:, 8], walls[:, 7])
+            zero = np.zeros_like(yaw)
+            turns = np.stack([zero, zero, np.sin(yaw / 2.0), np.cos(yaw / 2.0)], axis=1)
+            boxes = rr.Boxes3D(
+                centers=walls[:, 1:4],
+                half_sizes=walls[:, 4:7],
+                quaternions=turns,
+                colors=[NEUTRAL],
+                fill_mode="solid",
+            )
+            self._static("world/walls", boxes)
+        if len(cylinders):
+            self._static(
+                "world/cylinders",
+                rr.Cylinders3D(
+                    lengths=2.0 * cylinders[:, 6],
+                    radii=cylinders[:, 4],
+                    centers=cylinders[:, 1:4],
+                    colors=[NEUTRAL],
+                    fill_mode="solid",
+                ),
+            )
+        if len(stage.geofence_I):
+            low, high = stage.geofence_I
+            box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[NEUTRAL])
+            self._static("world/geofence", box)
 
     def _about(self) -> str:
         stage = self._stage

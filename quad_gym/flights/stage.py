@@ -1,6 +1,6 @@
 """`Stage`: where a flight takes place and what flies; what a picture needs besides the rows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,11 @@ class Stage:
     """(k, 3) its cosine coefficients [m]"""
     reference_sin: Floats
     """(k, 3) its sine coefficients [m]"""
+    obstacles: Floats = field(default_factory=lambda: np.zeros((0, 9)))
+    """(n, 9) shape (see `records.Shape`), center in I, half length, thickness and height (of a
+    cylinder: radius, radius, half height), level direction of the length [m]"""
+    geofence_I: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(2, 3) lowest and highest corner of the geofence; (0, 3): there is none [m]"""
 
     @property
     def has_camera(self) -> bool:

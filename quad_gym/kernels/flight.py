@@ -35,6 +35,7 @@ _ALIGN, _WARM = int(Stage.ALIGN), int(Stage.WARM)
 _DRAW, _IMPOSE, _BEGIN = int(Stage.DRAW), int(Stage.IMPOSE), int(Stage.BEGIN)
 _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
 _BEGIN_FAULTS = int(Stage.BEGIN_FAULTS)
+_BEGIN_CONTACTS, _TOUCH = int(Stage.BEGIN_CONTACTS), int(Stage.TOUCH)
 
 _BEGIN_AID, _SAMPLE_AID = int(Act.BEGIN), int(Act.SAMPLE)
 _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
@@ -112,6 +113,8 @@ def tick(flight, world, model, settings, work, stages, last):
         call_stage(stages, _MOVE, flight, world, model, settings, work, 0)
     if resting:
         call_stage(stages, _REST_ON_PAD, flight, world, model, settings, work, 0)
+    if settings.contacts:
+        call_stage(stages, _TOUCH, flight, world, model, settings, work, 0)
     if settings.run_filter:
         if settings.imu_averages:
             call_stage(stages, _AVERAGE_IMU, flight, world, model, settings, work, 0)
@@ -161,6 +164,8 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:
         call_stage(stages, _BEGIN_FAULTS, flight, world, model, settings, work, 0)
+    if settings.contacts:
+        call_stage(stages, _BEGIN_CONTACTS, flight, world, model, settings, work, 0)
     sense(flight, world, model, settings, work, stages, mask, 1, 0)
     r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     error = norm(sub(r_ref, load3(flight.r)))

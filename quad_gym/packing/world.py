@@ -64,8 +64,23 @@ def pack_options(
             # no angle is less known than one that may be any
             s["start_tilt_variance"][i] = min(draws.mean_square(name)[0], math.pi**2 / 3.0)
     s["randomized"], s["known"] = bool(draws.names), known
+    pack_obstacles(s, world)
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))
+
+
+def pack_obstacles(s: Any, world: WorldParams) -> None:
+    """Write into a settings record what stands in a world."""
+    s["obstacle_count"] = len(world.obstacles)
+    s["vehicle_radius"] = world.vehicle_radius
+    for k, obstacle in enumerate(world.obstacles):
+        s["obstacle_shape"][k] = obstacle.shape
+        s["obstacle_center"][k], s["obstacle_shift"][k] = obstacle.center_I, obstacle.shift_I
+        s["obstacle_half"][k], s["obstacle_axis"][k] = obstacle.half_size, obstacle.axis
+        s["obstacle_follows"][k] = -1 if obstacle.follows is None else obstacle.follows
+    if world.geofence is not None:
+        s["fenced"], s["fence"] = True, world.geofence
+    s["contacts"] = bool(world.obstacles) or world.geofence is not None
 
 
 def world_settings(world: WorldParams) -> NDArray[Any]:

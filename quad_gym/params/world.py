@@ -1,7 +1,8 @@
-"""The world around a vehicle: wind and gusts, drag of rotors, ground effect, battery.
+"""The world around a vehicle: air, ground, battery, and what stands in the way.
 
 As in `params`: frozen, keyword-only, SI units, the source with every number. By default the air is
-still, the ground far away and the battery never empty, as in the laboratory's model.
+still, the ground far away, the battery never empty and the room without walls, as in the
+laboratory's model.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from quad_gym.params import checks as check
-from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
+from quad_gym.records import MAX_OBSTACLES
 
 MAX_WIND = 200.0
 """The strongest tornadoes blow at some 135 m/s."""
@@ -47,7 +50,7 @@ class BatteryParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldParams(Checked):
-    """What the air, the ground and the battery do to a vehicle.
+    """What the air, the ground and the battery do to a vehicle, and what stands in its way.
 
     Drag of the disc and of the rotors is that of the vehicle's velocity relative to the air. The
     filter and the controller know nothing of this world.
@@ -78,6 +81,15 @@ class WorldParams(Checked):
     that stands on its legs is at height 0"""
     battery: BatteryParams | None = None
     """None: always full voltage"""
+    obstacles: tuple[Obstacle, ...] = ()
+    """walls and cylinders, at most MAX_OBSTACLES: who touches one has collided, which ends the
+    episode, and the camera sees nothing behind one"""
+    vehicle_radius: float = 0.42
+    """distance of the center of mass from an obstacle at which the vehicle touches it [m]; the
+    laboratory's rotor hubs are 0.30 m from there, and its propellers reach 0.13 m beyond"""
+    geofence: Matrix | None = None
+    """(2, 3) lowest and highest corner in I of the box that the center of mass must not leave [m];
+    who does ends the episode; None: there is none"""
 
     def __post_init__(self) -> None:
         self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)
@@ -96,6 +108,45 @@ class WorldParams(Checked):
                 )
         if self.battery is not None:
             check.instance("WorldParams.battery", self.battery, BatteryParams)
+        self._check_room()
+
+    def _check_room(self) -> None:
+        """Check obstacles and geofence."""
+        if not isinstance(self.obstacles, (tuple, list)):
+            raise ValueError(
+                "WorldParams.obstacles must be a tuple of Wall and Cylinder, got "
+                f"{self.obstacles!r}"
+            )
+        self._set("obstacles", tuple(self.obstacles))
+        check_obstacles("WorldParams.obstacles", self.obstacles)
+        if len(self.obstacles) > MAX_OBSTACLES:
+            raise ValueError(
+                f"WorldParams.obstacles must be at most {MAX_OBSTACLES}, got {len(self.obstacles)}"
+            )
+        self._check(check.positive, "vehicle_radius", most=100.0)
+        if self.geofence is not None:
+            self._check(check.matrix, "geofence", rows=2, columns=3)
+            low, high = self.geofence
+            if not all(a < b for a, b in zip(low, high, strict=True)):
+                raise ValueError(
+                    f"WorldParams.geofence must be a lower and a higher corner, got {self.geofence}"
+                )
+
+
+def _slalom(first: float = 72.0, spacing: float = 12.0, gaps: int = 14) -> tuple[Wall, ...]:
+    """Walls from the north and from the south, each pair with a gap of 3 to 6 m.
+
+    The northern edge of a gap is drawn within 1.5 m of its middle place, and its width by itself;
+    gaps are alternately to the north and to the south, so that none leads straight to the next.
+    """
+    walls, size = [], (0.3, 30.0, 12.0)
+    for k in range(gaps):
+        x, edge = first - spacing * k, (3.75 if k % 2 else 0.75)
+        north = Wall(center_I=(x, edge + 15.0, 6.0), size=size, shift_I=(0.0, 1.5, 0.0))
+        south = (x, edge - 4.5 - 15.0, 6.0)
+        walls.append(north)
+        walls.append(Wall(center_I=south, size=size, shift_I=(0.0, 1.5, 0.0), follows=2 * k))
+    return tuple(walls)
 
 
 _LAB_ROTOR_DRAG = (0.78 * 0.544, 0.78 * 0.386, 0.0)  # Faessler et al., for the laboratory's mass
@@ -118,9 +169,17 @@ _WORLDS = {
         ground_effect=True,
         battery=BatteryParams(),
     ),
+    # that of OutageDash: 14 walls, 12 m apart, from east to west, each with a gap somewhere else
+    "slalom": WorldParams(
+        obstacles=_slalom(), geofence=((-250.0, -14.0, -1.0), (96.0, 14.0, 12.0))
+    ),
 }
 
 
 def world_params(name: str) -> WorldParams:
-    """The world called `name`: "calm" (the report's), "breeze" (4 m/s), "fresh_breeze" (8 m/s)."""
+    """The world called `name`.
+
+    "calm" is the report's, "breeze" has wind of 4 m/s, "fresh_breeze" of 8 m/s, and "slalom" walls
+    with gaps.
+    """
     return _WORLDS[check.choice("world", name, tuple(_WORLDS))]

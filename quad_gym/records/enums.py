@@ -148,6 +148,16 @@ class Ending(IntEnum):
     FILTER_LOST = 7
     TASK = 8
     """a user's task says so, see `quad_gym.Task`"""
+    COLLISION = 9
+    """the vehicle touched an obstacle"""
+    LEFT_GEOFENCE = 10
+
+
+class Shape(IntEnum):
+    """What an obstacle is."""
+
+    WALL = 0
+    CYLINDER = 1
 
 
 class Command(IntEnum):

@@ -10,6 +10,7 @@ from quad_gym.records.sizes import (
     MAX_FEATURES,
     MAX_GATES,
     MAX_HARMONICS,
+    MAX_OBSTACLES,
     MAX_SLOW,
     MAX_STATES,
     SENSOR_GROUPS,
@@ -18,6 +19,14 @@ from quad_gym.records.sizes import (
 )
 
 # fmt: off
+_CONTACT_FIELDS = (
+    # what stands in the way
+    Field("obstacle_center", (MAX_OBSTACLES, 3), "m", "centers of the obstacles in I"),
+    Field("obstacle_distance", (), "m", "from the center of mass to the nearest surface of an obstacle, negative inside; infinite: there is none"),
+    Field("obstacle_vector", (3,), "m", "from the center of mass to that surface's nearest point, in I"),
+    Field("collided", (), "0 or 1", "whether the vehicle has touched an obstacle in this episode"),
+    Field("left_fence", (), "0 or 1", "whether it has left the geofence in this episode"),
+)
 _FAULT_FIELDS = (
     # what goes wrong
     Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
@@ -201,6 +210,7 @@ _LATE_AID_FIELDS = (
 )
 # fmt: on
 PARTS = (
+    ("contacts", _CONTACT_FIELDS),
     ("faults", _FAULT_FIELDS),
     ("draws", _DRAW_FIELDS),
     ("actions", _ACTION_FIELDS),

@@ -4,6 +4,7 @@ from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
     AIDS,
     FAULT_KINDS,
+    MAX_OBSTACLES,
     MAX_STATES,
     WARM_DRAWS,
     WARM_SLOW_DRAWS,
@@ -80,12 +81,25 @@ SETTINGS_FIELDS = (
     Field("camera_limited", (), "0 or 1", "whether range, blur or ground limit what is seen", "i8"),
     Field("camera_blurs", (), "0 or 1", "whether images are blurred", "i8"),
     Field("ground_hides", (), "0 or 1", "whether the ground hides features", "i8"),
-    # the world, and what is drawn
+    # the world
     Field("air", (), "0 or 1", "whether the air does more than in a calm world", "i8"),
     Field("gusts", (), "0 or 1", "whether there are gusts", "i8"),
     Field("linear_drag", (), "0 or 1", "whether there is linear drag", "i8"),
     Field("ground_effect", (), "0 or 1", "whether there is ground effect", "i8"),
     Field("supply", (), "-", "what limits the motor voltages, see Supply", "i8"),
+    # what stands in it
+    Field("contacts", (), "0 or 1", "whether there are obstacles or a geofence", "i8"),
+    Field("obstacle_count", (), "-", "obstacles in use", "i8"),
+    Field("obstacle_shape", (MAX_OBSTACLES,), "-", "what each is, see Shape", "i8"),
+    Field("obstacle_center", (MAX_OBSTACLES, 3), "m", "their centers in I, without shifts"),
+    Field("obstacle_half", (MAX_OBSTACLES, 3), "m", "half length, thickness and height; of a cylinder: radius, radius, half height"),
+    Field("obstacle_axis", (MAX_OBSTACLES, 2), "-", "cosine and sine of the yaw of their length"),
+    Field("obstacle_shift", (MAX_OBSTACLES, 3), "m", "largest shift along each axis of I, either way"),
+    Field("obstacle_follows", (MAX_OBSTACLES,), "-", "the earlier one whose shift it shares; -1: none", "i8"),
+    Field("vehicle_radius", (), "m", "distance from an obstacle at which the vehicle touches it"),
+    Field("fenced", (), "0 or 1", "whether there is a geofence", "i8"),
+    Field("fence", (2, 3), "m", "lowest and highest corner of the geofence in I"),
+    # what is drawn
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
     Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),
     Field("known", (), "0 or 1", "whether filter and controller know the world as it is", "i8"),

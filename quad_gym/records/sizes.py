@@ -11,6 +11,8 @@ MAX_GATES = 8
 """Gates of a course."""
 MAX_FEATURES = 16
 """Features of a camera."""
+MAX_OBSTACLES = 32
+"""Obstacles of a world."""
 MAX_UNDER_WAY = 2
 """Longest latency of a sensor, in its periods: as many measurements can be in transit."""
 DELAY_SLOTS = MAX_UNDER_WAY + 1

@@ -13,6 +13,7 @@ from quad_gym.records.sizes import (
     MAX_FEATURES,
     MAX_GATES,
     MAX_HARMONICS,
+    MAX_OBSTACLES,
     MAX_SLOW,
 )
 
@@ -76,4 +77,5 @@ DRAW_HEADING = _claim("constant error of the baseline", 649, 1)
 DRAW_SLOW = _claim("slow errors of aiding sensors at the start", 656, MAX_SLOW)
 DRAW_AID_MATRIX = _claim("errors of scale and alignment of aiding sensors", 672, 5 * AIDS)
 DRAW_AID_PHASE = _claim("phases of aiding sensors", 704, AIDS)
+DRAW_OBSTACLES = _claim("shifts of obstacles", 768, 2 * MAX_OBSTACLES)
 DRAW_WARM_DRIFT = _claim("slow error of GNSS positions at a warm start", 552, 3)

@@ -60,6 +60,21 @@ class View:
         cut = a + np.clip(share, 0.0, 1.0) * (b - a)
         return self.flatten(np.where(in_front, both, cut))
 
+    def outline(self, corners: Floats) -> Floats:
+        """Pixels (m, 2) of a flat polygon with corners (n, 3), cut off where it comes too near."""
+        points = self.in_view(corners)
+        depth = points[:, 2] - NEAR * 1.001
+        if (depth > 0.0).all():
+            return self.flatten(points)
+        kept: list[Floats] = []
+        for k, (a, b) in enumerate(zip(depth, np.roll(depth, -1), strict=True)):
+            if a > 0.0:
+                kept.append(points[k])
+            if (a > 0.0) != (b > 0.0):
+                after = points[(k + 1) % len(points)]
+                kept.append(points[k] + a / (a - b) * (after - points[k]))
+        return self.flatten(np.array(kept)) if kept else np.zeros((0, 2))
+
     @property
     def horizon(self) -> float:
         """The row of pixels at which level lines end; a view without roll has one [pixels]."""

@@ -27,6 +27,7 @@ from quad_gym.rendering.geometry import (
     ellipsoid_outline,
 )
 from quad_gym.rendering.inset import last_image
+from quad_gym.rendering.solids import faces_of
 from quad_gym.rotations import quaternion_to_dcm
 
 Floats = NDArray[np.float64]
@@ -54,6 +55,14 @@ _GRID = np.stack([np.concatenate([ends, ends[:, [1, 0, 2]]]) for ends in _NORTHW
 """Starts and ends of the lines on the ground, one meter apart, (2, n, 3)."""
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
+
+SOLID, GLASS = 0.55, 0.12
+"""Opacity of obstacles behind the vehicle, and of those before it."""
+EDGES = (
+    *((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3)),
+    *((2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)),
+)
+"""Of a box whose corners are numbered in binary: x, y, z."""
 
 Label = tuple[str, Floats, tuple[int, int, int]]
 """Words, where (2,), color."""
@@ -101,6 +110,8 @@ class Scene:
             self.labels.append((name, self._view.project(np.array(tip))[0], GREY))
         self._reference()
         self._gates()
+        self._fence()
+        self._obstacles(before_vehicle=False)
         self._shadow()
         self._trails()
         self._camera()
@@ -108,6 +119,7 @@ class Scene:
         self._estimate()
         self._vehicle()
         self._axes()
+        self._obstacles(before_vehicle=True)
         return self.labels
 
     # ---- the world ----------------------------------------------------------------------------
@@ -163,6 +175,37 @@ class Scene:
             canvas.line(outline, color, 2.5 if k == passed else 1.5, closed=True)
             ink = GREY if k < passed else INK
             self.labels.append((str(k + 1), view.project(gate)[0] - (0.0, 6.0), ink))
+
+    def _obstacles(self, before_vehicle: bool) -> None:
+        """Draw obstacles that are nearer than the vehicle to the eye, or those that are not.
+
+        Those before it are drawn as if of glass, so that they hide nothing.
+        """
+        view, canvas = self._view, self._canvas
+        far = np.linalg.norm(self._now["position"] - view.eye)
+        chosen = []
+        for obstacle in self._stage.obstacles:
+            faces = faces_of(obstacle, view.eye)
+            # a wall is long: the point of it that is nearest to the eye counts
+            distance = min(float(np.linalg.norm(face - view.eye, axis=1).min()) for face in faces)
+            if (distance < far) == before_vehicle:
+                chosen.append((distance, faces))
+        for _, faces in sorted(chosen, key=lambda one: -one[0]):
+            is_round = any(len(face) > 4 for face in faces)
+            for face in faces:
+                outline = view.outline(face)
+                canvas.polygon(outline, GREY, GLASS if before_vehicle else SOLID)
+                if len(face) > 4 or not is_round:
+                    canvas.line(outline, GREY, 1.2, closed=True)
+
+    def _fence(self) -> None:
+        """Draw the edges of the geofence."""
+        fence = self._stage.geofence_I
+        if len(fence):
+            corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+            places = np.where(corners == 0, fence[0], fence[1])
+            a, b = np.array(EDGES).T
+            self._canvas.segments(self._view.segments(places[a], places[b]), PALE, 1.0)
 
     def _shadow(self) -> None:
         r_I = np.array(self._now["position"])

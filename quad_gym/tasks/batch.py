@@ -54,6 +54,7 @@ class TaskBatch(ReadableBatch):
         custom: The task.
         parts: What its `observe` returns, by name; None: it is not asked.
         split: Where that stands in an observation: after so many shipped numbers.
+        kept: Which of these stay; None: all.
         autoreset: When a flight whose episode is over begins the next one.
         keywords: Those of `FlightBatch`.
 
@@ -68,6 +69,7 @@ class TaskBatch(ReadableBatch):
         custom: Task,
         parts: Mapping[str, Part] | None = None,
         split: int = 0,
+        kept: Sequence[int] | None = None,
         autoreset: Autoreset = Autoreset.DISABLED,
         **keywords: Any,
     ) -> None:
@@ -79,7 +81,9 @@ class TaskBatch(ReadableBatch):
         self._same_step = autoreset == Autoreset.SAME_STEP
         self._parts, self._split = dict(parts or {}), split
         self._observes = parts is not None and "observe" in self.methods
-        self._kept = slice(split, split) if custom.replaces_observation else slice(0, split)
+        self._kept: slice | NDArray[np.intp] = slice(0, split)
+        if kept is not None and len(kept) < split:
+            self._kept = np.array(kept, np.intp)
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         camera = self.sensors.camera
@@ -184,7 +188,7 @@ class TaskBatch(ReadableBatch):
             start = answers.ask(self.custom, "reset", self.view, rng)
         if start is not None:
             shipped = self._begin_again(
-                chosen, starts(self.custom, start, chosen, given, self.task)
+                chosen, starts(self.custom, start, chosen, given, self.task, self.world)
             )
         return shipped
 
@@ -308,7 +312,8 @@ class TaskBatch(ReadableBatch):
 
     def _size_of_observation(self) -> int:
         """Numbers of an observation that the environment shows."""
-        kept = len(range(*self._kept.indices(self._low.size))) + self._low.size - self._split
+        shipped = self._split if isinstance(self._kept, slice) else len(self._kept)
+        kept = shipped + self._low.size - self._split
         own = sum(part.size for part in self._parts.values())
         return kept + own if self._observes else self._low.size
 

@@ -9,7 +9,7 @@ class ViewField(NamedTuple):
     name: str
     """with its group: "truth.position" """
     shape: str
-    """n: flights, m: features of the camera, k: numbers of an observation"""
+    """n: flights, m: features of the camera, o: obstacles, k: numbers of an observation"""
     unit: str
     frame: str
     """I: inertial (east, north, up), B: body, C: image; "-": none"""
@@ -35,6 +35,8 @@ VIEW_FIELDS = (
     ViewField("gates_passed", "(n,) int", "-", "-", "in this episode"),
     ViewField("gate_passed", "(n,) bool", "-", "-", "whether this step passed one"),
     ViewField("features", "(m, 3)", "m", "I", "the markers that the camera sees, the same for all flights"),
+    ViewField("world", "", "-", "-", "its `WorldParams`, without draws and shifts"),
+    ViewField("obstacles", "(n, o, 3)", "m", "I", "where the middles of the world's obstacles are in this episode, in their order"),
     ViewField("observation", "(n, k)", "mixed", "mixed", "the shipped observation, less its privileged part"),
     # the truth, which `observe` may read only if the task is privileged
     ViewField("truth.position", "(n, 3)", "m", "I", "of the center of mass; `view.position` for short"),
@@ -51,7 +53,9 @@ VIEW_FIELDS = (
     ViewField("truth.estimation_error", "(n,)", "m", "-", "distance of the seen from the true position; `view.estimation_error`"),
     ViewField("truth.progress", "(n,)", "m/s", "-", "speed toward the reference; on a course, toward the gate that was next"),
     ViewField("truth.nees", "(n,)", "-", "-", "normalized estimation error squared; 15 on average if the filter is consistent"),
-    ViewField("truth.features_in_view", "(n, m) bool", "-", "-", "whether the camera faces a marker, as the vehicle and the sensors are nominally"),
+    ViewField("truth.features_in_view", "(n, m) bool", "-", "-", "whether the camera faces a marker, as the vehicle and the sensors are nominally, and no obstacle hides it"),
+    ViewField("truth.obstacle_distance", "(n,)", "m", "-", "from the nearest obstacle's surface, negative inside, infinite where there is none; `view.obstacle_distance`"),
+    ViewField("truth.obstacle_vector", "(n, 3)", "m", "I", "to that surface's nearest point"),
     ViewField("truth.faults", "dict of (n,) bool", "-", "-", "which are there now, by name"),
     ViewField("truth.drawn", "dict of (n, ...)", "mixed", "mixed", "parameters of the episode, by name, see `randomization`"),
     # what the filter estimates
@@ -82,6 +86,8 @@ VIEW_FIELDS = (
     ViewField("seen.heading", "(n, 3)", "-", "B", "horizontal direction that body x is to point in"),
     ViewField("seen.reference_acceleration", "(n, 3)", "m/s^2", "B", "of the reference"),
     ViewField("seen.preview", "(n, 2, 3)", "m", "B", "`view.preview` less the present reference"),
+    ViewField("seen.obstacle_distance", "(n,)", "m", "-", "of the seen position from the nearest obstacle's surface, negative inside"),
+    ViewField("seen.obstacle_vector", "(n, 3)", "m", "B", "to that surface's nearest point"),
     # what was measured in this step; the last of each kind, NaN where there was none
     ViewField("measured.gyro", "(n, 3)", "rad/s", "B", ""),
     ViewField("measured.accel", "(n, 3)", "m/s^2", "B", "specific force"),

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
+from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
 from quad_gym.rotations import dcm_to_quaternion
 from quad_gym.tasks.lazy import Group, Lazy, Shown, frozen
 
@@ -93,7 +94,10 @@ class Truth(Group):
 
     @Lazy
     def features_in_view(self) -> Truths:
-        """(n, m) whether the camera faces a marker, as vehicle and sensors are nominally."""
+        """(n, m) whether the camera faces a marker, as vehicle and sensors are nominally.
+
+        A marker behind an obstacle does not count.
+        """
         p = self._flights.nominal()
         R_BI, r = self.R_BI[:, np.newaxis], self.position[:, np.newaxis]
         X_B = (R_BI @ (self._view.features - r)[..., np.newaxis])[..., 0] - p["camera"]
@@ -102,7 +106,24 @@ class Truth(Group):
         pixels = (
             X_C[..., :2] * (p["focal_length"] / np.where(in_front, X_C[..., 2], 1.0))[..., None]
         )
-        return in_front & (np.abs(pixels) <= p["half_image"]).all(axis=-1)
+        seen = in_front & (np.abs(pixels) <= p["half_image"]).all(axis=-1)
+        obstacles = self._flights.world.obstacles
+        if obstacles:
+            eyes = self.position + (p["camera"] @ self.R_BI)
+            seen &= ~hidden_points(obstacles, self._view.obstacles, eyes, self._view.features)
+        return seen
+
+    @Lazy
+    def obstacle_distance(self) -> Floats:
+        """(n,) from the nearest obstacle's surface, negative inside; infinite: none there [m]."""
+        if not self._flights.world.obstacles:
+            return np.full(self._view.count, np.inf)
+        return self._flights.columns("obstacle_distance")
+
+    @Lazy
+    def obstacle_vector(self) -> Floats:
+        """(n, 3) from the vehicle to the nearest point of that surface, in I [m]."""
+        return self._flights.rows("obstacle_vector")
 
     @Lazy
     def faults(self) -> Any:
@@ -245,6 +266,25 @@ class Seen(Group):
     preview = Shown(
         "ahead", "(n, 2, 3) the reference a little later, less the present one, in B [m]."
     )
+
+    @Lazy
+    def _obstacle(self) -> Any:
+        """Distance from the nearest obstacle, and the vector there in I, by name."""
+        distance, vector = nearest_obstacle(
+            self._flights.world.obstacles, self._flights.obstacle_centers(), self.position
+        )
+        return {"distance": distance, "vector": vector}
+
+    @Lazy
+    def obstacle_distance(self) -> Floats:
+        """(n,) of the seen position from the nearest obstacle's surface, negative inside [m]."""
+        return self._obstacle["distance"]
+
+    @Lazy
+    def obstacle_vector(self) -> Floats:
+        """(n, 3) from the seen position to the nearest point of that surface, in B [m]."""
+        vector = self._obstacle["vector"][:, :, np.newaxis]
+        return np.ascontiguousarray((self.R_BI @ vector)[:, :, 0])
 
 
 class Measured(Group):

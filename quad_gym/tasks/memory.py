@@ -79,6 +79,13 @@ class ReadableBatch(FlightBatch):
         gates = self.task.gate_count if self.task.kind == "waypoints" else 0
         return self.rows("gates")[:, :gates]
 
+    def obstacle_centers(self) -> Floats:
+        """(n, k, 3) where the middles of the world's obstacles are in I [m]."""
+        count = len(self.world.obstacles)
+        if not count:
+            return np.zeros((self.count, 0, 3))
+        return np.ascontiguousarray(self.rows("obstacle_center")[:, :count])
+
     def nominal(self) -> dict[str, Any]:
         """Numbers of the nominal sensors."""
         names = ("camera", "R_CB", "focal_length", "half_image", "R_IG")

@@ -24,7 +24,13 @@ Floats = NDArray[np.float64]
 BLOCKS = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 """Blocks of the filter's covariance."""
 
-_CRASHES = [int(e) for e in (Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.ON_THE_GROUND)]
+_CRASHES = [
+    int(ending)
+    for ending in (
+        *(Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.ON_THE_GROUND),
+        *(Ending.COLLISION, Ending.LEFT_GEOFENCE),
+    )
+]
 
 
 class Piece:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.starts import checked_start
 from quad_gym.params.task import TaskParams
+from quad_gym.params.world import WorldParams
 from quad_gym.tasks import answers
 from quad_gym.tasks.task import Task, TaskError, label
 
@@ -18,7 +19,12 @@ _SHAPES: dict[str, tuple[int, ...]] = {"position": (3,), "velocity": (3,), "yaw"
 
 
 def starts(
-    task: Task, returned: Any, chosen: NDArray[np.bool_], given: Start, params: TaskParams
+    task: Task,
+    returned: Any,
+    chosen: NDArray[np.bool_],
+    given: Start,
+    params: TaskParams,
+    world: WorldParams,
 ) -> Start:
     """Start values that a task's `reset` returned, beside those that a caller has given.
 
@@ -28,6 +34,7 @@ def starts(
         chosen: (n,) which flights begin an episode; the rows of the others do not count.
         given: What the caller has given, which comes first; None: nothing.
         params: Of the id's task.
+        world: Says what stands in the way.
 
     Returns:
         "position", "velocity", "yaw", as `FlightBatch.reset` takes them.
@@ -55,7 +62,7 @@ def starts(
         if given.get(name) is None:
             found[name] = rows
     try:
-        checked_start(count, **found, task=params)
+        checked_start(count, **found, task=params, world=world, chosen=chosen)
     except ValueError as error:
         raise TaskError(f"{label(task)}.reset returned a wrong start: {error}") from None
     return found

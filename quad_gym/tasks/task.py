@@ -3,7 +3,7 @@
 import importlib
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -67,12 +67,15 @@ class Task:
     - `observes`: unit, frame and bounds of what `observe` returns, by name.
     - `replaces_observation`: whether that takes the place of the shipped observation; else it
       follows it.
+    - `keeps`: names of parts of the shipped observation that stay where it is replaced, as far as
+      there are such, and come first.
     - `privileged`: whether `observe` may read the truth.
     """
 
     state: Mapping[str, ArrayLike] = {}
     observes: Mapping[str, Observed] = {}
     replaces_observation: bool = False
+    keeps: Collection[str] = ()
     privileged: bool = False
 
     @staticmethod
@@ -81,6 +84,7 @@ class Task:
         state: Mapping[str, ArrayLike] | None = None,
         observes: Mapping[str, Observed] | None = None,
         replaces_observation: bool = False,
+        keeps: Collection[str] = (),
         privileged: bool = False,
         **methods: Callable[..., Any],
     ) -> "Task":
@@ -90,6 +94,7 @@ class Task:
             state: As the class attribute.
             observes: Likewise.
             replaces_observation: Likewise.
+            keeps: Likewise.
             privileged: Likewise.
             methods: Functions by the names of the methods.
 
@@ -104,6 +109,7 @@ class Task:
         task = Task()
         task.state, task.observes = dict(state or {}), dict(observes or {})
         task.replaces_observation, task.privileged = replaces_observation, privileged
+        task.keeps = tuple(keeps)
         vars(task).update(methods)
         return task
 
@@ -163,6 +169,8 @@ def resolve_task(custom: Any) -> Task:
     for name in ("replaces_observation", "privileged"):
         if not isinstance(getattr(found, name), bool):
             raise ValueError(f"{name} of {label(found)} must be True or False")
+    if isinstance(found.keeps, str) or not all(isinstance(name, str) for name in found.keeps):
+        raise ValueError(f"keeps of {label(found)} must hold names, got {found.keeps!r}")
     for name, part in found.observes.items():
         if not isinstance(part, Observed) or not part.low < part.high:
             raise ValueError(

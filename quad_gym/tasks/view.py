@@ -12,6 +12,7 @@ from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
 
 if TYPE_CHECKING:
+    from quad_gym.params.world import WorldParams
     from quad_gym.tasks.batch import TaskBatch
 
 Floats = NDArray[np.float64]
@@ -161,6 +162,12 @@ class View(Group):
         self._open("estimation_error")
         return self._truth.estimation_error
 
+    @property
+    def obstacle_distance(self) -> Floats:
+        """(n,) distance of the true position from the nearest obstacle's surface [m]."""
+        self._open("obstacle_distance")
+        return self._truth.obstacle_distance
+
     # ---- what everybody knows -----------------------------------------------------------------
 
     @property
@@ -225,6 +232,16 @@ class View(Group):
     def features(self) -> Floats:
         """(m, 3) markers that the camera sees, in I [m]."""
         return self._flights.features  # type: ignore[no-any-return]
+
+    @property
+    def world(self) -> "WorldParams":
+        """The world, without draws and shifts."""
+        return self._flights.world  # type: ignore[no-any-return]
+
+    @Lazy
+    def obstacles(self) -> Floats:
+        """(n, k, 3) where the middles of the world's obstacles are in this episode, in I [m]."""
+        return self._flights.obstacle_centers()
 
     @Lazy
     def observation(self) -> NDArray[np.float32]:

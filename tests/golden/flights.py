@@ -93,6 +93,17 @@ def cases():
         "innovations": rtk | {"innovations": True},
         "warm": rtk | {"filter_start": "warm"},
         "breeze": rtk | {"world": "fresh_breeze"},
+        "obstacles": {
+            "sensors": "indoor",
+            "world": quad_gym.WorldParams(
+                obstacles=(
+                    quad_gym.Wall(center_I=(6.0, 0.0, 1.0), shift_I=(0.5, 0.5, 0.0), yaw=0.4),
+                    quad_gym.Wall(center_I=(0.0, 2.0, 1.0), shift_I=(0.5, 0.0, 0.0), follows=0),
+                    quad_gym.Cylinder(center_I=(2.0, -1.0, 1.0)),
+                ),
+                geofence=((-6.0, -6.0, -1.0), (6.0, 6.0, 3.0)),
+            ),
+        },
         "battery": rtk | {"world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())},
         "randomization": rtk | {"randomization": RANDOMIZATION},
         "randomization known": rtk

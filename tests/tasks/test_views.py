@@ -45,6 +45,7 @@ def every_name():
 def test_the_table_has_the_shape_and_the_type_of_every_array(task):
     batch, view = flown(task, sensors="rtk", randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
     lengths = {"n": FLIGHTS, "m": len(batch.sensors.camera.features_I), "k": 28}
+    lengths["o"] = 0
     lengths["gates"] = 5 if task == "waypoints" else 0
     for field in every_name():
         value = value_of(view, field.name)
@@ -64,6 +65,7 @@ def test_every_public_array_of_a_view_is_in_the_table():
     told = {field.name for field in every_name()}
     shorts = {"position", "velocity", "R_BI", "quaternion", "body_rates", "rotor_speeds"}
     shorts |= {"accel_bias", "gyro_bias", "position_error", "estimation_error"}
+    shorts |= {"obstacle_distance"}
     for prefix, group in [("", view)] + [
         (name, getattr(view, name)) for name in ("truth", "estimate", "seen", "measured", "shipped")
     ]:

@@ -32,6 +32,12 @@ MORE = {
     "plain": {},
     "drawn": {"randomization": {"mass": Uniform(0.7, 0.8)}},
     "faults": {"faults": ["rotor_loss"]},
+    "obstacles": {
+        "world": quad_gym.WorldParams(
+            obstacles=(quad_gym.Wall(center_I=(2.0, 0.5, 1.0), shift_I=(0.2, 0.0, 0.0)),),
+            geofence=((-5.0, -5.0, -1.0), (5.0, 5.0, 3.0)),
+        )
+    },
 }
 CASES = {
     f"{name}, {more}": CHOICES[name] | MORE[more] for name, more in itertools.product(CHOICES, MORE)

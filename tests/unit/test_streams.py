@@ -22,6 +22,7 @@ from quad_gym.records import (
     DRAWS_OF_FAULT,
     FAULT_KINDS,
     MAX_FEATURES,
+    MAX_OBSTACLES,
     MAX_SLOW,
     FaultKind,
 )
@@ -61,6 +62,7 @@ DRAWS_OF = {"uniform_pair": 1, "normal_pair": 1, "six_normals": 3, "_any_directi
 LARGEST = {
     "feature_count": MAX_FEATURES,
     "settings.feature_count": MAX_FEATURES,
+    "settings.obstacle_count": MAX_OBSTACLES,
     "slow.slow_states": MAX_SLOW,
 }
 """What kernels are told while they run, at its largest."""

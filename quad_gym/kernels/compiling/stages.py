@@ -75,6 +75,10 @@ class Stage(IntEnum):
     JUDGE = auto()
     OBSERVE = auto()
     SHOW = auto()
+    BEGIN_CONTACTS = auto()
+    TOUCH = auto()
+    JUDGE_CONTACTS = auto()
+    HIDE_FEATURES = auto()
     PREDICT_WITH_SLOW = auto()
     UPDATE_WITH_SLOW = auto()
     LATE_UPDATE_WITH_SLOW = auto()
@@ -148,6 +152,14 @@ def _pad(s: Any) -> bool:
     return bool(s["pad"] and s["start"] != Start.HOVER)
 
 
+def _contacts(s: Any) -> bool:
+    return bool(s["contacts"])
+
+
+def _hides(s: Any) -> bool:
+    return bool(s["run_filter"] and s["camera_ticks"] > 0 and s["obstacle_count"] > 0)
+
+
 def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
@@ -211,6 +223,10 @@ SOURCES = {
     Stage.DELAY_ACTION: Source(
         "vehicle.delay", "delay_action_stage", lambda s: s["action_delays"] > 0
     ),
+    Stage.HIDE_FEATURES: Source("obstacles.sight", "hide_features_stage", _hides),
+    Stage.BEGIN_CONTACTS: Source("obstacles.contact", "begin_contacts_stage", _contacts),
+    Stage.TOUCH: Source("obstacles.contact", "touch_stage", _contacts),
+    Stage.JUDGE_CONTACTS: Source("obstacles.contact", "judge_contacts_stage", _contacts),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
     Stage.SUM_IMU: Source("sensors.sample", "sum_imu_stage", _raw),
@@ -230,6 +246,7 @@ def used_parts(settings: Any) -> frozenset[str]:
     """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
     watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
     uses = {
+        "contacts": _contacts(settings),
         "faults": _faults(settings),
         "draws": _drawn(settings),
         "filter": _filter(settings),

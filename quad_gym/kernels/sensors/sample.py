@@ -15,7 +15,7 @@ from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 
 _DISTURB_IMU, _TURN_BASELINE = int(Stage.DISTURB_IMU), int(Stage.TURN_BASELINE)
-_LIMIT_CAMERA = int(Stage.LIMIT_CAMERA)
+_LIMIT_CAMERA, _HIDE_FEATURES = int(Stage.LIMIT_CAMERA), int(Stage.HIDE_FEATURES)
 _SATURATE_IMU = int(Stage.SATURATE_IMU)
 _CORRUPT_GNSS, _CORRUPT_FEATURES = int(Stage.CORRUPT_GNSS), int(Stage.CORRUPT_FEATURES)
 
@@ -83,6 +83,9 @@ def _sample_camera(flight, world, settings, work, stages, mask):
         if settings.camera_limited:
             work.mask = select(due, 1.0, 0.0)
             call_stage(stages, _LIMIT_CAMERA, flight, world, world, settings, work, 0)
+        if settings.obstacle_count > 0:
+            work.mask = select(due, 1.0, 0.0)
+            call_stage(stages, _HIDE_FEATURES, flight, world, world, settings, work, 0)
         if settings.faults:
             work.mask = select(due, 1.0, 0.0)
             call_stage(stages, _CORRUPT_FEATURES, flight, world, world, settings, work, 0)

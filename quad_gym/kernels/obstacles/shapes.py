@@ -1,0 +1,155 @@
+"""Walls and cylinders: how far a point is from one, and where a line enters one.
+
+Both are upright. A wall is a box that is turned about the vertical, `half` its half length,
+thickness and height; a cylinder has `half` radius, radius and half height.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum
+from quad_gym.kernels.maths.linalg import load3, norm, select3, sub
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import Shape
+
+AT_THE_END = 1e-3
+"""A line that enters an obstacle so little before its end does not cross it: a marker may hang on a
+wall [m]."""
+_FAR, _PARALLEL = 1e30, 1e-12
+
+
+@kernel
+def to_obstacle(v_I, settings, k):
+    """A vector in the axes of obstacle k: along its length, its thickness, and up."""
+    c, s = settings.obstacle_axis[k, 0], settings.obstacle_axis[k, 1]
+    return (c * v_I[0] + s * v_I[1], c * v_I[1] - s * v_I[0], v_I[2])
+
+
+@kernel
+def from_obstacle(v, settings, k):
+    """A vector in the axes of obstacle k turned back to I."""
+    c, s = settings.obstacle_axis[k, 0], settings.obstacle_axis[k, 1]
+    return (c * v[0] - s * v[1], s * v[0] + c * v[1], v[2])
+
+
+@kernel
+def _outward(p, inside):
+    """`inside` (a depth, at least 0) in the direction of p's sign."""
+    return select(p < 0.0, -inside, inside)
+
+
+@kernel
+def _from_wall(p, half):
+    """(distance, vector to the nearest point of the surface) of a point in a wall's axes."""
+    zero = 0.0 * p[0]
+    q = (abs(p[0]) - half[0], abs(p[1]) - half[1], abs(p[2]) - half[2])
+    deepest = maximum(maximum(q[0], q[1]), q[2])
+    outside = (
+        clip(p[0], -half[0], half[0]) - p[0],
+        clip(p[1], -half[1], half[1]) - p[1],
+        clip(p[2], -half[2], half[2]) - p[2],
+    )
+    by_length, by_thickness = q[0] >= deepest, q[1] >= deepest
+    upward = (zero, zero, _outward(p[2], -q[2]))
+    inside = select3(by_thickness, (zero, _outward(p[1], -q[1]), zero), upward)
+    inside = select3(by_length, (_outward(p[0], -q[0]), zero, zero), inside)
+    is_outside = deepest > 0.0
+    return select(is_outside, norm(outside), deepest), select3(is_outside, outside, inside)
+
+
+@kernel
+def _from_cylinder(p, half):
+    """Likewise of a point in a cylinder's axes."""
+    zero = 0.0 * p[0]
+    rho = math.sqrt(p[0] * p[0] + p[1] * p[1])
+    aside = rho > _PARALLEL
+    per_rho = 1.0 / select(aside, rho, 1.0)
+    x, y = select(aside, p[0] * per_rho, 1.0), p[1] * per_rho  # on the axis: to its east
+    q_r, q_z = rho - half[0], abs(p[2]) - half[2]
+    deepest = maximum(q_r, q_z)
+    back = -maximum(q_r, zero)
+    outside = (back * x, back * y, clip(p[2], -half[2], half[2]) - p[2])
+    inside = select3(q_r >= q_z, (-q_r * x, -q_r * y, zero), (zero, zero, _outward(p[2], -q_z)))
+    is_outside = deepest > 0.0
+    return select(is_outside, norm(outside), deepest), select3(is_outside, outside, inside)
+
+
+@kernel
+def distance_from(r_I, center_I, settings, k):
+    """Distance of a point from the surface of obstacle k, negative inside, and the vector there.
+
+    Args:
+        r_I: The point in I [m].
+        center_I: Where the obstacle's middle is in I [m].
+        settings: Have its shape.
+        k: Its number.
+
+    Returns:
+        Distance [m]; vector in I to the surface's nearest point [m].
+    """
+    p, half = to_obstacle(sub(r_I, center_I), settings, k), load3(settings.obstacle_half[k])
+    if settings.obstacle_shape[k] == Shape.CYLINDER:
+        distance, vector = _from_cylinder(p, half)
+    else:
+        distance, vector = _from_wall(p, half)
+    return distance, from_obstacle(vector, settings, k)
+
+
+@kernel
+def _slab(start, along, half):
+    """The shares of a line at which it enters and leaves the slab [-half, half]."""
+    across = abs(along) > _PARALLEL
+    per = 1.0 / select(across, along, 1.0)
+    a, b = (-half - start) * per, (half - start) * per
+    within = abs(start) < half
+    enters = select(across, minimum(a, b), select(within, -_FAR, _FAR))
+    leaves = select(across, maximum(a, b), select(within, _FAR, -_FAR))
+    return enters, leaves
+
+
+@kernel
+def _disc(start, along, radius):
+    """Likewise the infinite cylinder around the vertical."""
+    a = along[0] * along[0] + along[1] * along[1]
+    across = a > _PARALLEL * _PARALLEL
+    b = start[0] * along[0] + start[1] * along[1]
+    c = start[0] * start[0] + start[1] * start[1] - radius * radius
+    root = b * b - a * c
+    meets, per = root > 0.0, 1.0 / select(across, a, 1.0)
+    reach = math.sqrt(select(meets, root, 0.0)) * per
+    within = c < 0.0
+    enters = select(across & meets, -b * per - reach, _FAR)
+    leaves = select(across & meets, -b * per + reach, -_FAR)
+    enters = select(across, enters, select(within, -_FAR, _FAR))
+    leaves = select(across, leaves, select(within, _FAR, -_FAR))
+    return enters, leaves
+
+
+@kernel
+def crosses(start_I, end_I, center_I, settings, k):
+    """Whether the line from one point to another crosses obstacle k, before AT_THE_END.
+
+    It does where the share at which it has entered all slabs is before that at which it leaves the
+    first one.
+
+    Args:
+        start_I: Where the line starts, in I [m].
+        end_I: Where it ends [m].
+        center_I: Where the obstacle's middle is [m].
+        settings: Have its shape.
+        k: Its number.
+    """
+    along_I = sub(end_I, start_I)
+    length = norm(along_I)
+    start = to_obstacle(sub(start_I, center_I), settings, k)
+    along, half = to_obstacle(along_I, settings, k), load3(settings.obstacle_half[k])
+    enters, leaves = _slab(start[2], along[2], half[2])
+    if settings.obstacle_shape[k] == Shape.CYLINDER:
+        into, out = _disc(start, along, half[0])
+    else:
+        into, out = _slab(start[0], along[0], half[0])
+        by_thickness, out_of_it = _slab(start[1], along[1], half[1])
+        into, out = maximum(into, by_thickness), minimum(out, out_of_it)
+    enters, leaves = maximum(enters, into), minimum(leaves, out)
+    end = 1.0 - AT_THE_END / maximum(length, AT_THE_END)
+    return maximum(enters, 0.0) < minimum(leaves, end)

@@ -1,0 +1,184 @@
+"""`OutageDash`: a task in which being unsure changes what is best to do."""
+
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.obstacles import Wall
+from quad_gym.tasks.rewards import BodyRates, Crash, Effort, OfFunction, Piece
+from quad_gym.tasks.task import Observed, Task
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.view import View
+
+Floats = NDArray[np.float64]
+
+PROGRESS_WEIGHT = 0.1
+"""Of the speed along the course [s/m]."""
+
+CRASH_COST = 300.0
+"""Once, as much as 60 m of the course; a crash also costs the course that was left. With 100, the
+best that pilots found was to hurry on through an outage."""
+
+ACTION_COST, RATE_COST = 0.02, 0.002
+"""Of |change of action|^2 and |body rates|^2, as those that ship."""
+
+PAST = 0.7
+"""How far beyond a wall the vehicle is through its gap: then nothing of it is in there [m]."""
+
+FINISH_WIDTH = 6.0
+"""Of what follows the last gap in observations [m]."""
+
+
+class Gaps(NamedTuple):
+    """The gaps of a course, in the order in which they come, and the finish last."""
+
+    centers: Floats
+    """(n, gaps + 1, 3) in I [m]"""
+    widths: Floats
+    """(n, gaps + 1) [m]"""
+
+
+class OutageDash(Task):
+    """Dash through the gaps of 14 walls, while GNSS fails for 5 to 15 s.
+
+    The sensors are those of a hobby vehicle. With GNSS the filter knows the position to a
+    decimeter; without it the error is a decimeter after two seconds, a meter after five, and five
+    meters after twelve. Gaps are 3 to 6 m wide, walls 12 m apart. A controller that hurries on
+    through an outage hits a wall; one that waits for its end loses the course that it could have
+    flown, and drifts. How long to go on depends on how sure the filter is, and on how wide the next
+    gap is.
+
+    ## Course
+    It leads from east to west, from (84, 0, 4) through the origin. Walls stand at x = 72, 60, ...,
+    -84 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
+    alternately 3.75 and 0.75 m north of the course's line, and the width uniformly in [3, 6] m: new
+    for each episode. A geofence keeps the vehicle within 14 m of the line and below 12 m.
+
+    GNSS (position, velocity and the compass that comes with it) fails once, from a time in [2, 8] s
+    on, for a time in [5, 15] s.
+
+    ## Reward
+    In each step, with the true speed v to the west [m/s] until the last gap is 12 m behind, the
+    change of the action da and the body rates w
+
+        0.1 v - 0.02 |da|^2 - 0.002 |w|^2 - 300 (crashed)
+
+    that is 5 a meter at 50 Hz. A crash costs as much as 60 m.
+
+    ## Observation
+    In the place of what ships, as the controller's source believes:
+
+    | name | meaning | unit | frame |
+    |---|---|---|---|
+    | position_error (3) | from the vehicle to the middle of the next gap | m | B |
+    | velocity_error (3) | minus the velocity | m/s | B |
+    | up (3) | the vertical | - | B |
+    | heading (3) | the direction of the course | - | B |
+    | body_rates (3) | angular rate | rad/s | B |
+    | gap_width (1) | of the next gap | m | - |
+    | next_gap (3) | from the middle of the next gap to that of the one after it | m | B |
+    | next_width (1) | of that one | m | - |
+
+    and before it `last_action` (4) and, with `include_covariance=True`, the filter's 15 standard
+    deviations, which tell that GNSS is gone. The next gap is the first one that is not yet 0.7 m
+    behind the vehicle; after the last one comes the finish, 12 m further.
+
+    ## Endings
+    Those of `QuadEnv`: touching a wall, leaving the geofence, the ground at height 0, tipping over;
+    the time limit of 20 s.
+
+    Args:
+        progress_weight: Of v in the reward.
+        crash_cost: What a crash costs, once.
+
+    Raises:
+        ValueError: If a number is negative or not finite.
+    """
+
+    replaces_observation = True
+    keeps: Collection[str] = (
+        *("last_action", "position_sigma", "velocity_sigma", "attitude_sigma"),
+        *("accel_bias_sigma", "gyro_bias_sigma"),
+    )
+    observes: Mapping[str, Observed] = {
+        "position_error": Observed("m", "B", -200.0, 200.0),
+        "velocity_error": Observed("m/s", "B", -100.0, 100.0),
+        "up": Observed("-", "B", -1.0, 1.0),
+        "heading": Observed("-", "B", -1.0, 1.0),
+        "body_rates": Observed("rad/s", "B", -200.0, 200.0),
+        "gap_width": Observed("m", "-", 0.0, 100.0),
+        "next_gap": Observed("m", "B", -100.0, 100.0),
+        "next_width": Observed("m", "-", 0.0, 100.0),
+    }
+
+    def __init__(
+        self, progress_weight: float = PROGRESS_WEIGHT, crash_cost: float = CRASH_COST
+    ) -> None:
+        self.pieces: Piece = (
+            check.number("progress_weight", progress_weight, least=0.0) * OfFunction(westward)
+            - ACTION_COST * Effort()
+            - RATE_COST * BodyRates()
+            - check.number("crash_cost", crash_cost, least=0.0) * Crash()
+        )
+
+    def reward(self, view: "View") -> Floats:
+        """(n,) see the class."""
+        return self.pieces(view)
+
+    def observe(self, view: "View") -> dict[str, Floats]:
+        """See the class."""
+        seen, gaps = view.seen, gaps_of(view)
+        through = gaps_behind(gaps, seen.position)
+        every, last = np.arange(view.count), gaps.widths.shape[1] - 1
+        after = np.minimum(through + 1, last)
+        here, there = gaps.centers[every, through], gaps.centers[every, after]
+
+        def in_body(vectors: Floats) -> Floats:
+            return np.ascontiguousarray((seen.R_BI @ vectors[:, :, np.newaxis])[:, :, 0])
+
+        return {
+            "position_error": in_body(here - seen.position),
+            "velocity_error": in_body(-seen.velocity),
+            "up": seen.up,
+            "heading": seen.heading,
+            "body_rates": seen.body_rates,
+            "gap_width": gaps.widths[every, through],
+            "next_gap": in_body(there - here),
+            "next_width": gaps.widths[every, after],
+        }
+
+
+def gaps_of(view: "View") -> Gaps:
+    """The gaps between the walls of a world, which come in pairs, from the north and the south.
+
+    Raises:
+        ValueError: If the world is none of these.
+    """
+    walls = view.world.obstacles
+    if len(walls) < 2 or len(walls) % 2 or not all(isinstance(wall, Wall) for wall in walls):
+        raise ValueError('OutageDash needs pairs of walls, as those of world="slalom"')
+    half = np.array([wall.half_size[1] for wall in walls])
+    middle = view.obstacles
+    north, south = middle[:, ::2, 1] - half[::2], middle[:, 1::2, 1] + half[1::2]
+    centers = middle[:, ::2].copy()
+    centers[:, :, 1] = 0.5 * (north + south)
+    centers[:, :, 2] = view.reference_position[:, 2:]
+    finish = centers[:, -1:].copy()
+    finish[:, :, 0] -= centers[:, :1, 0] - centers[:, 1:2, 0] if len(walls) > 2 else 10.0
+    widths = np.concatenate([north - south, np.full((view.count, 1), FINISH_WIDTH)], axis=1)
+    return Gaps(np.concatenate([centers, finish], axis=1), widths)
+
+
+def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
+    """(n,) how many gaps are behind a vehicle at a position (n, 3) in I."""
+    return (position[:, :1] < gaps.centers[:, :-1, 0] - PAST).sum(axis=1)
+
+
+def westward(view: "View") -> Floats:
+    """(n,) true speed along the course [m/s], 0 beyond the finish."""
+    finish = gaps_of(view).centers[:, -1, 0]
+    return np.where(view.position[:, 0] > finish, -view.velocity[:, 0], 0.0)

@@ -1,0 +1,233 @@
+"""Environments whose world has obstacles: endings, interfaces, autoreset, snapshots, pictures."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import Cylinder, Wall, WorldParams
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.flights.record import Flight, FlightRecorder
+from quad_gym.tasks.rewards import Crash
+
+WORLD = WorldParams(
+    obstacles=(
+        Wall(center_I=(5.5, 0.0, 1.0), size=(0.2, 6.0, 3.0), shift_I=(0.4, 0.0, 0.0)),
+        Cylinder(center_I=(2.0, 0.5, 1.0), radius=0.3, shift_I=(0.3, 0.3, 0.0)),
+    ),
+    geofence=((-1.0, -2.0, -1.0), (9.0, 2.0, 5.0)),
+)
+EASTWARD = np.array([0.0, 0.0, -0.03, 0.0], np.float32)  # pitches the vehicle, which looks west
+
+
+class Near(quad_gym.Task):
+    """Observes where the nearest obstacle is, as the controller believes."""
+
+    def observe(self, view):
+        return {
+            "wall_distance": view.seen.obstacle_distance,
+            "wall_vector": view.seen.obstacle_vector,
+        }
+
+
+def actions(count, steps, seed=0):
+    noise = np.random.default_rng(seed).normal(0.0, 0.1, (steps, count, 4))
+    return np.clip(noise, -1.0, 1.0).astype(np.float32)
+
+
+def hovering(count=6, **keywords):
+    return QuadVectorEnv(count, "hover", world=WORLD, **keywords)
+
+
+def test_all_three_interfaces_fly_the_same_flights():
+    many = hovering(3, custom=Near)
+    lone = [QuadEnv("hover", world=WORLD, custom=Near) for _ in range(3)]
+    seen, _ = many.reset(seed=4)
+    for i, env in enumerate(lone):
+        np.testing.assert_array_equal(env.reset(seed=4 + i)[0], seen[i])
+    over = np.zeros(3, bool)
+    for action in actions(3, 80):
+        seen, reward, terminated, truncated, info = many.step(action)
+        for i in np.flatnonzero(~over):
+            one = lone[i].step(action[i])
+            np.testing.assert_array_equal(one[0], seen[i])
+            assert one[1:4] == (reward[i], terminated[i], truncated[i])
+            assert one[4]["ending"] == info["ending"][i]
+        over |= terminated | truncated
+    pytest.importorskip("stable_baselines3")
+    third = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=4, world=WORLD, custom=Near)
+    first = QuadVectorEnv(3, "hover", world=WORLD, custom=Near).reset(seed=4)[0]
+    np.testing.assert_array_equal(third.reset(), first)
+
+
+def test_who_hits_a_wall_has_crashed_and_info_says_so():
+    env = QuadEnv("hover", world=WORLD, observation="truth", custom=Near)
+    env.reset(seed=0)
+    for _ in range(400):
+        _, _, terminated, truncated, info = env.step(EASTWARD)
+        if terminated or truncated:
+            break
+    assert terminated
+    assert not truncated
+    assert info["ending"] == "collision"
+    view = env.flights.batch.view
+    assert 0.3 < view.obstacle_distance[0] <= WORLD.vehicle_radius
+    assert Crash()(view)[0] == 1.0
+
+
+def test_who_leaves_the_geofence_has_crashed_too():
+    fenced = WORLD.replace(obstacles=())
+    env = QuadEnv("hover", world=fenced, observation="truth", custom=Near, out_of_bounds=50.0)
+    with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):
+        env.reset(seed=0)
+    env = QuadEnv("hover", world=fenced, observation="truth", out_of_bounds=50.0)
+    env.reset(seed=0)
+    for _ in range(400):
+        *_, terminated, truncated, info = env.step(EASTWARD)
+        if terminated or truncated:
+            break
+    assert terminated
+    assert info["ending"] == "left_geofence"
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
+    env = gymnasium.make_vec(
+        "QuadGym/Hover-v0", num_envs=4, world=WORLD, observation="truth", autoreset_mode=mode
+    )
+    env.reset(seed=0)
+    batch = env.unwrapped.flights.batch
+    places, endings, lasted = [batch.read("obstacle_center")], [], []
+    for _ in range(300):
+        *_, info = env.step(np.tile(EASTWARD, (4, 1)))
+        places.append(batch.read("obstacle_center"))
+        ended = info.get("final_info", info)
+        endings += [str(name) for name in np.ravel(ended["ending"])]
+        lasted.append(batch.read("step"))
+    episodes = (np.diff(np.array(places)[:, 0, 0, 0]) != 0.0).sum()
+    assert endings.count("collision") > 4
+    assert episodes >= 1
+    # nobody collides at once in the next episode, as one whose collision is not forgotten would
+    assert np.array(lasted).max() > 50
+
+
+def test_a_snapshot_brings_back_obstacles_and_contact():
+    env = hovering(5)
+    env.reset(seed=1)
+    batch = env.flights.batch
+    for action in actions(5, 10):
+        env.step(action)
+    kept = batch.snapshot()
+
+    def on():
+        found = []
+        for action in actions(5, 60, seed=2):
+            seen, reward, *_ = env.step(action)
+            found += [seen.copy(), reward, batch.read("obstacle_center"), batch.read("collided")]
+        return found
+
+    first = on()
+    batch.restore(kept)
+    for a, b in zip(first, on(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_task_reads_the_distance_of_what_is_seen_and_of_what_is_so():
+    env = hovering(6, custom=Near, sensors="rtk")
+    seen, _ = env.reset(seed=3)
+    batch = env.flights.batch
+    for action in actions(6, 30):
+        seen, *_ = env.step(action)
+    view = batch.view
+    np.testing.assert_array_equal(view.obstacles, batch.read("obstacle_center")[:, :2])
+    vector_I = np.einsum("nji,nj->ni", view.seen.R_BI, view.seen.obstacle_vector)
+    truth, believed = view.truth.obstacle_vector, view.seen.position - view.position
+    near_wall = np.abs(truth[:, 0]) > np.abs(truth[:, 1])  # flat, so that the gap adds up
+    np.testing.assert_allclose((vector_I - truth)[near_wall, 0], -believed[near_wall, 0], atol=1e-9)
+    np.testing.assert_allclose(view.truth.obstacle_distance, np.linalg.norm(truth, axis=1))
+    np.testing.assert_allclose(seen[:, -4], view.seen.obstacle_distance, atol=1e-6)
+
+
+class Peeking(quad_gym.Task):
+    def observe(self, view):
+        return view.obstacle_distance
+
+
+def test_the_true_distance_is_hidden_from_the_controller():
+    with pytest.raises(quad_gym.TaskError, match="observe cannot read the truth"):
+        QuadEnv("hover", world=WORLD, custom=Peeking)
+
+
+def test_starts_within_obstacles_are_refused():
+    env = hovering(2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="position must be farther than vehicle_radius"):
+        env.reset(options={"position": (2.0, 0.5, 1.0)})
+
+
+class InTheWall(quad_gym.Task):
+    def reset(self, view, rng):
+        return {"position": (5.5, 0.0, 1.0)}
+
+
+def test_starts_that_a_task_puts_into_obstacles_are_refused():
+    env = hovering(2, custom=InTheWall)
+    with pytest.raises(
+        quad_gym.TaskError, match=r"InTheWall\.reset returned a wrong start: position"
+    ):
+        env.reset(seed=0)
+
+
+# ---- records and pictures -----------------------------------------------------------------------
+
+
+def flown(world, steps=3, **keywords):
+    env = QuadEnv("hover", world=world, **keywords)
+    recorder = FlightRecorder(env.flights.batch)
+    env.reset(seed=0)
+    recorder.keep()
+    for _ in range(steps):
+        env.step(np.zeros(4, np.float32))
+        recorder.keep()
+    return recorder.flight, env.flights.batch
+
+
+def test_a_flight_keeps_its_obstacles(tmp_path):
+    flight, batch = flown(WORLD)
+    centers = batch.read("obstacle_center")[0, :2]
+    np.testing.assert_array_equal(flight.stage.obstacles[:, 1:4], centers)
+    np.testing.assert_array_equal(flight.stage.obstacles[:, 0], [0.0, 1.0])
+    np.testing.assert_array_equal(flight.stage.obstacles[1, 4:7], [0.3, 0.3, 1.5])
+    again = Flight.load(flight.save(tmp_path / "flight.npz")).stage
+    np.testing.assert_array_equal(again.obstacles, flight.stage.obstacles)
+    np.testing.assert_array_equal(again.geofence_I, WORLD.geofence)
+
+
+def test_files_from_before_there_were_obstacles_can_be_read(tmp_path):
+    flight, _ = flown(WORLD)
+    path = flight.save(tmp_path / "flight.npz")
+    with np.load(path) as file:
+        kept = {n: file[n] for n in file.files if "obstacles" not in n and "geofence" not in n}
+    np.savez(path, **kept)
+    stage = Flight.load(path).stage
+    assert stage.obstacles.shape == (0, 9)
+    assert stage.geofence_I.shape == (0, 3)
+
+
+@pytest.mark.parametrize("view", ["fixed", "chase"])
+def test_obstacles_are_drawn(view):
+    pytest.importorskip("pygame")
+    frames = []
+    # beside the vehicle, and around the eye of the chase view
+    for obstacles in ((), (*WORLD.obstacles, Wall(center_I=(3.0, 1.5, 1.0)))):
+        env = gymnasium.make(
+            "QuadGym/Hover-v0",
+            world=WorldParams(obstacles=obstacles),
+            render_mode="rgb_array",
+            render_view=view,
+        )
+        env.reset(seed=0)
+        frames.append(env.render().astype(int))
+    changed = (np.abs(frames[0] - frames[1]).sum(axis=2) > 6).mean()
+    assert 0.005 < changed < 0.9

@@ -1,0 +1,218 @@
+"""`OutageDash`: course, reward and observation recomputed, and what fixed rules reach."""
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from baselines import PDPolicy
+from baselines.policies import keywords_of_policy, load_policy
+from quad_gym.evaluation import roll_out
+from quad_gym.tasks.outage_dash import OutageDash
+
+ID = "QuadGym/OutageDash-v0"
+SHOWN = {
+    **{"position_error": 3, "velocity_error": 3, "up": 3, "heading": 3, "body_rates": 3},
+    **{"gap_width": 1, "next_gap": 3, "next_width": 1},
+}
+
+
+def make(count=20, **keywords):
+    return gymnasium.make_vec(ID, num_envs=count, autoreset_mode="Disabled", **keywords)
+
+
+def actions(rng, count):
+    return np.clip(rng.normal(0.0, 0.1, (count, 4)), -1.0, 1.0).astype(np.float32)
+
+
+def part(env, observations, name):
+    field = next(f for f in env.unwrapped.flights.table if f.name == name)
+    return observations[:, field.slice]
+
+
+def edges(batch):
+    """(n, 14) places of the walls, and of the northern and southern edges of their gaps."""
+    walls = batch.read("obstacle_center")[:, :28]
+    assert batch.world.obstacles[0].size == (0.3, 30.0, 12.0)
+    return walls[:, ::2, 0], walls[:, ::2, 1] - 15.0, walls[:, 1::2, 1] + 15.0
+
+
+def test_what_the_task_is_by_default():
+    flights = make(1).unwrapped.flights
+    assert flights.name == "outage_dash"
+    assert flights.batch.max_steps == 1000
+    assert flights.batch.sensors == quad_gym.sensor_suite("consumer_barometer")
+    assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
+    assert [f.name for f in flights.table] == ["last_action", *SHOWN]
+    assert flights.space.shape == (24,)
+
+
+def test_gaps_are_where_the_specification_says():
+    env = make(500, observation="truth")
+    env.reset(seed=0)
+    x, north, south = edges(env.unwrapped.flights.batch)
+    np.testing.assert_array_equal(x, np.tile(72.0 - 12.0 * np.arange(14), (500, 1)))
+    width, nominal = north - south, np.tile([0.75, 3.75], 7)
+    assert (np.abs(north - nominal) <= 1.5 + 1e-9).all()
+    assert (width >= 3.0 - 1e-9).all()
+    assert (width <= 6.0 + 1e-9).all()
+    assert abs(width.mean() - 4.5) < 0.05
+    assert np.abs(np.corrcoef(north[:, 0], width[:, 0])[0, 1]) < 0.2
+
+
+def test_the_reward_is_that_of_its_equation():
+    env, rng = make(30, observation="truth"), np.random.default_rng(0)
+    env.reset(seed=0)
+    batch, crashes, over = env.unwrapped.flights.batch, 0, np.zeros(30, bool)
+    last = np.zeros((30, 4))
+    for _ in range(150):
+        action = np.clip(actions(rng, 30) - (0.3, 0.0, 0.0, 0.0), -1.0, 1.0)  # down to the ground
+        _, reward, terminated, truncated, _ = env.step(action)
+        effort = ((action - last) ** 2).sum(axis=1)
+        rates = (batch.read("w") ** 2).sum(axis=1)
+        expected = -0.1 * batch.read("v")[:, 0] - 0.02 * effort - 0.002 * rates - 300.0 * terminated
+        np.testing.assert_allclose(reward, expected, atol=1e-9)
+        over = terminated | truncated
+        crashes += over.sum()
+        last = np.where(over[:, np.newaxis], 0.0, action)
+        if over.any():
+            env.reset(options={"reset_mask": over})
+    assert crashes > 5
+
+
+@pytest.mark.parametrize("observation", ["estimate", "truth"])
+def test_the_observation_is_what_the_source_believes(observation):
+    env = make(12, observation=observation)
+    policy = PDPolicy(env)
+    observed, _ = env.reset(seed=5)
+    batch, passed = env.unwrapped.flights.batch, set()
+    for _ in range(300):
+        observed, *_ = env.step(policy.predict(observed)[0])
+        x, north, south = edges(batch)
+        r, turn = batch.read("r_seen"), Rotation.from_matrix(batch.read("R_seen"))
+        for i in range(12):
+            behind = int((r[i, 0] < x[i] - 0.7).sum())
+            middle = np.stack([x[i], 0.5 * (north[i] + south[i]), np.full(14, 4.0)], axis=1)
+            passed.add(behind)
+            np.testing.assert_allclose(
+                part(env, observed, "position_error")[i],
+                turn[i].apply(middle[behind] - r[i]),
+                atol=1e-5,
+            )
+            np.testing.assert_allclose(
+                part(env, observed, "next_gap")[i],
+                turn[i].apply(middle[behind + 1] - middle[behind]),
+                atol=1e-5,
+            )
+            widths = [part(env, observed, name)[i, 0] for name in ("gap_width", "next_width")]
+            np.testing.assert_allclose(widths, (north - south)[i, behind : behind + 2], atol=1e-5)
+        velocity = turn.apply(batch.read("v_seen"))
+        np.testing.assert_allclose(part(env, observed, "velocity_error"), -velocity, atol=1e-5)
+        course = np.tile(turn.apply([-1.0, 0.0, 0.0]), (1, 1))
+        np.testing.assert_allclose(part(env, observed, "heading"), course, atol=1e-6)
+    assert {0, 1, 2} <= passed
+
+
+def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
+    env = make(2, observation="truth")
+    env.reset(seed=0, options={"position": (-89.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
+    observed, reward, *_ = env.step(np.zeros((2, 4), np.float32))
+    np.testing.assert_array_equal(part(env, observed, "gap_width"), 6.0)
+    np.testing.assert_array_equal(part(env, observed, "next_gap"), 0.0)
+    assert (reward > 0.25).all()
+    env.reset(seed=0, options={"position": (-97.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
+    _, reward, *_ = env.step(np.zeros((2, 4), np.float32))
+    np.testing.assert_allclose(reward, 0.0, atol=1e-3)
+
+
+def test_the_standard_deviations_tell_that_gnss_is_gone():
+    env = make(16, include_covariance=True)
+    assert env.unwrapped.flights.space.shape == (39,)
+    policy = PDPolicy(env, max_position_error=0.2)
+    observed, _ = env.reset(seed=2)
+    batch = env.unwrapped.flights.batch
+    gone, sigma = [], []
+    for _ in range(600):
+        observed, *_ = env.step(policy.predict(observed)[0])
+        gone.append(batch.active_faults()["gnss_outage"])
+        sigma.append(part(env, observed, "position_sigma")[:, :2].max(axis=1))
+        factor = batch.read("L")
+        np.testing.assert_allclose(
+            part(env, observed, "position_sigma"),
+            np.sqrt((factor[:, :3] ** 2).sum(axis=2)),
+            rtol=1e-5,
+        )
+    gone, sigma = np.array(gone), np.array(sigma)
+    lasted = np.cumsum(gone, axis=0) * gone * 0.02
+    assert sigma[~gone & (np.cumsum(gone, axis=0) == 0)].max() < 0.3
+    assert sigma[lasted > 4.5].min() > 0.5
+
+
+def test_who_flies_on_the_truth_has_no_outage_and_who_asks_for_one_is_told_so():
+    assert make(1, observation="truth").unwrapped.flights.batch.faults == ()
+    watched = make(1, observation="truth", include_covariance=True)
+    assert len(watched.unwrapped.flights.batch.faults) == 1
+    with pytest.raises(ValueError, match="GnssOutage concerns sensors, and none runs"):
+        make(1, observation="truth", faults=[quad_gym.faults.GnssOutage(start=1.0)])
+
+
+def test_fixed_rules_are_neither_lost_nor_safe():
+    """Of 300 flights 0, 48 and 18 % crash."""
+    crashed, returns = {}, {}
+    for name, shown in (
+        ("pd", {"observation": "truth"}),
+        ("pd", {}),
+        ("pd:waiting", keywords_of_policy("pd:waiting", ID)),
+    ):
+        env = gymnasium.make_vec(ID, num_envs=60, **shown)
+        flown = roll_out(load_policy(name, env), env, seed=0)
+        case = f"{name} {shown.get('observation', '')}".strip()
+        crashed[case], returns[case] = flown.crashed.mean(), flown.returns.mean()
+    assert crashed["pd truth"] == 0.0
+    assert crashed["pd"] > 0.25
+    assert crashed["pd:waiting"] < crashed["pd"] - 0.1
+    assert max(returns["pd"], returns["pd:waiting"]) < returns["pd truth"] - 80.0
+
+
+def test_rules_that_need_what_is_not_shown_are_refused():
+    with pytest.raises(ValueError, match='env must observe position_sigma for pace="waiting"'):
+        load_policy("pd:waiting", make(1))
+    circle = gymnasium.make("QuadGym/Circle-v0")
+    with pytest.raises(ValueError, match='env must observe gap_width for pace="waiting"'):
+        PDPolicy(circle, pace="waiting")
+    with pytest.raises(ValueError, match="pace must be one of steady, waiting"):
+        PDPolicy(circle, pace="hasty")
+
+
+def test_worlds_without_gaps_and_wrong_weights_are_refused():
+    with pytest.raises(quad_gym.TaskError, match="OutageDash needs pairs of walls"):
+        make(1, world="calm")
+    for bad in (-1.0, np.inf, "much"):
+        with pytest.raises(ValueError, match="progress_weight must be"):
+            OutageDash(progress_weight=bad)
+        with pytest.raises(ValueError, match="crash_cost must be"):
+            OutageDash(crash_cost=bad)
+
+
+class KeepsSome(quad_gym.Task):
+    replaces_observation = True
+    keeps = ("up", "body_rates", "nothing of the kind")
+
+    def observe(self, view):
+        return {"height": view.seen.position[:, 2]}
+
+
+def test_a_task_that_replaces_the_observation_may_keep_parts_of_it():
+    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, custom=KeepsSome, privileged=True)
+    plain = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, privileged=True)
+    assert [f.name for f in env.unwrapped.flights.table][:3] == ["up", "body_rates", "height"]
+    ours, shipped = env.reset(seed=0)[0], plain.reset(seed=0)[0]
+    assert ours["policy"].shape == (3, 7)
+    np.testing.assert_array_equal(ours["policy"][:, :3], shipped["policy"][:, 6:9])
+    np.testing.assert_array_equal(ours["policy"][:, 3:6], shipped["policy"][:, 12:15])
+    np.testing.assert_array_equal(ours["privileged"], shipped["privileged"])
+    wrong = quad_gym.Task.of(replaces_observation=True, observe=KeepsSome.observe)
+    wrong.keeps = "up"
+    with pytest.raises(ValueError, match="keeps of Task must hold names, got 'up'"):
+        gymnasium.make("QuadGym/Circle-v0", custom=wrong)
