@@ -50,7 +50,13 @@ class Args:
     FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults"}
 
     task: Literal[
-        "hover", "circle", "lemniscate", "random_trajectory", "waypoints", "look_around"
+        "hover",
+        "circle",
+        "lemniscate",
+        "random_trajectory",
+        "waypoints",
+        "trajectory",
+        "look_around",
     ] = "circle"
     """what to fly"""
     policy: str = "pd"

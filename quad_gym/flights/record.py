@@ -341,7 +341,21 @@ class FlightRecorder:
             reference_center=self._read("ref_center"),
             reference_cos=self._read("ref_cos"),
             reference_sin=self._read("ref_sin"),
+            **self._trajectory_of_episode(),
         )
+
+    def _trajectory_of_episode(self) -> dict[str, Any]:
+        """The stage's fields of a trajectory, where the task follows one."""
+        found = self._batch.trajectory(int(self._which[0]))
+        if found is None:
+            return {}
+        trajectory, phase = found
+        return {
+            "trajectory_times": trajectory.times,
+            "trajectory_coefficients": trajectory.coefficients,
+            "trajectory_closed": trajectory.closed,
+            "trajectory_phase": phase,
+        }
 
 
 def _quaternion(R_BI: Floats) -> Floats:

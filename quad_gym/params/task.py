@@ -106,7 +106,6 @@ class TaskParams(Checked):
         if min(self.preview) < 0.0:
             raise ValueError(f"TaskParams.preview must be at least 0, got {self.preview}")
 
-
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
         """What flights of the task "trajectory" follow, one of them each; none elsewhere."""

@@ -109,7 +109,7 @@ def _turned(flight, x, y, z):
 
 @kernel
 def _heading(flight, work, r, v):
-    """The wanted direction of body x, as `reference.heading` has it, for a trajectory not turned."""
+    """The wanted direction of body x, as `reference.heading` has it, turned as the trajectory is."""
     zero = 0.0 * r[0]
     rule = work.path_heading
     yaw, _, _ = _value(work, 3)
@@ -117,7 +117,7 @@ def _heading(flight, work, r, v):
     toward = (work.path_point[0] - r[0], work.path_point[1] - r[1], zero)
     along = select3(work.path_held > 0.0, (work.path_end[0], work.path_end[1], zero), v)
     direction = select3(rule == HEADING_VELOCITY, along, toward)
-    x, y, _ = direction_of(select3(rule == HEADING_GIVEN, (c, s, zero), direction))
+    x, y, _ = direction_of(select3(rule == HEADING_GIVEN, (c, s, zero), direction), zero)
     return _turned(flight, x, y, zero)
 
 

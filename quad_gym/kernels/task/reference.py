@@ -27,9 +27,8 @@ def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
 
 
 @kernel
-def direction_of(v):
-    """The horizontal unit vector along v; east where it has none."""
-    zero = 0.0 * v[0]
+def direction_of(v, zero):
+    """The horizontal unit vector along v; east where it has none. `zero`: its third component."""
     return unit_or((v[0], v[1], zero), (zero + 1.0, zero, zero))
 
 
@@ -40,7 +39,8 @@ def heading(flight, r_ref, v_ref):
     toward = sub(point, r_ref)
     rule = flight.ref_heading_rule
     along = select3(rule == HEADING_VELOCITY, v_ref, toward)
-    return direction_of(select3(rule == HEADING_ALONG, point, along))
+    direction = select3(rule == HEADING_ALONG, point, along)
+    return direction_of(direction, 0.0 * r_ref[0])
 
 
 @kernel

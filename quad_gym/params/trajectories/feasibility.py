@@ -19,6 +19,9 @@ Floats = NDArray[np.float64]
 INTERVAL, SAMPLES, MOST_SAMPLES = 0.01, 16, 400
 """Demands are looked at this often [s], at least and at most so many times in a segment."""
 
+LEAST_THRUST = 0.01
+"""Over the weight; below, in free fall, nothing says where the body z axis points."""
+
 JUMP = 1e-5
 """Largest jump between segments of position [m], velocity [m/s] and acceleration [m/s^2]."""
 
@@ -80,7 +83,7 @@ def _checked(
     speeds, accelerations = (np.linalg.norm(trajectory(times, k), axis=1) for k in (1, 2))
     force, rates = motion.rotor_forces, np.abs(motion.body_rates)
     largest = vehicle.max_rotor_force
-    least_thrust = 1e-6 * vehicle.mass * vehicle.gravity
+    least_thrust = LEAST_THRUST * vehicle.mass * vehicle.gravity
     # what, of each instant, in which unit, and the least and the most that there is
     demands: list[tuple[str, Floats, str, float, float]] = [
         ("a speed", speeds, "m/s", 0.0, max_speed or math.inf),
@@ -92,9 +95,7 @@ def _checked(
             (f"a body rate about {axis}", rates[:, k], "rad/s", 0.0, max_rates[k])
             for k, axis in enumerate("xyz")
         ]
-    demands += [
-        (f"a force of rotor {k + 1}", force[:, k], "N", 0.0, largest) for k in range(4)
-    ]
+    demands += [(f"a force of rotor {k + 1}", force[:, k], "N", 0.0, largest) for k in range(4)]
     _refuse_excess(trajectory, demands, times, name)
     return Demand(
         thrust=(float(motion.thrust.min()), float(motion.thrust.max())),

@@ -46,7 +46,7 @@ def heading_choice(yaw: Any, look_at: Any) -> tuple[str, tuple[float, float], An
 
 
 def yaw_angles(trajectory: "Trajectory", times: Floats) -> tuple[Floats, Floats, Floats]:
-    """The angle of the heading [rad] and its first two derivatives, each of the shape of `times`."""
+    """The angle of the heading [rad] and its first two derivatives, of the shape of `times`."""
     inside, beyond = trajectory._within(times)
     if trajectory.heading == "given":
         yaw = trajectory._polynomials(3, 4)

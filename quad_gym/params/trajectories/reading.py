@@ -47,7 +47,9 @@ def from_csv(cls: "type[Trajectory]", path: Path, options: dict[str, Any]) -> "T
             f"{path} must have increasing times, got {table[k, 0]:g} s and then "
             f"{table[k + 1, 0]:g} s in rows {k + 1} and {k + 2}"
         )
-    if "yaw" in wanted and not {"yaw", "look_at"} & {k for k, v in options.items() if v is not None}:
+    if "yaw" in wanted and not {"yaw", "look_at"} & {
+        k for k, v in options.items() if v is not None
+    }:
         options = options | {"yaw": table[:, 4]}
     if not options.get("closed", False):
         return cls.through(table[:, 1:4], table[:, 0], **options)
@@ -56,7 +58,7 @@ def from_csv(cls: "type[Trajectory]", path: Path, options: dict[str, Any]) -> "T
             f"{path} must end where it begins with closed=True, got {table[0, 1:4]} and "
             f"{table[-1, 1:4]}"
         )
-    if np.ndim(options.get("yaw")) > 0:
+    if isinstance(options.get("yaw"), np.ndarray):
         options = options | {"yaw": options["yaw"][:-1]}
     return cls.through(table[:-1, 1:4], table[:, 0], **options)
 

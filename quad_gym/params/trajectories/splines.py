@@ -2,8 +2,8 @@
 
 The motion through given points at given times that has the least integral of its squared k-th
 derivative is a spline of degree 2k - 1 with knots at the times, whose derivatives up to the
-(2k - 2)-th are continuous. With those up to the (k - 1)-th given at the ends, or those from the k-th
-on zero there (natural), or repeating, SciPy's interpolating splines are that minimum.
+(2k - 2)-th are continuous. With those up to the (k - 1)-th zero at the ends (at rest), or those from
+the k-th on (natural), or repeating, SciPy's interpolating splines are that minimum.
 """
 
 from collections.abc import Sequence
@@ -54,6 +54,11 @@ def through(
     places = check.array("points", points, (None, 3))
     if len(places) < 2:
         raise ValueError(f"points must be at least two, got {len(places)}")
+    if not (at_rest or closed) and len(places) < order:
+        raise ValueError(
+            f"at_rest must be True with fewer than {order} points, which leave the ends open, got "
+            f"{len(places)}"
+        )
     rule, point, angles = heading_choice(yaw, look_at)
     if callable(angles):
         raise ValueError("yaw must be angles at the points, not a function; see Trajectory.of")

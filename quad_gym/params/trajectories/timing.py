@@ -11,8 +11,8 @@ EXPONENTS = (0.5, 0.75, 1.0)
 """Times of segments that are tried first: powers of their lengths."""
 
 IMPROVED, STEPS = 12, 10
-"""Segments up to which their times are improved, and steps of the search: beyond, it would take long
-and gain a few percent."""
+"""Segments up to which their times are improved, and steps of the search: with more, it would take
+long and gain a few percent."""
 
 NORM = 20.0
 """Power of the mean that stands for the largest use in the search, which needs derivatives."""
@@ -33,9 +33,9 @@ def choose_times(
 ) -> Floats:
     """When each point is passed.
 
-    The shares of the segments are powers of their lengths, then improved by a search for the shortest
-    flight. Velocities scale with 1/s and accelerations with 1/s^2 when all times do with s: the whole
-    is scaled so that the largest speed, or the largest acceleration, is its bound.
+    The shares of the segments are powers of their lengths, then improved by a search for the
+    shortest flight. Velocities scale with 1/s and accelerations with 1/s^2 when all times do with
+    s: the whole is scaled so that the largest speed, or the largest acceleration, is its bound.
 
     Args:
         path: Polynomials (8, m, 3) for times (m + 1,).

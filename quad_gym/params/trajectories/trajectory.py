@@ -34,11 +34,11 @@ EARLY = 1e-3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory(Checked):
-    """Where a vehicle is to be at every time: piecewise polynomials, which kernels evaluate exactly.
+    """Where a vehicle is to be at every time: piecewise polynomials, exact in the kernels, too.
 
-    `r*(t) = sum_k c_k (t - t_j)^(7 - k)` in the segment that begins at t_j; likewise the yaw. Made by
-    `through`, `from_csv` or `of` rather than from coefficients. A closed one repeats; another one
-    stands still at its first point before time 0 and at its last one past its end.
+    `r*(t) = sum_k c_k (t - t_j)^(7 - k)` in the segment that begins at t_j; likewise the yaw. Made
+    by `through`, `from_csv` or `of` rather than from coefficients. A closed one repeats; another
+    one stands still at its first point before time 0 and at its last one past its end.
 
     Trajectories compare by their numbers, and pickle.
     """
@@ -190,9 +190,9 @@ class Trajectory(Checked):
             The trajectory.
 
         Raises:
-            ValueError: If a function returns something else than finite numbers, a derivative is not
-                that of the function, a closed one does not return to its start, or the function is
-                not smooth enough.
+            ValueError: If a function returns something else than finite numbers, a derivative is
+                not that of the function, a closed one does not return to its start, or the function
+                is not smooth enough.
         """
         from quad_gym.params.trajectories.fitting import fit
 
@@ -219,7 +219,7 @@ class Trajectory(Checked):
         """Position, or a derivative of it.
 
         Args:
-            t: (...) times [s]; a closed trajectory repeats, another one stands still beyond its ends.
+            t: (...) times [s]; a closed trajectory repeats, others stand still beyond their ends.
             derivative: 0: position, 1: velocity, 2: acceleration, 3: jerk, 4: snap and so on.
 
         Returns:
@@ -274,8 +274,8 @@ class Trajectory(Checked):
             The largest demands.
 
         Raises:
-            ValueError: If it demands too much, or jumps. Says what, when, in which segment and by how
-                much.
+            ValueError: If it demands too much, or jumps. Says what, when, in which segment, and by
+                how much.
         """
         from quad_gym.params.trajectories.feasibility import check_trajectory
 
@@ -319,17 +319,18 @@ class Trajectory(Checked):
 
     @functools.cached_property
     def end_headings(self) -> Floats:
-        """(2, 2) horizontal directions of the velocity at the start and the end, those from rest too.
+        """(2, 2) horizontal directions of the velocity at the start and the end, even at rest.
 
         What a heading along the path holds beyond the ends of a trajectory that is not closed.
         """
         near = EARLY * self.duration
         found = np.array([[1.0, 0.0], [1.0, 0.0]])
         for row, (end, inner) in enumerate(((0.0, near), (self.duration, self.duration - near))):
-            for time in (inner, end):  # the end's own, unless it is at rest there
+            # the end's own, unless it is at rest there but for rounding
+            for time, least in ((inner, 1e-10), (end, 1e-4)):
                 velocity = self._polynomials(0, 2)(time, 1)
                 speed = float(np.linalg.norm(velocity))
-                if speed > 1e-6:
+                if speed > least:
                     found[row] = velocity / speed
         return found
 
