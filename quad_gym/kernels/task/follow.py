@@ -109,7 +109,7 @@ def _turned(flight, x, y, z):
 
 @kernel
 def _heading(flight, work, r, v):
-    """The wanted direction of body x, as `reference.heading` has it, turned as the trajectory is."""
+    """The wanted direction of body x, turned with the trajectory."""
     zero = 0.0 * r[0]
     rule = work.path_heading
     yaw, _, _ = _value(work, 3)

@@ -1,7 +1,7 @@
 """What a motion takes: thrust, attitude, body rates and torques, by differential flatness.
 
-Without drag, `f z = m (a + g e3)`, and body y is `unit(z x x*)` with the wanted heading x*. Both are
-differentiated twice: body rates come from jerk and yaw rate, their change from snap.
+Without drag, `f z = m (a + g e3)`, and body y is `unit(z x x*)` with the wanted heading x*. Both
+are differentiated twice: body rates come from jerk and yaw rate, their change from snap.
 
 Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA
 2011; axes as those of the report's controller.

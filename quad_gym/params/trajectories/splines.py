@@ -2,8 +2,8 @@
 
 The motion through given points at given times that has the least integral of its squared k-th
 derivative is a spline of degree 2k - 1 with knots at the times, whose derivatives up to the
-(2k - 2)-th are continuous. With those up to the (k - 1)-th zero at the ends (at rest), or those from
-the k-th on (natural), or repeating, SciPy's interpolating splines are that minimum.
+(2k - 2)-th are continuous. With those up to the (k - 1)-th zero at the ends (at rest), or those
+from the k-th on (natural), or repeating, SciPy's interpolating splines are that minimum.
 """
 
 from collections.abc import Sequence
