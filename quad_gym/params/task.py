@@ -137,7 +137,7 @@ def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None
         raise ValueError(f"trajectory must be a Trajectory or a sequence of them, got {given!r}")
     found = []
     for one in several:
-        path = Trajectory.from_csv(one) if isinstance(one, (str, Path)) else one
+        path = _read(one) if isinstance(one, (str, Path)) else one
         check.instance("trajectory", path, Trajectory)
         if path.reach > FARTHEST:
             raise ValueError(
@@ -145,6 +145,13 @@ def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None
             )
         found.append(path)
     return tuple(found)
+
+
+def _read(file: str | Path) -> Trajectory:
+    try:
+        return Trajectory.from_csv(file)
+    except OSError as error:
+        raise ValueError(f"trajectory must be a file that can be read: {error}") from None
 
 
 def check_limit(task: TaskParams, rate: float, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Trajectories of a user's own in all interfaces: kernels against `Trajectory`, and every option."""
+"""Trajectories of a user's own in all interfaces: kernels against `Trajectory`, and options."""
 
 import copy
 import pickle
@@ -276,6 +276,7 @@ def test_what_does_not_fit_is_refused():
     for keywords, message in (
         ({"task": "circle", "trajectory": OPEN}, "trajectory belongs to the task trajectory"),
         ({"trajectory": 3}, "must be a Trajectory or a sequence of them"),
+        ({"trajectory": "nowhere.csv"}, "trajectory must be a file that can be read"),
         ({"trajectory": []}, "must be a Trajectory or a sequence of them"),
         ({"trajectory": [OPEN, 3]}, "trajectory must be a Trajectory"),
         ({"trajectory": far}, "must stay within 1000 m"),
