@@ -22,6 +22,7 @@ from quad_gym.params.randomization import Randomization
 from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
+from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import BatteryParams, WorldParams, world_params
 
@@ -90,6 +91,7 @@ __all__ = [
     "Randomization",
     "SensorSuite",
     "TaskParams",
+    "Trajectory",
     "Uniform",
     "VehicleParams",
     "Wall",

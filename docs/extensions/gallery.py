@@ -11,6 +11,7 @@ LESSONS = (
     "sensor_suite.py",
     "faults.py",
     "wind.py",
+    "own_trajectory.py",
     "moving_target.py",
     "look_at_markers.py",
     "filter_alone.py",

@@ -221,6 +221,10 @@ def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
 
 def reference_of_flight(batch: FlightBatch, flight: int, times: Floats) -> Floats:
     """Where the reference of a flight is at given times [s], (n, 3) in I [m]."""
+    followed = batch.trajectory(flight)
+    if followed is not None:
+        trajectory, phase = followed
+        return trajectory(times + phase)
     omega, center = batch.read("ref_omega")[flight], batch.read("ref_center")[flight]
     cosines, sines = batch.read("ref_cos")[flight], batch.read("ref_sin")[flight]
     angles = omega * np.outer(times, np.arange(1, len(cosines) + 1))

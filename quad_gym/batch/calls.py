@@ -22,6 +22,7 @@ class Calls:
         shared: Arrays that all threads see.
         numbers: Words that are no addresses.
         own, work: Arrays of each thread.
+        kept: Arrays whose addresses others hold.
     """
 
     def __init__(
@@ -32,28 +33,29 @@ class Calls:
         numbers: Mapping[Call, int],
         own: Sequence[NDArray[Any]],
         work: Sequence[NDArray[Any]],
+        kept: Sequence[NDArray[Any]] = (),
     ) -> None:
-        self._memory = (blocks, dict(shared), own, work)
+        self._memory = (blocks, dict(shared), own, work, kept)
         self._words = np.zeros((len(own), len(Call)), np.int64)
-        self._words[:, Call.BLOCKS] = _address(blocks) - room.skipped
+        self._words[:, Call.BLOCKS] = address_of(blocks) - room.skipped
         self._words[:, Call.PITCH] = room.dtype.itemsize
         for word, array in shared.items():
-            self._words[:, word] = _address(array)
+            self._words[:, word] = address_of(array)
         for word, number in numbers.items():
             self._words[:, word] = number
-        self._words[:, Call.OWN] = [_address(array) for array in own]
-        self._words[:, Call.WORK] = [_address(array) for array in work]
+        self._words[:, Call.OWN] = [address_of(array) for array in own]
+        self._words[:, Call.WORK] = [address_of(array) for array in work]
         self._rows = list(self._words)
 
     def observe_into(self, observations: NDArray[np.float32]) -> None:
         """Let the next step write its observations here."""
         self._memory[1][Call.OBSERVATIONS] = observations
-        self._words[:, Call.OBSERVATIONS] = _address(observations)
+        self._words[:, Call.OBSERVATIONS] = address_of(observations)
 
     def show_into(self, shown: NDArray[np.float64]) -> None:
         """Let the next step or reset write what is shown here."""
         self._memory[1][Call.SHOWN] = shown
-        self._words[:, Call.SHOWN] = _address(shown)
+        self._words[:, Call.SHOWN] = address_of(shown)
         self._words[:, Call.SHOWN_PITCH] = shown.strides[0]
 
     def __call__(self, board: NDArray[np.int64], number: int, command: int, serving: bool) -> bool:
@@ -61,6 +63,7 @@ class Calls:
         return bool(fly(self._rows[number], board, number, command, serving))
 
 
-def _address(array: NDArray[Any]) -> int:
+def address_of(array: NDArray[Any]) -> int:
+    """Where the memory of an array begins."""
     address: int = array.__array_interface__["data"][0]
     return address

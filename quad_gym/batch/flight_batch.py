@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.calls import Calls
+from quad_gym.batch.calls import Calls, address_of
+from quad_gym.batch.following import check_trajectories, followed
 from quad_gym.batch.memory import FlightMemory
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
@@ -24,6 +25,7 @@ from quad_gym.packing.flight import (
     params_record,
     settings_record,
 )
+from quad_gym.packing.paths import pack_paths
 from quad_gym.packing.world import pack_options
 from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
@@ -32,6 +34,7 @@ from quad_gym.params.randomization import DrawingTable, Given, Randomization, ch
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
+from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
@@ -184,6 +187,7 @@ class FlightBatch(FlightMemory):
         if longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
+        check_trajectories(self.task, self.vehicle, self.actions, self.control)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
         true["action_delay"] = self.action_delay
@@ -213,6 +217,8 @@ class FlightBatch(FlightMemory):
             limited=true_vehicle.max_voltage < self.vehicle.max_voltage,
         )
         self._settings["action_delays"] = longest_delay
+        self._paths = pack_paths(self.task.trajectories)
+        self._settings["path_count"] = len(self._paths[0])
         pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
         pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors)
         pack_imperfections(self._settings[0], true_sensors)
@@ -345,11 +351,24 @@ class FlightBatch(FlightMemory):
             Call.SIZE: self._low.size,
             Call.RESULT_PITCH: self._results.strides[0],
         }
-        return Calls(self._blocks, self._room, shared, numbers, self._own, self._work)
+        self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
+        return Calls(self._blocks, self._room, shared, numbers, self._own, self._work, self._paths)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""
         return self.__dict__ | {"_crew": None, "_calls": None}
+
+    def trajectory(self, flight: int) -> tuple[Trajectory, float] | None:
+        """The trajectory of a flight's present episode, turned as it is flown, and its phase.
+
+        Args:
+            flight: Its number.
+
+        Returns:
+            The trajectory and the time on it at which the episode began [s]; None where the task
+            has another reference.
+        """
+        return followed(self, flight)
 
     def limit(self, max_steps: int) -> None:
         """Truncate episodes after this many steps; 0: never."""

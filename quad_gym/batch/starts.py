@@ -99,6 +99,7 @@ def checked_start(
             raise ValueError(f"{name} must be finite, got {value!r}")
         given[:, columns] = numbers
     reach = 1.5 * task.radius + 1.3 * task.height  # of any reference from the origin
+    reach = max((path.reach for path in task.trajectories), default=reach)
     farthest = task.out_of_bounds + reach
     with np.errstate(over="ignore"):  # infinite lengths are refused like others
         distance = _largest(given[:, :3])

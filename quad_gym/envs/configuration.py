@@ -47,6 +47,7 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
     "waypoints": TaskParams(
         kind="waypoints", start="hover", radius=3.5, height=1.5, duration=20.0, out_of_bounds=12.0
     ),
+    "trajectory": TaskParams(kind="trajectory", start="hover"),
 }
 """What each task is unless keywords say otherwise."""
 
@@ -58,10 +59,15 @@ ONE_TASK_KEYWORDS = {
     "max_acceleration": "random_trajectory",
     "gate_count": "waypoints",
     "gate_radius": "waypoints",
+    "trajectory": "trajectory",
 }
 """Those that mean something to a single task."""
 
-KEYWORDS_WITHOUT_EFFECT = {"hover": ("period",), "waypoints": ("period", "preview")}
+KEYWORDS_WITHOUT_EFFECT = {
+    "hover": ("period",),
+    "waypoints": ("period", "preview"),
+    "trajectory": ("radius", "period", "height"),
+}
 """Those that mean something to most tasks, by the tasks to which they mean nothing."""
 
 INTERFACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
@@ -109,6 +115,9 @@ class Flights:
         self.task: TaskParams = defaults.replace(**given)
         if "pad" in given and self.task.start == "hover":
             raise ValueError('pad means nothing with start="hover", and must not be given')
+        if "trajectory" in given and "duration" not in given:  # all of it, or a round
+            longest = max(path.duration for path in self.task.trajectories)
+            self.task = self.task.replace(duration=longest)
         keywords = {**own, **keywords}
         if "faults" in own and keywords["faults"] is own["faults"] and _runs_no_sensor(keywords):
             del keywords["faults"]  # the task's own, which nobody would notice

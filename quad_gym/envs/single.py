@@ -48,6 +48,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
+    | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; unless given, a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; unless given, 10 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a price for looking at them | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
     | `QuadGym/OutageDash-v0` | a course of 14 gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 20 s |
@@ -179,7 +180,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
         keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize, duration,
             out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration, gate_count,
-            gate_radius, preview; see `quad_gym.TaskParams`.
+            gate_radius, preview, trajectory; see `quad_gym.TaskParams`.
         custom: A task of your own, laid over that of the id (in place of `LookAround`'s): a `quad_gym.Task`, its class, or
             "module:name" of either.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.

@@ -113,17 +113,14 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def _stage(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> Stage:
-    fields = {field.name: field for field in dataclasses.fields(Stage)}
-    values: dict[str, Any] = {
-        name: entries.get(f"stage/{name}", header.get(name)) for name in fields
-    }
-    # files that were written before there were obstacles have none
-    later = {n for n, f in fields.items() if f.default_factory is not dataclasses.MISSING}
-    values = {n: v for n, v in values.items() if v is not None or n not in later}
-    missing = [name for name, value in values.items() if value is None]
-    if missing:
-        raise ValueError(f"it lacks {missing[0]}")
-    return Stage(**values)
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(Stage):
+        value = entries.get(f"stage/{field.name}", header.get(field.name))
+        if value is not None:
+            found[field.name] = value
+        elif field.default is field.default_factory is dataclasses.MISSING:
+            raise ValueError(f"it lacks {field.name}")  # others came later: older files lack them
+    return Stage(**found)
 
 
 def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:

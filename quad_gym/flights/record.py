@@ -343,6 +343,7 @@ class FlightRecorder:
             reference_sin=self._read("ref_sin"),
             obstacles=self._obstacles(),
             geofence_I=np.array(batch.world.geofence or np.zeros((0, 3))),
+            **self._trajectory_of_episode(),
         )
 
     def _obstacles(self) -> Floats:
@@ -353,6 +354,19 @@ class FlightRecorder:
             for o, center in zip(obstacles, centers, strict=False)
         ]
         return np.array(rows).reshape(-1, 9)
+
+    def _trajectory_of_episode(self) -> dict[str, Any]:
+        """The stage's fields of a trajectory, where the task follows one."""
+        found = self._batch.trajectory(int(self._which[0]))
+        if found is None:
+            return {}
+        trajectory, phase = found
+        return {
+            "trajectory_times": trajectory.times,
+            "trajectory_coefficients": trajectory.coefficients,
+            "trajectory_closed": trajectory.closed,
+            "trajectory_phase": phase,
+        }
 
 
 def _quaternion(R_BI: Floats) -> Floats:

@@ -105,7 +105,7 @@ class _Log:
         self._static("about", rr.TextDocument(self._about(), media_type=rr.MediaType.MARKDOWN))
         self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         if stage.reference_period and not len(stage.gates_I):
-            path = stage.reference(np.linspace(0.0, stage.reference_period, 241))
+            path = stage.reference(np.linspace(0.0, stage.reference_period, 81 + stage.pieces))
             self._static("world/reference/path", rr.LineStrips3D([path], colors=[NEUTRAL]))
         if len(stage.gates_I):
             self._static(

@@ -1,9 +1,12 @@
 """`Stage`: where a flight takes place and what flies; what a picture needs besides the rows."""
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from quad_gym.params.trajectories import Trajectory
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +58,14 @@ class Stage:
     cylinder: radius, radius, half height), level direction of the length [m]"""
     geofence_I: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """(2, 3) lowest and highest corner of the geofence; (0, 3): there is none [m]"""
+    trajectory_times: Floats = field(default_factory=lambda: np.zeros(0))
+    """(m + 1,) of the segments of a trajectory, the reference then; (0,): there is none [s]"""
+    trajectory_coefficients: Floats = field(default_factory=lambda: np.zeros((8, 0, 4)))
+    """(8, m, 4) of `quad_gym.Trajectory`, turned as it is flown"""
+    trajectory_closed: bool = False
+    """whether it repeats"""
+    trajectory_phase: float = 0.0
+    """time on it at which the episode begins [s]"""
 
     @property
     def has_camera(self) -> bool:
@@ -67,7 +78,9 @@ class Stage:
         return bool(np.isfinite(self.antennas_B).all())
 
     def reference(self, times: Floats) -> Floats:
-        """Where the reference is at times [s], (n, 3) in I [m]: a Fourier series per axis."""
+        """Where the reference is at times [s], (n, 3) in I [m]: a series or a trajectory."""
+        if len(self.trajectory_times):
+            return self._trajectory(np.atleast_1d(times) + self.trajectory_phase)
         harmonics = np.arange(1, len(self.reference_cos) + 1)
         angles = self.reference_omega * np.outer(times, harmonics)
         swing = np.cos(angles) @ self.reference_cos + np.sin(angles) @ self.reference_sin
@@ -75,9 +88,24 @@ class Stage:
 
     @property
     def reference_period(self) -> float:
-        """Time after which the reference repeats [s]; 0: it stands still."""
+        """Time after which the reference repeats, or ends [s]; 0: it stands still."""
+        if len(self.trajectory_times):
+            return float(self.trajectory_times[-1])
         moves = bool(np.any(self.reference_cos) or np.any(self.reference_sin))
         return 2.0 * np.pi / self.reference_omega if moves else 0.0
+
+    @property
+    def pieces(self) -> int:
+        """Straight lines that show the whole reference."""
+        return max(160, min(8 * len(self.trajectory_times), 2000))
+
+    @functools.cached_property
+    def _trajectory(self) -> Trajectory:
+        return Trajectory(
+            times=self.trajectory_times,
+            coefficients=self.trajectory_coefficients,
+            closed=bool(self.trajectory_closed),
+        )
 
     def project_features(self, position: Floats, R_BI: Floats) -> Floats:
         """Where the features are in the image of a camera at a pose.

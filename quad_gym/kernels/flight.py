@@ -14,7 +14,7 @@ from quad_gym.kernels.maths.linalg import load3, load4, norm, sub
 from quad_gym.kernels.measurements.aid import ACTS, call_aids
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import Act, Layout, Start, Supply
+from quad_gym.records import FOLLOWED, Act, Control, Layout, Start, Supply
 
 _DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
 _DELAY_ACTION = int(Stage.DELAY_ACTION)
@@ -36,6 +36,7 @@ _DRAW, _IMPOSE, _BEGIN = int(Stage.DRAW), int(Stage.IMPOSE), int(Stage.BEGIN)
 _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
 _BEGIN_FAULTS = int(Stage.BEGIN_FAULTS)
 _BEGIN_CONTACTS, _TOUCH = int(Stage.BEGIN_CONTACTS), int(Stage.TOUCH)
+_FOLLOW = int(Stage.FOLLOW)
 
 _BEGIN_AID, _SAMPLE_AID = int(Act.BEGIN), int(Act.SAMPLE)
 _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
@@ -128,6 +129,8 @@ def tick(flight, world, model, settings, work, stages, last):
             call_stage(stages, _INCREMENT, flight, world, model, settings, work, 0)
         call_stage(stages, _DRIFT_BIASES, flight, world, model, settings, work, 0)
     flight.tick = flight.tick + 1.0
+    if settings.harmonics == FOLLOWED and (last or settings.control == Control.PD):
+        call_stage(stages, _FOLLOW, flight, world, model, settings, work, 0)
     if settings.faults:
         call_stage(stages, _ADVANCE_FAULTS, flight, world, model, settings, work, 0)
     sense(flight, world, model, settings, work, stages, everyone, 0, 0 if last else 1)

@@ -21,6 +21,7 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import (
     BASELINE_BLOCK,
+    FOLLOWED,
     FREEDOMS,
     MAX_HARMONICS,
     PARAMS,
@@ -175,7 +176,12 @@ def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
     return FilterForm.LEVER_AVERAGES if averages else FilterForm.LEVER_SAMPLES
 
 
-_HARMONICS = {Task.CIRCLE: 1, Task.LEMNISCATE: 2, Task.RANDOM_TRAJECTORY: MAX_HARMONICS}
+_HARMONICS = {
+    Task.CIRCLE: 1,
+    Task.LEMNISCATE: 2,
+    Task.RANDOM_TRAJECTORY: MAX_HARMONICS,
+    Task.TRAJECTORY: FOLLOWED,
+}
 """Terms of the series of a task's reference; none elsewhere."""
 
 

@@ -1,10 +1,15 @@
 """The task: what the vehicle is to do, and when an episode is over."""
 
+import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import MAX_GATES, Start, Task
 
 TASKS = tuple(task.name.lower() for task in Task)
@@ -44,7 +49,8 @@ class TaskParams(Checked):
     the same times the control period"""
     randomize: bool = False
     """draw the reference anew each episode: phase, radius, period and sense of circle and
-    lemniscate, the heading of a random trajectory and of a course of gates"""
+    lemniscate, the heading of a random trajectory and of a course of gates; a trajectory of one's
+    own is turned about the vertical through the origin, and a closed one begins anywhere"""
     duration: float = 10.0
     """time limit of an episode [s], at least half a control period; 0: none; report section 4.2"""
     out_of_bounds: float = 3.0
@@ -66,6 +72,9 @@ class TaskParams(Checked):
     """distance at which a gate counts as passed [m]"""
     preview: Vector = (0.2, 0.4)
     """(2,) how far ahead an observation shows the reference [s]"""
+    trajectory: Trajectory | Sequence[Trajectory] | None = None
+    """what to follow: a `quad_gym.Trajectory`, the path of a table for `Trajectory.from_csv`, or
+    several of them, of which each episode draws one; None: a figure of eight through five points"""
 
     def __post_init__(self) -> None:
         self._check(check.choice, "kind", choices=TASKS)
@@ -85,6 +94,7 @@ class TaskParams(Checked):
         self._check(check.number, "ground")
         self._check(check.flag, "randomize")
         self._check(check.vector, "preview", length=2)
+        self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
         self._check(check.whole, "gate_count")
         if self.gate_count > MAX_GATES:
             raise ValueError(
@@ -95,6 +105,53 @@ class TaskParams(Checked):
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
         if min(self.preview) < 0.0:
             raise ValueError(f"TaskParams.preview must be at least 0, got {self.preview}")
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """What flights of the task "trajectory" follow, one of them each; none elsewhere."""
+        if self.kind != "trajectory":
+            return ()
+        given: Any = self.trajectory
+        return given or (figure_of_eight(),)
+
+
+@functools.cache
+def figure_of_eight() -> Trajectory:
+    """A closed flight through five points at 2.5 m/s and 3 m/s^2 at most, looking ahead."""
+    points = [(0, 0, 1.5), (3, 1.5, 2), (3, -1.5, 1), (-3, 1.5, 2), (-3, -1.5, 1)]
+    return Trajectory.through(points, closed=True, yaw="along")
+
+
+def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None:
+    """Trajectories of a task as a tuple, or None.
+
+    Raises:
+        ValueError: If something else is among them, one is too far away, or the task follows none.
+    """
+    if given is None:
+        return None
+    if kind != "trajectory":
+        raise ValueError(f"TaskParams.trajectory must not be given for the task {kind}")
+    several = [given] if isinstance(given, (Trajectory, str, Path)) else given
+    if not isinstance(several, Sequence) or not several:
+        raise ValueError(f"trajectory must be a Trajectory or a sequence of them, got {given!r}")
+    found = []
+    for one in several:
+        path = _read(one) if isinstance(one, (str, Path)) else one
+        check.instance("trajectory", path, Trajectory)
+        if path.reach > FARTHEST:
+            raise ValueError(
+                f"trajectory must stay within {FARTHEST:g} m of the origin, got {path.reach:.4g} m"
+            )
+        found.append(path)
+    return tuple(found)
+
+
+def _read(file: str | Path) -> Trajectory:
+    try:
+        return Trajectory.from_csv(file)
+    except OSError as error:
+        raise ValueError(f"trajectory must be a file that can be read: {error}") from None
 
 
 def check_limit(task: TaskParams, rate: float, name: str) -> None:

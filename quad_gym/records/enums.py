@@ -106,6 +106,7 @@ class Task(IntEnum):
     LEMNISCATE = 3
     RANDOM_TRAJECTORY = 4
     WAYPOINTS = 5
+    TRAJECTORY = 6
 
 
 class Start(IntEnum):

@@ -27,6 +27,17 @@ _CONTACT_FIELDS = (
     Field("collided", (), "0 or 1", "whether the vehicle has touched an obstacle in this episode"),
     Field("left_fence", (), "0 or 1", "whether it has left the geofence in this episode"),
 )
+_PATH_FIELDS = (
+    # the trajectory of this episode, and what it says of the present instant
+    Field("path", (), "-", "which one, in the order in which they were given"),
+    Field("path_share", (), "-", "share of the round at which the episode begins, if it is closed"),
+    Field("path_turn", (2,), "-", "cosine and sine of the angle by which it is turned about the vertical"),
+    Field("path_r", (3,), "m", "reference position in I"),
+    Field("path_v", (3,), "m/s", "reference velocity in I"),
+    Field("path_a", (3,), "m/s^2", "reference acceleration in I"),
+    Field("path_x", (3,), "-", "reference heading in I"),
+    Field("path_ahead", (2, 3), "m", "reference position in I a little later: the preview"),
+)
 _FAULT_FIELDS = (
     # what goes wrong
     Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
@@ -211,6 +222,7 @@ _LATE_AID_FIELDS = (
 # fmt: on
 PARTS = (
     ("contacts", _CONTACT_FIELDS),
+    ("path", _PATH_FIELDS),
     ("faults", _FAULT_FIELDS),
     ("draws", _DRAW_FIELDS),
     ("actions", _ACTION_FIELDS),

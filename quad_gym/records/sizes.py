@@ -7,6 +7,12 @@ from quad_gym.records.width import WIDTH as WIDTH
 
 MAX_HARMONICS = 6
 """Terms of the Fourier series of a reference."""
+FOLLOWED = -1
+"""In place of that number: the reference is a trajectory of a user's own."""
+TERMS = 8
+"""Coefficients of a segment of such a trajectory, of degree 7."""
+HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY, HEADING_GIVEN = 0.0, 1.0, 2.0, 3.0
+"""Rules of a reference's heading: toward a point, along a direction, along the velocity, a yaw."""
 MAX_GATES = 8
 """Gates of a course."""
 MAX_FEATURES = 16

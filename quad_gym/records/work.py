@@ -8,6 +8,7 @@ from quad_gym.records.sizes import (
     MAX_SLOW,
     MAX_STATES,
     STAMP,
+    TERMS,
     Field,
 )
 
@@ -40,6 +41,14 @@ WORK_FIELDS = (
     Field("judged_nis", (), "-", "sum of their NIS"),
     Field("judged_freedoms", (), "-", "sum of their degrees of freedom"),
     Field("left_out", (), "-", "numbers masked"),
+    # the segment of a trajectory at an instant
+    Field("path_time", (), "s", "of the episode; then since the beginning of the segment"),
+    Field("path_still", (), "0 or 1", "before the start or past the end"),
+    Field("path_held", (), "0 or 1", "the same, start and end themselves included"),
+    Field("path_terms", (TERMS, 4), "mixed", "its coefficients"),
+    Field("path_heading", (), "-", "rule of the heading"),
+    Field("path_point", (2,), "m", "to look toward, in I"),
+    Field("path_end", (2,), "-", "heading at the start or end"),
     # the batch
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),

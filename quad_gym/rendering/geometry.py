@@ -128,7 +128,7 @@ def fit_view(
 def fixed_view(flight: Flight, width: float, height: float) -> View:
     """A view that shows the whole reference, the start and what the camera looks at."""
     stage, start = flight.stage, flight["position"][0]
-    times = np.linspace(0.0, stage.reference_period or 1.0, 64)
+    times = np.linspace(0.0, stage.reference_period or 1.0, max(64, stage.pieces // 4))
     around = [stage.reference(times), start[np.newaxis], stage.gates_I, stage.features_I]
     around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # what lies below
     points = np.concatenate(around)

@@ -102,7 +102,7 @@ class Scene:
         self._ground()
         stage = self._stage
         if stage.reference_period and not len(stage.gates_I):
-            self._path(stage.reference(np.linspace(0.0, stage.reference_period, 161)))
+            self._path(stage.reference(np.linspace(0.0, stage.reference_period, 1 + stage.pieces)))
 
     def draw(self) -> list[Label]:
         """Draw the rest from back to front; return the labels to write when all is drawn."""

@@ -8,6 +8,7 @@ IDS = (
     "QuadGym/Lemniscate-v0",
     "QuadGym/RandomTrajectory-v0",
     "QuadGym/Waypoints-v0",
+    "QuadGym/Trajectory-v0",
     "QuadGym/LookAround-v0",
     "QuadGym/StaleRace-v0",
 )

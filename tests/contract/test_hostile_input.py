@@ -49,6 +49,7 @@ ONE_TASK = {
     "gate_radius": "Waypoints",
     "max_speed": "RandomTrajectory",
     "max_acceleration": "RandomTrajectory",
+    "trajectory": "Trajectory",
 }
 
 

@@ -51,6 +51,25 @@ def _early(fault):
     ]
 
 
+def trajectories():
+    """Two of coefficients that no solver has rounded: loops, and from rest to rest."""
+    s3 = np.poly1d([1, 0, 0, 0])
+    hump = s3 * np.poly1d([-1, 1]) ** 3  # s^3 (1 - s)^3
+    rise = s3 * np.poly1d([-20, 70, -84, 35, 0])
+    found = []
+    for polynomials, options in (
+        ((192 * hump, 256 * hump * np.poly1d([-2, 1]), 1.5 + 16 * hump, 0 * hump), {}),
+        ((-3 * rise, 2 * rise, 1 + rise, 0 * rise), {"closed": False}),
+    ):
+        terms = np.zeros((8, 1, 4))
+        for i, polynomial in enumerate(polynomials):
+            shares = polynomial.c / 8.0 ** np.arange(polynomial.order, -1, -1)
+            terms[8 - len(shares) :, 0, i] = shares
+        options = {"closed": True, "heading": "along", **options}
+        found.append(quad_gym.Trajectory(times=[0.0, 8.0], coefficients=terms, **options))
+    return found
+
+
 def cases():
     """Keywords of the environments that fly, by name."""
     found = {}
@@ -110,6 +129,10 @@ def cases():
         | {"randomization": quad_gym.Randomization(RANDOMIZATION, known=True)},
         "privileged": rtk | {"privileged": True, "include_covariance": True},
         "absolute": rtk | {"layout": "absolute"},
+        "trajectories": {
+            **{"id": "Trajectory", "trajectory": trajectories(), "randomize": True},
+            **{"sensors": "rtk", "layout": "absolute", "start": "mixed"},
+        },
         "many options": {
             **{"sensors": _late("rtk"), "world": "fresh_breeze", "randomization": RANDOMIZATION},
             **{"faults": [*_early("gnss_outage"), "wrong_associations"], "innovations": True},

@@ -51,6 +51,12 @@ def test_the_moving_target_is_followed():
     assert np.mean(names["mean_rewards"]) > 0.3
 
 
+def test_the_trajectory_is_followed():
+    names = run("own_trajectory.py")
+    assert names["info"]["position_error"].max() < 0.1
+    assert np.linalg.norm(names["path"](names["t"], 1), axis=1).max() <= 2.5
+
+
 def test_looking_at_markers_pays():
     names = run("look_at_markers.py")
     toward, away = (line.get_ydata() for line in names["of_reward"].lines)

@@ -71,7 +71,9 @@ def test_estimate_and_reference_are_those_that_the_controller_observed():
     np.testing.assert_allclose(observed[:, part["R_BI"]], R_hat, atol=1e-6)
 
 
-@pytest.mark.parametrize("task", ["hover", "lemniscate", "random_trajectory", "waypoints"])
+@pytest.mark.parametrize(
+    "task", ["hover", "lemniscate", "random_trajectory", "trajectory", "waypoints"]
+)
 def test_errors_are_distances_between_columns(task):
     _, flight, _ = recorded(task)
     gap = np.linalg.norm(flight["position"] - flight["reference_position"], axis=1)

@@ -129,7 +129,7 @@ def test_an_ellipsoid_around_the_eye_has_no_outline():
 
 
 @pytest.mark.parametrize(
-    "task", ["hover", "circle", "lemniscate", "random_trajectory", "waypoints"]
+    "task", ["hover", "circle", "lemniscate", "random_trajectory", "trajectory", "waypoints"]
 )
 def test_the_fixed_view_shows_reference_features_and_start(task):
     flight = a_flight(task)

@@ -30,6 +30,7 @@ CHOICES = {
 }
 MORE = {
     "plain": {},
+    "trajectory": {"task": quad_gym.TaskParams(kind="trajectory", start="hover")},
     "drawn": {"randomization": {"mass": Uniform(0.7, 0.8)}},
     "faults": {"faults": ["rotor_loss"]},
     "obstacles": {

@@ -170,6 +170,9 @@ def reference_of(batch, task):
             for i in range(3):
                 drawn[f"odd cos {k}, {i}"] = cosines[:, k, i]
                 drawn[f"odd sin {k}, {i}"] = sines[:, k, i]
+    elif task == "trajectory":
+        drawn = {"phase": batch.read("path_share"), "turn": angle_of(batch.read("path_turn"))}
+        place, ahead = batch.read("path_r"), batch.read("path_x")
     else:
         gates = batch.read("gates")
         azimuth = np.arctan2(gates[..., 1], gates[..., 0])

@@ -24,6 +24,7 @@ from numba.np.numpy_support import from_dtype
 from quad_gym.kernels.compiling.decorators import entry, kernel
 from quad_gym.records import (
     FLIGHT_BLOCK,
+    FOLLOWED,
     PARAMS_BLOCK,
     SETTINGS,
     WORK_BLOCK,
@@ -83,6 +84,7 @@ class Stage(IntEnum):
     UPDATE_WITH_SLOW = auto()
     LATE_UPDATE_WITH_SLOW = auto()
     WARM_WITH_SLOW = auto()
+    FOLLOW = auto()
     _ignore_ = "aid"
     for aid in Aid:  # one for each aiding sensor, last and in their order
         vars()[aid.name] = auto()
@@ -160,6 +162,10 @@ def _hides(s: Any) -> bool:
     return bool(s["run_filter"] and s["camera_ticks"] > 0 and s["obstacle_count"] > 0)
 
 
+def _follows(s: Any) -> bool:
+    return bool(s["harmonics"] == FOLLOWED)
+
+
 def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
@@ -208,6 +214,7 @@ SOURCES = {
     Stage.LOOK: Source("task.look", "look_stage", _always),
     Stage.JUDGE: Source("task.reward", "judge_stage", _always),
     Stage.DRIFT_BIASES: Source("sensors.measure", "drift_biases_stage", _filter),
+    Stage.FOLLOW: Source("task.follow", "follow_stage", _follows),
     Stage.REST_ON_PAD: Source("vehicle.pad", "rest_on_pad_stage", _pad),
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
     Stage.BEGIN_LATE: Source("filter.waiting", "begin_late_stage", _late),
@@ -247,6 +254,7 @@ def used_parts(settings: Any) -> frozenset[str]:
     watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
     uses = {
         "contacts": _contacts(settings),
+        "path": _follows(settings),
         "faults": _faults(settings),
         "draws": _drawn(settings),
         "filter": _filter(settings),

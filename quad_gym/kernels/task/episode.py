@@ -2,7 +2,7 @@
 
 import math
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.elementary import atan2, clip, maximum, minimum, sin_cos
 from quad_gym.kernels.maths.linalg import add, dot, keep3, load3, multiply, scale
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
@@ -10,6 +10,7 @@ from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
 from quad_gym.kernels.measurements.clock import first_wait
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.task.follow import draw_path
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import (
     COLUMNS,
@@ -20,6 +21,10 @@ from quad_gym.records import (
     DRAW_PHASE,
     DRAW_SERIES,
     DRAW_START,
+    FOLLOWED,
+    HEADING_ALONG,
+    HEADING_TOWARD,
+    HEADING_VELOCITY,
     MAX_GATES,
     MAX_HARMONICS,
     Start,
@@ -30,10 +35,10 @@ START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 
 """Spread of a hovering start: [m], [rad], [rad], [m/s]."""
 GROUND_SHARE = 0.5
 """Share of the mixed starts that are on the ground."""
+_FOLLOW = int(Stage.FOLLOW)
 _POSITION, _VELOCITY = COLUMNS["start_position_I"].start, COLUMNS["start_velocity_I"].start
 _RATES, _YAW = COLUMNS["start_body_rates"].start, COLUMNS["start_yaw"].start
 _ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start
-HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY = 0.0, 1.0, 2.0
 
 
 @kernel
@@ -139,6 +144,9 @@ def draw_reference(flight, settings, stream, mask):
         _clear_reference(flight, mask, over_origin, omega, HEADING_ALONG, ahead)
         flight.ref_omega = select(mask, 2.0 * math.pi / settings.period, flight.ref_omega)
         _draw_series(flight, settings, stream, mask)
+    elif settings.task == Task.TRAJECTORY:
+        _clear_reference(flight, mask, over_origin, zero, HEADING_TOWARD, origin)
+        draw_path(flight, settings, stream, mask)
     else:
         # a fixed heading: one that follows the gates would turn about from one to the next
         _clear_reference(flight, mask, over_origin, zero, HEADING_ALONG, ahead)
@@ -255,6 +263,8 @@ def begin_stage(flight, world, model, settings, work, stages, flag):
     stream, mask = stream_of(flying), lanes_of(work).mask > 0.0
     begin_clocks(flying, settings, stream, mask)
     draw_reference(flying, settings, stream, mask)
+    if settings.harmonics == FOLLOWED:
+        call_stage(stages, _FOLLOW, flight, world, model, settings, work, 0)
     draw_start(flying, true, believed, settings, stream, mask)
     flying.charge = select(mask, true.battery_charge, flying.charge)
     begin_counters(flying, mask)

@@ -13,6 +13,7 @@ from quad_gym.records import (
     AIDS,
     DRAWN_SIZE,
     FIXED,
+    FOLLOWED,
     MAX_GATES,
     Layout,
     Source,
@@ -44,6 +45,8 @@ def previewed(flight, p, settings, i):
     """The reference a little later: in time, or on a course the gates after the next."""
     if settings.task == Task.WAYPOINTS:
         return _upcoming_gate(flight, 1.0 + i)
+    if settings.harmonics == FOLLOWED:
+        return load3(flight.path_ahead[i])
     later = flight.tick * p.dt + settings.preview[i]
     return position_on_reference(flight, later, settings.harmonics)
 

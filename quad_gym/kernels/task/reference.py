@@ -1,13 +1,14 @@
 """References: a finite Fourier series per axis and a rule for the heading.
 
 `r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)`: hover has no terms, a circle one, a lemniscate
-two, a random flight several. One kernel evaluates them all, with exact derivatives.
+two, a random flight several. One kernel evaluates them all, with exact derivatives. A trajectory of
+a user's own is looked up by the stage of `follow.py`, and read here.
 """
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import load3, select3, sub, unit_or
-from quad_gym.records import MAX_HARMONICS
+from quad_gym.records import FOLLOWED, HEADING_ALONG, HEADING_VELOCITY, MAX_HARMONICS
 
 
 @kernel
@@ -26,23 +27,47 @@ def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
 
 
 @kernel
+def direction_of(v, zero):
+    """The horizontal unit vector along v; east where it has none. `zero`: its third component."""
+    return unit_or((v[0], v[1], zero), (zero + 1.0, zero, zero))
+
+
+@kernel
 def heading(flight, r_ref, v_ref):
     """x*: the horizontal unit direction that the body x axis is to point in."""
-    zero = 0.0 * r_ref[0]
-    east = (zero + 1.0, zero, zero)
     point = load3(flight.ref_heading_point)
     toward = sub(point, r_ref)
     rule = flight.ref_heading_rule
-    direction = select3(rule == 1.0, point, select3(rule == 2.0, v_ref, toward))
-    return unit_or((direction[0], direction[1], zero), east)
+    along = select3(rule == HEADING_VELOCITY, v_ref, toward)
+    direction = select3(rule == HEADING_ALONG, point, along)
+    return direction_of(direction, 0.0 * r_ref[0])
+
+
+@kernel
+def _followed(flight):
+    """(r*, v*, a*, x*) that a trajectory of a user's own has at the present instant."""
+    return (
+        load3(flight.path_r),
+        load3(flight.path_v),
+        load3(flight.path_a),
+        load3(flight.path_x),
+    )
 
 
 @kernel
 def evaluate_reference(flight, t, harmonics=MAX_HARMONICS):
     """(r*, v*, a*, x*) in I at the time t of the episode [s].
 
-    `harmonics`: how many terms of the series there are; the others are zero.
+    `harmonics`: how many terms of the series there are; the others are zero. FOLLOWED: it is a
+    trajectory, and t the present instant, for which `follow.py` has looked it up.
     """
+    if harmonics == FOLLOWED:
+        return _followed(flight)
+    return _evaluate_series(flight, t, harmonics)
+
+
+@kernel
+def _evaluate_series(flight, t, harmonics):
     omega = flight.ref_omega
     x, y, z = load3(flight.ref_center)
     zero = 0.0 * x

@@ -1,0 +1,147 @@
+"""Trajectories of a user's own: piecewise polynomials, looked up flight by flight.
+
+The stage sets what is asked of the reference at the present instant: `reference.py` reads it from
+the flight's record. Each lane finds its own segment, by itself, and copies its coefficients to the
+workspace; from there on lanes fly together.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.linalg import select3, store3
+from quad_gym.kernels.maths.random import uniform_pair
+from quad_gym.kernels.simd.addresses import record_at
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.task.reference import direction_of
+from quad_gym.records import (
+    DRAW_PATH,
+    HEADING_GIVEN,
+    HEADING_VELOCITY,
+    PATH,
+    PIECE,
+    TERMS,
+    WIDTH,
+)
+
+_path_at, _piece_at = record_at(PATH), record_at(PIECE)
+_PATH_SIZE, _PIECE_SIZE = PATH.itemsize, PIECE.itemsize
+
+
+@kernel
+def draw_path(flight, settings, stream, mask):
+    """Choose the trajectory of a new episode, where `mask`; its phase and turn, if asked for."""
+    u_path, u_share = uniform_pair(stream, DRAW_PATH)
+    u_turn, _ = uniform_pair(stream, DRAW_PATH + 1)
+    zero = 0.0 * u_path
+    chosen, share, turn = zero, zero, zero
+    for k in range(1, settings.path_count):
+        chosen = select(u_path * settings.path_count >= 1.0 * k, 1.0 * k, chosen)
+    if settings.randomize:
+        share, turn = u_share, 2.0 * math.pi * u_turn
+    s, c = sin_cos(turn)
+    flight.path = select(mask, chosen, flight.path)
+    flight.path_share = select(mask, share, flight.path_share)
+    flight.path_turn[0] = select(mask, c, flight.path_turn[0])
+    flight.path_turn[1] = select(mask, s, flight.path_turn[1])
+
+
+@kernel
+def _piece_of(settings, path, time):
+    """The last segment that begins at a time or before; the first before all."""
+    low, high = path.first, path.first + path.pieces - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        if _piece_at(settings.pieces + middle * _PIECE_SIZE).begin <= time:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@kernel
+def _look_up(flight, work, settings):
+    """For each lane: what holds of its trajectory and of its segment at `path_time`."""
+    for lane in range(WIDTH):
+        path = _path_at(settings.paths + int(flight.path[lane]) * _PATH_SIZE)
+        time, span = work.path_time[lane], path.duration
+        before, beyond = 0.0, 0.0
+        if path.closed > 0:
+            time = time + flight.path_share[lane] * span
+            time = time - math.floor(time / span) * span
+        else:
+            before = 1.0 if time <= 0.0 else 0.0
+            beyond = 1.0 if time >= span else 0.0
+        work.path_still[lane] = 1.0 if path.closed == 0 and (time < 0.0 or time > span) else 0.0
+        time = min(max(time, 0.0), span)
+        piece = _piece_at(settings.pieces + _piece_of(settings, path, time) * _PIECE_SIZE)
+        work.path_time[lane] = time - piece.begin
+        for k in range(TERMS):
+            for i in range(4):
+                work.path_terms[k, i, lane] = piece.terms[k, i]
+        work.path_heading[lane] = path.heading
+        work.path_held[lane] = before + beyond
+        for i in range(2):
+            work.path_point[i, lane] = path.point[i]
+            work.path_end[i, lane] = path.end_heading[i] if beyond > 0.0 else path.begin_heading[i]
+
+
+@kernel
+def _value(work, i):
+    """A polynomial and its first two derivatives, by Horner's rule."""
+    t = work.path_time
+    value = work.path_terms[0, i]
+    rate, bend = 0.0 * t, 0.0 * t
+    for k in range(1, TERMS):
+        bend = bend * t + rate
+        rate = rate * t + value
+        value = value * t + work.path_terms[k, i]
+    return value, rate, 2.0 * bend
+
+
+@kernel
+def _turned(flight, x, y, z):
+    """A vector turned about the vertical as the flight's trajectory is."""
+    c, s = flight.path_turn[0], flight.path_turn[1]
+    return (c * x - s * y, s * x + c * y, z)
+
+
+@kernel
+def _heading(flight, work, r, v):
+    """The wanted direction of body x, turned with the trajectory."""
+    zero = 0.0 * r[0]
+    rule = work.path_heading
+    yaw, _, _ = _value(work, 3)
+    s, c = sin_cos(yaw)
+    toward = (work.path_point[0] - r[0], work.path_point[1] - r[1], zero)
+    along = select3(work.path_held > 0.0, (work.path_end[0], work.path_end[1], zero), v)
+    direction = select3(rule == HEADING_VELOCITY, along, toward)
+    x, y, _ = direction_of(select3(rule == HEADING_GIVEN, (c, s, zero), direction), zero)
+    return _turned(flight, x, y, zero)
+
+
+@stage
+def follow_stage(flight, world, model, settings, work, stages, flag):
+    """Set the reference of the present instant, and its preview."""
+    flying, room = lanes_of(flight), lanes_of(work)
+    time = flying.tick * lanes_of(model).dt
+    for i in range(2):
+        room.path_time = time + settings.preview[i]
+        _look_up(flight, work, settings)
+        x, _, _ = _value(room, 0)
+        y, _, _ = _value(room, 1)
+        z, _, _ = _value(room, 2)
+        store3(flying.path_ahead[i], _turned(flying, x, y, z))
+    room.path_time = time
+    _look_up(flight, work, settings)
+    x, vx, ax = _value(room, 0)
+    y, vy, ay = _value(room, 1)
+    z, vz, az = _value(room, 2)
+    still, none = room.path_still > 0.0, (0.0 * x, 0.0 * x, 0.0 * x)
+    v = select3(still, none, (vx, vy, vz))
+    store3(flying.path_r, _turned(flying, x, y, z))
+    store3(flying.path_v, _turned(flying, v[0], v[1], v[2]))
+    ax, ay, az = select3(still, none, (ax, ay, az))
+    store3(flying.path_a, _turned(flying, ax, ay, az))
+    store3(flying.path_x, _heading(flying, room, (x, y, z), v))

@@ -1,0 +1,182 @@
+"""Whether a vehicle can fly a trajectory; if not, what is missing, where, and by how much."""
+
+import functools
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.trajectories.flatness import motion_of
+from quad_gym.params.vehicle import VehicleParams
+
+if TYPE_CHECKING:
+    from quad_gym.params.trajectories.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+INTERVAL, SAMPLES, MOST_SAMPLES = 0.01, 16, 400
+"""Demands are looked at this often [s], at least and at most so many times in a segment."""
+
+LEAST_THRUST = 0.01
+"""Over the weight; below, in free fall, nothing says where the body z axis points."""
+
+JUMP = 1e-5
+"""Largest jump between segments of position [m], velocity [m/s] and acceleration [m/s^2]."""
+
+ROUNDING = 1e-6
+"""Share of a limit by which a demand may exceed it: bounds that just hold are met."""
+
+
+class Demand(NamedTuple):
+    """The largest demands of a trajectory."""
+
+    thrust: tuple[float, float]
+    """least and largest, of all rotors [N]"""
+    rotor_force: tuple[float, float]
+    """least and largest of any rotor [N]"""
+    tilt: float
+    """between body z and the vertical [rad]"""
+    body_rates: tuple[float, float, float]
+    """largest about each body axis, either way [rad/s]"""
+    speed: float
+    """[m/s]"""
+    acceleration: float
+    """[m/s^2]"""
+
+
+def check_trajectory(
+    trajectory: "Trajectory",
+    vehicle: VehicleParams,
+    *,
+    max_thrust: float | None = None,
+    max_tilt: float = math.pi,
+    max_body_rates: Any = None,
+    max_speed: float | None = None,
+    name: str = "trajectory",
+) -> Demand:
+    """See `Trajectory.check`."""
+    check.instance("vehicle", vehicle, VehicleParams)
+    rates = None
+    if max_body_rates is not None:
+        rates = check.vector("max_body_rates", max_body_rates, length=3)
+    thrust = None if max_thrust is None else check.positive("max_thrust", max_thrust)
+    speed = None if max_speed is None else check.positive("max_speed", max_speed)
+    tilt = check.positive("max_tilt", max_tilt, most=math.pi)
+    return _checked(trajectory, vehicle, thrust, tilt, rates, speed, name)
+
+
+@functools.lru_cache(maxsize=256)
+def _checked(
+    trajectory: "Trajectory",
+    vehicle: VehicleParams,
+    max_thrust: float | None,
+    max_tilt: float,
+    max_rates: tuple[float, ...] | None,
+    max_speed: float | None,
+    name: str,
+) -> Demand:
+    _refuse_jumps(trajectory, name)
+    times = sampling_times(trajectory)
+    motion = motion_of(trajectory, vehicle, times)
+    speeds, accelerations = (np.linalg.norm(trajectory(times, k), axis=1) for k in (1, 2))
+    force, rates = motion.rotor_forces, np.abs(motion.body_rates)
+    largest = vehicle.max_rotor_force
+    least_thrust = LEAST_THRUST * vehicle.mass * vehicle.gravity
+    # what, of each instant, in which unit, and the least and the most that there is
+    demands: list[tuple[str, Floats, str, float, float]] = [
+        ("a speed", speeds, "m/s", 0.0, max_speed or math.inf),
+        ("a thrust", motion.thrust, "N", least_thrust, max_thrust or 4.0 * largest),
+        ("a tilt", np.degrees(motion.tilt), "degrees", 0.0, math.degrees(max_tilt)),
+    ]
+    if max_rates is not None:
+        demands += [
+            (f"a body rate about {axis}", rates[:, k], "rad/s", 0.0, max_rates[k])
+            for k, axis in enumerate("xyz")
+        ]
+    demands += [(f"a force of rotor {k + 1}", force[:, k], "N", 0.0, largest) for k in range(4)]
+    _refuse_excess(trajectory, demands, times, name)
+    return Demand(
+        thrust=(float(motion.thrust.min()), float(motion.thrust.max())),
+        rotor_force=(float(force.min()), float(force.max())),
+        tilt=float(motion.tilt.max()),
+        body_rates=tuple(rates.max(axis=0).tolist()),
+        speed=float(speeds.max()),
+        acceleration=float(accelerations.max()),
+    )
+
+
+def _refuse_excess(
+    trajectory: "Trajectory",
+    demands: list[tuple[str, Floats, str, float, float]],
+    times: Floats,
+    name: str,
+) -> None:
+    """Name the demand that exceeds what there is by the largest share."""
+    worst, words = 0.0, ""
+    for what, values, unit, least, most in demands:
+        high, low = int(np.argmax(values)), int(np.argmin(values))
+        if values[high] > most * (1.0 + ROUNDING) and values[high] / most - 1.0 > worst:
+            worst = values[high] / most - 1.0
+            share = f"{100.0 * worst:.0f} %" if worst > 0.01 else f"{100.0 * worst:.2g} %"
+            words = (
+                f"{what} of {values[high]:.4g} {unit} {_where(trajectory, times[high])}, "
+                f"{share} more than the {most:.4g} {unit} that there are"
+            )
+        scale = most if math.isfinite(most) else 1.0
+        short = (least - values[low]) / scale
+        if short > ROUNDING and short > worst:
+            worst = short
+            words = (
+                f"{what} of {values[low]:.4g} {unit} {_where(trajectory, times[low])}, "
+                f"{least - values[low]:.3g} {unit} less than the least, {least:.3g} {unit}"
+            )
+    if words:
+        raise ValueError(
+            f"{name} must be one that the vehicle can fly: it takes {words}. Give it more time, or "
+            "smaller bounds of speed and acceleration"
+        )
+
+
+def _where(trajectory: "Trajectory", time: float) -> str:
+    segments = len(trajectory.times) - 1
+    segment = min(int(np.searchsorted(trajectory.times, time, side="right")), segments)
+    return f"at {time:.3f} s (segment {segment} of {segments})"
+
+
+def sampling_times(trajectory: "Trajectory") -> Floats:
+    """When demands are looked at."""
+    lengths = np.diff(trajectory.times)
+    count = int(np.clip(np.ceil(lengths.max() / INTERVAL), SAMPLES, MOST_SAMPLES))
+    return trajectory.instants(count)
+
+
+def _refuse_jumps(trajectory: "Trajectory", name: str) -> None:
+    """Refuse segments that do not continue each other, as no vehicle does."""
+    lengths = np.diff(trajectory.times)
+    path = trajectory._polynomials(0, 3)
+    shared = np.concatenate([path.c, np.zeros((0, *path.c.shape[1:]))])
+    following = slice(1, None)
+    for order, (what, unit) in enumerate(
+        (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
+    ):
+        terms = shared
+        for _ in range(order):
+            powers = np.arange(len(terms) - 1, 0, -1)[:, np.newaxis, np.newaxis]
+            terms = terms[:-1] * powers
+        ends = np.zeros(terms.shape[1:])
+        for row in terms:
+            ends = ends * lengths[:, np.newaxis] + row
+        begins = terms[-1]
+        if trajectory.closed:
+            gaps = np.abs(np.roll(begins, -1, axis=0) - ends).max(axis=1)
+        else:
+            gaps = np.abs(begins[following] - ends[:-1]).max(axis=1)
+        scale = 1.0 + float(np.abs(ends).max())
+        if gaps.size and gaps.max() > JUMP * scale:
+            k = int(gaps.argmax())
+            raise ValueError(
+                f"{name} must not jump: its {what} does by {gaps[k]:.3g} {unit} at "
+                f"{trajectory.times[k + 1]:.3f} s, after segment {k + 1}"
+            )

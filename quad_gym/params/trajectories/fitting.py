@@ -1,0 +1,174 @@
+"""Piecewise polynomials in place of any smooth function of time."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.trajectories.headings import heading_choice
+
+if TYPE_CHECKING:
+    from quad_gym.params.trajectories.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+Function = Callable[[float], Any]
+
+FEWEST, MOST = 16, 8192
+"""Segments that are tried, each time twice as many."""
+
+STEP = 1e-3
+"""Of differences that check derivatives, as a share of the duration."""
+
+SLACK = 1e-3
+"""By which a derivative may differ from differences, as a share of its size."""
+
+LOOSER = 1e3
+"""Times the tolerance, to which derivatives are met [1/s, 1/s^2]."""
+
+
+def fit(
+    cls: "type[Trajectory]",
+    function: Function,
+    duration: float,
+    *,
+    velocity: Function | None,
+    acceleration: Function | None,
+    closed: bool,
+    tolerance: float,
+    yaw: Any,
+    look_at: Any,
+) -> "Trajectory":
+    """See `Trajectory.of`."""
+    span = check.positive("duration", duration, least=1e-3)
+    check.flag("closed", closed)
+    limit = check.positive("tolerance", tolerance, least=1e-9)
+    given = {"function": function, "velocity": velocity, "acceleration": acceleration}
+    for name, part in given.items():
+        if not (callable(part) or (part is None and name != "function")):
+            raise ValueError(f"{name} must be a function of time, got {part!r}")
+    rule, point, angles = heading_choice(yaw, look_at)
+    if np.ndim(angles) > 0:
+        raise ValueError("yaw must be a number, 'along' or a function of time, got an array")
+    _check_derivatives(given, span)
+    if closed:
+        _check_return(function, span, limit)
+    turns = 0.0
+    if callable(angles) and closed:
+        whole = _called("yaw", angles, [0.0, span], 1)[:, 0]
+        turns = float(np.round((whole[1] - whole[0]) / (2.0 * np.pi)) * 2.0 * np.pi / span)
+
+    def joint(t: float) -> Any:
+        if not callable(angles):
+            return function(t)
+        row = np.append(np.asarray(function(t), np.float64), angles(t))
+        row[-1] -= turns * t
+        return row
+
+    size = 4 if callable(angles) else 3
+    count = FEWEST
+    known: dict[float, Floats] = {}
+    while True:
+        times = np.linspace(0.0, span, count + 1)
+        spline = _spline(times, _values(joint, times, size, known), closed)
+        miss = _misses(spline, joint, times, size, known, given)
+        if miss <= limit:
+            break
+        count *= 2
+        if count > MOST:
+            raise ValueError(
+                f"function must be smooth: splines of {MOST} segments still miss it by "
+                f"{miss:.3g} m, tolerance={limit:g} m"
+            )
+    terms = np.zeros((8, count, 4))
+    factorial = 1.0
+    for k in range(8):
+        factorial *= max(k, 1)
+        terms[7 - k, :, :size] = np.asarray(spline(times[:-1], k)) / factorial
+    if callable(angles):
+        terms[7, :, 3] += turns * times[:-1]
+        terms[6, :, 3] += turns
+    else:
+        terms[7, :, 3] = angles
+    return cls(times=times, coefficients=terms, closed=closed, heading=rule, point=point)
+
+
+def _called(name: str, function: Function, times: Any, size: int) -> Floats:
+    """What a function returns at times, (n, size)."""
+    rows = []
+    for t in times:
+        label = f"{name}({float(t):g})"
+        rows.append(check.array(label, np.atleast_1d(function(float(t))), (size,)))
+    return np.array(rows)
+
+
+def _values(joint: Function, times: Floats, size: int, known: dict[float, Floats]) -> Floats:
+    """The same, of which what was asked before is not asked again."""
+    new = [t for t in times.tolist() if t not in known]
+    if new:
+        known.update(zip(new, _called("function", joint, new, size), strict=True))
+    return np.array([known[t] for t in times.tolist()])
+
+
+def _spline(times: Floats, values: Floats, closed: bool) -> Any:
+    from scipy.interpolate import make_interp_spline
+
+    if closed:
+        values = np.concatenate([values[:-1], values[:1]])
+        return make_interp_spline(times, values, k=7, bc_type="periodic")
+    return make_interp_spline(times, values, k=7)
+
+
+def _misses(
+    spline: Any,
+    joint: Function,
+    times: Floats,
+    size: int,
+    known: dict[float, Floats],
+    given: dict[str, Function | None],
+) -> float:
+    """How far it is from the function halfway between knots; from derivatives, over LOOSER."""
+    between = 0.5 * (times[:-1] + times[1:])
+    miss = float(np.abs(spline(between) - _values(joint, between, size, known)).max())
+    for order, name in ((1, "velocity"), (2, "acceleration")):
+        part = given[name]
+        if part is not None:
+            gap = spline(between, order)[:, :3] - _called(name, part, between, 3)
+            miss = max(miss, float(np.abs(gap).max()) / LOOSER)
+    return miss
+
+
+def _check_derivatives(given: dict[str, Any], span: float) -> None:
+    """Refuse derivatives that differences of what they derive contradict."""
+    step = STEP * span
+    times = np.linspace(2.0 * step, span - 2.0 * step, 31)
+    weights = np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
+    below = "function"
+    for name in ("velocity", "acceleration"):
+        if given[name] is None:
+            if name == "velocity" and given["acceleration"] is not None:
+                raise ValueError("velocity must be given where acceleration is")
+            continue
+        around = (times[:, np.newaxis] + step * np.array([-2.0, -1.0, 1.0, 2.0])).ravel()
+        values = _called(below, given[below], around, 3).reshape(-1, 4, 3)
+        slope = np.einsum("k,tki->ti", weights, values)
+        said = _called(name, given[name], times, 3)
+        miss = np.abs(said - slope).max(axis=1)
+        k = int(miss.argmax())
+        allowed = SLACK * (float(np.abs(slope).max()) + 1e-6)
+        if miss[k] > allowed:
+            raise ValueError(
+                f"{name} must be the derivative of {below}: at {times[k]:g} s differences say "
+                f"{slope[k]}, got {said[k]}"
+            )
+        below = name
+
+
+def _check_return(function: Function, span: float, limit: float) -> None:
+    begin, end = _called("function", function, [0.0, span], 3)
+    if np.abs(end - begin).max() > limit:
+        raise ValueError(
+            f"function must return to its start where closed=True, got {begin} at 0 s and {end} at "
+            f"{span:g} s"
+        )

@@ -1,0 +1,74 @@
+"""Trajectories from tables."""
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quad_gym.params import checks as check
+
+if TYPE_CHECKING:
+    from quad_gym.params.trajectories.trajectory import Trajectory
+
+COLUMNS = ("time", "x", "y", "z")
+"""What a table must have; "yaw" is optional."""
+
+OPTIONS = ("closed", "minimize", "at_rest", "yaw", "look_at")
+"""Keywords of `Trajectory.through` that do not contradict a table."""
+
+
+def from_csv(cls: "type[Trajectory]", path: Path, options: dict[str, Any]) -> "Trajectory":
+    """See `Trajectory.from_csv`."""
+    check.keywords(options, OPTIONS, "Trajectory.from_csv")
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        lines = csv.reader(stream)
+        names = [name.strip().lower() for name in next(lines, [])]
+        missing = [name for name in COLUMNS if name not in names]
+        if missing:
+            raise ValueError(
+                f"{path} must name the columns {', '.join(COLUMNS)} in its first line, got "
+                f"{', '.join(names) or 'nothing'}"
+            )
+        wanted = [*COLUMNS, *(["yaw"] if "yaw" in names else [])]
+        places = [names.index(name) for name in wanted]
+        rows = [
+            _numbers(f"{path}, line {lines.line_num}", cells, places, wanted)
+            for cells in lines
+            if any(cell.strip() for cell in cells)
+        ]
+    if len(rows) < 2:
+        raise ValueError(f"{path} must have at least two rows, got {len(rows)}")
+    table = np.array(rows)
+    behind = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
+    if behind.size:
+        k = int(behind[0])
+        raise ValueError(
+            f"{path} must have increasing times, got {table[k, 0]:g} s and then "
+            f"{table[k + 1, 0]:g} s in rows {k + 1} and {k + 2}"
+        )
+    if "yaw" in wanted and not {"yaw", "look_at"} & {
+        k for k, v in options.items() if v is not None
+    }:
+        options = options | {"yaw": table[:, 4]}
+    if not options.get("closed", False):
+        return cls.through(table[:, 1:4], table[:, 0], **options)
+    if np.abs(table[-1, 1:4] - table[0, 1:4]).max() > 1e-3:
+        raise ValueError(
+            f"{path} must end where it begins with closed=True, got {table[0, 1:4]} and "
+            f"{table[-1, 1:4]}"
+        )
+    if isinstance(options.get("yaw"), np.ndarray):
+        options = options | {"yaw": options["yaw"][:-1]}
+    return cls.through(table[:-1, 1:4], table[:, 0], **options)
+
+
+def _numbers(where: str, cells: list[str], places: list[int], names: list[str]) -> list[float]:
+    found = []
+    for place, name in zip(places, names, strict=True):
+        cell = cells[place].strip() if place < len(cells) else ""
+        try:
+            found.append(check.number(name, float(cell)))
+        except ValueError:
+            raise ValueError(f"{where}: {name} must be a finite number, got {cell!r}") from None
+    return found

@@ -1,0 +1,187 @@
+"""Minimum snap and minimum jerk through points.
+
+The motion through given points at given times that has the least integral of its squared k-th
+derivative is a spline of degree 2k - 1 with knots at the times, whose derivatives up to the
+(2k - 2)-th are continuous. With those up to the (k - 1)-th zero at the ends (at rest), or those
+from the k-th on (natural), or repeating, SciPy's interpolating splines are that minimum.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.trajectories.headings import heading_choice
+from quad_gym.params.trajectories.timing import choose_times
+
+if TYPE_CHECKING:
+    from quad_gym.params.trajectories.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+ORDERS = {"snap": 4, "jerk": 3}
+"""Which derivative is minimized."""
+
+MAX_SPEED, MAX_ACCELERATION = 2.5, 3.0
+"""Bounds where none are given [m/s], [m/s^2]: those of the task of random trajectories."""
+
+PADDING = 6
+"""Points before and after one round of a closed path, where it is approximated."""
+
+SHORTEST = 1e-6
+"""Time between two points, and distance where times are chosen, at least [s], [m]."""
+
+
+def through(
+    cls: "type[Trajectory]",
+    points: Any,
+    times: Any,
+    *,
+    max_speed: float | None,
+    max_acceleration: float | None,
+    closed: bool,
+    minimize: str,
+    at_rest: bool,
+    yaw: Any,
+    look_at: Any,
+) -> "Trajectory":
+    """See `Trajectory.through`."""
+    order = ORDERS[check.choice("minimize", minimize, tuple(ORDERS))]
+    check.flag("closed", closed)
+    check.flag("at_rest", at_rest)
+    places = check.array("points", points, (None, 3))
+    if len(places) < 2:
+        raise ValueError(f"points must be at least two, got {len(places)}")
+    if not (at_rest or closed) and len(places) < order:
+        raise ValueError(
+            f"at_rest must be True with fewer than {order} points, which leave the ends open, got "
+            f"{len(places)}"
+        )
+    rule, point, angles = heading_choice(yaw, look_at)
+    if callable(angles):
+        raise ValueError("yaw must be angles at the points, not a function; see Trajectory.of")
+    if np.ndim(angles) > 0:
+        angles = check.array("yaw", angles, (len(places),))
+    if closed:
+        places = np.concatenate([places, places[:1]])
+
+    def path(when: Floats) -> Floats:
+        return coefficients(when, places, order, closed=closed, at_rest=at_rest)
+
+    def rough(when: Floats) -> Floats:
+        return _unrolled(when, places, order) if closed else path(when)
+
+    if times is not None:
+        if max_speed is not None or max_acceleration is not None:
+            name = "max_speed" if max_speed is not None else "max_acceleration"
+            raise ValueError(f"{name} must not be given with times, which it would choose")
+        when = _given_times(times, len(places), closed)
+    else:
+        _refuse_equal_neighbors(places, closed)
+        speed = MAX_SPEED if max_speed is None else check.positive("max_speed", max_speed)
+        most = MAX_ACCELERATION if max_acceleration is None else max_acceleration
+        most = check.positive("max_acceleration", most)
+        when = choose_times(path, rough, places, speed, most)
+    terms = np.zeros((8, len(when) - 1, 4))
+    terms[..., :3] = path(when)
+    if np.ndim(angles) > 0:
+        terms[..., 3] = _yaw_coefficients(when, angles, closed, at_rest)
+    else:
+        terms[-1, :, 3] = angles
+    return cls(times=when, coefficients=terms, closed=closed, heading=rule, point=point)
+
+
+def _given_times(times: Any, count: int, closed: bool) -> Floats:
+    when = check.array("times", times, (None,))
+    if len(when) != count:
+        more = ", the last for the return to the first" if closed else ""
+        raise ValueError(f"times must be {count}, one for each point{more}, got {len(when)}")
+    steps = np.diff(when)
+    if (steps < SHORTEST).any():
+        k = int(np.argmax(steps < SHORTEST))
+        raise ValueError(
+            f"times must increase, got {when[k]:g} s and then {when[k + 1]:g} s for points {k} and "
+            f"{k + 1}"
+        )
+    return when - when[0]
+
+
+def _refuse_equal_neighbors(places: Floats, closed: bool) -> None:
+    near = np.linalg.norm(np.diff(places, axis=0), axis=1) < SHORTEST
+    if near.any():
+        k = int(np.argmax(near))
+        if closed and k == len(places) - 2:
+            raise ValueError(
+                "points must not end where they begin: a closed trajectory returns by itself"
+            )
+        raise ValueError(
+            f"points must differ from one to the next where no times are given, got {places[k]} "
+            f"as points {k} and {k + 1}"
+        )
+
+
+def coefficients(
+    times: Floats, values: Floats, order: int, *, closed: bool = False, at_rest: bool = True
+) -> Floats:
+    """Polynomials of the least integral of a squared derivative through values at times.
+
+    Args:
+        times: (m + 1,) increasing.
+        values: (m + 1, n); closed: the last are the first.
+        order: Which derivative is minimized: 4 or 3.
+        closed: Whether it repeats.
+        at_rest: Whether derivatives below `order` are zero at both ends.
+
+    Returns:
+        (8, m, n), the highest power first, of times since the beginning of a segment.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    degree = 2 * order - 1
+    known = range(1, order) if at_rest else range(order, degree)
+    if closed:
+        spline = make_interp_spline(times, values, k=degree, bc_type="periodic")
+    else:
+        ends = [(k, np.zeros(values.shape[1])) for k in known]
+        spline = make_interp_spline(times, values, k=degree, bc_type=(ends, ends))
+    terms = np.zeros((8, len(times) - 1, values.shape[1]))
+    factorial = 1.0
+    for k in range(degree + 1):
+        factorial *= max(k, 1)
+        terms[7 - k] = np.asarray(spline(times[:-1], k)) / factorial
+    terms[7] = values[:-1]  # what they are, without the rounding of the solution
+    if not closed:
+        for k in known:
+            terms[7 - k, 0] = 0.0
+    return terms
+
+
+def _unrolled(times: Floats, values: Floats, order: int) -> Floats:
+    """Nearly those of a closed path: of one of some rounds, whose ends are too far away to matter.
+
+    SciPy's periodic splines take long where several threads share the processor's cores.
+    """
+    count, span = len(times) - 1, times[-1]
+    before = -(-PADDING // count)
+    starts = np.arange(-before, before + 1) * span
+    when = np.append((starts[:, np.newaxis] + times[:-1]).ravel(), (before + 1) * span)
+    given = np.concatenate([np.tile(values[:-1], (2 * before + 1, 1)), values[:1]])
+    terms = coefficients(when, given, order, at_rest=False)
+    return terms[:, before * count : (before + 1) * count]
+
+
+def _yaw_coefficients(times: Floats, angles: Sequence[float], closed: bool, rest: bool) -> Floats:
+    """(8, m) of least jerk through angles, by the shorter way from each to the next."""
+    if not closed:
+        turned = np.unwrap(angles)[:, np.newaxis]
+        return coefficients(times, turned, 3, at_rest=rest)[..., 0]
+    turned = np.unwrap(np.append(angles, angles[0]))
+    rate = (turned[-1] - turned[0]) / times[-1]  # of the whole turns of a round
+    swing = (turned - rate * times)[:, np.newaxis]
+    swing[-1] = swing[0]
+    terms = coefficients(times, swing, 3, closed=True)[..., 0]
+    terms[7] += rate * times[:-1]
+    terms[6] += rate
+    return terms

@@ -1,0 +1,300 @@
+"""Trajectories of a user's own in all interfaces: kernels against `Trajectory`, and options."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines import PDPolicy
+from quad_gym import FlightBatch, FlightRecorder, TaskParams, Trajectory
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Control, Source
+from tests.contract.comparing import actions_of
+
+FIVE = [(0, 0, 1.5), (1, 0.5, 2), (1, -0.5, 1), (-1, 0.5, 2), (-1, -0.5, 1)]
+WHEN = [0.0, 1.0, 2.2, 3.2, 4.8]
+RADIUS = {"out_of_bounds": 50.0, "max_tilt": np.pi, "ground": -50.0}
+TRUTH = {"source": Source.TRUTH, "run_filter": False, "threads": 1}
+OPEN = Trajectory.through(FIVE, WHEN, yaw=[0.0, 0.5, 1.0, 1.5, 2.0])
+CLOSED = Trajectory.through(FIVE, [*WHEN, 6.2], closed=True, look_at=(0.2, 5.0))
+BEND = [(0, 0, 1), (1, 0.2, 1.5), (2, 1, 1.5), (2.4, 2.5, 1)]
+ALONG = Trajectory.through(BEND, [0, 1, 2.2, 4.2], yaw="along", minimize="jerk")
+SEVERAL = (OPEN, CLOSED, ALONG)
+
+
+def batch_of(trajectory, count=9, **options):
+    task = TaskParams(
+        kind="trajectory", start="hover", trajectory=trajectory, **{**RADIUS, **options}
+    )
+    return FlightBatch(count, task=task, control_rate=50.0, **TRUTH)
+
+
+def direction(angle):
+    return np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=-1)
+
+
+def assert_on_reference(batch, time):
+    """What kernels have is what the trajectories of the flights say."""
+    for i in range(batch.count):
+        path, phase = batch.trajectory(i)
+        t = time + phase
+        for k, name in enumerate(("path_r", "path_v", "path_a")):
+            np.testing.assert_allclose(
+                batch.read(name)[i], path(t, k), rtol=0.0, atol=1e-12 * (1 + 100 * k)
+            )
+        heading, speed = direction(path.yaw(t)), np.linalg.norm(path(t, 1))
+        miss = 1e-12 * max(1.0, 1.0 / (speed + 1e-6))  # of the direction of a short velocity
+        np.testing.assert_allclose(batch.read("path_x")[i], heading, rtol=0.0, atol=miss)
+        ahead = path(t + np.array(batch.task.preview))
+        np.testing.assert_allclose(batch.read("path_ahead")[i], ahead, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("randomize", [False, True])
+@pytest.mark.parametrize("preview", [(0.2, 0.4), (0.0, 1.0)])
+def test_kernels_evaluate_what_python_does(randomize, preview):
+    batch = batch_of(SEVERAL, count=12, randomize=randomize, preview=preview)
+    batch.reset(seeds=range(12))
+    assert len(set(batch.read("path"))) == 3
+    for step in range(350):  # at knots, and past the ends
+        if step % 5 == 0:
+            assert_on_reference(batch, step / 50.0)
+        error = np.linalg.norm(batch.read("r") - batch.read("path_r"), axis=1)
+        np.testing.assert_allclose(batch.read("position_error"), error, rtol=1e-12)
+        batch.step()
+    before = batch_of(SEVERAL, randomize=randomize, preview=preview)
+    before.reset(seeds=range(9))
+    before._blocks["tick"] = -104.0  # before the start, where no flight ever is
+    before.step()
+    assert_on_reference(before, -0.5)
+
+
+def test_many_segments_and_long_flights():
+    rng = np.random.default_rng(0)
+    places = np.cumsum(rng.normal(size=(300, 3)) * 0.3, axis=0)
+    path = Trajectory.through(places, np.arange(300.0), yaw=np.cumsum(rng.normal(size=300)))
+    batch = batch_of(path, count=3)
+    batch.reset(seeds=range(3))
+    for tick in (0.0, 12_345.0, 44_444.0, 59_799.0, 59_800.0, 80_000.0):
+        batch._blocks["tick"] = tick - 4.0
+        batch.step()
+        t = batch.read("tick")[0] / 200.0
+        assert t == tick / 200.0
+        for k, name in enumerate(("path_r", "path_v", "path_a")):
+            np.testing.assert_allclose(batch.read(name)[0], path(t, k), rtol=0, atol=1e-10)
+
+
+def test_an_episode_draws_its_trajectory_phase_and_turn():
+    n = 3000
+    plain = batch_of(SEVERAL, count=n)
+    plain.reset(seeds=range(n))
+    counts = np.bincount(plain.read("path").astype(int), minlength=3)
+    assert abs(counts - n / 3).max() < 5.0 * np.sqrt(n * 2 / 9)
+    assert (plain.read("path_turn") == [1.0, 0.0]).all()
+    assert (plain.read("path_share") == 0.0).all()
+    drawn = batch_of(SEVERAL, count=n, randomize=True)
+    drawn.reset(seeds=range(n))
+    np.testing.assert_array_equal(drawn.read("path"), plain.read("path"))
+    share = drawn.read("path_share")
+    turn = np.arctan2(*drawn.read("path_turn").T[::-1]) / (2.0 * np.pi) % 1.0
+    for values in (share, turn):
+        deciles = np.histogram(values, 10, (0.0, 1.0))[0]
+        assert abs(deciles - n / 10).max() < 5.0 * np.sqrt(n * 0.09)
+    assert abs(np.corrcoef(share, turn)[0, 1]) < 5.0 / np.sqrt(n)
+    again = drawn.read("path")
+    drawn.reset()
+    assert (drawn.read("path") != again).any()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_flights_are_the_same_in_every_interface(mode):
+    keywords = {"trajectory": SEVERAL, "randomize": True, "observation": "truth", "duration": 1.0}
+    envs = QuadVectorEnv(5, "trajectory", autoreset_mode=mode, **keywords)
+    observations, _ = envs.reset(seed=7)
+    actions = 0.1 * np.stack([actions_of(i, 40) for i in range(5)], axis=1)
+    singles = [QuadEnv("trajectory", **keywords) for _ in range(5)]
+    for i, env in enumerate(singles):
+        observation, _ = env.reset(seed=7 + i)
+        np.testing.assert_array_equal(observation, observations[i])
+    for k in range(40):
+        observations, rewards, *_ = envs.step(actions[k])
+        for i, env in enumerate(singles):
+            observation, reward, *_ = env.step(actions[k, i])
+            np.testing.assert_array_equal(observation, observations[i])
+            assert reward == rewards[i]
+
+
+def test_stable_baselines():
+    pytest.importorskip("stable_baselines3")
+    env = quad_gym.make_sb3_vec_env(
+        "QuadGym/Trajectory-v0", n_envs=3, seed=1, trajectory=OPEN, observation="truth"
+    )
+    other = QuadVectorEnv(3, "trajectory", trajectory=OPEN, observation="truth")
+    first, _ = other.reset(seed=1)
+    np.testing.assert_array_equal(env.reset(), first)
+
+
+def test_snapshots_copies_and_pickles_go_on_bit_for_bit():
+    batch = batch_of(SEVERAL, randomize=True)
+    batch.reset(seeds=range(9))
+    for _ in range(20):
+        batch.step()
+    kept = batch.snapshot()
+    copies = [copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
+    for _ in range(60):
+        batch.step()
+    end = batch.snapshot()
+    batch.restore(kept)
+    for one in (batch, *copies):
+        for _ in range(60):
+            one.step()
+        assert one.snapshot().tobytes() == end.tobytes()
+
+
+def test_a_task_of_ones_own_sees_the_reference():
+    seen = {}
+
+    class Watch(quad_gym.Task):
+        def reward(self, view):
+            seen.update(r=view.reference_position.copy(), v=view.reference_velocity.copy())
+            return super().reward(view)
+
+    keywords = {"trajectory": SEVERAL, "randomize": True, "observation": "truth"}
+    envs = QuadVectorEnv(4, "trajectory", custom=Watch(), **keywords)
+    plain = QuadVectorEnv(4, "trajectory", **keywords)
+    envs.reset(seed=3), plain.reset(seed=3)
+    for k in range(1, 20):
+        action = np.zeros((4, 4))
+        rewards = [env.step(action)[1] for env in (envs, plain)]
+        np.testing.assert_array_equal(*rewards)
+        for i in range(4):
+            path, phase = envs.flights.batch.trajectory(i)
+            np.testing.assert_allclose(seen["r"][i], path(phase + k / 50), rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(seen["v"][i], path(phase + k / 50, 1), rtol=0.0, atol=1e-10)
+
+
+def test_a_recorded_flight_knows_its_trajectory(tmp_path):
+    env = QuadEnv("trajectory", trajectory=[CLOSED, OPEN], randomize=True, observation="truth")
+    recorder = FlightRecorder(env.flights.batch)
+    policy, times = PDPolicy(env), np.linspace(0.0, 7.0, 50)
+    for seed in (0, 1, 5):
+        observation, _ = env.reset(seed=seed)
+        recorder.keep()
+        for _ in range(30):
+            observation, *_ = env.step(policy.predict(observation)[0])
+            recorder.keep()
+        path, phase = env.flights.batch.trajectory(0)
+        flight = recorder.flight
+        expected = path(flight["time"] + phase)
+        np.testing.assert_allclose(flight["reference_position"], expected, rtol=0.0, atol=1e-12)
+        loaded = quad_gym.Flight.load(flight.save(tmp_path / f"{seed}.npz"))
+        for stage in (flight.stage, loaded.stage):
+            np.testing.assert_allclose(
+                stage.reference(times), path(times + phase), rtol=0.0, atol=1e-12
+            )
+            assert stage.reference_period == path.duration
+
+
+def test_the_path_is_drawn():
+    pytest.importorskip("pygame")
+    frames = []
+    for trajectory in (OPEN, CLOSED):
+        env = QuadEnv(
+            "trajectory", trajectory=trajectory, observation="truth", render_mode="rgb_array"
+        )
+        env.reset(seed=1)
+        frames.append(env.render())
+        env.close()
+    assert frames[0].shape == frames[1].shape
+    assert (frames[0] != frames[1]).any()
+
+
+@pytest.mark.parametrize("action", ["ctbr", "attitude", "velocity"])
+def test_pd_control_follows_the_default(action):
+    layout = "absolute" if action == "velocity" else "relative"
+    env = gymnasium.make_vec(
+        "QuadGym/Trajectory-v0", num_envs=20, action=action, layout=layout, randomize=True
+    )
+    policy, errors = PDPolicy(env), []
+    observation, _ = env.reset(seed=0)
+    for _ in range(400):
+        observation, _, terminated, _, info = env.step(policy.predict(observation)[0])
+        assert not terminated.any()
+        errors.append(info["position_error"])
+    assert np.mean(errors[150:]) < 0.15
+
+
+def test_the_report_s_controller_follows_at_every_tick():
+    batch = FlightBatch(
+        2,
+        task=TaskParams(kind="trajectory", start="hover", duration=0.0),
+        source=Source.TRUTH,
+        control=Control.PD,
+        threads=1,
+    )
+    batch.reset(seeds=[0, 1], position=(0.0, 0.0, 1.5), velocity=(0.0, 0.0, 0.0))
+    for _ in range(2000):
+        batch.step()
+        assert batch.read("path_r").shape == (2, 3)
+    assert batch.read("position_error").max() < 0.15
+
+
+def test_the_filter_starts_warm_on_it():
+    env = QuadEnv("trajectory", trajectory=OPEN, filter_start="warm", sensors="rtk")
+    env.reset(seed=0)
+    assert env.step(np.zeros(4))[4]["estimation_error"] < 0.5
+
+
+def test_the_time_limit_is_the_trajectorys():
+    for given, seconds in ((OPEN, 4.8), (CLOSED, 6.2), (SEVERAL, 6.2), (None, 10.0)):
+        env = QuadEnv("trajectory", trajectory=given, observation="truth")
+        assert env.flights.batch.max_steps == round(50 * seconds)
+    assert QuadEnv("trajectory", trajectory=OPEN, duration=7.0).flights.batch.max_steps == 350
+    env = gymnasium.make("QuadGym/Trajectory-v0", trajectory=OPEN, max_episode_steps=40)
+    assert env.unwrapped.flights.batch.max_steps == 40
+
+
+def test_a_table_by_its_path(tmp_path):
+    file = tmp_path / "path.csv"
+    rows = [f"{t},{x},{y},{z}" for t, (x, y, z) in zip(WHEN, FIVE, strict=True)]
+    file.write_text("\n".join(["time,x,y,z", *rows]))
+    for given in (file, str(file), [file, CLOSED]):
+        env = QuadEnv("trajectory", trajectory=given, observation="truth")
+        assert env.flights.task.trajectories[0] == Trajectory.through(FIVE, WHEN)
+
+
+def test_what_does_not_fit_is_refused():
+    fast = Trajectory.through(FIVE, max_speed=8.0, max_acceleration=30.0)
+    with pytest.raises(ValueError, match=r"trajectory must be .* fly: .* at .* s .segment . of 4"):
+        gymnasium.make("QuadGym/Trajectory-v0", trajectory=fast)
+    with pytest.raises(ValueError, match=r"trajectory\[1\] must be one that the vehicle can fly"):
+        gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=2, trajectory=[OPEN, fast])
+    far = Trajectory.through([(0, 0, 1), (2000, 0, 1)])
+    for keywords, message in (
+        ({"task": "circle", "trajectory": OPEN}, "trajectory belongs to the task trajectory"),
+        ({"trajectory": 3}, "must be a Trajectory or a sequence of them"),
+        ({"trajectory": "nowhere.csv"}, "trajectory must be a file that can be read"),
+        ({"trajectory": []}, "must be a Trajectory or a sequence of them"),
+        ({"trajectory": [OPEN, 3]}, "trajectory must be a Trajectory"),
+        ({"trajectory": far}, "must stay within 1000 m"),
+        ({"radius": 3.0}, "radius means nothing to the task trajectory"),
+        ({"period": 3.0}, "period means nothing to the task trajectory"),
+        ({"max_speed": 3.0}, "max_speed belongs to the task random_trajectory"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            QuadEnv(**{"task": "trajectory", **keywords})
+    with pytest.raises(ValueError, match="must not be given for the task hover"):
+        TaskParams(kind="hover", trajectory=OPEN)
+    env = QuadEnv("trajectory", trajectory=OPEN, observation="truth")
+    env.reset(options={"position": (2.0, 0.0, 1.0)})
+    with pytest.raises(ValueError, match="position must be within"):
+        env.reset(options={"position": (9.0, 0.0, 1.0)})
+
+
+def test_others_have_no_room_for_it():
+    plain = FlightBatch(8, **TRUTH)
+    assert "path_r" not in plain.snapshot().dtype.names
+    assert plain.trajectory(0) is None

@@ -1,0 +1,149 @@
+"""What trajectories demand of a vehicle, by an inverse dynamics of the test's own."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym import Trajectory
+from quad_gym.params.trajectories.feasibility import sampling_times
+from quad_gym.params.trajectories.flatness import motion_of
+from tests.unit.test_trajectory import FIVE
+
+VEHICLE = quad_gym.vehicle_params("lab")
+UP = np.array([0.0, 0.0, VEHICLE.gravity])
+
+
+def attitudes(path, t):
+    """(n, 3, 3) body axes in I as rows, from thrust direction and heading."""
+    z = path(t, 2) + UP
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    yaw = path.yaw(t)
+    y = np.cross(z, np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1))
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def rates_between(path, t, h):
+    """Mean body rates over [t - h, t + h], from the turn between the attitudes."""
+    turn = attitudes(path, t + h) @ attitudes(path, t - h).transpose(0, 2, 1)
+    return -Rotation.from_matrix(turn).as_rotvec() / (2.0 * h)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"yaw": "along"}, {"look_at": (0.5, 9.0)}, {"yaw": [0.0, 1.0, -1.0, 2.0, 0.5]}]
+)
+@pytest.mark.parametrize("closed", [False, True])
+def test_what_a_motion_takes_is_what_makes_it(options, closed):
+    """Thrust and torques, put into the equations of motion, give its accelerations."""
+    path = Trajectory.through(FIVE, max_speed=4.0, max_acceleration=6.0, closed=closed, **options)
+    t, h = np.linspace(0.4, path.duration - 0.4, 60), 1e-4
+    motion = motion_of(path, VEHICLE, t)
+    np.testing.assert_allclose(motion.R_BI, attitudes(path, t), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(motion.body_rates, rates_between(path, t, h), rtol=0, atol=1e-5)
+    # J dw/dt + w x J w by differences of the rates
+    J = np.array(VEHICLE.inertia)
+    after, before = (motion_of(path, VEHICLE, t + s * h).body_rates for s in (1.0, -1.0))
+    change = (after - before) / (2.0 * h)
+    torque = change @ J.T + np.cross(motion.body_rates, motion.body_rates @ J.T)
+    np.testing.assert_allclose(motion.torque, torque, rtol=0.0, atol=1e-6)
+    # the rotors' forces, rotor by rotor: l x F e3 - s kN/kF F e3
+    arms, spins = np.array(VEHICLE.rotor_positions_B), np.array(VEHICLE.rotor_spins)
+    drag = VEHICLE.torque_coefficient / VEHICLE.thrust_coefficient
+    for force, wanted, thrust in zip(motion.rotor_forces, torque, motion.thrust, strict=True):
+        up = np.outer(force, [0.0, 0.0, 1.0])
+        made = np.cross(arms, up).sum(axis=0) - [0.0, 0.0, drag * (spins * force).sum()]
+        np.testing.assert_allclose(made, wanted, rtol=0.0, atol=1e-6)
+        assert force.sum() == pytest.approx(thrust, rel=1e-12)
+    demand = path.check(VEHICLE)
+    fine = np.linspace(0.0, path.duration, 40_001)
+    speed, acceleration = (np.linalg.norm(path(fine, k), axis=1).max() for k in (1, 2))
+    force = np.linalg.norm(path(fine, 2) + UP, axis=1) * VEHICLE.mass
+    assert demand.speed == pytest.approx(speed, rel=1e-3)
+    assert demand.acceleration == pytest.approx(acceleration, rel=1e-3)
+    assert demand.thrust == pytest.approx((force.min(), force.max()), rel=1e-3)
+    assert demand.tilt == pytest.approx(np.arccos(attitudes(path, fine)[:, 2, 2]).max(), rel=1e-3)
+
+
+def test_a_circle_takes_what_books_say():
+    """At 5 m and 4 m/s: tilt atan(v^2 / r g), thrust m sqrt(g^2 + (v^2/r)^2), yaw rate v / r."""
+    rate = 4.0 / 5.0
+    path = Trajectory.of(
+        lambda t: (5.0 * math.cos(rate * t), 5.0 * math.sin(rate * t), 1.0),
+        2.0 * math.pi / rate,
+        closed=True,
+        yaw="along",
+    )
+    inward, g = 16.0 / 5.0, VEHICLE.gravity
+    demand, tilt = path.check(VEHICLE), math.atan(inward / g)
+    assert demand.tilt == pytest.approx(tilt, rel=1e-4)
+    assert demand.thrust == pytest.approx([VEHICLE.mass * math.hypot(g, inward)] * 2, rel=1e-4)
+    assert demand.body_rates[2] == pytest.approx(rate * math.cos(tilt), rel=1e-3)
+    assert demand.body_rates[0] == pytest.approx(0.0, abs=1e-3)
+    assert demand.body_rates[1] == pytest.approx(rate * math.sin(tilt), rel=1e-3)
+
+
+def test_what_cannot_be_flown_is_refused_with_its_place_and_size():
+    path = Trajectory.through(FIVE, max_speed=9.0, max_acceleration=7.0)
+    motion = motion_of(path, VEHICLE, sampling_times(path))
+    times, rates = sampling_times(path), np.abs(motion.body_rates)
+    segments = len(path.times) - 1
+
+    def where(k):
+        segment = np.searchsorted(path.times, times[k], side="right")
+        return f"at {times[k]:.3f} s .segment {segment} of {segments}."
+
+    k = int(motion.thrust.argmax())
+    excess = round(100 * (motion.thrust[k] / 8.5 - 1.0))
+    assert excess > 1
+    with pytest.raises(
+        ValueError, match=f"thrust of {motion.thrust[k]:.4g} N {where(k)}, {excess} %"
+    ):
+        path.check(VEHICLE, max_thrust=8.5)
+    k = int(motion.tilt.argmax())
+    with pytest.raises(ValueError, match=f"a tilt of .* degrees {where(k)}, .* 20 degrees"):
+        path.check(VEHICLE, max_tilt=math.radians(20.0))
+    k = int(rates[:, 0].argmax())
+    with pytest.raises(
+        ValueError, match=f"body rate about x of {rates[k, 0]:.4g} rad/s {where(k)}"
+    ):
+        path.check(VEHICLE, max_body_rates=(0.1, 6.0, 6.0))
+    with pytest.raises(ValueError, match=r"a speed of .* m/s"):
+        path.check(VEHICLE, max_speed=1.0)
+    weak = VEHICLE.replace(max_voltage=1.03 * VEHICLE.hover_voltage)
+    k = np.unravel_index(motion.rotor_forces.argmax(), motion.rotor_forces.shape)
+    with pytest.raises(ValueError, match=f"force of rotor {k[1] + 1} of .* N {where(k[0])}"):
+        path.check(weak, max_thrust=1e3)
+    path.check(VEHICLE)
+    with pytest.raises(ValueError, match="vehicle must be a VehicleParams"):
+        path.check("lab")
+
+
+def test_a_rotor_cannot_pull():
+    """Falling faster than gravity takes rotors that pull; a trajectory on its head, none."""
+    path = Trajectory.of(lambda t: (0.0, 0.0, 9.0 - 5.5 * t * t), 1.0)
+    path.check(VEHICLE, max_tilt=math.pi)  # upside down, thrust downward
+    with pytest.raises(ValueError, match="a tilt of 180 degrees"):
+        path.check(VEHICLE, max_tilt=math.radians(100.0))
+    free_fall = Trajectory.of(lambda t: (0.0, 0.0, 9.0 - 0.5 * VEHICLE.gravity * t * t), 1.0)
+    with pytest.raises(ValueError, match="must be one that the vehicle can fly"):
+        free_fall.check(VEHICLE)
+
+
+def test_jumps_are_refused():
+    terms = np.zeros((8, 2, 4))
+    terms[6, :, 0] = 1.0
+    terms[7, 1, 0] = 1.0
+    path = Trajectory(times=[0.0, 1.0, 2.0], coefficients=terms)
+    path.check(VEHICLE)
+    for row, what in ((7, "position"), (6, "velocity"), (5, "acceleration")):
+        other = terms.copy()
+        other[row, 1, 1] = 0.25
+        path = Trajectory(times=[0.0, 1.0, 2.0], coefficients=other)
+        with pytest.raises(ValueError, match=f"jump: its {what} does by 0.*at 1.000 s"):
+            path.check(VEHICLE)
+    closed = Trajectory(times=[0.0, 1.0, 2.0], coefficients=terms, closed=True)
+    with pytest.raises(ValueError, match=r"jump: its position does by 2 m at 2.000 s"):
+        closed.check(VEHICLE)
