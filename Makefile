@@ -20,7 +20,7 @@ $(VENV)/.trainer: $(VENV)/.user
 	touch $@
 
 $(VENV)/.developer: $(VENV)/.user
-	$(INSTALL) ".[train,plot,render,pandas,rerun,export,dev]"
+	$(INSTALL) ".[train,plot,render,pandas,ulog,rerun,export,dev]"
 	touch $@
 
 $(VENV)/.writer: $(VENV)/.user

@@ -32,6 +32,31 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
     return _geodetic(_checked_place("r_G", r_G))
 
 
+def geodetic_to_ecef(latitude: float, longitude: float, height: float) -> NDArray[np.float64]:
+    """A point in ECEF from its geodetic coordinates: the inverse of `ecef_to_geodetic`.
+
+    Args:
+        latitude: From the equator toward north [rad].
+        longitude: From Greenwich toward east [rad].
+        height: Above the ellipsoid [m].
+
+    Returns:
+        (3,) position in G [m].
+
+    Raises:
+        ValueError: If an argument is not finite, the latitude is beyond a pole, or the point lies
+            within 1,000 km of the Earth's center.
+    """
+    lat = check.number("latitude", latitude, least=-0.5 * math.pi, most=0.5 * math.pi)
+    lon, h = check.number("longitude", longitude), check.number("height", height, least=-5.3e6)
+    eccentricity2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING)
+    sin_lat, cos_lat = math.sin(lat), math.cos(lat)
+    radius = WGS84_SEMI_MAJOR_AXIS / math.sqrt(1.0 - eccentricity2 * sin_lat**2)
+    p = (radius + h) * cos_lat
+    z = (radius * (1.0 - eccentricity2) + h) * sin_lat
+    return np.array([p * math.cos(lon), p * math.sin(lon), z])
+
+
 def _checked_place(name: str, value: ArrayLike) -> NDArray[np.float64]:
     place = check.array(name, value, (3,))
     if norm(place) < 1e6:

@@ -1,10 +1,30 @@
-"""State estimation for one vehicle: Wahba's problem, an unscented and an extended Kalman filter."""
+"""State estimation for one vehicle: filters, their use on logs, and Wahba's problem."""
 
+from quad_gym.estimation.estimate import Innovations
 from quad_gym.estimation.filters import (
-    FARTHEST_FIX,
+    LONGEST_STEP,
     ExtendedKalmanFilter,
     UnscentedKalmanFilter,
 )
+from quad_gym.estimation.first_fix import FARTHEST_FIX
+from quad_gym.estimation.logs import LOG_COLUMNS, Log, LogColumn, Stream
+from quad_gym.estimation.replaying import Measured, Replay, replay
+from quad_gym.estimation.tables import read_log
 from quad_gym.estimation.wahba import solve_wahba
 
-__all__ = ["FARTHEST_FIX", "ExtendedKalmanFilter", "UnscentedKalmanFilter", "solve_wahba"]
+__all__ = [
+    "FARTHEST_FIX",
+    "LOG_COLUMNS",
+    "LONGEST_STEP",
+    "ExtendedKalmanFilter",
+    "Innovations",
+    "Log",
+    "LogColumn",
+    "Measured",
+    "Replay",
+    "Stream",
+    "UnscentedKalmanFilter",
+    "read_log",
+    "replay",
+    "solve_wahba",
+]

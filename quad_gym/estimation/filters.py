@@ -1,73 +1,47 @@
 """An unscented and an extended Kalman filter for one vehicle."""
 
+import math
 import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from quad_gym.estimation.correlated import update_with_correlated
+from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.estimate import Estimate
-from quad_gym.kernels import single
-from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import Stage
-from quad_gym.packing.aids import pack_aid_settings
-from quad_gym.packing.flight import form_of, params_block, params_record
+from quad_gym.estimation.first_fix import checked_fix
+from quad_gym.estimation.headings import RESOLVED, collapse, moments, update_and_weigh
+from quad_gym.estimation.history import SAME_TIME, History
+from quad_gym.estimation.samples import Measurement, Sample, checked_measurement
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import (
-    AID_FREEDOMS,
-    FLIGHT_BLOCK,
-    SETTINGS,
-    WORK_BLOCK,
-    Aid,
-    FilterForm,
-    aligned_zeros,
-)
+from quad_gym.records import FilterForm, FilterStatus
 
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
-FARTHEST_FIX = 1e6
-"""From the reference antenna [m]; positions from the center of the Earth are farther."""
+LONGEST_STEP = 1.0
+"""Of a prediction with one sample of the IMU [s], unless the suite's tick is longer."""
 
-
-def _require_relative(position_G: NDArray[np.float64]) -> None:
-    """Refuse a first fix that is no place near the reference antenna."""
-    if np.abs(position_G).max() > FARTHEST_FIX:
-        raise ValueError(
-            "gnss_position_G must be relative to the reference antenna "
-            f"(GnssParams.reference_antenna_G), within {FARTHEST_FIX:g} m of it, got "
-            f"{position_G}; from an absolute position in ECEF subtract that of the antenna"
-        )
+_OF_GATES = int(FilterForm.GATE)
 
 
 class _KalmanFilter(Estimate):
-    """What the filters have in common: their interface, and all but the kind of their kernels.
-
-    They run the stages of flights on one block, all of whose lanes hold the same flight.
-    """
+    """What the filters have in common: their interface, and all but the kind of their kernels."""
 
     _kind: str
 
-    def __init__(self, sensors: SensorSuite) -> None:
+    def __init__(self, sensors: SensorSuite, *, window: float = 0.5) -> None:
         if not isinstance(sensors, SensorSuite):
             raise ValueError(f"sensors must be a SensorSuite, got {type(sensors).__name__}")
         sensors.require_filter()
+        length = check.number("window", window, least=0.0, most=60.0)
         self.sensors = sensors
-        self._features = 0 if sensors.camera is None else len(sensors.camera.features_I)
-        params = params_record(VehicleParams(), sensors)
-        params["gravity"] = sensors.estimator.gravity
-        self._params = params_block(params)
-        lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
-        estimator = sensors.estimator.replace(kind=self._kind)
-        form = form_of(estimator, innovations=True, lever_arm=lever_arm)
-        self._settings = np.zeros(1, SETTINGS)
-        self._settings["form"], self._settings["feature_count"] = int(form), self._features
-        pack_aid_settings(self._settings[0], sensors, sensors)
-        self._slow = bool(self._settings["slow_states"] > 0)
-        self._flight = aligned_zeros(1, FLIGHT_BLOCK)
-        self._work = aligned_zeros(1, WORK_BLOCK)
-        self._work["mask"] = 1.0
+        self._engine = Engine(sensors, self._kind)
+        self._history = History(length, self._apply, self._copy, self._restore)
+        self._log_weights, self._moments = None, None
+        self._awaited: Measurement | None = None
+        self._report = self._innovations([])
         self._running = False
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -75,37 +49,74 @@ class _KalmanFilter(Estimate):
     def initialize(
         self,
         gnss_position_G: ArrayLike,
-        gnss_baseline_G: ArrayLike,
+        gnss_baseline_G: ArrayLike | None = None,
         heading: float | None = None,
+        *,
+        heading_sigma: float | None = None,
+        magnetometer: ArrayLike | None = None,
+        magnetometer_sigma: float | None = None,
+        gnss_velocity_G: ArrayLike | None = None,
+        course: bool = False,
+        gnss_sigma: ArrayLike | None = None,
+        velocity_sigma: float | None = None,
+        tilt_sigma: float | None = None,
+        time: float = 0.0,
     ) -> None:
-        """Start from a first fix: attitude by Wahba's problem, the body z axis taken as vertical.
+        """Start from a first fix.
 
-        A baseline within 12 degrees of the vertical hardly tells the heading; then `heading` does,
-        with the deviation `placement.heading_sigma` of the suite.
+        With a baseline: attitude by Wahba's problem, the body z axis taken as vertical. A baseline
+        within 12 degrees of the vertical hardly tells the heading; then `heading` does, with the
+        deviation `placement.heading_sigma` of the suite.
+
+        Without: the vehicle is taken as level, and its heading comes from the first of these that
+        is given: `heading`, `magnetometer`, or with `course` the direction of `gnss_velocity_G`. If
+        none is, the heading may be any, and the motion tells it: see `heading_known`. The
+        covariance says how uncertain all of this is, and what hangs together: a tilt or hard iron
+        turns the magnetic heading, and the center of mass hangs below its antenna.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
-            gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
-            heading: Of the body x axis, from east toward north, for a steep baseline [rad]; None:
-                not known. The filter of a steep baseline then takes it for anything, and as it
-                linearizes, it may be lost.
+            gnss_baseline_G: (3,) primary to secondary antenna, in G [m]; None: not measured.
+            heading: Of the body x axis, from east toward north [rad]; None: not known. The filter
+                of a steep baseline then takes it for anything, and as it linearizes, it may be
+                lost.
+            heading_sigma: Its deviation, or with `course` that of the body x axis from the course
+                [rad]; None: `placement.heading_sigma`.
+            magnetometer: (3,) magnetic field in B [T], for suites with a magnetometer.
+            magnetometer_sigma: Its white noise per axis [T]; None: as the suite says.
+            gnss_velocity_G: (3,) velocity in G [m/s]; None: at rest.
+            course: Whether the vehicle flies nose first.
+            gnss_sigma: Noise of the position, as of `update`; None: as the suite says.
+            velocity_sigma: Noise of the velocity per axis [m/s]; None: as the suite says.
+            tilt_sigma: Deviation of roll and pitch of a level start [rad]; None:
+                `FilterParams.initial_tilt_sigma`, or else LEVEL_SIGMA.
+            time: Time stamp of the start [s]; others count from the same zero.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the position is farther
-                than FARTHEST_FIX from the reference antenna, or the baseline is zero; or the suite
-                has no GNSS.
+                than FARTHEST_FIX from the reference antenna, the baseline is zero, or arguments do
+                not belong together; or the suite lacks a sensor.
         """
-        self._require_gnss("initialize: start with set_state() instead")
-        position = check.array("gnss_position_G", gnss_position_G, (3,))
-        _require_relative(position)
-        baseline = self._checked_baseline(gnss_baseline_G)
-        x_I = np.zeros(3)
-        if heading is not None:
-            angle = check.number("heading", heading)
-            x_I[:2] = np.cos(angle), np.sin(angle)
-        self._set("gnss_position", position)
-        self._set("gnss_baseline", baseline)
-        self._start(x_I)
+        fix = checked_fix(
+            self.sensors,
+            gnss_position_G,
+            gnss_baseline_G,
+            heading,
+            heading_sigma,
+            magnetometer,
+            magnetometer_sigma,
+            gnss_velocity_G,
+            course,
+            gnss_sigma,
+            velocity_sigma,
+            tilt_sigma,
+        )
+        begin, engine = check.number("time", time), self._engine
+        self._begin(begin, len(fix.starts))
+        fix.write(engine)
+        if len(fix.starts) > 1:
+            self._log_weights = np.full(engine.lanes, -math.log(engine.lanes))
+            self._choose_form()
         self._running = True
 
     def set_state(
@@ -117,6 +128,7 @@ class _KalmanFilter(Estimate):
         accel_bias: ArrayLike,
         gyro_bias: ArrayLike,
         covariance: ArrayLike,
+        time: float = 0.0,
     ) -> None:
         """Start from a given estimate.
 
@@ -127,6 +139,7 @@ class _KalmanFilter(Estimate):
             accel_bias: (3,) in B [m/s^2].
             gyro_bias: (3,) in B [rad/s].
             covariance: (15, 15) in the order r, v, e, b_a, b_g; symmetric positive definite.
+            time: Time stamp of the start [s].
 
         Raises:
             ValueError: If an argument has another shape, is not finite, R_BI is no rotation, or the
@@ -149,41 +162,40 @@ class _KalmanFilter(Estimate):
             check.array("accel_bias", accel_bias, (3,)),
             check.array("gyro_bias", gyro_bias, (3,)),
         )
-        self._start(np.zeros(3))  # what the filter remembers begins anew; the estimate is given
+        begin = check.number("time", time)
+        self._begin(begin)
+        self._engine.start(np.zeros(3))  # what it remembers begins anew; the estimate is given
         for name, value in zip((*_STATE, "L"), (*values, L), strict=True):
-            self._set(name, value)
+            self._engine.fill(name, value)
         self._running = True
 
-    def _start(self, x_I: NDArray[np.float64]) -> None:
-        """Start from the fix in the record, with clocks at zero and nothing remembered."""
-        self._table()
-        self._flight["tick"], self._flight["w_before"] = 0.0, np.nan
-        single.start_filter(self._flight, self._params, self._settings, self._work, x_I)
+    def predict(self, gyro: ArrayLike, accel: ArrayLike, dt: float | None = None) -> None:
+        """Carry the estimate over one tick, or another time.
 
-    def _table(self) -> NDArray[Any]:
-        """The table of the stages that the filter runs."""
-        stages = single.SLOW_FILTER_STAGES if self._slow else single.FILTER_STAGES
-        own = {Stage[aid.name] for aid in self.sensors.aids}
-        return linked_table(stages | own, single.FILTER_ENTRIES)
+        Args:
+            gyro: (3,) angular rate measured at the start of the time, or its mean over it (see
+                `ImuParams.samples`), in B [rad/s].
+            accel: (3,) specific force, likewise, in B [m/s^2].
+            dt: The time, at most LONGEST_STEP [s]; None: a tick of the suite's IMU. The white noise
+                of a sample over another time is that of the same density.
 
-    def _run(self, stage: Stage, with_slow: Stage) -> None:
-        """Run a stage, or the one of a filter that estimates slow errors; warn of news.
-
-        News are what goes wrong in it.
+        Raises:
+            ValueError: If an argument has another shape or is not finite, or `dt` is not positive
+                or too long; the estimate is unchanged then.
+            RuntimeError: Before `initialize` or `set_state`.
         """
-        chosen = with_slow if self._slow else stage
-        before, p = self.status, self._params
-        others = (p, p, self._settings, self._work, self._table(), self._features)
-        single.run_stage(self._flight.ctypes.data, 0, 1, int(chosen), *others)
-        news = self.status & ~before
-        if news:
-            warnings.warn(
-                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
-            )
-
-    def _set(self, name: str, value: NDArray[Any]) -> None:
-        """Write a field of the flight."""
-        self._flight[name][0] = value[..., np.newaxis]
+        self._require_start()
+        rates = check.array("gyro", gyro, (3,))
+        force = check.array("accel", accel, (3,))
+        tick = self.sensors.imu.dt
+        step = tick
+        if dt is not None:
+            step = check.positive("dt", dt, least=1e-9, most=max(LONGEST_STEP, tick))
+        status, before = self.status, self._of_lane("w_before")
+        known = np.isfinite(before).all()
+        earlier = self._of_lane("w_meas") if known else rates
+        self._history.add(Sample(rates, force, step, earlier))
+        self._warn_of_news(status)
 
     def update(
         self,
@@ -191,9 +203,13 @@ class _KalmanFilter(Estimate):
         gnss_baseline_G: ArrayLike | None = None,
         pixels: ArrayLike | None = None,
         gnss_velocity_G: ArrayLike | None = None,
-        **aids: ArrayLike | None,
+        *,
+        time: float | None = None,
+        **others: Any,
     ) -> None:
         """Condition the estimate on measurements of one instant; None: not measured.
+
+        What comes late is included as if it had come in time, see `quad_gym.estimation.history`.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
@@ -202,102 +218,116 @@ class _KalmanFilter(Estimate):
                 seen.
             gnss_velocity_G: (3,) velocity of the primary antenna, in G [m/s]; for suites whose GNSS
                 measures it. Its lever arm is turned with the last `gyro` predicted with.
-            aids: What aiding sensors measure that the suite has: `barometer`, the height in I by
-                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T].
+            time: Their time stamp [s], from `oldest_time` to `time` of the filter; None: now.
+            others: What aiding sensors measure that the suite has: `barometer`, the height in I by
+                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T]. And noise in
+                place of the suite's, per axis: `gnss_sigma`, a number, three (east, north, up), or
+                a (3, 3) covariance in I, with which the position is processed by itself [m, m^2];
+                `velocity_sigma` [m/s], `baseline_sigma` [rad], `pixel_sigma` [pixels],
+                `barometer_sigma` [m], `magnetometer_sigma` [T].
 
         Raises:
-            ValueError: If an argument has another shape or is not finite, or the suite lacks the
-                sensor whose measurement is given; the estimate is unchanged then.
+            ValueError: If an argument has another shape or is not finite, the suite lacks the
+                sensor whose measurement is given, or the time stamp is older than the window or
+                later than the last prediction; the estimate is unchanged then.
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
-        f = self._flight
-        aided = self._checked_aids(aids)
-        if gnss_position_G is not None or gnss_baseline_G is not None:
-            self._require_gnss("update")
-        position = baseline = velocity = image = None
-        if gnss_position_G is not None:
-            position = check.array("gnss_position_G", gnss_position_G, (3,))
-        if gnss_baseline_G is not None:
-            baseline = self._checked_baseline(gnss_baseline_G)
-        if pixels is not None:
-            image = check.array("pixels", pixels, (self._features, 2), allow_nan=True)
+        measurement = checked_measurement(
+            self.sensors, gnss_position_G, gnss_baseline_G, pixels, gnss_velocity_G, others
+        )
+        status, now = self.status, self._history.time
+        stamp = now if time is None else check.number("time", time)
+        self._awaited = measurement
+        if stamp > now + SAME_TIME:
+            raise ValueError(
+                f"time must not be later than the filter, which is at {now:.6f} s, got "
+                f"{stamp:.6f} s: predict up to it first"
+            )
+        if stamp >= now - SAME_TIME:
+            self._history.add(measurement)
+        elif stamp < self.oldest_time - SAME_TIME:
+            raise ValueError(
+                f"time must be at least {self.oldest_time:.6f} s, as the filter remembers "
+                f"{self._history.window:g} s (window=) and what came since its start, got "
+                f"{stamp:.6f} s"
+            )
+        else:
+            self._history.insert(measurement, stamp)
+        self._warn_of_news(status)
 
-        if gnss_velocity_G is not None:
-            if self.sensors.gnss is None or self.sensors.gnss.velocity_sigma is None:
-                raise ValueError("the sensor suite has no GNSS velocity to update with")
-            velocity = check.array("gnss_velocity_G", gnss_velocity_G, (3,))
+    @property
+    def time(self) -> float:
+        """Time stamp up to which the filter has predicted [s]."""
+        return self._history.time
 
-        f["position_valid"], f["baseline_valid"] = position is not None, baseline is not None
-        f["velocity_valid"] = velocity is not None
-        f["feature_valid"], f["aid_valid"] = 0.0, 0.0
-        for aid, value in aided.items():
-            f["aid_valid"][0, aid] = 1.0
-            f["aid_measurement"][0, aid, : len(value)] = value[:, np.newaxis]
-        if position is not None:
-            self._set("gnss_position", position)
-        if baseline is not None:
-            self._set("gnss_baseline", baseline)
-        if velocity is not None:
-            self._set("gnss_velocity", velocity)
-        if image is not None:
-            seen = np.asarray(~np.isnan(image).any(axis=1))[:, np.newaxis]
-            f["feature_valid"][0, : self._features] = seen
-            f["pixels"][0, : self._features] = np.where(seen, image, 0.0)[..., np.newaxis]
-        self._run(Stage.UPDATE, Stage.UPDATE_WITH_SLOW)
+    @property
+    def oldest_time(self) -> float:
+        """The oldest time stamp of a measurement that `update` still takes [s]."""
+        return self._history.oldest
 
-    def predict(self, gyro: ArrayLike, accel: ArrayLike) -> None:
-        """Carry the estimate over one tick.
+    # ---- memory -------------------------------------------------------------------------------
 
-        Args:
-            gyro: (3,) angular rate measured at the start of the tick, or its mean over it (see
-                `ImuParams.samples`), in B [rad/s].
-            accel: (3,) specific force, likewise, in B [m/s^2].
+    def _begin(self, time: float, flights: int = 1) -> None:
+        """Forget everything, and make room for flights."""
+        self._log_weights, self._moments = None, None
+        self._report = self._innovations([])
+        self._choose_form()
+        if flights > 1 or len(self._engine.blocks) > 1:
+            self._engine.allocate(flights)
+        self._history.begin(time)
 
-        Raises:
-            ValueError: If an argument has another shape or is not finite; the estimate is unchanged
-                then.
-            RuntimeError: Before `initialize` or `set_state`.
-        """
-        self._require_start()
-        rates = check.array("gyro", gyro, (3,))
-        force = check.array("accel", accel, (3,))
-        f = self._flight
-        known = np.isfinite(f["w_before"]).all()
-        self._set("gyro", rates)
-        self._set("accel", force)
-        f["tick"] += 1.0
-        # they turn the lever arms of a velocity and of the accelerometer
-        f["w_before"] = f["w_meas"] if known else f["gyro"]
-        f["w_meas"] = f["gyro"]
-        self._run(Stage.PREDICT, Stage.PREDICT_WITH_SLOW)
+    def _apply(self, given: Sample | Measurement) -> None:
+        """Give the filter a sample or a measurement."""
+        self._moments, whole = None, given
+        if isinstance(given, Sample):
+            self._engine.predict(given)
+            return
+        covariance = given.position_covariance_I
+        if covariance is not None:
+            correlated = given.only_position()
+            update_with_correlated(self._engine, self._condition, correlated, covariance)
+            given = given.without_position()
+        if not given.empty:
+            self._condition(given)
+        if whole is self._awaited:
+            self._report = self._innovations(whole.blocks)
 
-    def _require_gnss(self, what: str) -> None:
-        if self.sensors.gnss is None:
-            raise ValueError(f"the sensor suite has no GNSS to {what}")
+    def _condition(self, measurement: Measurement) -> None:
+        """Condition the estimate, or those for each heading, until one of them is left."""
+        if self._log_weights is None:
+            self._engine.update(measurement)
+            return
+        self._log_weights = update_and_weigh(self._engine, measurement, self._log_weights)
+        mixed = moments(self._engine, self._log_weights)
+        if mixed.heading_sigma < RESOLVED:
+            collapse(self._engine, self._log_weights, mixed)
+            self._log_weights = None
+            self._choose_form()
 
-    def _checked_aids(self, given: dict[str, Any]) -> dict[Aid, NDArray[np.float64]]:
-        """What aiding sensors measure, as arrays; None: not measured."""
-        check.keywords(given, tuple(aid.name.lower() for aid in Aid), "update")
-        found = {}
-        for name, value in given.items():
-            aid = Aid[name.upper()]
-            if value is None:
-                continue
-            if aid not in self.sensors.aids:
-                raise ValueError(f"the sensor suite has no {name} to update with")
-            alone = AID_FREEDOMS[aid] == 1
-            numbers = [check.number(name, value)] if alone else value
-            found[aid] = check.array(name, numbers, (AID_FREEDOMS[aid],))
-        return found
+    def _copy(self) -> Any:
+        return self._engine.copy(), self._log_weights
 
-    def _checked_baseline(self, gnss_baseline_G: ArrayLike) -> NDArray[np.float64]:
-        baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
-        largest = np.abs(baseline).max()
-        if largest == 0.0:
-            raise ValueError("gnss_baseline_G must have a direction, got zeros")
-        # its length does not count: by a power of two it comes near one, exactly
-        return np.ldexp(baseline, -int(np.frexp(largest)[1]))
+    def _restore(self, state: Any) -> None:
+        words, self._log_weights = state
+        self._moments = None
+        self._engine.restore(words)
+        self._choose_form()
+
+    def _choose_form(self) -> None:
+        """Gate only where one flight is estimated: what is unlikely of a heading weighs it."""
+        form = int(self._engine.form)
+        if self._log_weights is not None:
+            form &= ~_OF_GATES
+        self._engine.settings["form"] = form
+
+    def _warn_of_news(self, before: FilterStatus) -> None:
+        """Warn of what has gone wrong since."""
+        news = self.status & ~before
+        if news:
+            warnings.warn(
+                f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
+            )
 
 
 class UnscentedKalmanFilter(_KalmanFilter):
@@ -308,11 +338,16 @@ class UnscentedKalmanFilter(_KalmanFilter):
     with antenna position, baseline direction and feature directions; any of them may be missing at
     any time. `FilterParams` tells where the filter may differ from the report's.
 
+    Samples may come at any time, and measurements late, with their time stamps and their own noise:
+    see `predict` and `update`. `quad_gym.estimation.replay` filters a log.
+
     A cycle whose result is not finite, or whose covariance would not be positive definite, leaves
     the estimate as it was, sets `status`, and warns.
 
     Args:
         sensors: The sensor suite whose geometry and noise the filter believes in.
+        window: How late measurements may come that carry their time stamp [s]; 0: none may, and
+            nothing is kept for them.
 
     Raises:
         ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
@@ -330,6 +365,8 @@ class ExtendedKalmanFilter(_KalmanFilter):
 
     Args:
         sensors: The sensor suite whose geometry and noise the filter believes in.
+        window: How late measurements may come that carry their time stamp [s]; 0: none may, and
+            nothing is kept for them.
 
     Raises:
         ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU

@@ -68,6 +68,14 @@ def _fall(error: SlowError, time: float) -> tuple[float, float]:
     return decay, error.sigma * math.sqrt(-math.expm1(-2.0 * time / error.tau))
 
 
+def slow_falls(
+    sensors: SensorSuite, time: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Decays of the filter's slow errors over a time [s], and deviations of what drives them."""
+    falls = np.array([_fall(error, time) for error in slow_states(sensors).errors]).reshape(-1, 2)
+    return falls[:, 0], falls[:, 1]
+
+
 def pack_aids(p: Any, sensors: SensorSuite) -> None:
     """Write the numbers of aiding sensors and slow errors into a parameter record."""
     p["slow_decay"] = p["slow_sigma"] = 1.0

@@ -1,0 +1,74 @@
+"""Positions with correlated errors, by a filter that knows deviations along the axes of I alone.
+
+With the covariance C = T^T diag(s^2) T the errors are independent along the rows of T. So the state
+is turned into the frame of T (r, v, the drift of GNSS, R_BI; error angles and biases are in B
+already), updated with the deviations s, and turned back. Nothing is approximated.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from quad_gym.estimation.engine import Engine, Floats
+from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.starts import lower_factor
+
+
+def in_principal_axes(covariance: Floats) -> tuple[Floats, Floats]:
+    """The rotation T and the deviations s of a covariance T^T diag(s^2) T."""
+    variances, axes = np.linalg.eigh(covariance)
+    T = axes.T
+    if np.linalg.det(T) < 0.0:
+        T[0] = -T[0]
+    return T, np.sqrt(variances)
+
+
+def turn_state(engine: Engine, T: Floats) -> None:
+    """Turn everything of the estimate that is in I, and what turns GNSS positions into I."""
+    n = int(engine.settings["slow_states"][0])
+    drifts = bool(engine.settings["estimates_drift"][0])
+    for name in ("r_hat", "v_hat"):
+        engine.write(name, engine.read(name) @ T.T)
+    engine.write("R_hat", engine.read("R_hat") @ T.T)
+    R_IG = engine.params["R_IG"]
+    engine.params["R_IG"] = np.einsum("ij,bjkl->bikl", T, R_IG)
+    if drifts:
+        slow = engine.read("slow_hat")
+        slow[:, :3] = slow[:, :3] @ T.T
+        engine.write("slow_hat", slow)
+    L, rows = engine.read("L"), engine.read("L_slow")
+    joint = np.zeros((engine.lanes, 15 + n, 15 + n))
+    joint[:, :15, :15], joint[:, 15:] = L, rows[:, :n, : 15 + n]
+    for first in (0, 3, *((15,) if drifts else ())):
+        joint[:, first : first + 3] = T @ joint[:, first : first + 3]
+    factors = np.array([lower_factor(root) for root in joint])
+    rows[:, :n, : 15 + n] = factors[:, 15:]
+    engine.write("L", factors[:, :15, :15])
+    engine.write("L_slow", rows)
+
+
+def update_with_correlated(
+    engine: Engine,
+    condition: Callable[[Measurement], None],
+    measurement: Measurement,
+    covariance: Floats,
+) -> None:
+    """Update with a position alone whose errors have a covariance.
+
+    Args:
+        engine: The filter's memory.
+        condition: Gives the filter a measurement.
+        measurement: The position.
+        covariance: (3, 3) of its errors in I [m^2].
+    """
+    T, sigmas = in_principal_axes(covariance)
+    R_IG = engine.params["R_IG"].copy()
+    turn_state(engine, T)
+    noise = {**measurement.noise, "gnss_sigma": sigmas}
+    condition(dataclasses.replace(measurement, noise=noise))
+    turn_state(engine, T.T)
+    engine.params["R_IG"] = R_IG
+    innovation = engine.read("innovation")
+    innovation[:, 0] = innovation[:, 0] @ T
+    engine.write("innovation", innovation)

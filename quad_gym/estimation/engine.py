@@ -1,0 +1,213 @@
+"""The memory of a filter for one vehicle, and the stages of flights that run on it.
+
+All lanes of its block hold the same flight, or, as long as nobody knows the heading, each lane of
+some blocks a flight of another heading (`headings.py`).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.estimation.samples import Measurement, Sample
+from quad_gym.kernels import single
+from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.compiling.stages import Stage
+from quad_gym.packing.aids import pack_aid_settings, slow_falls
+from quad_gym.packing.flight import form_of, params_block, params_record
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.records import (
+    FLIGHT_BLOCK,
+    SETTINGS,
+    WIDTH,
+    WORK_BLOCK,
+    FilterForm,
+    aligned_zeros,
+    room_of,
+)
+
+Floats = NDArray[np.float64]
+
+_OF_TICKS = (
+    *("dt", "accel_noise", "gyro_noise", "accel_error_noise"),
+    *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
+    *("slow_decay", "slow_drive"),
+)
+"""Fields of the parameter record that depend on how long a prediction is."""
+
+_PARTS = frozenset({"filter", "watch", "slow", "aids"})
+
+
+class Engine:
+    """Records, parameters and stages of one filter.
+
+    Args:
+        sensors: What the filter believes in.
+        kind: "ukf" or "ekf".
+    """
+
+    def __init__(self, sensors: SensorSuite, kind: str) -> None:
+        self.sensors = sensors
+        self.features = 0 if sensors.camera is None else len(sensors.camera.features_I)
+        params = params_record(VehicleParams(), sensors)
+        params["gravity"] = sensors.estimator.gravity
+        self.params = params_block(params)
+        self._of_tick = {name: self.params[name].copy() for name in _OF_TICKS}
+        self._dt = sensors.imu.dt
+        lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
+        estimator = sensors.estimator.replace(kind=kind)
+        self.form = form_of(estimator, innovations=True, lever_arm=lever_arm)
+        self.settings = np.zeros(1, SETTINGS)
+        self.settings["form"], self.settings["feature_count"] = int(self.form), self.features
+        pack_aid_settings(self.settings[0], sensors, sensors)
+        self.slow = bool(self.settings["slow_states"] > 0)
+        self._room = room_of(_PARTS)
+        self._work = aligned_zeros(1, WORK_BLOCK)
+        self._work["mask"] = 1.0
+        self.blocks = aligned_zeros(1, FLIGHT_BLOCK)
+
+    # ---- memory -------------------------------------------------------------------------------
+
+    @property
+    def lanes(self) -> int:
+        """How many flights there are in memory, equal ones included."""
+        return len(self.blocks) * WIDTH
+
+    def allocate(self, count: int) -> None:
+        """Make room for flights, at least one block of them; what there was is lost."""
+        self.blocks = aligned_zeros(max(1, -(-count // WIDTH)), FLIGHT_BLOCK)
+
+    def read(self, name: str) -> NDArray[Any]:
+        """A field of all lanes, (lanes, ...): a copy."""
+        values = np.moveaxis(self.blocks[name], -1, 1)
+        return values.reshape(-1, *values.shape[2:]).copy()
+
+    def write(self, name: str, values: NDArray[Any]) -> None:
+        """Write a field of all lanes, from (lanes, ...)."""
+        lanes = values.reshape(len(self.blocks), WIDTH, *values.shape[1:])
+        self.blocks[name] = np.moveaxis(lanes, 1, -1)
+
+    def fill(self, name: str, value: NDArray[Any]) -> None:
+        """Write the same into a field of all lanes."""
+        self.blocks[name] = value[..., np.newaxis]
+
+    def copy(self) -> NDArray[Any]:
+        """What the filter knows, for `restore`: one lane of it if all are equal."""
+        words = self._words()
+        return words[:, :, :1].copy() if len(words) == 1 else words.copy()
+
+    def restore(self, words: NDArray[Any]) -> None:
+        """Go back to a copy."""
+        if len(words) != len(self.blocks):
+            self.allocate(len(words) * WIDTH)
+        self._words()[...] = words
+
+    def _words(self) -> NDArray[Any]:
+        """The memory of the parts that the filter uses, (blocks, words, WIDTH)."""
+        raw = self.blocks.view(np.uint64).reshape(len(self.blocks), -1, WIDTH)
+        first = self._room.skipped // (8 * WIDTH)
+        return raw[:, first : first + self._room.dtype.itemsize // (8 * WIDTH)]
+
+    # ---- stages -------------------------------------------------------------------------------
+
+    def start(self, x_I: Floats) -> None:
+        """Start from the fix in the record, with clocks at zero and nothing remembered."""
+        self._table()
+        self.blocks["tick"], self.blocks["w_before"] = 0.0, np.nan
+        for k in range(len(self.blocks)):
+            block = self.blocks[k : k + 1]
+            single.start_filter(block, self.params, self.settings, self._work, x_I)
+
+    def predict(self, sample: Sample) -> None:
+        """Carry the estimate over the time of a sample."""
+        self._set_dt(sample.dt)
+        blocks = self.blocks
+        blocks["tick"] += 1.0
+        self.fill("gyro", sample.gyro)
+        self.fill("accel", sample.accel)
+        # they turn the lever arms of a velocity and of the accelerometer
+        self.fill("w_before", sample.gyro_before)
+        self.fill("w_meas", sample.gyro)
+        self._run(Stage.PREDICT, Stage.PREDICT_WITH_SLOW)
+
+    def update(self, measurement: Measurement) -> None:
+        """Condition the estimate on measurements."""
+        m, blocks = measurement, self.blocks
+        blocks["position_valid"] = m.position_G is not None
+        blocks["baseline_valid"] = m.baseline_G is not None
+        blocks["velocity_valid"] = m.velocity_G is not None
+        blocks["feature_valid"], blocks["aid_valid"] = 0.0, 0.0
+        for aid, value in m.aids.items():
+            blocks["aid_valid"][:, aid] = 1.0
+            blocks["aid_measurement"][:, aid, : len(value)] = value[:, np.newaxis]
+        given = {
+            "gnss_position": m.position_G,
+            "gnss_baseline": m.baseline_G,
+            "gnss_velocity": m.velocity_G,
+        }
+        for name, numbers in given.items():
+            if numbers is not None:
+                self.fill(name, numbers)
+        if m.pixels is not None:
+            seen = np.asarray(~np.isnan(m.pixels).any(axis=1))[:, np.newaxis]
+            blocks["feature_valid"][:, : self.features] = seen
+            image = np.where(seen, m.pixels, 0.0)[..., np.newaxis]
+            blocks["pixels"][:, : self.features] = image
+        kept = self.impose(m.noise)
+        self._run(Stage.UPDATE, Stage.UPDATE_WITH_SLOW)
+        self.restore_noise(kept)
+
+    def impose(self, noise: dict[str, Any]) -> dict[str, NDArray[Any]]:
+        """Give parameters the noise of a measurement; returns what they were."""
+        kept = {name: self.params[name].copy() for name in noise}
+        for name, value in noise.items():
+            if name == "aid_sigma":
+                for aid, sigma in value.items():
+                    self.params[name][0, aid] = sigma
+            else:
+                self.params[name] = np.asarray(value)[..., np.newaxis]
+        return kept
+
+    def restore_noise(self, kept: dict[str, NDArray[Any]]) -> None:
+        """Give parameters back the noise that they had before `impose`."""
+        for name, numbers in kept.items():
+            self.params[name] = numbers
+
+    def _set_dt(self, dt: float) -> None:
+        """Give parameters the length of a prediction.
+
+        White noise is a density: its samples are the smaller the longer they average.
+        """
+        if dt == self._dt:
+            return
+        self._dt, imu, p = dt, self.sensors.imu, self.params
+        for name, numbers in self._of_tick.items():
+            p[name] = numbers
+        if dt == imu.dt:
+            return
+        p["dt"] = dt
+        for name in ("accel_noise", "gyro_noise", "accel_error_noise"):
+            p[name] *= math.sqrt(imu.dt / dt)
+        for sensor in ("accel", "gyro"):
+            sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
+            p[f"{sensor}_bias_decay"] = math.exp(-dt / tau)
+            p[f"{sensor}_bias_drive"] = sigma * math.sqrt(-math.expm1(-2.0 * dt / tau))
+        if self.slow:
+            decay, drive = slow_falls(self.sensors, dt)
+            p["slow_decay"][0, : len(decay)] = decay[:, np.newaxis]
+            p["slow_drive"][0, : len(drive)] = drive[:, np.newaxis]
+
+    def _table(self) -> NDArray[Any]:
+        """The table of the stages that the filter runs."""
+        stages = single.SLOW_FILTER_STAGES if self.slow else single.FILTER_STAGES
+        own = {Stage[aid.name] for aid in self.sensors.aids}
+        return linked_table(stages | own, single.FILTER_ENTRIES)
+
+    def _run(self, stage: Stage, with_slow: Stage) -> None:
+        """Run a stage, or the one of a filter that estimates slow errors."""
+        chosen, p = with_slow if self.slow else stage, self.params
+        others = (p, p, self.settings, self._work, self._table(), self.features)
+        address, count = self.blocks.ctypes.data, len(self.blocks)
+        single.run_stage(address, FLIGHT_BLOCK.itemsize, count, int(chosen), *others)

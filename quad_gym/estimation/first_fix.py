@@ -1,0 +1,202 @@
+"""The arguments of `initialize`, checked, and what a filter starts from."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quad_gym.estimation.correlated import in_principal_axes
+from quad_gym.estimation.engine import Engine, Floats
+from quad_gym.estimation.headings import COUNT, SPACING, write_starts
+from quad_gym.estimation.samples import checked_baseline, gnss_noise, require_gnss
+from quad_gym.estimation.starts import (
+    LEVEL_SIGMA,
+    FirstEstimate,
+    Heading,
+    level_start,
+    magnetic_heading,
+)
+from quad_gym.frames import ecef_to_enu
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.records import Aid
+
+FARTHEST_FIX = 1e6
+"""From the reference antenna [m]; positions from the center of the Earth are farther."""
+
+LEAST_COURSE = 5.0
+"""Speed over its deviation from which a course tells the heading."""
+
+
+@dataclass(frozen=True)
+class FirstFix:
+    """What is measured at the start."""
+
+    position_G: Floats
+    sigmas: Floats
+    """(3,) of the position in I [m]"""
+    velocity_I: Floats | None
+    speeds: Floats
+    """(3,) deviations of the velocity [m/s]"""
+    baseline_G: Floats
+    x_I: Floats
+    """level direction of the body x axis, beside a steep baseline; zero: not known"""
+    starts: list[FirstEstimate] = field(default_factory=list)
+    """level starts, one or one for each heading; none where there is a baseline"""
+
+    def write(self, engine: Engine) -> None:
+        """Start the filters in an engine's memory."""
+        engine.fill("gnss_position", self.position_G)
+        engine.fill("gnss_baseline", self.baseline_G)
+        kept = engine.impose({"gnss_sigma": self.sigmas})
+        engine.start(self.x_I)
+        engine.restore_noise(kept)
+        if self.starts:
+            write_starts(engine, self.starts)
+        elif self.velocity_I is not None:
+            engine.fill("v_hat", self.velocity_I)
+            L = engine.read("L")
+            L[:, range(3, 6), range(3, 6)] = self.speeds
+            engine.write("L", L)
+
+
+def checked_fix(
+    sensors: SensorSuite,
+    gnss_position_G: ArrayLike,
+    gnss_baseline_G: ArrayLike | None,
+    heading: float | None,
+    heading_sigma: float | None,
+    magnetometer: ArrayLike | None,
+    magnetometer_sigma: float | None,
+    gnss_velocity_G: ArrayLike | None,
+    course: bool,
+    gnss_sigma: ArrayLike | None,
+    velocity_sigma: float | None,
+    tilt_sigma: float | None,
+) -> FirstFix:
+    """The arguments of `initialize`.
+
+    Raises:
+        ValueError: As `initialize` says.
+    """
+    require_gnss(sensors, "initialize: start with set_state() instead")
+    position = check.array("gnss_position_G", gnss_position_G, (3,))
+    _require_relative(position)
+    sigmas, covariance = _position_noise(sensors, gnss_sigma)
+    velocity, speeds = _first_velocity(sensors, gnss_velocity_G, velocity_sigma)
+    if gnss_baseline_G is not None:
+        baseline = checked_baseline(gnss_baseline_G)
+        _refuse_beside_baseline(
+            heading_sigma=heading_sigma,
+            magnetometer=magnetometer,
+            magnetometer_sigma=magnetometer_sigma,
+            tilt_sigma=tilt_sigma,
+            course=course or None,
+            **{"a covariance as gnss_sigma": covariance},
+        )
+        x_I = np.zeros(3)
+        if heading is not None:
+            angle = check.number("heading", heading)
+            x_I[:2] = np.cos(angle), np.sin(angle)
+        return FirstFix(position, sigmas, velocity, speeds, baseline, x_I)
+
+    tilt = sensors.estimator.initial_tilt_sigma or LEVEL_SIGMA
+    if tilt_sigma is not None:
+        tilt = check.positive("tilt_sigma", tilt_sigma, most=1.0)
+    told = [heading is not None, magnetometer is not None, check.flag("course", course)]
+    if sum(told) > 1:
+        raise ValueError("only one of heading, magnetometer and course must be given")
+    if magnetometer is None and magnetometer_sigma is not None:
+        raise ValueError("magnetometer_sigma must come with magnetometer")
+    own = sensors.placement.heading_sigma
+    if heading_sigma is not None:
+        if heading is None and not course:
+            raise ValueError("heading_sigma must come with heading or course")
+        own = check.positive("heading_sigma", heading_sigma, most=math.pi)
+
+    # by halves of the distance to the next one they overlap as one uniform distribution
+    headings = [Heading(k * SPACING, 0.5 * SPACING) for k in range(COUNT)]
+    if heading is not None:
+        headings = [Heading(check.number("heading", heading), own)]
+    elif magnetometer is not None:
+        headings = [_by_magnetometer(sensors, magnetometer, magnetometer_sigma)]
+    elif course:
+        headings = [_by_course(velocity, float(speeds[0]), own)]
+    assert sensors.gnss is not None
+    antenna_I = ecef_to_enu(sensors.gnss.reference_antenna_G) @ position
+    root = math.sqrt(sensors.estimator.initial_scale) * _root(sigmas, covariance)
+    still = np.zeros(3) if velocity is None else velocity
+    starts = [level_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
+    return FirstFix(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), starts)
+
+
+def _require_relative(position_G: Floats) -> None:
+    """Refuse a first fix that is no place near the reference antenna."""
+    if np.abs(position_G).max() > FARTHEST_FIX:
+        raise ValueError(
+            "gnss_position_G must be relative to the reference antenna "
+            f"(GnssParams.reference_antenna_G), within {FARTHEST_FIX:g} m of it, got "
+            f"{position_G}; from an absolute position in ECEF subtract that of the antenna"
+        )
+
+
+def _refuse_beside_baseline(**given: Any) -> None:
+    """Refuse what a start with a baseline does not take."""
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name} must not be given with gnss_baseline_G")
+
+
+def _root(sigmas: Floats, covariance: Floats | None) -> Floats:
+    """A root of the covariance of the position."""
+    if covariance is None:
+        return np.diag(sigmas)
+    T, s = in_principal_axes(covariance)
+    return T.T * s  # type: ignore[no-any-return]
+
+
+def _position_noise(sensors: SensorSuite, given: ArrayLike | None) -> tuple[Floats, Floats | None]:
+    assert sensors.gnss is not None
+    if given is None:
+        return np.array(sensors.gnss.position_sigma_I), None
+    return gnss_noise("gnss_sigma", given)
+
+
+def _first_velocity(
+    sensors: SensorSuite, given_G: ArrayLike | None, sigma: float | None
+) -> tuple[Floats | None, Floats]:
+    """The velocity in I at the start, or None, and the deviations of what is taken for it."""
+    gnss = sensors.gnss
+    assert gnss is not None
+    if given_G is None:
+        if sigma is not None:
+            raise ValueError("velocity_sigma must come with gnss_velocity_G")
+        return None, np.full(3, math.sqrt(sensors.estimator.initial_velocity_variance))
+    noise = gnss.velocity_sigma if sigma is None else check.positive("velocity_sigma", sigma)
+    if noise is None:
+        raise ValueError("velocity_sigma must be given: the suite has no GNSS velocity")
+    v_G = check.array("gnss_velocity_G", given_G, (3,))
+    return ecef_to_enu(gnss.reference_antenna_G) @ v_G, np.full(3, noise)
+
+
+def _by_magnetometer(sensors: SensorSuite, magnetometer: ArrayLike, sigma: float | None) -> Heading:
+    if Aid.MAGNETOMETER not in sensors.aids:
+        raise ValueError("the sensor suite has no magnetometer to initialize with")
+    field_B = check.array("magnetometer", magnetometer, (3,))
+    if sigma is not None:
+        sigma = check.positive("magnetometer_sigma", sigma)
+    return magnetic_heading(sensors, field_B, sigma)
+
+
+def _by_course(velocity: Floats | None, sigma: float, own: float) -> Heading:
+    if velocity is None:
+        raise ValueError("course must come with gnss_velocity_G")
+    speed = math.hypot(velocity[0], velocity[1])
+    if speed < LEAST_COURSE * sigma:
+        raise ValueError(
+            f"course must be that of a vehicle that moves, at least {LEAST_COURSE * sigma:g} m/s "
+            f"over the ground, got {speed:g} m/s"
+        )
+    return Heading(math.atan2(velocity[1], velocity[0]), math.hypot(own, sigma / speed))

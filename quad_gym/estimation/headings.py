@@ -1,0 +1,154 @@
+"""A filter that does not know its heading: a sum of Gaussians, one for each of many headings.
+
+Linearized about one heading a filter that may look anywhere is lost. So each lane of some blocks
+starts from another heading, and from a deviation of half the distance to the next: together they
+are as good as uniform. Each measurement weighs them by how likely it was in each,
+
+    log w += -(nu^T S^-1 nu + log det S) / 2,   det S = det R (det L- / det L+)^2,
+
+where R is the same in all. What the vehicle does tells the heading: without accelerating it never
+learns it. When the deviation of the heading is below `RESOLVED`, one Gaussian with the mean and the
+covariance of the sum takes over.
+
+Source: D. L. Alspach and H. W. Sorenson, IEEE Trans. Automatic Control 17(4), 1972.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from quad_gym.estimation.engine import Engine
+from quad_gym.estimation.samples import Measurement
+from quad_gym.estimation.starts import FirstEstimate, lower_factor
+
+Floats = NDArray[np.float64]
+
+COUNT = 24
+"""Headings; a multiple of the lanes of any machine."""
+SPACING = 2.0 * math.pi / COUNT
+"""Between two of them [rad]."""
+RESOLVED = 0.15
+"""Deviation of the heading below which one Gaussian takes over [rad]."""
+
+_VECTORS = ("r_hat", "v_hat", "b_a_hat", "b_g_hat")
+
+
+class Moments(NamedTuple):
+    """Mean and covariance of a sum of Gaussians."""
+
+    vectors: dict[str, Floats]
+    """(3,) each: r_hat, v_hat, b_a_hat, b_g_hat; (n,) slow_hat"""
+    R_hat: Floats
+    covariance: Floats
+    """(15 + n, 15 + n)"""
+
+    @property
+    def heading_sigma(self) -> float:
+        """Standard deviation of the heading [rad]."""
+        return math.sqrt(self.covariance[8, 8])
+
+
+def write_starts(engine: Engine, starts: list[FirstEstimate]) -> None:
+    """Write first estimates into the lanes of an engine that has just been started."""
+    n = len(starts[0].factor) - 15
+    fill = [starts[k % len(starts)] for k in range(engine.lanes)]
+    engine.write("r_hat", np.array([s.position for s in fill]))
+    engine.write("v_hat", np.array([s.velocity for s in fill]))
+    engine.write("R_hat", np.array([s.R_BI for s in fill]))
+    _write_factors(engine, np.array([s.factor for s in fill]), n)
+
+
+def _write_factors(engine: Engine, factors: Floats, n: int) -> None:
+    """Write joint factors (lanes, 15 + n, 15 + n)."""
+    engine.write("L", factors[:, :15, :15])
+    if n:
+        rows = engine.read("L_slow")
+        rows[:, :n, : 15 + n] = factors[:, 15:]
+        engine.write("L_slow", rows)
+
+
+def _factors(engine: Engine) -> Floats:
+    """(lanes, 15 + n, 15 + n) joint factors."""
+    n = int(engine.settings["slow_states"][0])
+    joint = np.zeros((engine.lanes, 15 + n, 15 + n))
+    joint[:, :15, :15] = engine.read("L")
+    joint[:, 15:] = engine.read("L_slow")[:, :n, : 15 + n]
+    return joint
+
+
+def _log_determinant(factors: Floats) -> Floats:
+    """Of each lane's covariance; errors that are known exactly, drift at the start, left out."""
+    diagonal = np.diagonal(factors, axis1=1, axis2=2)
+    return 2.0 * np.log(np.where(diagonal > 0.0, diagonal, 1.0)).sum(axis=1)
+
+
+def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floats) -> Floats:
+    """Update all lanes with a measurement; returns their new weights, normalized."""
+    before, failures = _log_determinant(_factors(engine)), engine.read("update_failures")
+    engine.update(measurement)
+    after = _log_determinant(_factors(engine))
+    nis, dimension = engine.read("nis"), engine.read("nis_dimension")
+    if not dimension.any() or not measurement.blocks:
+        return log_weights
+    in_steps = np.isnan(nis)
+    if in_steps.any():  # an image processed in steps: block by block
+        blocks = engine.read("block_nis")[:, measurement.blocks]
+        nis = np.where(in_steps, np.nansum(blocks, axis=1), nis)
+    weights = log_weights - 0.5 * (nis + before - after)
+    weights[engine.read("update_failures") > failures] = -np.inf
+    if not np.isfinite(weights).any():
+        return log_weights
+    weights -= weights.max()
+    return weights - math.log(np.exp(weights).sum())
+
+
+def _turns_of(R: Floats) -> Floats:
+    """(n, 3) the vectors e of rotations exp(-[e x])."""
+    return -Rotation.from_matrix(R).as_rotvec()  # type: ignore[no-any-return]
+
+
+def _turned(e: Floats, R: Floats) -> Floats:
+    """exp(-[e x]) R."""
+    return Rotation.from_rotvec(-e).as_matrix() @ R  # type: ignore[no-any-return]
+
+
+def moments(engine: Engine, log_weights: Floats) -> Moments:
+    """Mean and covariance of all lanes together; of the attitude about a mean on the circle."""
+    w, n = np.exp(log_weights), int(engine.settings["slow_states"][0])
+    R = engine.read("R_hat")
+    R_mean, turns = R[int(np.argmax(w))], np.zeros((len(w), 3))
+    for _ in range(10):
+        turns = _turns_of(R @ R_mean.T)
+        R_mean = _turned(w @ turns, R_mean)
+    turns = _turns_of(R @ R_mean.T)
+    means = {name: w @ engine.read(name) for name in _VECTORS}
+    slow = engine.read("slow_hat")[:, :n]
+    means["slow_hat"] = w @ slow
+    apart = [engine.read(name) - means[name] for name in _VECTORS]
+    d = np.hstack([*apart[:2], turns, *apart[2:], slow - means["slow_hat"]])
+    factors = _factors(engine)
+    covariance = np.einsum("k,kij,klj->il", w, factors, factors)
+    covariance += np.einsum("k,ki,kj->ij", w, d, d)
+    return Moments(means, R_mean, covariance)
+
+
+def collapse(engine: Engine, log_weights: Floats, m: Moments) -> None:
+    """Go on with one Gaussian of these moments; what else is remembered is the likeliest lane's."""
+    words = engine.copy()
+    best = int(np.argmax(log_weights))
+    width = words.shape[2]
+    engine.restore(words[best // width, :, best % width][np.newaxis, :, np.newaxis])
+    n = len(m.covariance) - 15
+    for name in _VECTORS:
+        engine.fill(name, m.vectors[name])
+    engine.fill("R_hat", m.R_hat)
+    if n:
+        slow = engine.read("slow_hat")
+        slow[:, :n] = m.vectors["slow_hat"]
+        engine.write("slow_hat", slow)
+    values, vectors = np.linalg.eigh(m.covariance)
+    factor = lower_factor(vectors * np.sqrt(np.maximum(values, 0.0)))
+    _write_factors(engine, np.repeat(factor[np.newaxis], engine.lanes, axis=0), n)

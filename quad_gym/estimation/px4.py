@@ -1,0 +1,167 @@
+"""Logs of PX4: what its file format ULog holds of the sensors, in the frames of this package.
+
+PX4's body is FRD (x forward, y right, z down) and its world NED (north, east, down); a body here is
+FLU (x forward, y left, z up) and the world ENU (east, north, up):
+
+    (x, y, z)_FLU = (x, -y, -z)_FRD,    (e, n, u)_ENU = (e, n, -d) of (n, e, d)_NED
+
+| topic | what is taken |
+|---|---|
+| `sensor_combined` | gyro and accelerometer: means over the time before `timestamp` |
+| `vehicle_gps_position`, or `sensor_gps` | position, velocity, and the accuracy that it reports |
+| `vehicle_air_data` | height by static pressure; it counts from another level |
+| `vehicle_magnetometer`, or `sensor_mag` | magnetic field [gauss] |
+
+A sample's `timestamp_sample` is its time stamp, and `timestamp` when it arrived. A GNSS receiver
+that reports no time of its own is taken to be late by PX4's parameter EKF2_GPS_DELAY, or 0.11 s.
+
+Source: the PX4 user guide, "ULog File Format" and the definitions of these messages.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quad_gym.estimation.logs import Floats, Log, Stream
+from quad_gym.frames import geodetic_to_ecef
+
+GNSS_DELAY = 0.11
+"""Of receivers, where a log does not say it [s]: PX4's default of EKF2_GPS_DELAY."""
+
+LEAST_FIX = 3
+"""`fix_type` from which a position is three-dimensional."""
+
+_GAUSS = 1e-4  # [T]
+_TO_FLU = np.array([1.0, -1.0, -1.0])
+
+
+def read_ulog(path: Path | str) -> Log:
+    """A log of PX4, as its file has it.
+
+    Args:
+        path: Of a `.ulg` file.
+
+    Raises:
+        ImportError: If pyulog is not installed.
+        ValueError: If the file is no ULog, is damaged, or has no samples of the IMU.
+        OSError: If there is no such file.
+    """
+    try:
+        from pyulog import ULog
+    except ImportError:
+        raise ImportError(
+            "logs of PX4 need pyulog: install it with pip install 'quad-gym[ulog]'"
+        ) from None
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"there is no file {file}")
+    try:
+        ulog = ULog(str(file))
+    except Exception as error:  # pyulog raises what it meets in a damaged file
+        raise ValueError(f"{file.name} must be a ULog: {error}") from None
+    topics: dict[str, dict[str, Any]] = {}
+    for data in ulog.data_list:
+        if data.multi_id == 0:
+            topics[data.name] = data.data
+    if "sensor_combined" not in topics:
+        raise ValueError(f"{file.name} must have the topic sensor_combined, got {sorted(topics)}")
+    delay = ulog.initial_parameters.get("EKF2_GPS_DELAY")
+    return Log(
+        imu=_imu(topics["sensor_combined"]),
+        gnss=_gnss(
+            _one_of(topics, "vehicle_gps_position", "sensor_gps"),
+            GNSS_DELAY if delay is None else 1e-3 * float(delay),
+        ),
+        barometer=_barometer(_one_of(topics, "vehicle_air_data")),
+        magnetometer=_magnetometer(_one_of(topics, "vehicle_magnetometer", "sensor_mag")),
+        barometer_from_start=True,
+        about={"file": file.name},
+    )
+
+
+def _one_of(topics: dict[str, dict[str, Any]], *names: str) -> dict[str, Any] | None:
+    """The first of some topics that has samples."""
+    for name in names:
+        if name in topics and len(topics[name]["timestamp"]):
+            return topics[name]
+    return None
+
+
+def _times(topic: dict[str, Any], delay: float = 0.0) -> tuple[Floats, Floats]:
+    """When samples were taken and arrived [s]; `delay`: where only the latter is known."""
+    received = 1e-6 * np.asarray(topic["timestamp"], np.float64)
+    taken = received - delay
+    if "timestamp_sample" in topic:
+        stamps = 1e-6 * np.asarray(topic["timestamp_sample"], np.float64)
+        taken = np.where(stamps > 0.0, stamps, taken)
+    return np.minimum(taken, received), received
+
+
+def _triples(topic: dict[str, Any], name: str) -> Floats:
+    """(n, 3) of an array of three."""
+    return np.column_stack([np.asarray(topic[f"{name}[{i}]"], np.float64) for i in range(3)])
+
+
+def _imu(topic: dict[str, Any]) -> Stream:
+    """Samples of the IMU; those that are not numbers, or come a second time, left out."""
+    time, received = _times(topic)
+    gyro = _triples(topic, "gyro_rad") * _TO_FLU
+    accel = _triples(topic, "accelerometer_m_s2") * _TO_FLU
+    good = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    good &= np.diff(time, prepend=-np.inf) > 0.0
+    return Stream(time[good], received[good], {"gyro": gyro[good], "accel": accel[good]})
+
+
+def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
+    """Positions and velocities, where there is a fix; NaN: not reported."""
+    if topic is None:
+        return None
+    time, received = _times(topic, delay)
+    if "latitude_deg" in topic:
+        lat = np.asarray(topic["latitude_deg"], np.float64)
+        lon = np.asarray(topic["longitude_deg"], np.float64)
+        height = np.asarray(topic["altitude_ellipsoid_m"], np.float64)
+    else:  # before PX4 1.14
+        lat, lon = (1e-7 * np.asarray(topic[w], np.float64) for w in ("lat", "lon"))
+        height = 1e-3 * np.asarray(topic["alt_ellipsoid"], np.float64)
+    fixed = np.asarray(topic["fix_type"]) >= LEAST_FIX
+    fixed &= np.isfinite(lat) & np.isfinite(lon) & np.isfinite(height)
+    position = np.full((len(time), 3), np.nan)
+    for k in np.flatnonzero(fixed):
+        position[k] = geodetic_to_ecef(np.radians(lat[k]), np.radians(lon[k]), height[k])
+    velocity = np.column_stack([topic["vel_e_m_s"], topic["vel_n_m_s"], -topic["vel_d_m_s"]])
+    told = np.asarray(topic.get("vel_ned_valid", np.ones(len(time))), bool) & fixed
+    eph, epv = (np.asarray(topic[name], np.float64) for name in ("eph", "epv"))
+    values = {
+        "position_G": position,
+        "velocity_I": np.where(told[:, np.newaxis], velocity, np.nan).astype(np.float64),
+        "position_sigma_I": _positive(np.column_stack([eph, eph, epv])),
+        "velocity_sigma": _positive(np.asarray(topic["s_variance_m_s"], np.float64)),
+    }
+    return Stream(time[fixed], received[fixed], {n: v[fixed] for n, v in values.items()})
+
+
+def _positive(values: Floats) -> Floats:
+    """Deviations that say something; NaN for the rest."""
+    return np.where(np.isfinite(values) & (values > 0.0), values, np.nan)
+
+
+def _barometer(topic: dict[str, Any] | None) -> Stream | None:
+    """Heights by pressure."""
+    if topic is None:
+        return None
+    time, received = _times(topic)
+    return Stream(time, received, {"barometer": np.asarray(topic["baro_alt_meter"], np.float64)})
+
+
+def _magnetometer(topic: dict[str, Any] | None) -> Stream | None:
+    """Magnetic fields."""
+    if topic is None:
+        return None
+    time, received = _times(topic)
+    if "magnetometer_ga[0]" in topic:
+        gauss = _triples(topic, "magnetometer_ga")
+    else:  # of a single sensor
+        gauss = np.column_stack([np.asarray(topic[axis], np.float64) for axis in "xyz"])
+    return Stream(time, received, {"magnetometer": gauss * _GAUSS * _TO_FLU})

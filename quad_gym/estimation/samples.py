@@ -1,0 +1,229 @@
+"""What a filter is given: samples of the IMU, and measurements of one instant, each checked."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.records import AID_BLOCKS, AID_FREEDOMS, FEATURE_BLOCKS, POSITION_BLOCK, Aid
+
+Floats = NDArray[np.float64]
+
+SIGMA_KEYWORDS = (
+    "gnss_sigma",
+    "baseline_sigma",
+    "velocity_sigma",
+    "pixel_sigma",
+    *(f"{aid.name.lower()}_sigma" for aid in Aid),
+)
+"""Keywords of `update` for the noise of its measurements."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A sample of the IMU that carries the estimate over a time."""
+
+    gyro: Floats
+    """(3,) in B [rad/s]"""
+    accel: Floats
+    """(3,) in B [m/s^2]"""
+    dt: float
+    """the time [s]"""
+    gyro_before: Floats
+    """(3,) what the gyro read one sample earlier; the lever arm's acceleration follows from both"""
+
+    def split(self, first: float) -> tuple["Sample", "Sample"]:
+        """The same sample over the first part [s] of its time, and over the rest.
+
+        The gyro's rate of change is that of the whole sample in both.
+        """
+        change = (self.gyro - self.gyro_before) / self.dt
+        parts = (first, self.dt - first)
+        one, two = (Sample(self.gyro, self.accel, t, self.gyro - t * change) for t in parts)
+        return one, two
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What was measured at one instant; None: not measured."""
+
+    position_G: Floats | None = None
+    """(3,) [m]"""
+    baseline_G: Floats | None = None
+    """(3,) [m], scaled to about one"""
+    velocity_G: Floats | None = None
+    """(3,) [m/s]"""
+    pixels: Floats | None = None
+    """(n_features, 2), NaN: not seen [pixels]"""
+    aids: dict[Aid, Floats] = field(default_factory=dict)
+    noise: dict[str, Any] = field(default_factory=dict)
+    """fields of the parameter record that this measurement has in place of the suite's"""
+    position_covariance_I: Floats | None = None
+    """(3, 3) of a position whose errors are correlated [m^2]"""
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was measured."""
+        values = (self.position_G, self.baseline_G, self.velocity_G, self.pixels)
+        return all(v is None for v in values) and not self.aids
+
+    @property
+    def blocks(self) -> list[int]:
+        """The blocks of innovations that it has."""
+        triples = enumerate((self.position_G, self.baseline_G, self.velocity_G))
+        found = [POSITION_BLOCK + k for k, values in triples if values is not None]
+        if self.pixels is not None:
+            seen = ~np.isnan(self.pixels).any(axis=1)
+            found += [FEATURE_BLOCKS + int(i) for i in np.flatnonzero(seen)]
+        return found + [AID_BLOCKS + int(aid) for aid in self.aids]
+
+    def only_position(self) -> "Measurement":
+        """Its position alone."""
+        return Measurement(position_G=self.position_G, noise=self.noise)
+
+    def without_position(self) -> "Measurement":
+        """All but its position."""
+        return Measurement(
+            baseline_G=self.baseline_G,
+            velocity_G=self.velocity_G,
+            pixels=self.pixels,
+            aids=self.aids,
+            noise=self.noise,
+        )
+
+
+def checked_measurement(
+    sensors: SensorSuite,
+    position_G: ArrayLike | None,
+    baseline_G: ArrayLike | None,
+    pixels: ArrayLike | None,
+    velocity_G: ArrayLike | None,
+    others: dict[str, Any],
+) -> Measurement:
+    """The arguments of `update`, checked.
+
+    Args:
+        sensors: The filter's suite.
+        position_G: As of `update`.
+        baseline_G: Likewise.
+        pixels: Likewise.
+        velocity_G: Likewise.
+        others: Measurements of aiding sensors by name, and noise by SIGMA_KEYWORDS.
+
+    Raises:
+        ValueError: If one has another shape or is not finite, the suite lacks its sensor, or noise
+            is given for what was not measured.
+    """
+    aids = _checked_aids(sensors, others)
+    if position_G is not None or baseline_G is not None:
+        require_gnss(sensors, "update")
+    position = baseline = velocity = image = None
+    if position_G is not None:
+        position = check.array("gnss_position_G", position_G, (3,))
+    if baseline_G is not None:
+        baseline = checked_baseline(baseline_G)
+    if pixels is not None:
+        count = 0 if sensors.camera is None else len(sensors.camera.features_I)
+        image = check.array("pixels", pixels, (count, 2), allow_nan=True)
+    if velocity_G is not None:
+        if sensors.gnss is None or sensors.gnss.velocity_sigma is None:
+            raise ValueError("the sensor suite has no GNSS velocity to update with")
+        velocity = check.array("gnss_velocity_G", velocity_G, (3,))
+    measured = {
+        "gnss_sigma": position is not None,
+        "baseline_sigma": baseline is not None,
+        "velocity_sigma": velocity is not None,
+        "pixel_sigma": image is not None,
+        **{f"{aid.name.lower()}_sigma": aid in aids for aid in Aid},
+    }
+    noise, covariance = _checked_noise(others, measured)
+    return Measurement(position, baseline, velocity, image, aids, noise, covariance)
+
+
+def require_gnss(sensors: SensorSuite, what: str) -> None:
+    """Refuse to do something without GNSS."""
+    if sensors.gnss is None:
+        raise ValueError(f"the sensor suite has no GNSS to {what}")
+
+
+def checked_baseline(gnss_baseline_G: ArrayLike) -> Floats:
+    """A baseline, scaled by a power of two: its length does not count."""
+    baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
+    largest = np.abs(baseline).max()
+    if largest == 0.0:
+        raise ValueError("gnss_baseline_G must have a direction, got zeros")
+    # by a power of two it comes near one, exactly
+    return np.ldexp(baseline, -int(np.frexp(largest)[1]))
+
+
+def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Floats]:
+    """What aiding sensors measure, as arrays; None: not measured."""
+    names = tuple(aid.name.lower() for aid in Aid)
+    check.keywords(others, names + SIGMA_KEYWORDS, "update")
+    found = {}
+    for name in names:
+        aid, value = Aid[name.upper()], others.get(name)
+        if value is None:
+            continue
+        if aid not in sensors.aids:
+            raise ValueError(f"the sensor suite has no {name} to update with")
+        alone = AID_FREEDOMS[aid] == 1
+        numbers = [check.number(name, value)] if alone else value
+        found[aid] = check.array(name, numbers, (AID_FREEDOMS[aid],))
+    return found
+
+
+def gnss_noise(name: str, value: Any) -> tuple[Floats, Floats | None]:
+    """Noise of a position: (3,) deviations in I [m], and its covariance where it is correlated.
+
+    Args:
+        name: Of the argument.
+        value: A deviation, three of them, or a (3, 3) covariance.
+
+    Raises:
+        ValueError: If it is none of these, or not positive (definite).
+    """
+    if np.ndim(value) == 0:
+        return np.full(3, check.positive(name, value, least=1e-9)), None
+    if np.ndim(value) == 2:
+        covariance = check.array(name, value, (3, 3))
+        if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
+            raise ValueError(f"{name} must be a symmetric covariance, got {value!r}")
+        if np.linalg.eigvalsh(covariance)[0] < 1e-18:
+            raise ValueError(f"{name} must be a positive definite covariance, got {value!r}")
+        sigmas = np.sqrt(np.diag(covariance))
+        correlated = np.count_nonzero(covariance - np.diag(np.diag(covariance)))
+        return sigmas, covariance if correlated else None
+    sigmas = check.array(name, value, (3,))
+    if not (sigmas >= 1e-9).all():
+        raise ValueError(f"{name} must be at least 1e-9, got {value!r}")
+    return sigmas, None
+
+
+def _checked_noise(
+    others: dict[str, Any], measured: dict[str, bool]
+) -> tuple[dict[str, Any], Floats | None]:
+    """Noise by fields of the parameter record, and the covariance of a position."""
+    noise: dict[str, Any] = {}
+    covariance = None
+    for name in SIGMA_KEYWORDS:
+        value = others.get(name)
+        if value is None:
+            continue
+        if not measured[name]:
+            raise ValueError(f"{name} must come with what it is the noise of")
+        if name == "gnss_sigma":
+            noise["gnss_sigma"], covariance = gnss_noise(name, value)
+            continue
+        sigma = check.positive(name, value, least=1e-12)
+        if name == "baseline_sigma":
+            noise["baseline_noise"] = min(sigma, math.pi)
+        elif name.removesuffix("_sigma").upper() in Aid.__members__:
+            noise.setdefault("aid_sigma", {})[Aid[name.removesuffix("_sigma").upper()]] = sigma
+        else:
+            noise[name] = sigma
+    return noise, covariance
