@@ -172,7 +172,9 @@ class ULogWriter:
 def errors_in_flight(recorded):
     """(n, 9) errors of position, velocity and attitude of the filter in flight."""
     f, k = recorded.flight, recorded.rows
-    return _errors(f, k, f["estimated_position"][k], f["estimated_velocity"][k], f["estimated_attitude"][k])
+    return _errors(
+        f, k, f["estimated_position"][k], f["estimated_velocity"][k], f["estimated_attitude"][k]
+    )
 
 
 def errors_in_replay(recorded, result):
