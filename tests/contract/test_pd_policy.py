@@ -50,9 +50,8 @@ def direct():
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
 @pytest.mark.parametrize("action", ["motor", "wrench"])
 def test_at_every_tick_it_flies_the_circle_like_the_compiled_controller(action, layout, direct):
-    env = QuadVectorEnv(
-        60, "circle", action=action, layout=layout, control_rate=200, autoreset_mode="Disabled"
-    )
+    given = {"action": action, "layout": layout, "control_rate": 200, "start": "ground"}
+    env = QuadVectorEnv(60, "circle", autoreset_mode="Disabled", **given)
     policy = PDPolicy(env, gains="lab")
     observation, _ = env.reset(seed=0)
     errors = []

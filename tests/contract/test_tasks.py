@@ -259,8 +259,20 @@ def test_a_hovering_start_has_the_documented_spread():
     np.testing.assert_allclose(lift, 0.78 * 9.8, rtol=1e-9)
 
 
+def test_the_circle_starts_on_the_ground_or_hovering():
+    env = QuadVectorEnv(2000, "circle", observation="truth")
+    env.reset(seed=1)
+    batch = env.flights.batch
+    grounded = (batch.read("r") == [4.0, 0.0, 0.0]).all(axis=1)
+    assert abs(grounded.mean() - 0.5) < 5.0 * 0.5 / np.sqrt(2000)
+    assert not batch.read("rotor_speeds")[grounded].any()
+    assert (batch.read("rotor_speeds")[~grounded] > 0.0).all()
+    off = np.linalg.norm(batch.read("r")[~grounded] - [4.0, 0.0, 1.0], axis=1)
+    assert off.max() < 0.3 * 6.0
+
+
 def test_a_start_on_the_ground_is_the_reports():
-    env = QuadVectorEnv(50, "circle")
+    env = QuadVectorEnv(50, "circle", start="ground")
     env.reset(seed=1)
     batch = env.flights.batch
     np.testing.assert_allclose(batch.read("r"), np.tile([4.0, 0.0, 0.0], (50, 1)), atol=1e-12)

@@ -119,9 +119,10 @@ def test_wind_does_not_move_it():
     assert (still.read("v") == 0.0).all()
 
 
-def test_the_default_environment_starts_on_a_pad_and_the_reports_does_not():
+def test_an_environment_has_a_pad_and_the_reports_has_not():
+    given = {"observation": "truth", "start": "ground"}
     for pad in (True, False):
-        env = gymnasium.make_vec("QuadGym/Circle-v0", 2, observation="truth", pad=pad)
+        env = gymnasium.make_vec("QuadGym/Circle-v0", 2, **given, **({} if pad else {"pad": False}))
         env.reset(seed=0)
         for _ in range(5):
             env.step(np.zeros((2, 4)))  # hover thrust, once the rotors have spun up
