@@ -72,7 +72,7 @@ class TaskParams(Checked):
     """distance at which a gate counts as passed [m]"""
     preview: Vector = (0.2, 0.4)
     """(2,) how far ahead an observation shows the reference [s]"""
-    trajectory: Trajectory | Sequence[Trajectory] | None = None
+    trajectory: Trajectory | str | Path | Sequence[Trajectory | str | Path] | None = None
     """what to follow: a `quad_gym.Trajectory`, the path of a table for `Trajectory.from_csv`, or
     several of them, of which each episode draws one; None: a figure of eight through five points"""
 
@@ -134,14 +134,17 @@ def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None
         raise ValueError(f"TaskParams.trajectory must not be given for the task {kind}")
     several = [given] if isinstance(given, (Trajectory, str, Path)) else given
     if not isinstance(several, Sequence) or not several:
-        raise ValueError(f"trajectory must be a Trajectory or a sequence of them, got {given!r}")
+        raise ValueError(
+            f"TaskParams.trajectory must be a Trajectory or a sequence of them, got {given!r}"
+        )
     found = []
     for one in several:
         path = _read(one) if isinstance(one, (str, Path)) else one
-        check.instance("trajectory", path, Trajectory)
+        check.instance("TaskParams.trajectory", path, Trajectory)
         if path.reach > FARTHEST:
             raise ValueError(
-                f"trajectory must stay within {FARTHEST:g} m of the origin, got {path.reach:.4g} m"
+                f"TaskParams.trajectory must stay within {FARTHEST:g} m of the origin, got "
+                f"{path.reach:.4g} m"
             )
         found.append(path)
     return tuple(found)
@@ -151,7 +154,9 @@ def _read(file: str | Path) -> Trajectory:
     try:
         return Trajectory.from_csv(file)
     except OSError as error:
-        raise ValueError(f"trajectory must be a file that can be read: {error}") from None
+        raise ValueError(
+            f"TaskParams.trajectory must be a file that can be read: {error}"
+        ) from None
 
 
 def check_limit(task: TaskParams, rate: float, name: str) -> None:

@@ -58,14 +58,17 @@ def trajectories():
     rise = s3 * np.poly1d([-20, 70, -84, 35, 0])
     found = []
     for polynomials, options in (
-        ((192 * hump, 256 * hump * np.poly1d([-2, 1]), 1.5 + 16 * hump, 0 * hump), {}),
-        ((-3 * rise, 2 * rise, 1 + rise, 0 * rise), {"closed": False}),
+        (
+            (192 * hump, 256 * hump * np.poly1d([-2, 1]), 1.5 + 16 * hump, 0 * hump),
+            {"closed": True},
+        ),
+        ((-3 * rise, 2 * rise, 1 + rise, 0 * rise), {"heading": "along"}),
     ):
         terms = np.zeros((8, 1, 4))
         for i, polynomial in enumerate(polynomials):
             shares = polynomial.c / 8.0 ** np.arange(polynomial.order, -1, -1)
             terms[8 - len(shares) :, 0, i] = shares
-        options = {"closed": True, "heading": "along", **options}
+        options = {"heading": "toward", "point": (1.0, 5.0), **options}
         found.append(quad_gym.Trajectory(times=[0.0, 8.0], coefficients=terms, **options))
     return found
 

@@ -147,3 +147,15 @@ def test_jumps_are_refused():
     closed = Trajectory(times=[0.0, 1.0, 2.0], coefficients=terms, closed=True)
     with pytest.raises(ValueError, match=r"jump: its position does by 2 m at 2.000 s"):
         closed.check(VEHICLE)
+
+
+def test_a_heading_that_turns_about_at_once_is_refused():
+    """There and back on a straight line: the heading along it jumps where the velocity turns."""
+    points = [(0, 0, 1), (3, 0, 1)]
+    Trajectory.through(points, closed=True).check(VEHICLE)
+    back = Trajectory.through(points, closed=True, yaw="along")
+    with pytest.raises(ValueError, match="its heading does by 180 degrees at"):
+        back.check(VEHICLE)
+    over = Trajectory.through([(-2, 0, 1), (2, 0, 1)], look_at=(0.0, 0.0))
+    with pytest.raises(ValueError, match="its heading does by 180 degrees at"):
+        over.check(VEHICLE)

@@ -186,6 +186,7 @@ BAD_VALUES = {
     ("BatteryParams", "resistance"): BELOW_ZERO,
     ("BatteryParams", "motor_efficiency"): [*NOT_POSITIVE, 1.1],
     ("TaskParams", "preview"): [(0.2,), 0.2, (-0.1, 0.2), (0.1, float("nan")), None],
+    ("TaskParams", "trajectory"): [3, [], "nowhere.csv", [None], float("nan")],
 }
 
 

@@ -25,6 +25,9 @@ LEAST_THRUST = 0.01
 JUMP = 1e-5
 """Largest jump between segments of position [m], velocity [m/s] and acceleration [m/s^2]."""
 
+TURNABOUT = 1.0
+"""Turn of the heading from one look to the next that no vehicle makes [rad]."""
+
 ROUNDING = 1e-6
 """Share of a limit by which a demand may exceed it: bounds that just hold are met."""
 
@@ -79,6 +82,7 @@ def _checked(
 ) -> Demand:
     _refuse_jumps(trajectory, name)
     times = sampling_times(trajectory)
+    _refuse_turnabouts(trajectory, times, name)
     motion = motion_of(trajectory, vehicle, times)
     speeds, accelerations = (np.linalg.norm(trajectory(times, k), axis=1) for k in (1, 2))
     force, rates = motion.rotor_forces, np.abs(motion.body_rates)
@@ -143,6 +147,18 @@ def _where(trajectory: "Trajectory", time: float) -> str:
     segments = len(trajectory.times) - 1
     segment = min(int(np.searchsorted(trajectory.times, time, side="right")), segments)
     return f"at {time:.3f} s (segment {segment} of {segments})"
+
+
+def _refuse_turnabouts(trajectory: "Trajectory", times: Floats, name: str) -> None:
+    """Refuse headings that turn about at once, as along a path that stops and comes back."""
+    turns = np.diff(trajectory.yaw(times))
+    turns = np.abs((turns + np.pi) % (2.0 * np.pi) - np.pi)
+    k = int(turns.argmax())
+    if turns[k] > TURNABOUT:
+        raise ValueError(
+            f"{name} must not jump: its heading does by {np.degrees(turns[k]):.0f} degrees "
+            f"{_where(trajectory, times[k + 1])}"
+        )
 
 
 def sampling_times(trajectory: "Trajectory") -> Floats:
