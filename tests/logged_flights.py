@@ -66,7 +66,6 @@ class Recorded:
             if rng.random() >= lost:
                 means = [flight[name][a + 1 : b + 1].mean(axis=0) for name in ("gyro", "accel")]
                 self.imu.append((time[b], time[b], np.concatenate(means)))
-        self.rows = np.array([round(s[0] * suite.imu.rate) for s in self.imu])
 
         def measured(names, latency):
             found = []
@@ -209,18 +208,16 @@ class ULogWriter:
         self.file.write_bytes(self.head + b"".join(message for _, message in in_order))
 
 
-def errors_in_flight(recorded):
-    """(n, 9) errors of position, velocity and attitude of the filter in flight."""
-    f, k = recorded.flight, recorded.rows
-    return _errors(
-        f, k, f["estimated_position"][k], f["estimated_velocity"][k], f["estimated_attitude"][k]
-    )
+def errors_in_flight(recorded, k):
+    """(n, 9) errors of position, velocity and attitude of the filter in flight, at rows `k`."""
+    f = recorded.flight
+    words = ("position", "velocity", "attitude")
+    return _errors(f, k, *(f[f"estimated_{word}"][k] for word in words))
 
 
-def errors_in_replay(recorded, result):
-    """The same of a replay, at the rows of `result`, and the rows."""
-    k = np.rint((result.time - recorded.flight["time"][0]) * recorded.suite.imu.rate).astype(int)
-    return _errors(recorded.flight, k, result.position, result.velocity, result.attitude), k
+def errors_in_replay(recorded, result, k):
+    """The same of a replay, each row of which is one of the flight."""
+    return _errors(recorded.flight, k, result.position, result.velocity, result.attitude)
 
 
 def _errors(flight, k, position, velocity, attitude):

@@ -50,7 +50,8 @@ def share(dimension, count):
 def test_errors_at_the_start_are_as_large_as_the_covariance_says(how):
     """1 in 1,000 each; a heading that may be any has errors as large, not distributed alike."""
     squares, kf = [], UnscentedKalmanFilter(MAGNETIC)
-    for seed in range(DRAWS):
+    count = DRAWS if how != "nothing" else 100
+    for seed in range(count):
         flight = flight_for(how, seed)
         start(flight, kf, how)
         error, P = flight.error(kf, 0.0), kf.covariance
@@ -58,9 +59,9 @@ def test_errors_at_the_start_are_as_large_as_the_covariance_says(how):
                  for i in (0, 3, 6)]  # fmt: skip
         squares.append([error @ np.linalg.solve(P, error), *parts])
     whole, *parts = np.mean(squares, axis=0)
-    low, high = share(15, DRAWS)
+    low, high = share(15, count)
     assert low < whole < high
-    low, high = share(3, DRAWS)
+    low, high = share(3, count)
     for part in parts:
         assert low < part < high
     assert kf.heading_known == (how != "nothing")
@@ -104,8 +105,8 @@ def test_the_magnetic_heading_hangs_on_tilt_and_iron():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motion_tells_a_heading_that_nobody_knew(kind):
-    """60 flights from any heading: consistent all the way, resolved, and right."""
-    count, dt, kf = 60, 0.02, kind(STEADY)
+    """25 flights from any heading: consistent all the way (4 in 1,000), resolved, and right."""
+    count, dt, kf = 25, 0.02, kind(STEADY)
     squares = np.zeros((count, 4))
     resolved = []
     for seed in range(count):
@@ -125,9 +126,10 @@ def test_motion_tells_a_heading_that_nobody_knew(kind):
         resolved.append(since)
         squares[seed] = looks
         assert abs(flight.error(kf, t)[8]) < 5.0 * math.sqrt(kf.covariance[8, 8])
-    assert all(time is not None and time < 2.0 for time in resolved)
-    # a sum of Gaussians is not one while it narrows: some more than one in a thousand
-    assert (np.abs(squares.mean(axis=0) - 15.0) < 3.0).all(), squares.mean(axis=0)
+    assert all(time is not None and time < 2.5 for time in resolved)
+    low, high = share(15, count)
+    mean = squares.mean(axis=0)
+    assert ((low < mean) & (mean < high)).all(), mean
 
 
 def test_without_motion_the_heading_stays_unknown_and_says_so():
@@ -177,13 +179,13 @@ def test_no_result_depends_on_the_lanes_that_hold_the_headings():
     kf = UnscentedKalmanFilter(MAGNETIC)
     kf.initialize(np.zeros(3))
     engine = kf._engine
-    assert engine.lanes == 24
+    assert engine.lanes == 48
     for name in ("L", "r_hat", "R_hat", "slow_hat"):
         before = engine.read(name)
         engine.write(name, before)
         np.testing.assert_array_equal(engine.read(name), before)
     headings = np.arctan2(engine.read("R_hat")[:, 0, 1], engine.read("R_hat")[:, 0, 0])
-    np.testing.assert_allclose(np.diff(np.sort(headings)), 2.0 * math.pi / 24)
+    np.testing.assert_allclose(np.diff(np.sort(headings)), 2.0 * math.pi / 48)
 
 
 def test_a_baseline_takes_velocity_and_noise_too():

@@ -17,6 +17,7 @@ SUITE = quad_gym.sensor_suite("consumer").replace(
 )
 STATE = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias", "covariance", "gnss_drift")
 TICK = SUITE.imu.dt
+FIX = [0.2, 0.1, 0.3]
 
 
 def started(kind=UnscentedKalmanFilter, suite=SUITE, **options):
@@ -27,9 +28,7 @@ def started(kind=UnscentedKalmanFilter, suite=SUITE, **options):
 
 def samples(count, seed=0):
     rng = np.random.default_rng(seed)
-    return [
-        (rng.normal(0.0, 0.3, 3), rng.normal(0.0, 1.0, 3) + [0.0, 0.0, 9.81]) for _ in range(count)
-    ]
+    return [(rng.normal(0.0, 0.3, 3), rng.normal((0.0, 0.0, 9.81), 1.0, 3)) for _ in range(count)]
 
 
 def measurement(rng):
@@ -144,7 +143,7 @@ def test_late_measurements_in_any_order_count_as_if_in_time(kind):
         if k % 7 == 3:
             waiting.append((k + int(rng.integers(1, 80)), late.time, measurement(rng)))
             in_time.update(**waiting[-1][2])
-        for due, stamp, given in [w for w in waiting if w[0] == k]:
+        for _, stamp, given in [w for w in waiting if w[0] == k]:
             late.update(**given, time=stamp)
     for due, stamp, given in sorted(waiting, key=lambda w: -w[1]):
         if due >= 200:
@@ -236,8 +235,8 @@ def test_the_last_update_is_of_what_was_given_even_late():
 @pytest.mark.parametrize(
     ("given", "sigma", "change"),
     [
-        ({"gnss_position_G": [0.2, 0.1, 0.3]}, {"gnss_sigma": 0.05}, ("gnss", "position_sigma_I", (0.05,) * 3)),
-        ({"gnss_velocity_G": [0.2, 0.1, 0.3]}, {"velocity_sigma": 0.4}, ("gnss", "velocity_sigma", 0.4)),
+        ({"gnss_position_G": FIX}, {"gnss_sigma": 0.05}, ("gnss", "position_sigma_I", (0.05,) * 3)),
+        ({"gnss_velocity_G": FIX}, {"velocity_sigma": 0.4}, ("gnss", "velocity_sigma", 0.4)),
         ({"barometer": 0.4}, {"barometer_sigma": 0.02}, ("barometer", "noise_sigma", 0.02)),
         (
             {"magnetometer": [1e-6, 24e-6, -39e-6]},
@@ -310,7 +309,7 @@ def test_a_diagonal_covariance_is_three_sigmas():
         ({"gnss_sigma": [0.1, -0.1, 0.1]}, "gnss_sigma"),
         ({"gnss_sigma": [0.1, 0.1]}, "gnss_sigma"),
         ({"gnss_sigma": np.ones((3, 3))}, "gnss_sigma must be a positive definite"),
-        ({"gnss_sigma": np.eye(3) + [[0, 1e-3, 0], [0, 0, 0], [0, 0, 0]]}, "symmetric"),
+        ({"gnss_sigma": np.array([[1, 1e-3, 0], [0, 1, 0], [0, 0, 1]])}, "symmetric"),
         ({"gnss_sigma": math.nan}, "gnss_sigma"),
         ({"velocity_sigma": 0.1}, "velocity_sigma must come with"),
         ({"barometer": 0.1, "barometer_sigma": -1.0}, "barometer_sigma"),
