@@ -23,13 +23,14 @@ batch = quad_gym.FlightBatch(1, sensors=suite, gains="tuned")
 batch.reset(seeds=[4])
 rng, rows, truth = np.random.default_rng(0), [], []
 R_IG, nothing = ecef_to_enu(suite.gnss.reference_antenna_G), np.full(3, np.nan)
-for k in range(1, 2001):
-    batch.step()
-    time, fields = 0.005 * k, ("gyro", "accel", "gnss_position", "gnss_velocity")
-    gyro, accel, place, speed = (batch.read(name)[0] for name in fields)
-    rows.append([time, time, *gyro, *accel, *nothing, *nothing])
-    if batch.read("position_fresh")[0] > 0:
-        stamps = (time - 0.1, time + rng.uniform(0.0, 0.05))
+fields = ("gyro", "accel", "gnss_position", "gnss_velocity")
+for k in range(2001):
+    if k > 0:
+        batch.step()
+    time, (gyro, accel, place, speed) = 0.005 * k, (batch.read(name)[0] for name in fields)
+    rows.append([time, time, *(gyro if k else nothing), *accel, *nothing, *nothing])
+    if batch.read("position_fresh")[0] + batch.read("position_valid")[0] > 0:
+        stamps = (time - 0.1, time + rng.uniform(0.0, 0.05)) if k else (0.0, 0.0)
         rows.append([*stamps, *nothing, *nothing, *R_IG @ place, *R_IG @ speed])
     truth.append(batch.read("r")[0])
 rows = np.array(rows)[rng.random(len(rows)) > 0.01]
@@ -39,10 +40,7 @@ rows = np.array(rows)[rng.random(len(rows)) > 0.01]
 
 parts = np.split(rows, [1, 2, 5, 8, 11], axis=1)
 names = ("time", "received", "gyro", "accel", "gnss_enu", "gnss_velocity_enu")
-log = {
-    name: part[:, 0] if part.shape[1] == 1 else part
-    for name, part in zip(names, parts, strict=True)
-}
+log = {name: np.squeeze(part) for name, part in zip(names, parts, strict=True)}
 result = replay(log, sensors=suite)
 print(f"heading known after {result.time[np.argmax(result.heading_known)]:.2f} s")
 
@@ -50,7 +48,7 @@ print(f"heading known after {result.time[np.argmax(result.heading_known)]:.2f} s
 # The error of the position stays within three deviations, and the deviation of the heading, which
 # is that of a uniform one at first, falls as soon as the vehicle accelerates.
 
-position = np.array(truth)[np.rint(result.time / 0.005).astype(int) - 1]
+position = np.array(truth)[np.rint(result.time / 0.005).astype(int)]
 figure, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5))
 sigma = 100 * result.sigma[:, 0]
 axes[0].fill_between(result.time, -3 * sigma, 3 * sigma, color="C1", alpha=0.25, linewidth=0)
