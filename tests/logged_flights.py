@@ -17,19 +17,38 @@ from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
 from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
+PX4 = RTK.replace(
+    camera=None,
+    barometer=quad_gym.BarometerParams(),
+    magnetometer=quad_gym.MagnetometerParams(),
+)
+"""What a log of PX4 can hold, and two antennas."""
 LOST, JITTER = 0.01, 0.05
 
 
 def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
-    """A flight under PD control on the estimate, with a row per IMU sample."""
+    """A flight under PD control on the estimate, with a row per IMU sample.
+
+    Its `about` has what aiding sensors measured, (n, 2, 3), NaN where they did not.
+    """
     rate = suite.imu.rate
-    env = QuadEnv(task, sensors=suite, control_rate=rate, observation="estimate")
+    env = QuadEnv(task, sensors=suite, control_rate=rate, duration=seconds)
     policy, recorder = PDPolicy(env), FlightRecorder(env.flights.batch)
     observation, _ = env.reset(seed=seed)
     recorder.keep()
+    aids = []
+
+    def keep_aids():
+        batch = env.flights.batch
+        fresh = (batch.read("aid_fresh") + batch.read("aid_valid"))[0] > 0.0
+        aids.append(np.where(fresh[:, np.newaxis], batch.read("aid_measurement")[0], np.nan))
+
+    keep_aids()
     for _ in range(round(seconds * rate)):
         observation = env.step(policy.predict(observation)[0])[0]
         recorder.keep()
+        keep_aids()
+    recorder.flight.about["aids"] = np.array(aids)
     return recorder.flight
 
 
@@ -47,7 +66,6 @@ class Recorded:
             if rng.random() >= lost:
                 means = [flight[name][a + 1 : b + 1].mean(axis=0) for name in ("gyro", "accel")]
                 self.imu.append((time[b], time[b], np.concatenate(means)))
-        self.rows = np.array([round(s[0] * suite.imu.rate) for s in self.imu])
 
         def measured(names, latency):
             found = []
@@ -63,6 +81,15 @@ class Recorded:
             return found
 
         self.gnss = measured(("gnss_position", "gnss_baseline", "gnss_velocity"), 0.1)
+        self.aids = []
+        for aid, params in suite.aids.items():
+            found, latency = [], params.latency
+            for k in np.flatnonzero(np.isfinite(flight.about["aids"][:, aid, 0])):
+                if k == 0 or rng.random() >= lost:
+                    arrival = time[k] + (rng.uniform(0.0, jitter) if k else 0.0)
+                    stamp = time[k] - (latency if k else 0.0)
+                    found.append((stamp, arrival, flight.about["aids"][k, aid]))
+            self.aids.append(found)
         self.camera = measured(("pixels",), suite.camera.latency if suite.camera else 0.0)
 
     def table(self):
@@ -117,6 +144,16 @@ class Recorded:
             accuracy = (sigma[0], sigma[2], self.suite.gnss.velocity_sigma)
             times = (us(received), us(time))
             ulog.add(us(received), gps, *times, *place, *accuracy, n, e, -u, 3, True)
+        if self.aids:
+            air, compass = (
+                ulog.topic(n, f)
+                for n, f in (("vehicle_air_data", _AIR), ("vehicle_magnetometer", _MAG))
+            )
+            for time, received, values in self.aids[0]:  # above the sea, not above the origin
+                ulog.add(us(received), air, us(received), us(time), values[0] + 213.0)
+            for time, received, values in self.aids[1]:
+                gauss = 1e4 * values * flu
+                ulog.add(us(received), compass, us(received), us(time), *gauss)
         ulog.write()
 
 
@@ -130,6 +167,8 @@ _GPS = (
     "double altitude_ellipsoid_m;float eph;float epv;float s_variance_m_s;"
     "float vel_n_m_s;float vel_e_m_s;float vel_d_m_s;uint8_t fix_type;bool vel_ned_valid;"
 )
+_AIR = "uint64_t timestamp;uint64_t timestamp_sample;float baro_alt_meter;"
+_MAG = "uint64_t timestamp;uint64_t timestamp_sample;float[3] magnetometer_ga;"
 _CODES = {"uint64_t": "Q", "uint32_t": "I", "int32_t": "i", "uint8_t": "B", "bool": "?"}
 _CODES |= {"double": "d", "float": "f"}
 
@@ -169,18 +208,16 @@ class ULogWriter:
         self.file.write_bytes(self.head + b"".join(message for _, message in in_order))
 
 
-def errors_in_flight(recorded):
-    """(n, 9) errors of position, velocity and attitude of the filter in flight."""
-    f, k = recorded.flight, recorded.rows
-    return _errors(
-        f, k, f["estimated_position"][k], f["estimated_velocity"][k], f["estimated_attitude"][k]
-    )
+def errors_in_flight(recorded, k):
+    """(n, 9) errors of position, velocity and attitude of the filter in flight, at rows `k`."""
+    f = recorded.flight
+    words = ("position", "velocity", "attitude")
+    return _errors(f, k, *(f[f"estimated_{word}"][k] for word in words))
 
 
-def errors_in_replay(recorded, result):
-    """The same of a replay, at the rows of `result`, and the rows."""
-    k = np.rint((result.time - recorded.flight["time"][0]) * recorded.suite.imu.rate).astype(int)
-    return _errors(recorded.flight, k, result.position, result.velocity, result.attitude), k
+def errors_in_replay(recorded, result, k):
+    """The same of a replay, each row of which is one of the flight."""
+    return _errors(recorded.flight, k, result.position, result.velocity, result.attitude)
 
 
 def _errors(flight, k, position, velocity, attitude):

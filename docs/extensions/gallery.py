@@ -15,6 +15,7 @@ LESSONS = (
     "moving_target.py",
     "look_at_markers.py",
     "filter_alone.py",
+    "replay.py",
     "deploy.py",
 )
 """The order in which to read them; others follow by name."""

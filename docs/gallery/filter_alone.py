@@ -86,5 +86,4 @@ axes[3].legend(loc="upper right")
 
 # %%
 # A real log works the same way. Make a suite with the noise and geometry of your sensors (see
-# :doc:`sensor_suite`), and turn fixes into ECEF coordinates relative to
-# ``GnssParams.reference_antenna_G``.
+# :doc:`sensor_suite`), and let :doc:`replay` read the log.

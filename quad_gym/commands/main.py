@@ -15,6 +15,7 @@ COMMANDS = {
     "sweep": "any set of trainings: on this machine, a cluster with Slurm, or Ray",
     "tune": "tune the gains of the PD controller",
     "fly": "watch one flight in a window, or film it",
+    "replay": "filter the log of a real flight: a table, or a log of PX4",
     "consistency": "is the filter's covariance right? NEES and NIS over many flights",
     "ablation": "what each correction of the filter is worth, and what wrong models cost",
     "benchmark": "measure the speed of everything",

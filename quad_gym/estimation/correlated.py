@@ -13,6 +13,7 @@ import numpy as np
 from quad_gym.estimation.engine import Engine, Floats
 from quad_gym.estimation.samples import Measurement
 from quad_gym.estimation.starts import lower_factor
+from quad_gym.records import POSITION_BLOCK
 
 
 def in_principal_axes(covariance: Floats) -> tuple[Floats, Floats]:
@@ -63,12 +64,34 @@ def update_with_correlated(
         covariance: (3, 3) of its errors in I [m^2].
     """
     T, sigmas = in_principal_axes(covariance)
+    expected = _innovation_sigmas(engine, covariance)
     R_IG = engine.params["R_IG"].copy()
     turn_state(engine, T)
     noise = {**measurement.noise, "gnss_sigma": sigmas}
     condition(dataclasses.replace(measurement, noise=noise))
     turn_state(engine, T.T)
     engine.params["R_IG"] = R_IG
-    innovation = engine.read("innovation")
-    innovation[:, 0] = innovation[:, 0] @ T
-    engine.write("innovation", innovation)
+    if len(expected) != engine.lanes:  # one heading is left
+        expected = expected[:1].repeat(engine.lanes, axis=0)
+    for name, of_position in (
+        ("innovation", engine.read("innovation")[:, POSITION_BLOCK] @ T),
+        ("innovation_sigma", expected),
+    ):
+        kept = engine.read(name)
+        kept[:, POSITION_BLOCK] = of_position
+        engine.write(name, kept)
+
+
+def _innovation_sigmas(engine: Engine, covariance: Floats) -> Floats:
+    """(lanes, 3) deviations of a position's innovation in I, to first order."""
+    gnss, L, R_BI = engine.sensors.gnss, engine.read("L"), engine.read("R_hat")
+    assert gnss is not None
+    x, y, z = gnss.primary_antenna_B
+    turned = R_BI.swapaxes(1, 2) @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    root = L[:, 0:3] - turned @ L[:, 6:9]
+    if engine.settings["estimates_drift"][0]:
+        rows = engine.read("L_slow")[:, :3]
+        rows[:, :, :15] += root
+        root = rows
+    variances = (root**2).sum(axis=2) + np.diag(covariance)
+    return np.sqrt(variances)  # type: ignore[no-any-return]

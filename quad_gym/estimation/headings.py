@@ -18,19 +18,19 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.samples import Measurement
 from quad_gym.estimation.starts import FirstEstimate, lower_factor
+from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 
 Floats = NDArray[np.float64]
 
-COUNT = 24
+COUNT = 48
 """Headings; a multiple of the lanes of any machine."""
 SPACING = 2.0 * math.pi / COUNT
 """Between two of them [rad]."""
-RESOLVED = 0.15
+RESOLVED = 0.07
 """Deviation of the heading below which one Gaussian takes over [rad]."""
 
 _VECTORS = ("r_hat", "v_hat", "b_a_hat", "b_g_hat")
@@ -105,25 +105,15 @@ def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floa
     return weights - math.log(np.exp(weights).sum())
 
 
-def _turns_of(R: Floats) -> Floats:
-    """(n, 3) the vectors e of rotations exp(-[e x])."""
-    return -Rotation.from_matrix(R).as_rotvec()  # type: ignore[no-any-return]
-
-
-def _turned(e: Floats, R: Floats) -> Floats:
-    """exp(-[e x]) R."""
-    return Rotation.from_rotvec(-e).as_matrix() @ R  # type: ignore[no-any-return]
-
-
 def moments(engine: Engine, log_weights: Floats) -> Moments:
     """Mean and covariance of all lanes together; of the attitude about a mean on the circle."""
     w, n = np.exp(log_weights), int(engine.settings["slow_states"][0])
     R = engine.read("R_hat")
     R_mean, turns = R[int(np.argmax(w))], np.zeros((len(w), 3))
     for _ in range(10):
-        turns = _turns_of(R @ R_mean.T)
-        R_mean = _turned(w @ turns, R_mean)
-    turns = _turns_of(R @ R_mean.T)
+        turns = dcm_to_euler(R @ R_mean.T)
+        R_mean = euler_to_dcm(w @ turns) @ R_mean
+    turns = dcm_to_euler(R @ R_mean.T)  # yaw first, so that tilts add up as they are
     means = {name: w @ engine.read(name) for name in _VECTORS}
     slow = engine.read("slow_hat")[:, :n]
     means["slow_hat"] = w @ slow

@@ -1,0 +1,113 @@
+"""The figure of a replayed log: estimates within their deviations, and innovations."""
+
+from typing import Any
+
+import numpy as np
+
+from quad_gym.analysis.metrics import chi_square_quantile
+from quad_gym.analysis.plots import BLUE, GREEN, GREY, ORANGE, PALE, VERMILLION, require_matplotlib
+from quad_gym.estimation.results import Measured, Replay
+from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
+
+_AXES = (BLUE, ORANGE, GREEN)
+_SENSORS = {
+    "gnss_position": "NIS of positions",
+    "gnss_velocity": "NIS of velocities",
+    "gnss_baseline": "NIS of baselines",
+    "features": "NIS of features",
+    "barometer": "NIS of the barometer",
+    "magnetometer": "NIS of the magnetometer",
+}
+
+
+def draw_states(axes: Any, result: Replay, name: str) -> None:
+    """Draw position, velocity or attitude, with bands of two deviations.
+
+    Args:
+        axes: Where to.
+        result: A replay.
+        name: "position", "velocity" or "attitude".
+    """
+    first = {"position": 0, "velocity": 3, "attitude": 6}[name]
+    labels, scale = ("east", "north", "up"), 1.0
+    if name == "attitude":
+        angles = dcm_to_euler(quaternion_to_dcm(result.attitude))
+        values, labels, scale = np.unwrap(angles, axis=0), ("roll", "pitch", "yaw"), 180.0 / np.pi
+    else:
+        values = getattr(result, name)
+    for i, (label, color) in enumerate(zip(labels, _AXES, strict=True)):
+        curve, sigma = scale * values[:, i], scale * result.sigma[:, first + i]
+        band = (curve - 2.0 * sigma, curve + 2.0 * sigma)
+        axes.fill_between(result.time, *band, color=color, alpha=0.2, linewidth=0.0)
+        axes.plot(result.time, curve, color=color, linewidth=1.1, label=label)
+    low, high = np.percentile(scale * values, [0.0, 100.0])
+    margin = 0.1 * max(high - low, 1e-3)
+    axes.set_ylim(low - margin, high + margin)
+    unit = {"position": "m", "velocity": "m/s", "attitude": "deg"}[name]
+    axes.set_title(f"{name} [{unit}], with two standard deviations")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3)
+
+
+def draw_nis(axes: Any, measured: Measured, title: str) -> None:
+    """Draw normalized innovations squared, what was left out, and where 99 of 100 should lie."""
+    freedoms = measured.innovation.shape[1]
+    bound = chi_square_quantile(freedoms, 0.99)
+    known = np.isfinite(measured.nis)
+    taken, left_out = known & ~measured.gated, known & measured.gated
+    top = 1.1 * max(1.3 * bound, measured.nis[taken].max(initial=0.0))
+    axes.axhspan(0.0, bound, color=PALE, linewidth=0.0)
+    dots: dict[str, Any] = {"linestyle": "none", "color": BLUE, "marker": ".", "markersize": 2.5}
+    axes.plot(measured.time[taken], measured.nis[taken], **dots)
+    # what is beyond the picture stands at its edge
+    high = np.minimum(measured.nis[left_out], 0.97 * top)
+    axes.plot(measured.time[left_out], high, "x", color=VERMILLION, markersize=5.0)
+    mean = f", mean {measured.nis[taken].mean():.2f} of {freedoms}" if taken.any() else ""
+    axes.set_title(f"{title}{mean}; left out: {int(left_out.sum())}")
+    axes.set_ylim(0.0, top)
+
+
+def replay_figure(result: Replay, title: str) -> Any:
+    """Position, velocity and attitude of a replay, and the NIS of each sensor.
+
+    Args:
+        result: A replay.
+        title: Of the figure.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    kinds = sensors_of(result)
+    rows = 3 + -(-len(kinds) // 2)
+    figure = Figure(figsize=(9.0, 0.6 + 1.9 * rows), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0)
+    grid = figure.add_gridspec(rows, 2)
+    for row, name in enumerate(("position", "velocity", "attitude")):
+        draw_states(figure.add_subplot(grid[row, :]), result, name)
+    for k, (name, measured) in enumerate(kinds.items()):
+        draw_nis(figure.add_subplot(grid[3 + k // 2, k % 2]), measured, _SENSORS[name])
+    for axes in figure.axes:
+        axes.set_xlim(result.time[0], result.time[-1])
+        axes.tick_params(colors=GREY)
+    figure.axes[-1].set_xlabel("time [s]")
+    if len(kinds) > 1:
+        figure.axes[-2].set_xlabel("time [s]")
+    return figure
+
+
+def sensors_of(result: Replay) -> dict[str, Measured]:
+    """Innovations by sensor, those of all features together."""
+    kinds = {n: m for n, m in result.measured.items() if not n.startswith("feature_")}
+    features = [m for n, m in result.measured.items() if n.startswith("feature_")]
+    if features:
+        parts = (
+            np.concatenate([getattr(m, name) for m in features])
+            for name in ("time", "received", "innovation", "sigma", "nis", "gate")
+        )
+        kinds["features"] = Measured(*parts)
+    return {name: kinds[name] for name in _SENSORS if name in kinds}

@@ -1,0 +1,190 @@
+"""Filter the log of a real flight: estimates, innovations, and what the gate left out.
+
+    quad-gym replay flight.csv --sensors rtk
+    quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
+
+A log is a table with commas, or a log of PX4 (which needs `pip install 'quad-gym[ulog]'`).
+docs/logs.md says which columns a table has, and what is taken from PX4.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from quad_gym.commands.options import SuiteName, refuse_overwriting, usage_errors
+
+if TYPE_CHECKING:
+    from quad_gym.estimation import Replay
+    from quad_gym.estimation.logs import Floats
+    from quad_gym.params.sensors import SensorSuite
+
+RESULT = "replay.json"
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the replay."""
+
+    log: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="LOG", help="a table (.csv) or a log of PX4 (.ulg)")]
+    ]
+    sensors: SuiteName = "standard"
+    estimator: Literal["ukf", "ekf"] = "ukf"
+    """the filter"""
+    barometer: bool = False
+    """give the suite a barometer, with the package's numbers"""
+    magnetometer: tuple[float, float, float] | None = None
+    """give the suite a magnetometer, with the package's numbers, in a magnetic field of this
+    strength [microtesla], declination and inclination [deg], as a model of the Earth's tells"""
+    heading: float | None = None
+    """of the body x axis at the start, from east toward north [deg]; if not given, as a baseline or
+    a magnetometer tells it, or else unknown"""
+    course: bool = False
+    """take the direction of the first GNSS velocity for the heading: the vehicle flies nose
+    first"""
+    body: Literal["flu", "frd"] = "flu"
+    """axes of a table's IMU and magnetometer: x forward, y left, z up; or x forward, y right, z
+    down"""
+    window: float = 0.5
+    """how late measurements may come [s]"""
+    reported_noise: bool = True
+    """let the accuracy that the receiver reports count, where the log has it"""
+    figure: bool = True
+    """draw the figure"""
+    output: Path | None = None
+    """folder for the results, made if it is missing; if not given, results/replay/LOG"""
+    overwrite: bool = False
+    """replace the results of an earlier replay"""
+
+
+def folder_of(args: Args) -> Path:
+    """Check the output, and make its folder.
+
+    Raises:
+        ValueError: If there are results already, or options do not belong together.
+        OSError: If nothing can be written there.
+        ImportError: If matplotlib is missing.
+    """
+    from quad_gym.analysis.plots import require_matplotlib
+    from quad_gym.analysis.reports import require_writable
+
+    if args.course and args.heading is not None:
+        raise ValueError("--heading must not be given with --course")
+    if args.figure:
+        require_matplotlib()
+    folder = args.output or Path("results/replay") / args.log.stem
+    refuse_overwriting(folder / RESULT, args.overwrite)
+    require_writable("--output", folder)
+    return folder
+
+
+def start_of(args: Args) -> dict[str, Any]:
+    """What the options say of the start."""
+    if args.heading is not None:
+        return {"heading": math.radians(args.heading)}
+    return {"course": True} if args.course else {}
+
+
+def suite_of(args: Args) -> "SensorSuite":
+    """The suite, with the sensors that options add."""
+    from quad_gym.params.barometer import BarometerParams
+    from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
+    from quad_gym.params.suites import sensor_suite
+
+    suite = sensor_suite(args.sensors)
+    if args.barometer:
+        suite = suite.replace(barometer=BarometerParams())
+    if args.magnetometer is not None:
+        strength, declination, inclination = args.magnetometer
+        compass = MagnetometerParams(
+            strength=MICROTESLA * strength,
+            declination=math.radians(declination),
+            inclination=math.radians(inclination),
+        )
+        suite = suite.replace(magnetometer=compass)
+    return suite
+
+
+def report_of(result: "Replay") -> str:
+    """What became of each measurement, for the screen."""
+    from quad_gym.analysis.replay_plots import sensors_of
+    from quad_gym.analysis.reports import text_table
+
+    rows = []
+    for name, measured in sensors_of(result).items():
+        nis = measured.nis[np.isfinite(measured.nis)]
+        mean = f"{nis.mean():.2f} of {measured.innovation.shape[1]}" if len(nis) else "-"
+        rows.append((name, f"{len(measured.time)}", f"{int(measured.gated.sum())}", mean))
+    table = text_table({"measurements": ["of", "count", "left out", "mean NIS"]}, rows)
+    lines = [f"{len(result)} IMU samples from {result.time[0]:.2f} s to {result.time[-1]:.2f} s."]
+    if result.too_late:
+        lines.append(f"Too late for the window: {result.too_late} measurements.")
+    if result.unused:
+        lines.append(f"Not used, as the suite has none: {', '.join(result.unused)}.")
+    if not result.heading_known[-1]:
+        lines.append("Nothing has told the heading: give --heading, or fly.")
+    if result.status:
+        lines.append(f"The filter failed in some cycles: {result.status.name}.")
+    return "\n".join([table, *lines])
+
+
+def innovations_of(result: "Replay") -> dict[str, list[Any]]:
+    """Columns of all innovations, in the order of sensors."""
+    names = ("time", "received", "innovation", "sigma", "nis", "gate")
+    table: dict[str, list[Any]] = {"sensor": []}
+    for sensor, measured in result.measured.items():
+        table["sensor"] += [sensor] * len(measured.time)
+        for name in names:
+            values = getattr(measured, name)
+            if values.ndim == 1:
+                table.setdefault(name, []).extend(values.tolist())
+                continue
+            wide = np.full((len(values), 3), np.nan)
+            wide[:, : values.shape[1]] = values
+            for i in range(3):
+                table.setdefault(f"{name}_{i}", []).extend(wide[:, i].tolist())
+    return table
+
+
+def _lists(columns: "dict[str, Floats]") -> dict[str, list[float]]:
+    return {name: values.tolist() for name, values in columns.items()}
+
+
+def main(args: Args) -> None:
+    """Read, filter, draw and write."""
+    from quad_gym.analysis.reports import versions, write_csv, write_json
+    from quad_gym.estimation import replay
+
+    with usage_errors():
+        folder = folder_of(args)
+        result = replay(
+            args.log,
+            sensors=suite_of(args),
+            estimator=args.estimator,
+            start=start_of(args),
+            reported_noise=args.reported_noise,
+            window=args.window,
+            body=args.body,
+        )
+    print(report_of(result))
+    files = [write_csv(folder / "estimates.csv", _lists(result.columns()))]
+    files.append(write_csv(folder / "innovations.csv", innovations_of(result)))
+    if args.figure:
+        from quad_gym.analysis.plots import house_style, save_figure
+        from quad_gym.analysis.replay_plots import replay_figure
+
+        with house_style():
+            title = f"{args.log.name}, {args.estimator.upper()}, suite {args.sensors}"
+            files += save_figure(replay_figure(result, title), folder / "replay")
+    found = {
+        **result.summary(),
+        "configuration": args,
+        "sensors": result.sensors,
+        "versions": versions("numpy", "numba", "scipy", "pyulog"),
+    }
+    files.append(write_json(folder / RESULT, found))
+    print(f"\nWrote {len(files)} files to {folder}.")

@@ -1,0 +1,253 @@
+"""Starts from one antenna: level, with a heading from elsewhere, or from nowhere."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import quad_gym
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from tests.level_flights import MAGNETIC, R_IG, LevelFlight
+
+KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
+DRAWS = 300
+STEADY = MAGNETIC.replace(  # so that biases do not change in a flight, as in these they do not
+    imu=MAGNETIC.imu.replace(accel_bias_tau=1e7, gyro_bias_tau=1e7)
+)
+
+
+def start(flight, kf, how):
+    """Start a filter on a flight."""
+    position, velocity = flight.gnss(0.0)
+    if how == "heading":
+        kf.initialize(position, heading=flight.yaw + flight.rng.normal(0.0, 0.05))
+    elif how == "magnetometer":
+        kf.initialize(position, magnetometer=flight.field())
+    elif how == "course":  # the nose is within 0.2 rad of the course
+        kf.initialize(position, gnss_velocity_G=velocity, course=True, heading_sigma=0.2)
+    else:
+        kf.initialize(position)
+    return kf
+
+
+def flight_for(how, seed):
+    rng = np.random.default_rng(seed)
+    flight = LevelFlight(MAGNETIC, rng)
+    if how == "course":
+        course = flight.yaw + rng.normal(0.0, 0.2)
+        flight.drift = np.array([6.0 * math.cos(course), 6.0 * math.sin(course), 0.0])
+        flight.speed = np.zeros(3)
+    return flight
+
+
+def share(dimension, count):
+    """Bounds that the mean NEES of a consistent filter leaves once in a thousand."""
+    return chi2.ppf((0.0005, 0.9995), dimension * count) / count
+
+
+@pytest.mark.parametrize("how", ["heading", "magnetometer", "course", "nothing"])
+def test_errors_at_the_start_are_as_large_as_the_covariance_says(how):
+    """1 in 1,000 each; a heading that may be any has errors as large, not distributed alike."""
+    squares, kf = [], UnscentedKalmanFilter(MAGNETIC)
+    count = DRAWS if how != "nothing" else 100
+    for seed in range(count):
+        flight = flight_for(how, seed)
+        start(flight, kf, how)
+        error, P = flight.error(kf, 0.0), kf.covariance
+        parts = [error[i : i + 3] @ np.linalg.solve(P[i : i + 3, i : i + 3], error[i : i + 3])
+                 for i in (0, 3, 6)]  # fmt: skip
+        squares.append([error @ np.linalg.solve(P, error), *parts])
+    whole, *parts = np.mean(squares, axis=0)
+    low, high = share(15, count)
+    assert low < whole < high
+    low, high = share(3, count)
+    for part in parts:
+        assert low < part < high
+    assert kf.heading_known == (how != "nothing")
+
+
+def test_the_magnetic_heading_hangs_on_tilt_and_iron():
+    """The joint covariance: its errors follow from the same draws, by finite differences."""
+    flight = LevelFlight(MAGNETIC, np.random.default_rng(3))
+    kf = start(flight, UnscentedKalmanFilter(MAGNETIC), "magnetometer")
+    L = kf._engine.read("L")[0]
+    rows = kf._engine.read("L_slow")[0][:, :21]
+    joint = np.vstack([np.hstack([L, np.zeros((15, 6))]), rows[:6]])
+    P = joint @ joint.T
+    tilt, yaw = P[6:8, 6:8], P[8, 6:8]
+    m = MAGNETIC.magnetometer
+
+    def heading(roll=0.0, pitch=0.0, iron=(0.0, 0.0), turn=0.0):
+        field = np.array([*kf.R_BI @ np.array(m.field_I)])
+        c, s = math.cos(turn), math.sin(turn)
+        e, n, u = m.field_I
+        field = kf.R_BI @ np.array([c * e + s * n, c * n - s * e, u])
+        # a small rotation R(e) = 1 - [e x] of what is measured
+        field = field + np.cross(field, [roll, pitch, 0.0]) + np.array([*iron, 0.0])
+        level = kf.R_BI @ np.array(m.field_I)
+        # by how much the level filter then errs: the true less the estimated angle
+        return math.atan2(field[1], field[0]) - math.atan2(level[1], level[0])
+
+    d = 1e-6
+    by_tilt = np.array([heading(roll=d), heading(pitch=d)]) / d
+    np.testing.assert_allclose(yaw, by_tilt @ tilt, rtol=1e-4)
+    by_iron = np.array([heading(iron=(1e-12, 0.0)), heading(iron=(0.0, 1e-12))]) / 1e-12
+    np.testing.assert_allclose(P[8, 15:17], by_iron * m.hard_iron_sigma**2, rtol=1e-3)
+    by_turn = heading(turn=d) / d
+    order = kf._engine.settings["aid_scalar"][0, 1]
+    np.testing.assert_allclose(P[8, 15 + order], by_turn * m.declination_sigma**2, rtol=1e-3)
+    variance = by_tilt @ tilt @ by_tilt + (by_iron @ by_iron) * m.hard_iron_sigma**2
+    variance += (by_turn * m.declination_sigma) ** 2
+    variance += (m.noise_sigma / math.hypot(*m.field_I[:2])) ** 2
+    np.testing.assert_allclose(P[8, 8], variance, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_motion_tells_a_heading_that_nobody_knew(kind):
+    """25 flights from any heading: consistent all the way (4 in 1,000), resolved, and right."""
+    count, dt, kf = 25, 0.02, kind(STEADY)
+    squares = np.zeros((count, 4))
+    resolved = []
+    for seed in range(count):
+        flight = LevelFlight(STEADY, np.random.default_rng(seed), amplitude=0.5)
+        start(flight, kf, "nothing")
+        t, since, looks = 0.0, None, []
+        for k in range(1, 151):
+            kf.predict(*flight.sample(t, dt), dt=dt)
+            t = k * dt
+            if k % 5 == 0:
+                position, velocity = flight.gnss(t)
+                kf.update(position, gnss_velocity_G=velocity)
+            if since is None and kf.heading_known:
+                since = t
+            if k in (25, 50, 100, 150):
+                looks.append(flight.nees(kf, t))
+        resolved.append(since)
+        squares[seed] = looks
+        assert abs(flight.error(kf, t)[8]) < 5.0 * math.sqrt(kf.covariance[8, 8])
+    assert all(time is not None and time < 2.5 for time in resolved)
+    low, high = share(15, count)
+    mean = squares.mean(axis=0)
+    assert ((low < mean) & (mean < high)).all(), mean
+
+
+def test_without_motion_the_heading_stays_unknown_and_says_so():
+    rng = np.random.default_rng(0)
+    flight = LevelFlight(MAGNETIC, rng, amplitude=0.0)
+    kf = start(flight, UnscentedKalmanFilter(MAGNETIC), "nothing")
+    for k in range(50):
+        kf.predict(*flight.sample(0.02 * k, 0.02), dt=0.02)
+        kf.update(flight.gnss(0.02 * (k + 1))[0])
+    assert not kf.heading_known
+    assert math.sqrt(kf.covariance[8, 8]) > 1.0
+    np.testing.assert_allclose(kf.R_BI @ kf.R_BI.T, np.eye(3), atol=1e-12)
+    kf.initialize(flight.gnss(0.0)[0], heading=0.3)  # and begins anew
+    assert kf.heading_known
+
+
+def test_late_measurements_resolve_the_heading_as_those_in_time():
+    flight = LevelFlight(MAGNETIC, np.random.default_rng(2), amplitude=0.5)
+    first, *_ = flight.gnss(0.0)
+    in_time, late = (UnscentedKalmanFilter(MAGNETIC) for _ in range(2))
+    waiting, told = [], []
+    for kf in (in_time, late):
+        kf.initialize(first)
+    for k in range(1, 151):
+        sample = flight.sample(0.02 * (k - 1), 0.02)
+        for kf in (in_time, late):
+            kf.predict(*sample, dt=0.02)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(0.02 * k)
+            in_time.update(position, gnss_velocity_G=velocity)
+            waiting.append((k + 12, late.time, position, velocity))
+        for due, stamp, position, velocity in waiting:
+            if due == k:
+                late.update(position, gnss_velocity_G=velocity, time=stamp)
+        told.append((in_time.heading_known, late.heading_known))
+    for due, stamp, position, velocity in waiting:
+        if due > 150:
+            late.update(position, gnss_velocity_G=velocity, time=stamp)
+    assert in_time.heading_known
+    assert (True, False) in told  # late it was told later
+    np.testing.assert_array_equal(in_time.covariance, late.covariance)
+    np.testing.assert_array_equal(in_time.position, late.position)
+
+
+def test_no_result_depends_on_the_lanes_that_hold_the_headings():
+    """Fields of lanes go there and back."""
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf.initialize(np.zeros(3))
+    engine = kf._engine
+    assert engine.lanes == 48
+    for name in ("L", "r_hat", "R_hat", "slow_hat"):
+        before = engine.read(name)
+        engine.write(name, before)
+        np.testing.assert_array_equal(engine.read(name), before)
+    headings = np.arctan2(engine.read("R_hat")[:, 0, 1], engine.read("R_hat")[:, 0, 0])
+    np.testing.assert_allclose(np.diff(np.sort(headings)), 2.0 * math.pi / 48)
+
+
+def test_a_baseline_takes_velocity_and_noise_too():
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf.initialize(
+        np.zeros(3), [1.0, 0.0, 0.0], gnss_velocity_G=R_IG.T @ [1.0, 2.0, 0.5],
+        velocity_sigma=0.2, gnss_sigma=[0.3, 0.4, 0.5], time=7.0,
+    )  # fmt: skip
+    np.testing.assert_allclose(kf.velocity, [1.0, 2.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(kf.covariance))[3:6], 0.2)
+    np.testing.assert_allclose(np.sqrt(np.diag(kf.covariance))[:3], [0.3, 0.4, 0.5], rtol=1e-3)
+    assert kf.time == 7.0
+
+
+FIX, SPEED = np.zeros(3), np.array([1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"heading": math.nan}, "heading must be finite"),
+        ({"heading": 0.1, "magnetometer": [1e-5, 1e-5, 0.0]}, "only one of heading"),
+        ({"heading": 0.1, "heading_sigma": 0.0}, "heading_sigma"),
+        ({"heading_sigma": 0.1}, "heading_sigma must come with"),
+        ({"magnetometer": [0.0, 0.0, 4e-5]}, "level part of the field"),
+        ({"magnetometer": [1e-5, 1e-5]}, "magnetometer must have shape"),
+        ({"magnetometer_sigma": 1e-6}, "magnetometer_sigma must come with"),
+        ({"course": True}, "course must come with gnss_velocity_G"),
+        ({"course": True, "gnss_velocity_G": [0.01, 0.0, 0.0]}, "course must be that of a vehicle"),
+        ({"course": 1}, "course must be True or False"),
+        ({"velocity_sigma": 0.1}, "velocity_sigma must come with"),
+        ({"tilt_sigma": -0.1}, "tilt_sigma"),
+        ({"gnss_sigma": [1.0, 0.0, 1.0]}, "gnss_sigma"),
+        ({"time": math.inf}, "time"),
+        ({"gnss_baseline_G": SPEED, "tilt_sigma": 0.1}, "tilt_sigma must not be given with"),
+        ({"gnss_baseline_G": SPEED, "magnetometer": SPEED}, "magnetometer must not be given with"),
+        ({"gnss_baseline_G": SPEED, "course": True}, "course must not be given with"),
+        ({"gnss_baseline_G": SPEED, "gnss_sigma": np.eye(3) + 0.1}, "covariance as gnss_sigma"),
+    ],
+)
+@pytest.mark.parametrize("running", [False, True])
+def test_bad_starts_raise_and_change_nothing(given, message, running):
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    if running:
+        kf.initialize(FIX, heading=0.5)
+        before = kf.covariance
+    with pytest.raises(ValueError, match=message):
+        kf.initialize(FIX, **given)
+    if running:
+        np.testing.assert_array_equal(kf.covariance, before)
+    else:
+        with pytest.raises(RuntimeError, match="initialize"):
+            _ = kf.position
+
+
+def test_suites_without_the_sensor_are_refused():
+    with pytest.raises(ValueError, match="no magnetometer"):
+        UnscentedKalmanFilter(quad_gym.sensor_suite("rtk")).initialize(FIX, magnetometer=SPEED)
+    with pytest.raises(ValueError, match="no GNSS"):
+        UnscentedKalmanFilter(quad_gym.sensor_suite("indoor")).initialize(FIX)
+    lab = UnscentedKalmanFilter(quad_gym.sensor_suite("lab"))
+    with pytest.raises(ValueError, match="velocity_sigma must be given"):
+        lab.initialize(FIX, gnss_velocity_G=SPEED)
+    lab.initialize(FIX, gnss_velocity_G=SPEED, velocity_sigma=0.1, heading=0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(lab.covariance))[6:9], [0.03, 0.03, 0.05])

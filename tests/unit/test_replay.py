@@ -1,0 +1,328 @@
+"""Logs of simulated flights, as tables and as PX4's files, replay as they were flown."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.analysis.replay_plots import replay_figure
+from quad_gym.estimation import LOG_COLUMNS, Log, read_log, replay
+from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
+from tests.console_commands import run
+from tests.logged_flights import PX4, RTK, Recorded, errors_in_flight, errors_in_replay, flown
+
+SECONDS = 10.0
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return flown(RTK, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def recorded(flight):
+    return Recorded(flight, RTK)
+
+
+@pytest.fixture(scope="module")
+def table(recorded):
+    return recorded.table()
+
+
+def sizes(errors):
+    """Root mean squares of position, velocity and attitude."""
+    return np.array([math.sqrt((errors[:, i : i + 3] ** 2).sum(axis=1).mean()) for i in (0, 3, 6)])
+
+
+def compare(recorded, result, settle, boot=0.0):
+    """Sizes of errors in replay over those in flight."""
+    shifted = result.time - boot
+    k = np.rint(shifted * recorded.suite.imu.rate).astype(int)
+    replayed = errors_in_replay(recorded, result, k)
+    return sizes(replayed[shifted > settle]) / sizes(
+        errors_in_flight(recorded, k)[shifted > settle]
+    )
+
+
+# ---- errors as in flight -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("estimator", ["ukf", "ekf"])
+def test_a_csv_replays_to_the_errors_of_the_flight(recorded, tmp_path, estimator):
+    """Irregular times, 1 % lost, 50 ms of jitter: within 10 % (4 % were seen)."""
+    assert len(np.unique(np.diff([s[0] for s in recorded.imu]).round(6))) > 3
+    recorded.write_csv(tmp_path / "flight.csv")
+    result = replay(tmp_path / "flight.csv", sensors=RTK, estimator=estimator)
+    assert np.abs(compare(recorded, result, 1.0) - 1.0).max() < 0.1
+    assert result.too_late == 0
+    assert not result.status
+    assert set(result.measured) >= {"gnss_position", "gnss_baseline", "gnss_velocity", "feature_3"}
+    count = len(result.measured["gnss_position"].time)
+    assert count == len(recorded.gnss) - 1  # less the one that started it
+    assert (result.measured["gnss_position"].received > result.measured["gnss_position"].time).all()
+
+
+def test_a_log_of_px4_replays_to_the_errors_of_the_flight(tmp_path):
+    """As above; its filter starts by a compass, and needs some seconds to know the heading."""
+    pytest.importorskip("pyulog")
+    recorded = Recorded(flown(PX4, SECONDS), PX4)
+    recorded.write_ulog(tmp_path / "flight.ulg", boot=12.0)
+    result = replay(tmp_path / "flight.ulg", sensors=PX4)
+    assert np.abs(compare(recorded, result, 3.0, boot=12.0)[:2] - 1.0).max() < 0.1
+    assert set(result.measured) == {
+        "gnss_position", "gnss_velocity", "barometer", "magnetometer"
+    }  # fmt: skip
+    for measured in result.measured.values():
+        mean = measured.nis.mean() / measured.innovation.shape[1]
+        assert 0.7 < mean < 1.4
+    log = read_log(tmp_path / "flight.ulg")
+    assert log.barometer_from_start
+    np.testing.assert_allclose(log.imu.values["accel"], [s[2][3:] for s in recorded.imu], atol=1e-5)
+    origin = np.array(PX4.gnss.reference_antenna_G)
+    there = log.gnss.values["position_G"] - origin
+    here = [s[2]["gnss_position"] for s in recorded.gnss]
+    np.testing.assert_allclose(
+        np.linalg.norm(there, axis=1), np.linalg.norm(here, axis=1), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        log.gnss.values["velocity_I"], [s[2]["gnss_velocity"] for s in recorded.gnss], atol=1e-5
+    )
+
+
+def test_a_regular_log_replays_as_it_was_flown(flight):
+    """Nothing lost, no jitter: the flight goes back by another way, exact to first order."""
+    recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
+    result = replay(recorded.table(), sensors=RTK)
+    k = np.rint(result.time * RTK.imu.rate).astype(int)
+    late = k > 400
+    gap = np.abs(result.position - flight["estimated_position"][k])[late]
+    assert gap.max() < 0.1 * sizes(errors_in_flight(recorded, k)[late])[0]
+
+
+def test_what_has_come_too_late_is_left_out_and_counted(table):
+    result = replay(table, sensors=RTK, window=0.12)
+    assert 0 < result.too_late < 70
+    assert np.isfinite(result.position).all()
+
+
+# ---- ways to give a log --------------------------------------------------------------------------
+
+
+def test_tables_of_any_kind_are_the_same_log(recorded, table, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    short = {name: column[:900] for name, column in table.items()}
+    first = replay(short, sensors=RTK)
+    together = {"time": short["time"], "received": short["received"]}
+    for key in ("gyro", "accel", "gnss_enu", "gnss_velocity_enu", "gnss_baseline_enu"):
+        together[key] = np.column_stack([short[name] for name in LOG_COLUMNS[key].names])
+    pixels = [short[n] for n in short if n.startswith("pixel")]
+    together["pixels"] = np.stack(pixels, axis=1).reshape(len(short["time"]), -1, 2)
+    for other in (pandas.DataFrame(short), together, read_log(short)):
+        np.testing.assert_array_equal(replay(other, sensors=RTK).position, first.position)
+
+
+def test_frames_of_positions_and_bodies_are_equivalent(table):
+    short = {name: column[:1200] for name, column in table.items() if "pixel" not in name}
+    suite = RTK.replace(camera=None)
+    first = replay(short, sensors=suite)
+    R_GI = quad_gym.frames.ecef_to_enu(suite.gnss.reference_antenna_G).T
+    origin = np.array(suite.gnss.reference_antenna_G)
+    ecef = {n: c for n, c in short.items() if not n.startswith("gnss")}
+    for key in ("gnss", "gnss_velocity", "gnss_baseline"):
+        vectors = np.column_stack([short[f"{key}_{axis}"] for axis in ("east", "north", "up")])
+        ecef[key] = vectors @ R_GI.T + (origin if key == "gnss" else 0.0)
+    frd = dict(ecef)
+    for name in ("gyro_y", "gyro_z", "accel_y", "accel_z"):
+        frd[name] = -frd[name]
+    places = [ecef_to_geodetic(p) if np.isfinite(p).all() else [np.nan] * 3 for p in ecef["gnss"]]
+    frd["gnss_lla"] = np.array(places) * [180.0 / math.pi, 180.0 / math.pi, 1.0]
+    del frd["gnss"]
+    for given, body in ((ecef, "flu"), (frd, "frd")):
+        result = replay(given, sensors=suite, body=body)
+        np.testing.assert_allclose(result.position, first.position, atol=1e-6)
+        np.testing.assert_allclose(result.attitude, first.attitude, atol=1e-6)
+
+
+def test_a_log_from_elsewhere_has_its_origin_at_the_first_fix(table):
+    short = {name: column[:600] for name, column in table.items() if "pixel" not in name}
+    suite = RTK.replace(camera=None)
+    zurich = geodetic_to_ecef(math.radians(47.4), math.radians(8.5), 450.0)
+    R_GI = quad_gym.frames.ecef_to_enu(zurich).T
+    for key in ("gnss", "gnss_velocity", "gnss_baseline"):
+        names = [f"{key}_{axis}" for axis in ("east", "north", "up")]
+        vectors = np.column_stack([short.pop(name) for name in names])
+        short[key] = vectors @ R_GI.T + (zurich if key == "gnss" else 0.0)
+    result = replay(short, sensors=suite)
+    first = short["gnss"][np.isfinite(short["gnss"]).all(axis=1)][0]
+    np.testing.assert_allclose(result.sensors.gnss.reference_antenna_G, first)
+    assert np.abs(result.position[:20]).max() < 0.2
+
+
+def test_geodetic_coordinates_go_there_and_back():
+    for lat, lon, height in ((0.5, -1.7, 169.0), (-1.2, 3.0, -40.0), (math.pi / 2, 0.0, 10.0)):
+        place = geodetic_to_ecef(lat, lon, height)
+        np.testing.assert_allclose(ecef_to_geodetic(place), (lat, lon, height), atol=2e-8)
+    with pytest.raises(ValueError, match="latitude"):
+        geodetic_to_ecef(1.6, 0.0, 0.0)
+
+
+def test_reported_noise_counts_unless_it_is_told_not_to(table):
+    short = {name: column[:900] for name, column in table.items() if "pixel" not in name}
+    suite = RTK.replace(camera=None)
+    fixes = np.isfinite(short["gnss_east"])
+    sigma = np.where(fixes, 0.5, np.nan)
+    told = short | {"gnss_sigma": np.column_stack([sigma] * 3)}
+    plain, worse = replay(short, sensors=suite), replay(told, sensors=suite)
+    assert worse.sigma[-1, 0] > 3.0 * plain.sigma[-1, 0]
+    ignored = replay(told, sensors=suite, reported_noise=False)
+    np.testing.assert_array_equal(ignored.position, plain.position)
+
+
+def test_starts_may_be_told(table):
+    short = {n: c[:900] for n, c in table.items() if not n.startswith(("pixel", "gnss_base"))}
+    suite = RTK.replace(camera=None)
+    assert not replay(short, sensors=suite).heading_known[0]
+    told = replay(short, sensors=suite, start={"heading": 3.1, "heading_sigma": 0.1})
+    assert told.heading_known.all()
+    state = {
+        "position": np.zeros(3),
+        "velocity": np.zeros(3),
+        "R_BI": np.eye(3),
+        "accel_bias": np.zeros(3),
+        "gyro_bias": np.zeros(3),
+        "covariance": np.eye(15),
+    }
+    given = replay(short, sensors=suite, start=state)
+    assert given.time[0] == short["time"][np.isfinite(short["gyro_x"])][0]
+    with pytest.raises(ValueError, match="keywords of set_state"):
+        replay(short, sensors=suite, start={"position": np.zeros(3)})
+
+
+# ---- what is refused -----------------------------------------------------------------------------
+
+
+def small(**changes):
+    """A log of four rows."""
+    time = np.array([0.0, 0.01, 0.02, 0.03])
+    ones = np.ones((4, 3))
+    log = {
+        "time": time,
+        "gyro": 0.0 * ones,
+        "accel": ones * [0.0, 0.0, 9.8],
+        "gnss_enu": 0.0 * ones,
+    }
+    return {name: value for name, value in (log | changes).items() if value is not None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"time": None}, "must have a column time"),
+        ({"gyro": None}, "must have a column gyro_x"),
+        ({"time": np.array([0.0, 0.02, 0.01, 0.03])}, r"must increase, got 0\.010000 s after"),
+        ({"time": np.array([0.0, 0.01, 0.01, 0.03])}, "must increase"),
+        ({"time": np.zeros(3)}, "of one length"),
+        ({"time": np.array(["a", "b", "c", "d"])}, "column time must hold numbers"),
+        ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
+        ({"accel": np.full((4, 3), np.inf)}, "accel must be finite"),
+        ({"accel": np.full((4, 3), np.nan)}, "at least two IMU samples"),
+        ({"gyros": np.zeros(4)}, "gyros is not a keyword of logs"),
+        ({"gnss": np.zeros((4, 3))}, "must have one of gnss, gnss_enu"),
+        ({"gnss_enu": None}, "must have a GNSS position to start from"),
+        ({"gnss_enu": None, "gnss_east": np.zeros(4)}, "must have a column gnss_north beside"),
+        ({"pixel_0_u": np.zeros(4), "pixel_0_v": np.zeros(4)}, "12 features of the suite, got 1"),
+        ({"time": np.array([0.0, 0.01, 1.5, 1.51])}, "at most 1 s apart, got none from 0.010 s"),
+        ({"time": np.array([0.0, np.nan, 0.02, 0.03])}, "must increase|must be finite"),
+    ],
+)  # fmt: skip
+def test_bad_logs_raise_by_name(changes, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        replay(small(**changes), sensors=RTK)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensors": "nothing"}, "sensors must be one of"),
+        ({"sensors": 3}, "sensors must be a SensorSuite"),
+        ({"estimator": "kf"}, "estimator must be one of"),
+        ({"body": "ned"}, "body must be one of"),
+        ({"window": -1.0}, "window"),
+        ({"reported_noise": 1}, "reported_noise"),
+        ({"start": {"nose": 1.0}}, "nose"),
+    ],
+)
+def test_bad_options_raise_by_name(options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        replay(small(), **{"sensors": RTK} | options)
+
+
+def test_files_that_are_none_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="must be a DataFrame"):
+        replay(3, sensors=RTK)
+    with pytest.raises(OSError, match="missing"):
+        replay(tmp_path / "missing.csv", sensors=RTK)
+    file = tmp_path / "broken.csv"
+    for text, message in (
+        ("time,gyro_x\n0.0\n", "2 cells in each row, got 1 in row 1"),
+        ("time,gyro_x\n0.0,x\n", "must hold numbers"),
+        ("time,time\n0.0,1.0\n", "a name for each column once"),
+        ("", "must have a column time"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            replay(file, sensors=RTK)
+    pytest.importorskip("pyulog")
+    with pytest.raises(OSError, match="there is no file"):
+        replay(tmp_path / "missing.ulg", sensors=RTK)
+    (tmp_path / "broken.ulg").write_bytes(b"no log at all")
+    with pytest.raises(ValueError, match="must be a ULog"):
+        replay(tmp_path / "broken.ulg", sensors=RTK)
+
+
+def test_measurements_without_a_sensor_in_the_suite_are_named():
+    result = replay(small(barometer=np.ones(4)), sensors=RTK, start={"heading": 0.0})
+    assert result.unused == ("barometer",)
+    assert isinstance(read_log(small()), Log)
+
+
+# ---- the command ---------------------------------------------------------------------------------
+
+
+def test_the_command_writes_estimates_innovations_and_configuration(recorded, tmp_path):
+    pytest.importorskip("matplotlib")
+    recorded.write_csv(tmp_path / "flight.csv")
+    options = ("flight.csv", "--sensors", "rtk", "--output", "out")
+    ended = run("replay", *options, where=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert "features" in ended.stdout
+    out = tmp_path / "out"
+    names = {"estimates.csv", "innovations.csv", "replay.json", "replay.png", "replay.svg"}
+    assert {file.name for file in out.iterdir()} == names
+    found = json.loads((out / "replay.json").read_text())
+    assert found["configuration"]["sensors"] == "rtk"
+    assert found["measurements"]["gnss_position"]["count"] == len(recorded.gnss) - 1
+    rows = np.genfromtxt(out / "estimates.csv", delimiter=",", names=True)
+    direct = replay(tmp_path / "flight.csv", sensors=RTK)
+    np.testing.assert_allclose(rows["position_x"], direct.position[:, 0], atol=1e-12)
+    again = run("replay", *options, where=tmp_path)
+    assert again.returncode == 2
+    assert "--overwrite" in again.stderr
+    for wrong, message in (
+        (("none.csv",), "none.csv"),
+        (("flight.csv", "--course", "--heading", "3"), "--heading must not be given"),
+    ):
+        failed = run("replay", *wrong, where=tmp_path)
+        assert failed.returncode == 2
+        assert message in failed.stderr
+
+
+def test_the_figure_has_a_picture_for_each_sensor(table):
+    pytest.importorskip("matplotlib")
+    short = {name: column[:800] for name, column in table.items()}
+    figure = replay_figure(replay(short, sensors=RTK), "a flight")
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in figure.axes]
+    assert len(titles) == 7
+    assert any("features" in title for title in titles)
