@@ -49,7 +49,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a price for looking at them | hovering near it | 15 s |
-    | `QuadGym/OutageDash-v0` | a course of 14 gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 20 s |
+    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 20 s |
 
     Reward and observation of `LookAround` and `OutageDash` are specified in their own classes,
     `quad_gym.tasks.look_around.LookAround` and `quad_gym.tasks.outage_dash.OutageDash`.

@@ -17,11 +17,14 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 PROGRESS_WEIGHT = 0.1
-"""Of the speed along the course [s/m]."""
+"""Of the speed along the course, as far as it is paid for [s/m]."""
 
-CRASH_COST = 300.0
-"""Once, as much as 60 m of the course; a crash also costs the course that was left. With 100, the
-best that pilots found was to hurry on through an outage."""
+PAID_SPEED = 5.0
+"""No more than this is paid for [m/s]: faster, an outage would be over after some gaps."""
+
+CRASH_COST = 100.0
+"""Once, as much as 4 s at that speed; a crash also costs the time that was left. With 200, policies
+in pilots did not dare to fly through the first gap."""
 
 ACTION_COST, RATE_COST = 0.02, 0.002
 """Of |change of action|^2 and |body rates|^2, as those that ship."""
@@ -43,7 +46,7 @@ class Gaps(NamedTuple):
 
 
 class OutageDash(Task):
-    """Dash through the gaps of 14 walls, while GNSS fails for 5 to 15 s.
+    """Dash through the gaps of ten walls, while GNSS fails for 5 to 15 s.
 
     The sensors are those of a hobby vehicle. With GNSS the filter knows the position to a
     decimeter; without it the error is a decimeter after two seconds, a meter after five, and five
@@ -53,8 +56,8 @@ class OutageDash(Task):
     gap is.
 
     ## Course
-    It leads from east to west, from (84, 0, 4) through the origin. Walls stand at x = 72, 60, ...,
-    -84 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
+    It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
+    -60 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
     alternately 3.75 and 0.75 m north of the course's line, and the width uniformly in [3, 6] m: new
     for each episode. A geofence keeps the vehicle within 14 m of the line and below 12 m.
 
@@ -65,9 +68,10 @@ class OutageDash(Task):
     In each step, with the true speed v to the west [m/s] until the last gap is 12 m behind, the
     change of the action da and the body rates w
 
-        0.1 v - 0.02 |da|^2 - 0.002 |w|^2 - 300 (crashed)
+        0.1 min(v, 5) - 0.02 |da|^2 - 0.002 |w|^2 - 100 (crashed)
 
-    that is 5 a meter at 50 Hz. A crash costs as much as 60 m.
+    At most 0.5 a step, so 500 in an episode of 1,000 steps. A crash costs as much as 4 s,
+    and the time that was left.
 
     ## Observation
     In the place of what ships, as the controller's source believes:
@@ -179,6 +183,7 @@ def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
 
 
 def westward(view: "View") -> Floats:
-    """(n,) true speed along the course [m/s], 0 beyond the finish."""
+    """(n,) true speed along the course as far as it is paid for [m/s], 0 beyond the finish."""
     finish = gaps_of(view).centers[:, -1, 0]
-    return np.where(view.position[:, 0] > finish, -view.velocity[:, 0], 0.0)
+    speed = np.minimum(-view.velocity[:, 0], PAID_SPEED)
+    return np.where(view.position[:, 0] > finish, speed, 0.0)
