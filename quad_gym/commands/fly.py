@@ -50,8 +50,13 @@ class Args:
     FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults"}
 
     task: Literal[
-        *("hover", "circle", "lemniscate", "random_trajectory", "waypoints"),
-        *("look_around", "outage_dash"),
+        "hover",
+        "circle",
+        "lemniscate",
+        "random_trajectory",
+        "waypoints",
+        "look_around",
+        "outage_dash",
     ] = "circle"
     """what to fly"""
     policy: str = "pd"

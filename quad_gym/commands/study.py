@@ -39,10 +39,9 @@ from quad_gym.params import checks as check
 
 EVALUATED = 9
 """How often a policy is evaluated over its training, to keep the best one."""
-QUICK_SEEDS, QUICK_EPISODES, STUDIED = ("look_around",)
+QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
+STUDIED = ("look_around",)
 """Tasks that arms and figures of a study are made for."""
-
-QUICK_STEPS = 2, 100, 300_000
 
 
 @dataclass(frozen=True)

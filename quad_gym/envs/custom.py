@@ -44,8 +44,7 @@ def with_task(
     kept = tuple(
         field
         for field in table
-        if field.slice.stop <= split
-        and (not task.replaces_observation or field.name in task.keeps)
+        if field.slice.stop <= split and (not task.replaces_observation or field.name in task.keeps)
     )
     rest = tuple(f for f in table if f.slice.start >= split)
     taken = {field.name for field in (*kept, *rest)} & set(sizes)

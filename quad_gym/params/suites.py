@@ -237,8 +237,8 @@ ONE_WALL = INDOOR.replace(
 """For `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west wall."""
 
 CONSUMER_BAROMETER = CONSUMER.replace(barometer=BarometerParams())
-"""For `OutageDash`: `consumer` with the barometer that every hobby vehicle has, so that an outage of
-GNSS costs the position in the plane, and not the height."""
+"""For `OutageDash`: `consumer` with the barometer that every hobby vehicle has, so that an outage
+of GNSS costs the position in the plane, and not the height."""
 
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),

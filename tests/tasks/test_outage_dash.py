@@ -14,7 +14,7 @@ from quad_gym.tasks.outage_dash import OutageDash
 ID = "QuadGym/OutageDash-v0"
 SHOWN = {
     **{"position_error": 3, "velocity_error": 3, "up": 3, "heading": 3, "body_rates": 3},
-    **{"gap_width": 1, "next_gap": 3, "next_width": 1},
+    **{"gap_width": 1, "next_gap": 3, "next_width": 1, "course_share": 1},
 }
 
 
@@ -45,7 +45,7 @@ def test_what_the_task_is_by_default():
     assert flights.batch.sensors == quad_gym.sensor_suite("consumer_barometer")
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
     assert [f.name for f in flights.table] == ["last_action", *SHOWN]
-    assert flights.space.shape == (24,)
+    assert flights.space.shape == (25,)
 
 
 def test_gaps_are_where_the_specification_says():
@@ -65,18 +65,19 @@ def test_the_reward_is_that_of_its_equation():
     env, rng = make(30, observation="truth"), np.random.default_rng(0)
     env.reset(seed=0)
     batch, crashes, over = env.unwrapped.flights.batch, 0, np.zeros(30, bool)
-    last = np.zeros((30, 4))
+    last, earned = np.zeros((30, 4)), np.zeros(30)
     for _ in range(150):
         action = np.clip(actions(rng, 30) - (0.3, 0.0, 0.0, 0.0), -1.0, 1.0)  # down to the ground
         _, reward, terminated, truncated, _ = env.step(action)
         effort = ((action - last) ** 2).sum(axis=1)
         rates = (batch.read("w") ** 2).sum(axis=1)
         paid = np.minimum(-batch.read("v")[:, 0], 5.0)
-        expected = 0.1 * paid - 0.02 * effort - 0.002 * rates - 100.0 * terminated
+        earned += 0.1 * paid
+        expected = 0.1 * paid - 0.02 * effort - 0.002 * rates - (50.0 + earned) * terminated
         np.testing.assert_allclose(reward, expected, atol=1e-9)
         over = terminated | truncated
         crashes += over.sum()
-        last = np.where(over[:, np.newaxis], 0.0, action)
+        last, earned = np.where(over[:, np.newaxis], 0.0, action), np.where(over, 0.0, earned)
         if over.any():
             env.reset(options={"reset_mask": over})
     assert crashes > 5
@@ -129,7 +130,7 @@ def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
 
 def test_the_standard_deviations_tell_that_gnss_is_gone():
     env = make(16, include_covariance=True)
-    assert env.unwrapped.flights.space.shape == (39,)
+    assert env.unwrapped.flights.space.shape == (40,)
     policy = PDPolicy(env, max_position_error=0.2)
     observed, _ = env.reset(seed=2)
     batch = env.unwrapped.flights.batch
