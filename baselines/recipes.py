@@ -148,7 +148,7 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),
-    # what a crash costs comes seconds after the decision; its start is never on the ground
+    # gaps lie seconds apart; a start on the ground is no part of it
     ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
         steps=4_000_000,
         reward_scale=0.1,

@@ -133,7 +133,7 @@ class WorldParams(Checked):
                 )
 
 
-def _slalom(first: float = 72.0, spacing: float = 12.0, gaps: int = 14) -> tuple[Wall, ...]:
+def _slalom(first: float = 48.0, spacing: float = 12.0, gaps: int = 10) -> tuple[Wall, ...]:
     """Walls from the north and from the south, each pair with a gap of 3 to 6 m.
 
     The northern edge of a gap is drawn within 1.5 m of its middle place, and its width by itself;
@@ -169,9 +169,9 @@ _WORLDS = {
         ground_effect=True,
         battery=BatteryParams(),
     ),
-    # that of OutageDash: 14 walls, 12 m apart, from east to west, each with a gap somewhere else
+    # that of OutageDash: ten walls, 12 m apart, from east to west, each with a gap somewhere else
     "slalom": WorldParams(
-        obstacles=_slalom(), geofence=((-250.0, -14.0, -1.0), (96.0, 14.0, 12.0))
+        obstacles=_slalom(), geofence=((-200.0, -14.0, -1.0), (72.0, 14.0, 12.0))
     ),
 }
 

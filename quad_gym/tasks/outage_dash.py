@@ -4,27 +4,35 @@ from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.obstacles import Wall
-from quad_gym.tasks.rewards import BodyRates, Crash, Effort, OfFunction, Piece
+from quad_gym.tasks.rewards import BodyRates, Crash, Effort, Piece
 from quad_gym.tasks.task import Observed, Task
 
 if TYPE_CHECKING:
+    from quad_gym.tasks.draws import FlightRandom
     from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
 
 PROGRESS_WEIGHT = 0.1
-"""Of the speed along the course [s/m]."""
+"""Of the speed along the course, as far as it is paid for [s/m]."""
 
-CRASH_COST = 300.0
-"""Once, as much as 60 m of the course; a crash also costs the course that was left. With 100, the
-best that pilots found was to hurry on through an outage."""
+PAID_SPEED = 5.0
+"""No more than this is paid for [m/s]: faster, an outage would be over after some gaps."""
+
+CRASH_COST = 50.0
+"""On top of what the course flown so far has earned. A cost that is the same all along keeps
+learning policies before the first gap where it is high (200), and lets them hurry on through an
+outage where it is not (100)."""
 
 ACTION_COST, RATE_COST = 0.02, 0.002
 """Of |change of action|^2 and |body rates|^2, as those that ship."""
+
+_COSTS: Piece = -ACTION_COST * Effort() - RATE_COST * BodyRates()
+_CRASH = Crash()
 
 PAST = 0.7
 """How far beyond a wall the vehicle is through its gap: then nothing of it is in there [m]."""
@@ -43,19 +51,19 @@ class Gaps(NamedTuple):
 
 
 class OutageDash(Task):
-    """Dash through the gaps of 14 walls, while GNSS fails for 5 to 15 s.
+    """Dash through the gaps of ten walls, while GNSS fails for 5 to 15 s.
 
     The sensors are those of a hobby vehicle. With GNSS the filter knows the position to a
-    decimeter; without it the error is a decimeter after two seconds, a meter after five, and five
+    decimeter; without it the error is two decimeters after two seconds, a meter after five, and six
     meters after twelve. Gaps are 3 to 6 m wide, walls 12 m apart. A controller that hurries on
     through an outage hits a wall; one that waits for its end loses the course that it could have
     flown, and drifts. How long to go on depends on how sure the filter is, and on how wide the next
     gap is.
 
     ## Course
-    It leads from east to west, from (84, 0, 4) through the origin. Walls stand at x = 72, 60, ...,
-    -84 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
-    alternately 3.75 and 0.75 m north of the course's line, and the width uniformly in [3, 6] m: new
+    It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
+    -60 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
+    alternately 0.75 and 3.75 m north of the course's line, and the width uniformly in [3, 6] m: new
     for each episode. A geofence keeps the vehicle within 14 m of the line and below 12 m.
 
     GNSS (position, velocity and the compass that comes with it) fails once, from a time in [2, 8] s
@@ -65,9 +73,10 @@ class OutageDash(Task):
     In each step, with the true speed v to the west [m/s] until the last gap is 12 m behind, the
     change of the action da and the body rates w
 
-        0.1 v - 0.02 |da|^2 - 0.002 |w|^2 - 300 (crashed)
+        0.1 min(v, 5) - 0.02 |da|^2 - 0.002 |w|^2
 
-    that is 5 a meter at 50 Hz. A crash costs as much as 60 m.
+    At most 0.5 a step, so 500 in an episode of 1,000 steps. A crash forfeits the course: it costs
+    50, and the sum of 0.1 min(v, 5) so far.
 
     ## Observation
     In the place of what ships, as the controller's source believes:
@@ -82,6 +91,7 @@ class OutageDash(Task):
     | gap_width (1) | of the next gap | m | - |
     | next_gap (3) | from the middle of the next gap to that of the one after it | m | B |
     | next_width (1) | of that one | m | - |
+    | course_share (1) | of the course that is behind, to the finish | - | - |
 
     and before it `last_action` (4) and, with `include_covariance=True`, the filter's 15 standard
     deviations, which tell that GNSS is gone. The next gap is the first one that is not yet 0.7 m
@@ -93,7 +103,7 @@ class OutageDash(Task):
 
     Args:
         progress_weight: Of v in the reward.
-        crash_cost: What a crash costs, once.
+        crash_cost: What a crash costs on top of what it forfeits.
 
     Raises:
         ValueError: If a number is negative or not finite.
@@ -113,21 +123,24 @@ class OutageDash(Task):
         "gap_width": Observed("m", "-", 0.0, 100.0),
         "next_gap": Observed("m", "B", -100.0, 100.0),
         "next_width": Observed("m", "-", 0.0, 100.0),
+        "course_share": Observed("-", "-", -1.0, 2.0),
     }
+    state: Mapping[str, ArrayLike] = {"earned": 0.0}
 
     def __init__(
         self, progress_weight: float = PROGRESS_WEIGHT, crash_cost: float = CRASH_COST
     ) -> None:
-        self.pieces: Piece = (
-            check.number("progress_weight", progress_weight, least=0.0) * OfFunction(westward)
-            - ACTION_COST * Effort()
-            - RATE_COST * BodyRates()
-            - check.number("crash_cost", crash_cost, least=0.0) * Crash()
-        )
+        self._weight = check.number("progress_weight", progress_weight, least=0.0)
+        self._crash_cost = check.number("crash_cost", crash_cost, least=0.0)
+
+    def update(self, view: "View", rng: "FlightRandom") -> None:
+        """Add up what the course has earned: `view.state.earned` (n,)."""
+        view.state.earned = view.state.earned + self._weight * westward(view)
 
     def reward(self, view: "View") -> Floats:
         """(n,) see the class."""
-        return self.pieces(view)
+        forfeited = _CRASH(view) * (self._crash_cost + view.state.earned)
+        return self._weight * westward(view) + _COSTS(view) - forfeited
 
     def observe(self, view: "View") -> dict[str, Floats]:
         """See the class."""
@@ -149,6 +162,7 @@ class OutageDash(Task):
             "gap_width": gaps.widths[every, through],
             "next_gap": in_body(there - here),
             "next_width": gaps.widths[every, after],
+            "course_share": _share(view, gaps),
         }
 
 
@@ -178,7 +192,14 @@ def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
     return (position[:, :1] < gaps.centers[:, :-1, 0] - PAST).sum(axis=1)
 
 
+def _share(view: "View", gaps: Gaps) -> Floats:
+    """(n,) of the course that is behind the seen position."""
+    start, finish = view.reference_position[:, 0], gaps.centers[:, -1, 0]
+    return np.asarray((start - view.seen.position[:, 0]) / (start - finish))
+
+
 def westward(view: "View") -> Floats:
-    """(n,) true speed along the course [m/s], 0 beyond the finish."""
+    """(n,) true speed along the course as far as it is paid for [m/s], 0 beyond the finish."""
     finish = gaps_of(view).centers[:, -1, 0]
-    return np.where(view.position[:, 0] > finish, -view.velocity[:, 0], 0.0)
+    speed = np.minimum(-view.velocity[:, 0], PAID_SPEED)
+    return np.where(view.position[:, 0] > finish, speed, 0.0)

@@ -14,7 +14,7 @@ from quad_gym.tasks.outage_dash import OutageDash
 ID = "QuadGym/OutageDash-v0"
 SHOWN = {
     **{"position_error": 3, "velocity_error": 3, "up": 3, "heading": 3, "body_rates": 3},
-    **{"gap_width": 1, "next_gap": 3, "next_width": 1},
+    **{"gap_width": 1, "next_gap": 3, "next_width": 1, "course_share": 1},
 }
 
 
@@ -32,8 +32,8 @@ def part(env, observations, name):
 
 
 def edges(batch):
-    """(n, 14) places of the walls, and of the northern and southern edges of their gaps."""
-    walls = batch.read("obstacle_center")[:, :28]
+    """(n, 10) places of the walls, and of the northern and southern edges of their gaps."""
+    walls = batch.read("obstacle_center")[:, :20]
     assert batch.world.obstacles[0].size == (0.3, 30.0, 12.0)
     return walls[:, ::2, 0], walls[:, ::2, 1] - 15.0, walls[:, 1::2, 1] + 15.0
 
@@ -45,15 +45,15 @@ def test_what_the_task_is_by_default():
     assert flights.batch.sensors == quad_gym.sensor_suite("consumer_barometer")
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
     assert [f.name for f in flights.table] == ["last_action", *SHOWN]
-    assert flights.space.shape == (24,)
+    assert flights.space.shape == (25,)
 
 
 def test_gaps_are_where_the_specification_says():
     env = make(500, observation="truth")
     env.reset(seed=0)
     x, north, south = edges(env.unwrapped.flights.batch)
-    np.testing.assert_array_equal(x, np.tile(72.0 - 12.0 * np.arange(14), (500, 1)))
-    width, nominal = north - south, np.tile([0.75, 3.75], 7)
+    np.testing.assert_array_equal(x, np.tile(48.0 - 12.0 * np.arange(10), (500, 1)))
+    width, nominal = north - south, np.tile([0.75, 3.75], 5)
     assert (np.abs(north - nominal) <= 1.5 + 1e-9).all()
     assert (width >= 3.0 - 1e-9).all()
     assert (width <= 6.0 + 1e-9).all()
@@ -65,17 +65,19 @@ def test_the_reward_is_that_of_its_equation():
     env, rng = make(30, observation="truth"), np.random.default_rng(0)
     env.reset(seed=0)
     batch, crashes, over = env.unwrapped.flights.batch, 0, np.zeros(30, bool)
-    last = np.zeros((30, 4))
+    last, earned = np.zeros((30, 4)), np.zeros(30)
     for _ in range(150):
         action = np.clip(actions(rng, 30) - (0.3, 0.0, 0.0, 0.0), -1.0, 1.0)  # down to the ground
         _, reward, terminated, truncated, _ = env.step(action)
         effort = ((action - last) ** 2).sum(axis=1)
         rates = (batch.read("w") ** 2).sum(axis=1)
-        expected = -0.1 * batch.read("v")[:, 0] - 0.02 * effort - 0.002 * rates - 300.0 * terminated
+        paid = np.minimum(-batch.read("v")[:, 0], 5.0)
+        earned += 0.1 * paid
+        expected = 0.1 * paid - 0.02 * effort - 0.002 * rates - (50.0 + earned) * terminated
         np.testing.assert_allclose(reward, expected, atol=1e-9)
         over = terminated | truncated
         crashes += over.sum()
-        last = np.where(over[:, np.newaxis], 0.0, action)
+        last, earned = np.where(over[:, np.newaxis], 0.0, action), np.where(over, 0.0, earned)
         if over.any():
             env.reset(options={"reset_mask": over})
     assert crashes > 5
@@ -93,7 +95,7 @@ def test_the_observation_is_what_the_source_believes(observation):
         r, turn = batch.read("r_seen"), Rotation.from_matrix(batch.read("R_seen"))
         for i in range(12):
             behind = int((r[i, 0] < x[i] - 0.7).sum())
-            middle = np.stack([x[i], 0.5 * (north[i] + south[i]), np.full(14, 4.0)], axis=1)
+            middle = np.stack([x[i], 0.5 * (north[i] + south[i]), np.full(10, 4.0)], axis=1)
             passed.add(behind)
             np.testing.assert_allclose(
                 part(env, observed, "position_error")[i],
@@ -116,19 +118,19 @@ def test_the_observation_is_what_the_source_believes(observation):
 
 def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
     env = make(2, observation="truth")
-    env.reset(seed=0, options={"position": (-89.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
+    env.reset(seed=0, options={"position": (-65.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
     observed, reward, *_ = env.step(np.zeros((2, 4), np.float32))
     np.testing.assert_array_equal(part(env, observed, "gap_width"), 6.0)
     np.testing.assert_array_equal(part(env, observed, "next_gap"), 0.0)
     assert (reward > 0.25).all()
-    env.reset(seed=0, options={"position": (-97.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
+    env.reset(seed=0, options={"position": (-73.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
     _, reward, *_ = env.step(np.zeros((2, 4), np.float32))
     np.testing.assert_allclose(reward, 0.0, atol=1e-3)
 
 
 def test_the_standard_deviations_tell_that_gnss_is_gone():
     env = make(16, include_covariance=True)
-    assert env.unwrapped.flights.space.shape == (39,)
+    assert env.unwrapped.flights.space.shape == (40,)
     policy = PDPolicy(env, max_position_error=0.2)
     observed, _ = env.reset(seed=2)
     batch = env.unwrapped.flights.batch
