@@ -74,9 +74,8 @@ def sense(flight, world, model, settings, work, stages, mask, starting, within):
             call_stage(stages, late_update, flight, world, model, settings, work, 0)
             work.mask = select(mask, 1.0, 0.0)
         else:
-            features = settings.feature_count
             update = _UPDATE_WITH_SLOW if settings.slow_states > 0 else _UPDATE
-            call_stage(stages, update, flight, world, model, settings, work, features)
+            call_stage(stages, update, flight, world, model, settings, work, 0)
     call_stage(stages, _LOOK, flight, world, model, settings, work, within)
 
 

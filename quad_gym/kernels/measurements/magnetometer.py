@@ -33,7 +33,7 @@ from quad_gym.kernels.maths.linalg import (
     store_block,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm, split_rotation
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.measurements.aid import (
     ACTS,
     aid_due,
@@ -108,7 +108,7 @@ def _expect(flight, p, work, settings, k):
             if (settings.form & _EKF) != 0:
                 straight = add(straight, cross(f_B, load_column3(L, E, j)))
             else:
-                even, odd, _ = split_rotation(scale(c, load_column3(L, E, j)))
+                odd, even = load33(work.odd[j]), load33(work.even[j])
                 bent = add(scale(1.0 / c, apply(odd, f_B)), apply(even, turned))
                 straight = add(straight, bent)
                 half_sum = add(scale(1.0 / c, apply(even, f_B)), apply(odd, turned))
