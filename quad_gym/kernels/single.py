@@ -146,10 +146,10 @@ def sense_imu_average(flights, params, starts):
     measure_imu_average(flights[0], params[0], load_state(starts[0]), True)
 
 
-@_entry(_FLIGHT, _PARAMS)
-def sense_gnss(flights, params):
-    """Measure flights[0] by GNSS."""
-    measure_gnss(flights[0], params[0], True)
+@_entry(_FLIGHT, _PARAMS, types.boolean)
+def sense_gnss(flights, params, paired):
+    """Measure flights[0] by GNSS, its baseline, too, if it is `paired`."""
+    measure_gnss(flights[0], params[0], paired, True)
 
 
 @_entry(_FLIGHT, _PARAMS)

@@ -119,6 +119,8 @@ class Act(IntEnum):
     """keep the innovation and mask it beyond the gate"""
     DOUBT = 4
     """add to the covariance of what may be wrong"""
+    ALIGN = 5
+    """give the filter's start its heading, where `heading_aid` of the settings says so"""
 
 
 class Task(IntEnum):

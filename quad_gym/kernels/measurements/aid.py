@@ -43,7 +43,7 @@ from quad_gym.records import (
 )
 
 ACTS = len(Act)
-_EXPECT, _JUDGE = int(Act.EXPECT), int(Act.JUDGE)
+_EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _FIRST = int(Stage[Aid(0).name])
 _NUMBERS = tuple(map(float, AID_FREEDOMS))
 _LOSS = int(FaultKind[f"{Aid(0).name}_LOSS"])
@@ -64,6 +64,12 @@ def call_aids(flight, world, model, settings, work, stages, act):
     for s in range(AIDS):
         if settings.aid_on[s] > 0:
             call_stage(stages, _FIRST + s, flight, world, model, settings, work, act)
+
+
+@kernel
+def align_by_aid(flight, p, settings, work, stages):
+    """Let a sensor give the filter's start its heading, where `work.mask`."""
+    call_stage(stages, _FIRST + settings.heading_aid, flight, p, p, settings, work, _ALIGN)
 
 
 @kernel
@@ -209,6 +215,13 @@ def _exchange(flight, settings, s, mask, taken, values):
             keep3(waiting[slot], taken, load3(waiting[slot - 1]))
         keep3(waiting[0], taken, values)
     return arrived
+
+
+@kernel
+def deliver_first(flight, s, mask, values):
+    """Keep the measurement of sensor s that starts the filter, which counts it but once."""
+    keep3(flight.aid_measurement[s], mask, values)
+    flight.aid_fresh[s] = select(mask, 1.0, flight.aid_fresh[s])
 
 
 @kernel

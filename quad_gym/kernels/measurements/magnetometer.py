@@ -12,33 +12,55 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
+
+Where GNSS has one antenna, the field tells the heading of the filter's start: the vehicle is taken
+for level, and its heading is that in which the field points where it is seen to. With the field's
+level direction h and vertical share m_z, and s to its side, the errors of heading, tilt, hard iron
+and declination go together as the derivative says, as nothing of the innovation is left along s:
+
+    |m_h| e_z = m_z (h . e_tilt) - |m_h| delta + s . b + s . v
+
+so that the covariance of the start has these correlations.
 """
 
+import math
+
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.error_state import D, E
+from quad_gym.kernels.filter.error_state import D, E, R
 from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add,
+    add33,
     add_outer,
     apply,
+    apply_transposed,
     cross,
+    keep3,
+    keep33,
     load3,
     load4,
     load33,
     load_block,
     load_column3,
+    multiply,
     scale,
     select3,
     store3,
     store_block,
+    sub,
+    sum_of_outers,
+    transpose,
+    unit_or,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.measurements.aid import (
     ACTS,
     aid_due,
     begin_aid,
     deliver,
+    deliver_first,
     draw_matrix,
     judge_aid,
 )
@@ -48,7 +70,7 @@ from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Act, Aid, FilterF
 
 _S = int(Aid.MAGNETOMETER)
 _BEGIN, _SAMPLE = int(Act.BEGIN), int(Act.SAMPLE)
-_EXPECT, _JUDGE = int(Act.EXPECT), int(Act.JUDGE)
+_EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _EKF = int(FilterForm.EKF)
 
 
@@ -65,7 +87,86 @@ def _measure(flight, p, settings, mask, starting):
     field_B = add(field_B, apply(load33(flight.aid_matrix[_S]), field_B))
     noise = scale(p.aid_sigma[_S], (a, b, c))
     values = add(add(field_B, load3(flight.aid_vector[_S])), noise)
-    deliver(flight, settings, _S, mask, due, values)
+    if starting and settings.heading_aid == _S and settings.warm == 0:
+        deliver_first(flight, _S, mask, values)
+    else:
+        deliver(flight, settings, _S, mask, due, values)
+
+
+@kernel
+def _align(flight, p, work, settings, mask):
+    """Give the filter's start its heading, and the covariance that comes with it."""
+    m, z, P, L = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S]), work.P, flight.L
+    R_BI, zero = level_attitude(z, m), 0.0 * z[0]
+    iron, delta = D + settings.aid_vector[_S], D + settings.aid_scalar[_S]
+    for i in range(0, D, 3):
+        for j in range(0, i + 3, 3):
+            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
+    for i in range(settings.slow_states):
+        for j in range(D + i):
+            P[D + i, j] = zero
+        sigma = p.slow_sigma[i]
+        P[D + i, D + i] = select(sigma > 0.0, sigma * sigma, 1.0)  # the drift of GNSS is none yet
+    _tie_heading(p, P, m, z, iron, delta)
+    _tie_position(p, P, R_BI, iron, delta)
+    cholesky(P, D + settings.slow_states, work.inverse_diagonal)
+    for i in range(D):
+        for j in range(i + 1):
+            L[i, j] = select(mask, P[i, j], L[i, j])
+    for i in range(settings.slow_states):
+        estimated = mask & (p.slow_sigma[i] > 0.0)
+        for j in range(D + i + 1):
+            kept = flight.L_slow[i, j]
+            flight.L_slow[i, j] = select(estimated, P[D + i, j], kept)
+    antenna_I = apply(load33(p.R_IG), load3(flight.gnss_position))
+    keep33(flight.R_hat, mask, R_BI)
+    keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
+
+
+@kernel
+def _tie_heading(p, P, m, z, iron, delta):
+    """Let the heading go with tilt, hard iron and declination in P, see above."""
+    zero = 0.0 * z[0]
+    h = unit_or((z[0], z[1], zero), (zero + 1.0, zero, zero))
+    level = math.sqrt(m[0] * m[0] + m[1] * m[1])
+    of_tilt, of_iron = scale(m[2] / level, h), scale(1.0 / level, (-h[1], h[0], zero))
+    P_t = (P[E, E], P[E + 1, E + 1])
+    white = p.initial_scale * p.aid_sigma[_S] * p.aid_sigma[_S] / (level * level)
+    with_tilt = (of_tilt[0] * P_t[0], of_tilt[1] * P_t[1])
+    with_iron = scale(P[iron, iron], of_iron)
+    variance = white + P[delta, delta]
+    variance = variance + of_tilt[0] * with_tilt[0] + of_tilt[1] * with_tilt[1]
+    variance = variance + of_iron[0] * with_iron[0] + of_iron[1] * with_iron[1]
+    P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2] = with_tilt[0], with_tilt[1], variance
+    P[E + 1, E] = zero
+    for i in range(3):
+        P[iron + i, E + 2] = with_iron[i]
+    P[delta, E + 2] = -P[delta, delta]
+
+
+@kernel
+def _tie_position(p, P, R_BI, iron, delta):
+    """Let the position go with the attitude in P, as an antenna was measured: see `align.py`."""
+    zero = 0.0 * p.dt
+    x, y, z = load3(p.antenna)
+    J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
+    P_ee = (
+        (P[E, E], P[E + 1, E], P[E + 2, E]),
+        (P[E + 1, E], P[E + 1, E + 1], P[E + 2, E + 1]),
+        (P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2]),
+    )
+    tied, s, k = multiply(J, P_ee), load3(p.gnss_sigma), p.initial_scale
+    white = (
+        (k * s[0] * s[0], zero, zero),
+        (zero, k * s[1] * s[1], zero),
+        (zero, zero, k * s[2] * s[2]),
+    )
+    store_block(P, R, R, add33(white, multiply(tied, transpose(J))))
+    store_block(P, E, R, transpose(tied))
+    of_heading = (J[0][2], J[1][2], J[2][2])
+    for i in range(3):
+        store3(P[iron + i], scale(P[iron + i, E + 2], of_heading))
+    store3(P[delta], scale(P[delta, E + 2], of_heading))
 
 
 @kernel
@@ -144,5 +245,7 @@ def magnetometer_stage(flight, world, model, settings, work, stages, flag):
         _expect(flying, p, scratch, settings, k)
     elif act == _JUDGE:
         judge_aid(flying, p, scratch, settings, _S, k)
+    elif act == _ALIGN:
+        _align(flying, p, scratch, settings, mask)
     else:
         _doubt(flying, p, scratch, settings, scratch.taking > 0.0)

@@ -108,12 +108,13 @@ def measure_imu_average(flight, p, start, mask):
 
 
 @kernel
-def measure_gnss(flight, p, mask):
-    """Measure antenna position and baseline in G, where `mask`."""
+def measure_gnss(flight, p, paired, mask):
+    """Measure antenna position, and the baseline if there is one (`paired`), in G, where `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
     position.measure(flight, p, R_BI, n_p, mask)
-    baseline.measure(flight, p, R_BI, n_b, mask)
+    if paired:
+        baseline.measure(flight, p, R_BI, n_b, mask)
 
 
 @kernel

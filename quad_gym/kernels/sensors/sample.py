@@ -42,7 +42,7 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
     if settings.faults and not sound:
         measured, paired = gnss_heard(flight, settings, due)
     if any_of(measured):
-        measure_gnss(flight, world, measured)
+        measure_gnss(flight, world, settings.gnss_baseline > 0, measured)
         if settings.heading_errs:
             work.mask = select(measured, 1.0, 0.0)
             call_stage(stages, _TURN_BASELINE, flight, world, world, settings, work, 0)
@@ -53,6 +53,8 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
             velocity.measure(flight, world, measured)
     wait = select(due, 1.0 * settings.gnss_ticks, flight.gnss_wait) - 1.0
     flight.gnss_wait = select(mask, wait, flight.gnss_wait)
+    if settings.gnss_baseline == 0:
+        paired = paired & logical_not(measured)
     fresh, alone = measured & (settings.gnss_ticks > 0), measured & logical_not(paired)
     fresh = fresh & (starting or settings.gnss_delay == 0)
     flight.position_fresh = select(fresh, 1.0, flight.position_fresh)
