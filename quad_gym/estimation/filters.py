@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.estimation.alignment import leveled
 from quad_gym.estimation.estimate import Estimate
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.linked import linked_table
@@ -20,6 +21,7 @@ from quad_gym.records import (
     FLIGHT_BLOCK,
     SETTINGS,
     WORK_BLOCK,
+    Act,
     Aid,
     FilterForm,
     aligned_zeros,
@@ -75,30 +77,58 @@ class _KalmanFilter(Estimate):
     def initialize(
         self,
         gnss_position_G: ArrayLike,
-        gnss_baseline_G: ArrayLike,
+        gnss_baseline_G: ArrayLike | None = None,
         heading: float | None = None,
+        *,
+        accel: ArrayLike | None = None,
+        magnetometer: ArrayLike | None = None,
     ) -> None:
         """Start from a first fix: attitude by Wahba's problem, the body z axis taken as vertical.
 
         A baseline within 12 degrees of the vertical hardly tells the heading; then `heading` does,
         with the deviation `placement.heading_sigma` of the suite.
 
+        GNSS with one antenna has no baseline. Then the vehicle is taken for level, or its tilt is
+        that in which a resting accelerometer measures `accel`; and the heading is that in which the
+        field points where the `magnetometer` sees it, or else `heading`. The covariance says how
+        their errors go with those of accelerometer bias, hard iron and declination.
+
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
-            gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
-            heading: Of the body x axis, from east toward north, for a steep baseline [rad]; None:
-                not known. The filter of a steep baseline then takes it for anything, and as it
-                linearizes, it may be lost.
+            gnss_baseline_G: (3,) primary to secondary antenna, in G [m]; None for one antenna.
+            heading: Of the body x axis, from east toward north, for a steep baseline or one antenna
+                [rad]; None: not known. The filter then takes it for anything, and as it linearizes,
+                it may be lost.
+            accel: (3,) specific force at rest, in B [m/s^2]; for one antenna.
+            magnetometer: (3,) magnetic field in B [T]; likewise. It counts once: do not `update`
+                with the same sample.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the position is farther
                 than FARTHEST_FIX from the reference antenna, or the baseline is zero; or the suite
-                has no GNSS.
+                has no GNSS, or lacks a sensor whose measurement is given, or a baseline is missing.
         """
         self._require_gnss("initialize: start with set_state() instead")
         position = check.array("gnss_position_G", gnss_position_G, (3,))
         _require_relative(position)
-        baseline = self._checked_baseline(gnss_baseline_G)
+        gnss = self.sensors.gnss
+        if gnss is not None and gnss.has_baseline:
+            if gnss_baseline_G is None:
+                raise ValueError("gnss_baseline_G must be given for GNSS with two antennas")
+            if accel is not None or magnetometer is not None:
+                raise ValueError(
+                    "accel and magnetometer must not be given for GNSS with two antennas, whose "
+                    "baseline tells the heading"
+                )
+            baseline = self._checked_baseline(gnss_baseline_G)
+        else:
+            if gnss_baseline_G is not None:
+                raise ValueError("gnss_baseline_G must be None for GNSS with one antenna")
+            baseline = np.zeros(3)
+        force = None if accel is None else check.array("accel", accel, (3,))
+        if force is not None and not force.any():
+            raise ValueError("accel must have a direction, got zeros")
+        field = self._checked_aids({"magnetometer": magnetometer}).get(Aid.MAGNETOMETER)
         x_I = np.zeros(3)
         if heading is not None:
             angle = check.number("heading", heading)
@@ -106,7 +136,23 @@ class _KalmanFilter(Estimate):
         self._set("gnss_position", position)
         self._set("gnss_baseline", baseline)
         self._start(x_I)
+        if force is not None:
+            self._level_by(force)
+        if field is not None:
+            self._flight["aid_measurement"][0, Aid.MAGNETOMETER] = field[:, np.newaxis]
+            self._run_stage(Stage[Aid.MAGNETOMETER.name], int(Act.ALIGN))
         self._running = True
+
+    def _level_by(self, force: NDArray[np.float64]) -> None:
+        """Tilt the level start as the accelerometer says, with the covariance of that."""
+        L, R_hat, fix_G = (
+            self._flight[name][0, ..., 0] for name in ("L", "R_hat", "gnss_position")
+        )
+        R_BI, P = leveled(R_hat, L @ L.T, force, self.sensors)
+        R_IG, antenna_B = (self._params[name][0, ..., 0] for name in ("R_IG", "antenna"))
+        self._set("r_hat", R_IG @ fix_G - R_BI.T @ antenna_B)
+        self._set("R_hat", R_BI)
+        self._set("L", np.linalg.cholesky(P))
 
     def set_state(
         self,
@@ -171,15 +217,18 @@ class _KalmanFilter(Estimate):
 
         News are what goes wrong in it.
         """
-        chosen = with_slow if self._slow else stage
-        before, p = self.status, self._params
-        others = (p, p, self._settings, self._work, self._table(), self._features)
-        single.run_stage(self._flight.ctypes.data, 0, 1, int(chosen), *others)
+        before = self.status
+        self._run_stage(with_slow if self._slow else stage, 0)
         news = self.status & ~before
         if news:
             warnings.warn(
                 f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
             )
+
+    def _run_stage(self, stage: Stage, flag: int) -> None:
+        p = self._params
+        others = (p, p, self._settings, self._work, self._table(), flag)
+        single.run_stage(self._flight.ctypes.data, 0, 1, int(stage), *others)
 
     def _set(self, name: str, value: NDArray[Any]) -> None:
         """Write a field of the flight."""
@@ -219,6 +268,8 @@ class _KalmanFilter(Estimate):
         if gnss_position_G is not None:
             position = check.array("gnss_position_G", gnss_position_G, (3,))
         if gnss_baseline_G is not None:
+            if self.sensors.gnss is not None and not self.sensors.gnss.has_baseline:
+                raise ValueError("gnss_baseline_G must be None for GNSS with one antenna")
             baseline = self._checked_baseline(gnss_baseline_G)
         if pixels is not None:
             image = check.array("pixels", pixels, (self._features, 2), allow_nan=True)

@@ -168,7 +168,7 @@ CONSUMER = SensorSuite(
     ),
     estimator=FIELD_FILTER,  # with the slow error among its states
     noisy=NoisyObservationParams(
-        position=0.125, velocity=0.024, attitude=0.021, body_rates=0.011
+        position=0.123, velocity=0.024, attitude=0.0040, body_rates=0.011
     ),  # measured, see above
 )
 """A hobby vehicle: a single-frequency receiver, barometer, magnetometer, a cheap IMU, no camera."""

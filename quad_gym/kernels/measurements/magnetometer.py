@@ -13,20 +13,18 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
 
-Where GNSS has one antenna, the field tells the heading of the filter's start: the vehicle is taken
-for level, and its heading is that in which the field points where it is seen to. With the field's
-level direction h and vertical share m_z, and s to its side, the errors of heading, tilt, hard iron
-and declination go together as the derivative says, as nothing of the innovation is left along s:
+Where GNSS has one antenna, the field tells the heading of the filter's start, which is level or so:
+that in which the field points where it is seen to. With the vertical k, the level direction h of
+the field and s = k x h, all in B, the field's level and vertical share m_h and m_z, nothing of the
+innovation is left along s, so that the derivative ties the error of the heading to others:
 
-    |m_h| e_z = m_z (h . e_tilt) - |m_h| delta + s . b + s . v
-
-so that the covariance of the start has these correlations.
+    m_h (k . e) = m_z (h . e) - m_h delta + s . b + s . v
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.error_state import D, E, R
+from quad_gym.kernels.filter.error_state import BA, D, E, R, V
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
@@ -44,6 +42,7 @@ from quad_gym.kernels.maths.linalg import (
     load_block,
     load_column3,
     multiply,
+    outer,
     scale,
     select3,
     store3,
@@ -51,7 +50,6 @@ from quad_gym.kernels.maths.linalg import (
     sub,
     sum_of_outers,
     transpose,
-    unit_or,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
@@ -95,19 +93,20 @@ def _measure(flight, p, settings, mask, starting):
 
 @kernel
 def _align(flight, p, work, settings, mask):
-    """Give the filter's start its heading, and the covariance that comes with it."""
-    m, z, P, L = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S]), work.P, flight.L
-    R_BI, zero = level_attitude(z, m), 0.0 * z[0]
-    iron, delta = D + settings.aid_vector[_S], D + settings.aid_scalar[_S]
+    """Give the filter's start the heading of the field, and the covariance that comes with it."""
+    P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
+    m, z = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S])
+    R_BI = multiply(R_BI, level_attitude(apply_transposed(R_BI, z), m))
     for i in range(0, D, 3):
         for j in range(0, i + 3, 3):
             store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
     for i in range(settings.slow_states):
         for j in range(D + i):
-            P[D + i, j] = zero
+            P[D + i, j] = 0.0 * p.dt
         sigma = p.slow_sigma[i]
-        P[D + i, D + i] = select(sigma > 0.0, sigma * sigma, 1.0)  # the drift of GNSS is none yet
-    _tie_heading(p, P, m, z, iron, delta)
+        P[D + i, D + i] = select(sigma > 0.0, sigma * sigma, 1.0)  # GNSS has not drifted yet
+    iron, delta = D + settings.aid_vector[_S], D + settings.aid_scalar[_S]
+    _tie_heading(p, P, m, R_BI, iron, delta)
     _tie_position(p, P, R_BI, iron, delta)
     cholesky(P, D + settings.slow_states, work.inverse_diagonal)
     for i in range(D):
@@ -124,24 +123,27 @@ def _align(flight, p, work, settings, mask):
 
 
 @kernel
-def _tie_heading(p, P, m, z, iron, delta):
-    """Let the heading go with tilt, hard iron and declination in P, see above."""
-    zero = 0.0 * z[0]
-    h = unit_or((z[0], z[1], zero), (zero + 1.0, zero, zero))
+def _tie_heading(p, P, m, R_BI, iron, delta):
+    """Replace the error of the heading in P by that of the field's heading, see above."""
+    zero = 0.0 * p.dt
     level = math.sqrt(m[0] * m[0] + m[1] * m[1])
-    of_tilt, of_iron = scale(m[2] / level, h), scale(1.0 / level, (-h[1], h[0], zero))
-    P_t = (P[E, E], P[E + 1, E + 1])
-    white = p.initial_scale * p.aid_sigma[_S] * p.aid_sigma[_S] / (level * level)
-    with_tilt = (of_tilt[0] * P_t[0], of_tilt[1] * P_t[1])
-    with_iron = scale(P[iron, iron], of_iron)
-    variance = white + P[delta, delta]
-    variance = variance + of_tilt[0] * with_tilt[0] + of_tilt[1] * with_tilt[1]
-    variance = variance + of_iron[0] * with_iron[0] + of_iron[1] * with_iron[1]
-    P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2] = with_tilt[0], with_tilt[1], variance
-    P[E + 1, E] = zero
-    for i in range(3):
-        P[iron + i, E + 2] = with_iron[i]
-    P[delta, E + 2] = -P[delta, delta]
+    h, k = apply(R_BI, (m[0] / level, m[1] / level, zero)), apply(R_BI, (zero, zero, zero + 1.0))
+    s, steep = cross(k, h), m[2] / level
+    F = outer(k, sub(scale(steep, h), k))  # e = F e + ..., of which the tilt is all that counts
+    F = add33(((zero + 1.0, zero, zero), (zero, zero + 1.0, zero), (zero, zero, zero + 1.0)), F)
+    P_bb, P_dd = P[iron, iron], P[delta, delta]
+    white = p.initial_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
+    alone = P_dd + (white + P_bb) / (level * level)
+    P_ee = multiply(multiply(F, _full(P)), transpose(F))
+    store_block(P, E, E, add_outer(P_ee, scale(alone, k), k))
+    store_block(P, E, V, multiply(F, load_block(P, E, V)))
+    for i in range(BA, D, 3):
+        store_block(P, i, E, multiply(load_block(P, i, E), transpose(F)))
+    with_iron = scale(P_bb / level, s)
+    store3(P[iron, E : E + 3], scale(with_iron[0], k))
+    store3(P[iron + 1, E : E + 3], scale(with_iron[1], k))
+    store3(P[iron + 2, E : E + 3], scale(with_iron[2], k))
+    store3(P[delta, E : E + 3], scale(-P_dd, k))
 
 
 @kernel
@@ -150,23 +152,30 @@ def _tie_position(p, P, R_BI, iron, delta):
     zero = 0.0 * p.dt
     x, y, z = load3(p.antenna)
     J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
-    P_ee = (
-        (P[E, E], P[E + 1, E], P[E + 2, E]),
-        (P[E + 1, E], P[E + 1, E + 1], P[E + 2, E + 1]),
-        (P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2]),
-    )
-    tied, s, k = multiply(J, P_ee), load3(p.gnss_sigma), p.initial_scale
+    J_t = transpose(J)
+    with_attitude, s, k = multiply(_full(P), J_t), load3(p.gnss_sigma), p.initial_scale
     white = (
         (k * s[0] * s[0], zero, zero),
         (zero, k * s[1] * s[1], zero),
         (zero, zero, k * s[2] * s[2]),
     )
-    store_block(P, R, R, add33(white, multiply(tied, transpose(J))))
-    store_block(P, E, R, transpose(tied))
-    of_heading = (J[0][2], J[1][2], J[2][2])
-    for i in range(3):
-        store3(P[iron + i], scale(P[iron + i, E + 2], of_heading))
-    store3(P[delta], scale(P[delta, E + 2], of_heading))
+    store_block(P, R, R, add33(white, multiply(J, with_attitude)))
+    store_block(P, E, R, with_attitude)
+    store_block(P, V, R, multiply(transpose(load_block(P, E, V)), J_t))
+    for i in range(BA, D, 3):
+        store_block(P, i, R, multiply(load_block(P, i, E), J_t))
+    for i in (iron, iron + 1, iron + 2, delta):
+        store3(P[i], apply(J, load3(P[i, E : E + 3])))
+
+
+@kernel
+def _full(P):
+    """The covariance of the error angles, of which P has the lower triangle."""
+    return (
+        (P[E, E], P[E + 1, E], P[E + 2, E]),
+        (P[E + 1, E], P[E + 1, E + 1], P[E + 2, E + 1]),
+        (P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2]),
+    )
 
 
 @kernel
