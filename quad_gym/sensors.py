@@ -39,7 +39,7 @@ class _Sensor:
 
 
 class GnssReceiver(_Sensor):
-    """Two GNSS antennas: noisy position of the primary one and noisy baseline of exact length.
+    """GNSS: noisy position of an antenna and, with two, a noisy baseline of exact length.
 
     Args:
         params: Geometry, noise, slow and constant errors; to delay measurements by `latency` is the
@@ -52,7 +52,8 @@ class GnssReceiver(_Sensor):
     def __init__(self, params: GnssParams, rng: np.random.Generator) -> None:
         imu = ImuParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
-        self._drifts, self._turns = params.drifts, params.heading_error_sigma > 0.0
+        self._drifts, self._paired = params.drifts, params.has_baseline
+        self._turns = self._paired and params.heading_error_sigma > 0.0
         if self._turns:
             single.draw_sensor_errors(self._flight, self._params)
 
@@ -66,7 +67,8 @@ class GnssReceiver(_Sensor):
             R_BI: (3, 3) true attitude.
 
         Returns:
-            (3,) primary antenna relative to the reference antenna and (3,) baseline, both in G [m].
+            (3,) primary antenna relative to the reference antenna and (3,) baseline, both in G [m];
+            NaN where there is no second antenna.
 
         Raises:
             ValueError: If an argument has another shape or is not finite.
@@ -74,10 +76,13 @@ class GnssReceiver(_Sensor):
         self._place(position, R_BI)
         if self._drifts:
             single.step_gnss_drift(self._flight, self._params)
-        single.sense_gnss(self._flight, self._params)
+        single.sense_gnss(self._flight, self._params, self._paired)
         if self._turns:
             single.turn_gnss_baseline(self._flight, self._params)
-        return self._flight["gnss_position"][0].copy(), self._flight["gnss_baseline"][0].copy()
+        baseline = self._flight["gnss_baseline"][0].copy()
+        return self._flight["gnss_position"][
+            0
+        ].copy(), baseline if self._paired else baseline * np.nan
 
 
 class Camera(_Sensor):

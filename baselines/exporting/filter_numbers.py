@@ -20,17 +20,18 @@ _FIELDS = {
         *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
         *("accel_bias_sigma", "gyro_bias_sigma"),
         *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
-        *("gnss_sigma", "baseline_noise", "first_baseline_sigma", "heading_sigma"),
-        *("baseline", "baseline_length", "R_IG", "antenna", "velocity_sigma"),
+        *("gnss_sigma", "heading_sigma", "R_IG", "antenna", "velocity_sigma"),
         *("initial_velocity_variance", "initial_scale", "initial_tilt_sigma"),
         *("gate_position", "gate_direction", "gate_uncertainty", "gate_patience"),
     ),
+    "baseline": ("baseline_noise", "first_baseline_sigma", "baseline", "baseline_length"),
     "camera": (
         *("camera", "R_CB", "pixel_size", "focal_length", "half_image", "pixel_sigma"),
         *("blur", "features", "noise_at_prediction", "noise_projected", "gradual_above"),
     ),
 }
-"""What the filter's kernels read of the parameters: of any suite, and of one with a camera."""
+"""What the filter's kernels read of the parameters: of any suite, of one with two antennas or with
+the mark that stands for them, and of one with a camera."""
 
 _SLOW = ("slow_sigma", "slow_decay", "slow_drive")
 _AIDS = ("aid_sigma", "aid_gate", "aid_numbers")
@@ -79,6 +80,7 @@ def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
     """
     record = params_record(vehicle_params("lab"), suite)[0]
     names = _FIELDS["any"] + (_FIELDS["camera"] if suite.camera is not None else ())
+    names += _FIELDS["baseline"] if suite.gnss is None or suite.gnss.has_baseline else ()
     names += (_SLOW if slow_states(suite).errors else ()) + (_AIDS if suite.aids else ())
     about = {field.name: field for field in PARAMS_FIELDS}
     numbers = {}

@@ -139,10 +139,11 @@ def sensors_as_they_are(suite: SensorSuite) -> dict[str, SensorSuite]:
                 velocity_sigma=gnss.velocity_sigma and 2.0 * gnss.velocity_sigma,
             )
         )
+        second = gnss.secondary_antenna_B
         found["antennas 2 cm off their places"] = suite.replace(
             gnss=gnss.replace(
                 primary_antenna_B=moved(gnss.primary_antenna_B, (0.0, 0.02, 0.0)),
-                secondary_antenna_B=moved(gnss.secondary_antenna_B, (0.0, 0.02, 0.0)),
+                secondary_antenna_B=second and moved(second, (0.0, 0.02, 0.0)),
             )
         )
     if camera is not None:

@@ -77,7 +77,7 @@ class Cell:
         if self.wrong:
             return {"": self.wrong}
         gnss = self.flown.gnss
-        if gnss is not None and gnss.heading_error_sigma > 0.0:
+        if gnss is not None and gnss.has_baseline and gnss.heading_error_sigma > 0.0:
             return {"nis_baseline": "counts constant heading errors as noise"}
         return {}
 
@@ -100,7 +100,8 @@ def _latencies(suite: SensorSuite) -> Iterator[tuple[str, SensorSuite]]:
 def _draws(suite: SensorSuite) -> dict[str, Any]:
     """What is drawn for the sensors of a suite, around what they are."""
     names = {"accel_noise_density", "gyro_noise_density"}
-    names |= {"position_sigma_I", "baseline_sigma"} if suite.gnss is not None else set()
+    if suite.gnss is not None:
+        names |= {"position_sigma_I"} | ({"baseline_sigma"} if suite.gnss.has_baseline else set())
     names |= {"pixel_sigma"} if suite.camera is not None else set()
     return {name: Uniform(1.0, 2.0, relative=True) for name in sorted(names)} | {
         "mass": Uniform(0.8, 1.2, relative=True)

@@ -87,7 +87,7 @@ def checked_fix(
     sigmas, covariance = _position_noise(sensors, gnss_sigma)
     velocity, speeds = _first_velocity(sensors, gnss_velocity_G, velocity_sigma)
     if gnss_baseline_G is not None:
-        baseline = checked_baseline(gnss_baseline_G)
+        baseline = checked_baseline(sensors, gnss_baseline_G)
         _refuse_beside_baseline(
             heading_sigma=heading_sigma,
             magnetometer=magnetometer,

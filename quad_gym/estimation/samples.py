@@ -125,7 +125,7 @@ def checked_measurement(
     if position_G is not None:
         position = check.array("gnss_position_G", position_G, (3,))
     if baseline_G is not None:
-        baseline = checked_baseline(baseline_G)
+        baseline = checked_baseline(sensors, baseline_G)
     if pixels is not None:
         count = 0 if sensors.camera is None else len(sensors.camera.features_I)
         image = check.array("pixels", pixels, (count, 2), allow_nan=True)
@@ -150,8 +150,14 @@ def require_gnss(sensors: SensorSuite, what: str) -> None:
         raise ValueError(f"the sensor suite has no GNSS to {what}")
 
 
-def checked_baseline(gnss_baseline_G: ArrayLike) -> Floats:
-    """A baseline, scaled by a power of two: its length does not count."""
+def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats:
+    """A baseline, scaled by a power of two: its length does not count.
+
+    Raises:
+        ValueError: If it has another shape, is not finite or zero, or GNSS has one antenna.
+    """
+    if sensors.gnss is not None and not sensors.gnss.has_baseline:
+        raise ValueError("gnss_baseline_G must be None for GNSS with one antenna")
     baseline = check.array("gnss_baseline_G", gnss_baseline_G, (3,))
     largest = np.abs(baseline).max()
     if largest == 0.0:

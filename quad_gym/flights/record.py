@@ -319,7 +319,11 @@ class FlightRecorder:
     def _stage_of_episode(self) -> Stage:
         batch, model = self._batch, self._model
         camera = batch.sensors.camera
-        antennas_B = np.array([model["antenna"], model["antenna"] + model["baseline"]])
+        antennas_B, gnss = np.full((2, 3), np.nan), batch.sensors.gnss
+        if gnss is not None:
+            antennas_B[0] = model["antenna"]
+        if gnss is not None and gnss.has_baseline:
+            antennas_B[1] = model["antenna"] + model["baseline"]
         gate_count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
         return Stage(
             task=batch.task.kind,
@@ -328,7 +332,7 @@ class FlightRecorder:
             rotor_positions_B=np.array(batch.vehicle.rotor_positions_B),
             max_rotor_speed=float(model["motor_gain"] * model["max_voltage"]),
             hover_rotor_speed=float(model["motor_gain"] * model["hover_voltage"]),
-            antennas_B=antennas_B if batch.sensors.gnss else np.full((2, 3), np.nan),
+            antennas_B=antennas_B,
             camera_B=np.array(camera.position_B if camera else [np.nan] * 3),
             R_CB=np.array(model["R_CB"]),
             camera_rate=camera.rate if camera else 0.0,

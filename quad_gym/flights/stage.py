@@ -75,7 +75,7 @@ class Stage:
     @property
     def has_gnss(self) -> bool:
         """Whether there is GNSS."""
-        return bool(np.isfinite(self.antennas_B).all())
+        return bool(np.isfinite(self.antennas_B[0]).all())
 
     def reference(self, times: Floats) -> Floats:
         """Where the reference is at times [s], (n, 3) in I [m]: a series or a trajectory."""

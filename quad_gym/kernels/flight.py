@@ -11,7 +11,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
 from quad_gym.kernels.maths.linalg import load3, load4, norm, sub
-from quad_gym.kernels.measurements.aid import ACTS, call_aids
+from quad_gym.kernels.measurements.aid import ACTS, align_by_aid, call_aids
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import FOLLOWED, Act, Control, Layout, Start, Supply
@@ -70,6 +70,8 @@ def sense(flight, world, model, settings, work, stages, mask, starting, within):
             if settings.warm:
                 warm = _WARM_WITH_SLOW if settings.slow_states > 0 else _WARM
                 call_stage(stages, warm, flight, world, model, settings, work, 0)
+            elif settings.heading_aid >= 0:
+                align_by_aid(flight, model, settings, work, stages)
         if late:
             call_stage(stages, _EXCHANGE, flight, world, model, settings, work, starting)
         if late and settings.rewinds and not starting:
@@ -77,9 +79,8 @@ def sense(flight, world, model, settings, work, stages, mask, starting, within):
             call_stage(stages, late_update, flight, world, model, settings, work, 0)
             work.mask = select(mask, 1.0, 0.0)
         else:
-            features = settings.feature_count
             update = _UPDATE_WITH_SLOW if settings.slow_states > 0 else _UPDATE
-            call_stage(stages, update, flight, world, model, settings, work, features)
+            call_stage(stages, update, flight, world, model, settings, work, 0)
     call_stage(stages, _LOOK, flight, world, model, settings, work, within)
 
 

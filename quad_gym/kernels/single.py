@@ -27,6 +27,8 @@ from quad_gym.kernels.maths.linalg import (
     store3,
     store33,
 )
+from quad_gym.kernels.measurements import features
+from quad_gym.kernels.measurements.position import drift_gnss
 from quad_gym.kernels.sensors.imperfect import (
     draw_heading_error,
     draw_imu_errors,
@@ -37,8 +39,6 @@ from quad_gym.kernels.sensors.imperfect import (
 )
 from quad_gym.kernels.sensors.measure import (
     drift_biases,
-    drift_gnss,
-    measure_features,
     measure_gnss,
     measure_imu,
     measure_imu_average,
@@ -146,10 +146,10 @@ def sense_imu_average(flights, params, starts):
     measure_imu_average(flights[0], params[0], load_state(starts[0]), True)
 
 
-@_entry(_FLIGHT, _PARAMS)
-def sense_gnss(flights, params):
-    """Measure flights[0] by GNSS."""
-    measure_gnss(flights[0], params[0], True)
+@_entry(_FLIGHT, _PARAMS, types.boolean)
+def sense_gnss(flights, params, paired):
+    """Measure flights[0] by GNSS, its baseline, too, if it is `paired`."""
+    measure_gnss(flights[0], params[0], paired, True)
 
 
 @_entry(_FLIGHT, _PARAMS)
@@ -187,7 +187,7 @@ def step_gnss_drift(flights, params):
 @_entry(_FLIGHT, _PARAMS, types.int64)
 def sense_features(flights, params, feature_count):
     """Measure the features that the camera of flights[0] sees."""
-    measure_features(flights[0], params[0], feature_count, True)
+    features.measure(flights[0], params[0], feature_count, True)
 
 
 @_entry(_FLIGHT, _PARAMS)

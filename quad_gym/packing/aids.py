@@ -113,6 +113,7 @@ def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuit
     settings["estimates_drift"] = states.drifts
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
     settings["aids"] = len(believes.aids)
+    settings["heading_aid"] = -1 if believes.heading_aid is None else believes.heading_aid
     for aid, params in measures.aids.items():
         ticks = check.ticks(f"{type(params).__name__}.rate", params.rate, measures.imu.rate)
         label = f"{type(params).__name__}.latency"

@@ -94,12 +94,17 @@ def params_record(
 
     if gnss is not None:
         p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
-        p["antenna"], p["baseline"] = gnss.primary_antenna_B, gnss.baseline_B
-        p["baseline_length"] = portable.norm(gnss.baseline_B)
-        p["gnss_sigma"], p["baseline_sigma"] = gnss.position_sigma_I, gnss.baseline_sigma
-        p["heading_error_sigma"] = gnss.heading_error_sigma
-        p["first_baseline_sigma"] = gnss.first_baseline_sigma
-        p["baseline_noise"] = gnss.believed_baseline_sigma
+        p["antenna"], p["gnss_sigma"] = gnss.primary_antenna_B, gnss.position_sigma_I
+        if gnss.has_baseline:
+            p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
+            p["baseline_sigma"] = gnss.baseline_sigma
+            p["heading_error_sigma"] = gnss.heading_error_sigma
+            p["first_baseline_sigma"] = gnss.first_baseline_sigma
+            p["baseline_noise"] = gnss.believed_baseline_sigma
+        else:  # one that is vertical, as that tells no heading either
+            p["baseline"], p["baseline_length"] = (0.0, 0.0, 1.0), 1.0
+            p["baseline_sigma"] = sensors.placement.heading_sigma
+            p["first_baseline_sigma"] = p["baseline_noise"] = sensors.placement.heading_sigma
         p["velocity_sigma"] = gnss.velocity_sigma or 0.0
         period = 1.0 / (gnss.rate * gnss.drift_tau)
         p["drift_decay"] = math.exp(-period)
@@ -215,7 +220,8 @@ def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
     """Fill the settings' fields of what sensors as they are (`measures`) do wrong."""
     imu, gnss, camera = measures.imu, measures.gnss, measures.camera
     settings["imu_errs"], settings["imu_vibrates"] = imu.errs, imu.vibrates
-    settings["heading_errs"] = gnss is not None and gnss.heading_error_sigma > 0.0
+    paired = gnss is not None and gnss.has_baseline
+    settings["heading_errs"] = paired and gnss is not None and gnss.heading_error_sigma > 0.0
     if camera is not None:
         settings["camera_limited"] = camera.limited
         settings["camera_blurs"] = camera.exposure > 0.0
@@ -256,6 +262,7 @@ def settings_record(
         s["gnss_ticks"] = clocks.ticks_between("gnss")
         s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
         s["gnss_phase"] = phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
+    s["gnss_baseline"] = sensors.gnss is None or sensors.gnss.has_baseline
     s["gnss_drifts"] = gnss_drifts
     s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
     if sensors.camera is not None:

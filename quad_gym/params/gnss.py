@@ -1,4 +1,4 @@
-"""GNSS: positions, the baseline between two antennas, velocities, and their errors."""
+"""GNSS: positions, the baseline between two antennas if there are two, velocities, and errors."""
 
 import math
 from dataclasses import dataclass
@@ -18,14 +18,18 @@ HEADING_MEMORY = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class GnssParams(Checked):
-    """Two GNSS antennas: position of the primary one, and the baseline to the secondary one."""
+    """GNSS: position of the primary antenna, and the baseline to the secondary one if there is one.
+
+    With one antenna the filter starts with the heading that a magnetometer tells, or else with that
+    of the mark of `PlacementParams`.
+    """
 
     rate: float = 200.0
     """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
     primary_antenna_B: Vector = (0.1013, -0.0004, 0.0472)
     """(3,) in B [m]; laboratory vehicle"""
-    secondary_antenna_B: Vector = (-0.0887, -0.0004, 0.0472)
-    """(3,) in B [m]; laboratory vehicle"""
+    secondary_antenna_B: Vector | None = (-0.0887, -0.0004, 0.0472)
+    """(3,) in B [m]; laboratory vehicle. None: one antenna, and no baseline"""
     reference_antenna_G: Vector = (-742080.456, -5462030.875, 3198338.956)
     """(3,) origin of the east-north-up frame I, in ECEF [m]; laboratory"""
     position_sigma_I: Vector = (0.006, 0.006, 0.012)
@@ -67,8 +71,7 @@ class GnssParams(Checked):
             )
         self._check(
             check.vector,
-            "primary_antenna_B",
-            "secondary_antenna_B",
+            *self._antennas,
             "reference_antenna_G",
             "position_sigma_I",
             length=3,
@@ -77,13 +80,13 @@ class GnssParams(Checked):
             raise ValueError(
                 f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
             )
-        for name in ("primary_antenna_B", "secondary_antenna_B"):
+        for name in self._antennas:
             if np.abs(getattr(self, name)).max() > 100.0:
                 raise ValueError(
                     f"GnssParams.{name} must be on the vehicle, within 100 m, got "
                     f"{getattr(self, name)}"
                 )
-        if np.linalg.norm(self.baseline_B) < 1e-3:
+        if self.has_baseline and np.linalg.norm(self.baseline_B) < 1e-3:
             raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
             raise ValueError(
@@ -92,8 +95,24 @@ class GnssParams(Checked):
             )
 
     @property
+    def has_baseline(self) -> bool:
+        """Whether there are two antennas."""
+        return self.secondary_antenna_B is not None
+
+    @property
+    def _antennas(self) -> tuple[str, ...]:
+        names = ("primary_antenna_B", "secondary_antenna_B")
+        return names if self.has_baseline else names[:1]
+
+    @property
     def baseline_B(self) -> np.ndarray:
-        """(3,) from the primary to the secondary antenna, in B [m]."""
+        """(3,) from the primary to the secondary antenna, in B [m].
+
+        Raises:
+            ValueError: If there is one antenna.
+        """
+        if self.secondary_antenna_B is None:
+            raise ValueError("GnssParams.secondary_antenna_B must be given for a baseline")
         return np.array(self.secondary_antenna_B) - np.array(self.primary_antenna_B)
 
     @property

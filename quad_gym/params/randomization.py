@@ -221,10 +221,12 @@ def _range_in_words(drawable: Drawable) -> str:
 
 
 _CAMERA = ("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length")
-_GNSS = ("position_sigma_I", "baseline_sigma", "primary_antenna_B", "secondary_antenna_B")
+_GNSS = ("position_sigma_I", "primary_antenna_B")
+_BASELINE = ("baseline_sigma", "secondary_antenna_B")
 _MISSING = (
     dict.fromkeys(_CAMERA, "a camera")
     | dict.fromkeys(_GNSS, "GNSS")
+    | dict.fromkeys(_BASELINE, "GNSS with two antennas")
     | dict.fromkeys(("battery_charge", "battery_resistance"), "a battery (WorldParams.battery)")
 )
 
@@ -250,6 +252,7 @@ def nominal_values(
         "pixel_sigma": math.nan if camera is None else camera.pixel_sigma,
         "focal_length": math.nan if camera is None else camera.focal_length,
         **(dict.fromkeys(_GNSS, math.nan) if gnss is None else {}),
+        **(dict.fromkeys(_BASELINE, math.nan) if gnss is None or not gnss.has_baseline else {}),
     }
     values = np.zeros(DRAWN_SIZE)
     for drawable in DRAWABLES:

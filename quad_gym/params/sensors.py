@@ -33,7 +33,7 @@ class PlacementParams(Checked):
     The vehicle is put down on a marked spot. The filter starts from the position of the spot and
     the heading of the vehicle, with these errors, and assumes that the vehicle is level. Where the
     baseline of GNSS lies within 12 degrees of the vertical, so that it hardly tells the heading,
-    the heading is known from the mark, too.
+    the heading is known from the mark, too; and with one antenna, where there is no magnetometer.
     """
 
     position_sigma: float = 0.05
@@ -130,6 +130,12 @@ class SensorSuite(Checked):
         return {aid: params for aid, params in found.items() if params is not None}
 
     @property
+    def heading_aid(self) -> Aid | None:
+        """The aiding sensor that tells the filter's start its heading, where no baseline does."""
+        alone = self.gnss is not None and not self.gnss.has_baseline
+        return Aid.MAGNETOMETER if alone and self.magnetometer is not None else None
+
+    @property
     def drifts(self) -> bool:
         """Whether GNSS positions have a slow error, so that a filter estimates it."""
         return self.gnss is not None and self.gnss.drifts
@@ -184,6 +190,8 @@ class SensorSuite(Checked):
             here, there = self.gnss, true.gnss
             yield "GNSS rate [Hz]", there.rate, here.rate
             yield "GNSS phase", there.phase, here.phase
+            paired = [p.has_baseline for p in (there, here)]
+            yield "presence of a GNSS baseline (secondary_antenna_B)", paired[0], paired[1]
             measured = [p.velocity_sigma is not None for p in (there, here)]
             yield "presence of GNSS velocities (velocity_sigma)", measured[0], measured[1]
         if self.camera is not None and true.camera is not None:

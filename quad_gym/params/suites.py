@@ -5,7 +5,7 @@
 | `standard` | as `lab` | as `lab` | as `lab`, but samples are means over the tick |
 | `lab` | RTK, two antennas, every tick | every tick, two points at the origin | the report's |
 | `rtk` | RTK, two antennas, 10 Hz | 25 Hz, twelve markers on the ground | industrial MEMS |
-| `consumer` | single frequency, and a compass, 10 Hz; its drift is a state | none | cheap MEMS |
+| `consumer` | single frequency, one antenna, 10 Hz; barometer, magnetometer | none | cheap MEMS |
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, taken for fresh | as `rtk`, 10 ms late, likewise | as `rtk` |
@@ -41,6 +41,7 @@ from quad_gym.params.camera import CameraParams
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
+from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
 from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
 
 _MILLI_G = 9.80665e-3
@@ -155,22 +156,25 @@ CONSUMER = SensorSuite(
         drift_sigma_I=(0.6, 0.6, 1.0),
         drift_tau=60.0,
         velocity_sigma=0.05,  # the same data sheet: velocity accuracy 0.05 m/s
-        # one antenna has no baseline. Yaw comes from a compass: some 2 deg of noise, and 4 deg that
-        # iron and a calibration leave for a whole flight; our judgment. It is modeled as the
-        # direction of the body x axis, here the line between the two "antennas"
+        # one antenna has no baseline: the magnetometer tells the heading
         primary_antenna_B=(0.0, 0.0, 0.0472),
-        secondary_antenna_B=(0.1, 0.0, 0.0472),
-        baseline_sigma=math.radians(2.0),
-        heading_error_sigma=math.radians(4.0),
+        secondary_antenna_B=None,
         phase=None,
     ),
     camera=None,
+    barometer=BarometerParams(rate=20.0),
+    magnetometer=MagnetometerParams(
+        rate=20.0,
+        # iron beside the motors, and what a calibration by hand leaves of it: 3.6 degrees of
+        # heading; our judgment
+        hard_iron_sigma=1.5 * MICROTESLA,
+    ),
     estimator=FIELD_FILTER,  # with the slow error among its states
     noisy=NoisyObservationParams(
-        position=0.125, velocity=0.024, attitude=0.021, body_rates=0.011
+        position=0.123, velocity=0.024, attitude=0.0040, body_rates=0.011
     ),  # measured, see above
 )
-"""A hobby vehicle: one single-frequency receiver, a compass, a cheap IMU, no camera."""
+"""A hobby vehicle: a single-frequency receiver, barometer, magnetometer, a cheap IMU, no camera."""
 
 
 def _on_walls(distance: float, low: float, high: float) -> tuple[tuple[float, ...], ...]:

@@ -67,6 +67,29 @@ class Control(IntEnum):
     """No action: the report's controller follows the reference at every tick."""
 
 
+class Sensor(IntEnum):
+    """The sensors whose measurements of one instant are one joint update; each has one clock."""
+
+    GNSS = 0
+    CAMERA = 1
+
+
+class Block(IntEnum):
+    """What these measure; each a file in `kernels/measurements/`, and a group of the gate.
+
+    The features of an image are as many blocks of the measurement and come last.
+    """
+
+    POSITION = 0
+    BASELINE = 1
+    VELOCITY = 2
+    FEATURES = 3
+
+
+BLOCK_FREEDOMS = (3, 2, 3, 2)
+"""Degrees of freedom of one of each, in the order of `Block`: a direction has two."""
+
+
 class Aid(IntEnum):
     """Aiding sensors: those beside IMU, GNSS and camera, each a file in `kernels/measurements/`.
 
@@ -96,6 +119,8 @@ class Act(IntEnum):
     """keep the innovation and mask it beyond the gate"""
     DOUBT = 4
     """add to the covariance of what may be wrong"""
+    ALIGN = 5
+    """give the filter's start its heading, where `heading_aid` of the settings says so"""
 
 
 class Task(IntEnum):

@@ -5,6 +5,7 @@ from quad_gym.records.sizes import (
     AIDS,
     DELAY_SLOTS,
     FAULT_KINDS,
+    FEATURE_BLOCKS,
     MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
@@ -14,6 +15,7 @@ from quad_gym.records.sizes import (
     MAX_SLOW,
     MAX_STATES,
     SENSOR_GROUPS,
+    SENSORS,
     STAMP,
     Field,
 )
@@ -185,17 +187,12 @@ _LATE_FIELDS = (
     Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
     Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
     # the same when the measurements in transit were taken, the latest first; of GNSS and camera
-    Field("stamp_tick", (2, DELAY_SLOTS), "ticks", "time stamp; NaN: none"),
-    Field("stamp_turn", (2, DELAY_SLOTS, 3, 3), "-", "C"),
-    Field("stamp_velocity", (2, DELAY_SLOTS, 3), "m/s", "V"),
-    Field("stamp_position", (2, DELAY_SLOTS, 3), "m", "X"),
-    Field("stamp_bias_gain", (2, DELAY_SLOTS, 3, 3), "s", "B"),
-    Field("stamp_rates", (2, DELAY_SLOTS, 3), "rad/s", "w_meas"),
+    Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),
     # the measurements in transit
     Field("late_position", (DELAY_SLOTS, 3), "m", "gnss_position"),
     Field("late_baseline", (DELAY_SLOTS, 3), "m", "gnss_baseline"),
     Field("late_velocity", (DELAY_SLOTS, 3), "m/s", "gnss_velocity"),
-    Field("late_valid", (DELAY_SLOTS, 3), "0 or 1", "whether these were measured"),
+    Field("late_valid", (DELAY_SLOTS, FEATURE_BLOCKS), "0 or 1", "whether these were measured"),
     Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
     Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
 )

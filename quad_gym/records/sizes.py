@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from quad_gym.records.enums import AID_FREEDOMS, Aid, FaultKind
+from quad_gym.records.enums import AID_FREEDOMS, BLOCK_FREEDOMS, Aid, Block, FaultKind, Sensor
 from quad_gym.records.width import WIDTH as WIDTH
 
 MAX_HARMONICS = 6
@@ -27,19 +27,24 @@ MAX_ACTION_DELAY = 10
 """Longest delay of an action, in control steps."""
 AIDS = len(Aid)
 """Number of kinds of aiding sensors."""
-AID_BLOCKS = 3 + MAX_FEATURES
+SENSORS = len(Sensor)
+"""Number of sensors beside the IMU and these."""
+POSITION_BLOCK = int(Block.POSITION)
+BASELINE_BLOCK = int(Block.BASELINE)
+VELOCITY_BLOCK = int(Block.VELOCITY)
+FEATURE_BLOCKS = int(Block.FEATURES)
+"""Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
+AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES
 """Where their blocks begin in a flight's fields of innovations; that of aid i is AID_BLOCKS + i."""
 MAX_BLOCKS = AID_BLOCKS + AIDS
 """Blocks of the measurement: antenna position, baseline, velocity, features, aiding sensors."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS
 """Length of the stacked measurement; a direction has three numbers."""
-AID_GROUPS = 4
+AID_GROUPS = len(Block)
 """Where aiding sensors begin among the kinds of measurements."""
 SENSOR_GROUPS = AID_GROUPS + AIDS
 """Kinds of measurements: positions, baselines, velocities, images, and aiding sensors."""
-POSITION_BLOCK, BASELINE_BLOCK, VELOCITY_BLOCK, FEATURE_BLOCKS = 0, 1, 2, 3
-"""Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
-FREEDOMS = (3, 2, 3, *[2] * MAX_FEATURES, *AID_FREEDOMS)
+FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1), *AID_FREEDOMS)
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 256
 """Numbers that an observation can hold."""

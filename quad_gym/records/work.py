@@ -1,13 +1,14 @@
 """The workspace of a thread: nothing in it outlasts a step."""
 
 from quad_gym.records.sizes import (
-    AIDS,
+    DELAY_SLOTS,
+    MAX_BLOCKS,
     MAX_FEATURES,
     MAX_MEASUREMENTS,
     MAX_OBSERVATION,
     MAX_SLOW,
     MAX_STATES,
-    STAMP,
+    SENSORS,
     TERMS,
     Field,
 )
@@ -27,6 +28,8 @@ WORK_FIELDS = (
     Field("h", (MAX_MEASUREMENTS,), "mixed", "measurement predicted at the center"),
     Field("z", (MAX_MEASUREMENTS,), "mixed", "innovation; then whitened"),
     Field("A", (MAX_STATES, MAX_MEASUREMENTS), "mixed", "half-differences of the measured sigma points / c; then whitened"),
+    Field("odd", (9, 3, 3), "-", "odd parts of the turns R(+-e) of the sigma points"),
+    Field("even", (9, 3, 3), "-", "even parts, less the identity"),
     Field("E", (9, MAX_MEASUREMENTS), "mixed", "half-sums of the measured sigma points less the center / c"),
     Field("mu", (MAX_MEASUREMENTS,), "mixed", "mean of the measured sigma points less the center"),
     Field("Rz", (MAX_MEASUREMENTS, MAX_MEASUREMENTS), "mixed", "noise, part even in the sigma points included; then its factor"),
@@ -34,7 +37,8 @@ WORK_FIELDS = (
     Field("t", (MAX_STATES,), "-", "C times the whitened innovation; then whitened by N"),
     Field("L9", (MAX_STATES, MAX_STATES), "mixed", "the columns of L that matter; then of the updated factor"),
     Field("inverse_diagonal", (MAX_MEASUREMENTS,), "mixed", "of a Cholesky factor"),
-    # what the stages of aiding sensors are told of an update, and what they tell
+    # what the blocks of a measurement are told of an update, and what they tell
+    Field("measured", (), "-", "numbers that each lane has"),
     Field("spread", (), "-", "c of the sigma points"),
     Field("taking", (), "0 or 1", "lanes that are updated"),
     Field("again", (), "0 or 1", "lanes that have met these measurements before"),
@@ -53,6 +57,8 @@ WORK_FIELDS = (
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
     # what arrived before, while something new is measured
+    Field("here", (DELAY_SLOTS,), "0 or 1", "which of a sensor's measurements in transit arrives now"),
+    Field("taken", (), "0 or 1", "whether it measures now"),
     Field("kept_position", (3,), "m", "gnss_position"),
     Field("kept_baseline", (3,), "m", "gnss_baseline"),
     Field("kept_velocity", (3,), "m/s", "gnss_velocity"),
@@ -67,11 +73,11 @@ WORK_FIELDS = (
     Field("kept_L", (15, 15), "mixed", "L"),
     Field("kept_slow", (MAX_SLOW,), "mixed", "slow_hat"),
     Field("kept_L_slow", (MAX_SLOW, MAX_STATES), "mixed", "L_slow"),
-    Field("kept_aids", (AIDS,), "0 or 1", "aid_valid"),
+    Field("kept_valid", (MAX_BLOCKS,), "0 or 1", "what was measured, block by block"),
     Field("kept_rates", (3,), "rad/s", "w_meas"),
     Field("kept_failures", (), "-", "update_failures"),
     # the instant to which a late update goes back
-    Field("stamp", (STAMP,), "mixed", "the present sums of the IMU, as a stamp"),
+    Field("turn", (SENSORS,), "0 or 1", "whether the measurements of a sensor have their turn"),
     Field("slow_decay", (MAX_SLOW,), "-", "of the slow errors since then"),
     Field("since_time", (), "s", "T since then"),
     Field("since_turn", (3, 3), "-", "C of then"),

@@ -269,12 +269,17 @@ def test_names_that_are_no_identifiers_are_refused():
 def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
     found = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
     source = "".join(file.read_text(encoding="utf-8") for file in KERNELS.rglob("*.py"))
+    for block in ("position", "baseline", "velocity", "features"):
+        text = (KERNELS.parent / "measurements" / f"{block}.py").read_text(encoding="utf-8")
+        source += text.partition("# ---- update")[2]  # before it is what sensors do
     read = set(re.findall(r"(?<![\w.])(?:p|params|model)\.(\w+)", source)) & set(PARAMS.names)
     camera = {"camera", "R_CB", "pixel_size", "focal_length", "features", "pixel_sigma", "blur"}
     camera |= {"noise_at_prediction", "noise_projected", "gradual_above"}
     gates = {"gate_position", "gate_direction", "gate_uncertainty"}  # open ones are left out
     present = quad_gym.sensor_suite(suite)
     absent = set() if present.camera is not None else camera
+    if present.gnss is not None and not present.gnss.has_baseline:
+        absent |= {"baseline", "baseline_length", "baseline_noise", "first_baseline_sigma"}
     if not present.drifts:
         absent |= {"slow_sigma", "slow_decay", "slow_drive"}
     assert read - set(found) <= gates | absent
@@ -283,9 +288,6 @@ def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
 
 def test_a_filters_numbers_hold_those_of_aiding_sensors():
     suite = quad_gym.sensor_suite("consumer")
-    suite = suite.replace(
-        barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
-    )
     found = filter_numbers(suite)
     numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
     assert len(numbers["slow_sigma"]) == 3 + 1 + 4  # drift; bias; hard iron and declination

@@ -76,7 +76,10 @@ BAD_VALUES = {
     ("ImuParams", "gyro_vibration"): BELOW_ZERO,
     ("GnssParams", "rate"): NOT_POSITIVE,
     ("GnssParams", "primary_antenna_B"): NO_VECTORS,
-    ("GnssParams", "secondary_antenna_B"): [*NO_VECTORS, (0.1013, -0.0004, 0.0472)],
+    ("GnssParams", "secondary_antenna_B"): [
+        *(bad for bad in NO_VECTORS if bad is not None),
+        (0.1013, -0.0004, 0.0472),
+    ],
     ("GnssParams", "reference_antenna_G"): [*NO_VECTORS, (0.0, 0.0, 0.0), (30.29, -97.74, 100.0)],
     ("GnssParams", "position_sigma_I"): [*NO_VECTORS, (0.01, 0.01, 0.0), (0.01, -0.01, 0.01)],
     ("GnssParams", "baseline_sigma"): NOT_POSITIVE,

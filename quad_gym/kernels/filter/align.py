@@ -36,6 +36,7 @@ from quad_gym.kernels.maths.linalg import (
     transpose,
     unit_or,
 )
+from quad_gym.kernels.maths.rotation import level_attitude
 from quad_gym.kernels.sensors.measure import look_along_mark
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
@@ -45,17 +46,6 @@ _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 NOTHING = (0.0, 0.0, 0.0)
 _NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
 _STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that tells no heading
-
-
-@kernel
-def _level_attitude(baseline_B, baseline_I):
-    """The level attitude R_BI in which a baseline has the heading it is seen to have."""
-    zero = 0.0 * baseline_B[0]
-    east = (zero + 1.0, zero, zero)
-    b = unit_or((baseline_B[0], baseline_B[1], zero), east)
-    i = unit_or((baseline_I[0], baseline_I[1], zero), east)
-    c, s = b[0] * i[0] + b[1] * i[1], b[0] * i[1] - b[1] * i[0]
-    return ((c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0))
 
 
 @kernel
@@ -86,7 +76,8 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
     """Start the filter from the first fix, where `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
-    with equal weights, or level with the baseline's heading; position from the antenna; velocity
+    with equal weights, or level with the baseline's heading (one antenna has a vertical baseline,
+    so to speak); position from the antenna; velocity
     and biases zero. A level start knows that its position hangs on its attitude. The heading is the
     less certain the steeper the baseline. Where that tells none to speak of, the body x axis joins
     in Wahba's problem, or gives the heading; where nobody knows it either, the heading may be any.
@@ -110,7 +101,7 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
     heading = select(placed, inflation * p.heading_sigma, heading)
 
     R_IG = load33(p.R_IG)
-    baseline_I = unit_or(apply(R_IG, load3(flight.gnss_baseline)), (1.0, 0.0, 0.0))
+    baseline_I = unit_or(apply(R_IG, load3(flight.gnss_baseline)), (0.0, 0.0, 1.0))
     nothing = scale(0.0, x_I)
     x_B = (nothing[0] + 1.0, nothing[1], nothing[2])
     profile = add33(outer(baseline_B, baseline_I), outer(x_B, select3(placed, x_I, nothing)))
@@ -118,7 +109,7 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
     R_BI, _ = wahba(profile)
     level = p.initial_tilt_sigma > 0.0
     ahead_B, ahead_I = select3(placed, x_B, baseline_B), select3(placed, x_I, baseline_I)
-    R_BI = select33(level, _level_attitude(ahead_B, ahead_I), R_BI)
+    R_BI = select33(level, level_attitude(ahead_B, ahead_I), R_BI)
     antenna_I = apply(R_IG, load3(flight.gnss_position))
     keep33(flight.R_hat, mask, R_BI)
     keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))

@@ -29,6 +29,7 @@ from quad_gym.kernels.filter.slow import (
     set_slow_aside,
     shift_carried_slow,
 )
+from quad_gym.kernels.filter.waiting import delay_of
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add_outer,
@@ -45,12 +46,20 @@ from quad_gym.kernels.maths.linalg import (
     sub,
     sum_of_outers,
 )
+from quad_gym.kernels.measurements.aid import (
+    choose_aids,
+    count_aids,
+    keep_valid_aids,
+    restore_valid_aids,
+)
+from quad_gym.kernels.measurements.blocks import choose, count, keep_valid
 from quad_gym.kernels.measurements.stamps import go_to_stamp
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import AIDS, DELAY_SLOTS, FilterStatus
+from quad_gym.records import AIDS, DELAY_SLOTS, SENSORS, FilterStatus
 
-_GNSS, _CAMERA, _FIRST_AID, _PRESENT = 0, 1, 2, 2 + AIDS
+_PRESENT = SENSORS + AIDS
+"""The turn of what is not late, after those of GNSS, camera and aiding sensors."""
 _UPDATE, _UPDATE_WITH_SLOW = int(Stage.UPDATE), int(Stage.UPDATE_WITH_SLOW)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
@@ -73,24 +82,24 @@ def _keep_estimate(flight, work, slow):
 
 
 @kernel
+def _go_to(stamps, flight, work, delay, arrived):
+    for slot in range(DELAY_SLOTS):
+        here = arrived & (stamps[slot, 0] == flight.tick - delay)
+        go_to_stamp(stamps[slot], flight, work, here)
+
+
+@kernel
 def _find_stamp(flight, p, work, sensor, delay, arrived, slow):
     """Fill work.since_* with the instant at which was measured what arrives, else with now."""
     store33(work.since_turn, load33(flight.imu_turn))
     store33(work.since_bias_gain, load33(flight.imu_bias_gain))
     store3(work.since_velocity, load3(flight.imu_velocity))
     store3(work.since_position, load3(flight.imu_position))
+    if sensor < SENSORS:
+        _go_to(flight.stamps[sensor], flight, work, delay, arrived)
     if slow is not None:
-        if sensor >= _FIRST_AID:
-            for slot in range(DELAY_SLOTS):
-                row = flight.aid_stamps[sensor - _FIRST_AID, slot]
-                go_to_stamp(row, flight, work, arrived & (row[0] == flight.tick - delay))
-    for slot in range(DELAY_SLOTS if sensor < _FIRST_AID else 0):
-        here = arrived & (flight.stamp_tick[sensor, slot] == flight.tick - delay)
-        keep33(work.since_turn, here, load33(flight.stamp_turn[sensor, slot]))
-        keep33(work.since_bias_gain, here, load33(flight.stamp_bias_gain[sensor, slot]))
-        keep3(work.since_velocity, here, load3(flight.stamp_velocity[sensor, slot]))
-        keep3(work.since_position, here, load3(flight.stamp_position[sensor, slot]))
-        keep3(flight.w_meas, here, load3(flight.stamp_rates[sensor, slot]))
+        if sensor >= SENSORS:
+            _go_to(flight.aid_stamps[sensor - SENSORS], flight, work, delay, arrived)
     work.since_time = select(arrived, delay * p.dt, 0.0)
     work.since_noise = select(arrived, 1.0, 0.0)
     C_s, B_s = load33(work.since_turn), load33(work.since_bias_gain)
@@ -190,39 +199,24 @@ def _restore_estimate(flight, work, arrived, good, slow):
 
 
 @kernel
-def _count_arrived(flight, settings, sensor, slow):
-    """How many measurements of a late sensor arrive now, lane by lane."""
-    if sensor == _GNSS:
-        return flight.position_valid + flight.baseline_valid + flight.velocity_valid
+def _choose(flight, p, work, settings, slow, turn):
+    """Let be measured what has its turn; return where there is something, and its latency."""
+    delay = 0
+    for sensor in range(SENSORS):
+        latency = delay_of(settings, sensor)
+        its = turn == (sensor if latency > 0 else _PRESENT)
+        work.turn[sensor] = 1.0 if its else 0.0
+        if turn == sensor:
+            delay = latency
+    choose(flight, p, work, settings, slow, 0)
+    work.measured = 0.0 * flight.tick
+    count(flight, p, work, settings, slow, 0)
     if slow is not None:
-        if sensor >= _FIRST_AID:
-            return flight.aid_valid[sensor - _FIRST_AID]
-    count = 0.0 * flight.tick
-    for i in range(settings.feature_count):
-        count = count + flight.feature_valid[i]
-    return count
-
-
-@kernel
-def _keep_aids(flight, work, slow):
-    """Copy the aiding sensors' flags of validity."""
-    if slow.aids > 0:
-        for s in range(AIDS):
-            work.kept_aids[s] = flight.aid_valid[s]
-
-
-@kernel
-def _choose_aids(flight, work, slow, turn):
-    """Let the aiding sensors be valid whose turn it is; return whether there are any."""
-    chosen = False
-    if slow.aids > 0:
-        for s in range(AIDS):
-            late = slow.aid_delay[s] > 0
-            its = turn == _FIRST_AID + s if late else turn == _PRESENT
-            its = its and slow.aid_on[s] > 0
-            flight.aid_valid[s] = (1.0 if its else 0.0) * work.kept_aids[s]
-            chosen = chosen or its
-    return chosen
+        choose_aids(flight, work, slow, turn, _PRESENT)
+        count_aids(flight, work, slow, 0)
+        if turn >= SENSORS and turn < _PRESENT:
+            delay = slow.aid_delay[turn - SENSORS]
+    return work.measured > 0.0, delay
 
 
 @kernel
@@ -238,33 +232,16 @@ def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
         mask: Which lanes.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
-    late_gnss, late_camera = settings.gnss_delay > 0, settings.camera_delay > 0
-    flags = (flight.position_valid, flight.baseline_valid, flight.velocity_valid)
+    keep_valid(flight, p, work, settings, slow, 0)
     if slow is not None:
-        _keep_aids(flight, work, slow)
-    for turn in range(_GNSS, _PRESENT + 1):
+        keep_valid_aids(flight, work, slow)
+    for turn in range(_PRESENT + 1):
         late = turn != _PRESENT
-        fixes = turn == (_GNSS if late_gnss else _PRESENT)
-        images = turn == (_CAMERA if late_camera else _PRESENT)
-        others = False
-        if slow is not None:
-            others = _choose_aids(flight, work, slow, turn)
-        if not (fixes or images or others):
+        measured, delay = _choose(flight, p, work, settings, slow, turn)
+        arrived = mask & measured if late else mask
+        if not any_of(mask & measured):
             continue
-        share = 1.0 if fixes else 0.0
-        flight.position_valid = share * flags[0]
-        flight.baseline_valid = share * flags[1]
-        flight.velocity_valid = share * flags[2]
-        features = settings.feature_count if images else 0
-        delay = settings.gnss_delay if turn == _GNSS else settings.camera_delay
-        if slow is not None:
-            if turn >= _FIRST_AID and turn < _PRESENT:
-                delay = slow.aid_delay[turn - _FIRST_AID]
-        arrived = mask
         if late:
-            arrived = mask & (_count_arrived(flight, settings, turn, slow) > 0.0)
-            if not any_of(arrived):
-                continue
             _keep_estimate(flight, work, slow)
             _find_stamp(flight, p, work, turn, delay, arrived, slow)
         good = arrived
@@ -274,15 +251,15 @@ def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
             if leg == 0:
                 work.mask = select(good, 1.0, 0.0)
                 update = _UPDATE if slow is None else _UPDATE_WITH_SLOW
-                call_stage(stages, update, flight, p, p, settings, work, features)
+                call_stage(stages, update, flight, p, p, settings, work, 0)
         if late:
             good = good & (flight.update_failures == work.kept_failures)
             _restore_estimate(flight, work, arrived, good, slow)
-    flight.position_valid, flight.baseline_valid, flight.velocity_valid = flags
+    for sensor in range(SENSORS):
+        work.turn[sensor] = 1.0
+    choose(flight, p, work, settings, slow, 0)
     if slow is not None:
-        if slow.aids > 0:
-            for s in range(AIDS):
-                flight.aid_valid[s] = work.kept_aids[s]
+        restore_valid_aids(flight, work, slow)
 
 
 # ---- stages ----------------------------------------------------------------------------------

@@ -124,26 +124,6 @@ def turn_slow(slow, P, T):
 
 
 @kernel
-def measure_slow(flight, slow, work, n, use_position):
-    """Add to work.A what a fix has of d, in all columns of the factor.
-
-    Column j is row `last - j`; the columns from the tenth on, on which nothing else depends, are
-    empty so far.
-    """
-    drifting = use_position and slow.estimates_drift > 0
-    last = D + slow.slow_states - 1
-    for j in range(last + 1):
-        row = work.A[last - j]
-        if j >= 9:
-            for k in range(n):
-                row[k] = 0.0 * work.h[0]
-        if drifting:
-            for i in range(3):
-                d = select(flight.position_valid > 0.0, flight.L_slow[i, j], 0.0)
-                row[i] = row[i] + d
-
-
-@kernel
 def load_slow(flight, slow, columns):
     """Complete the factor in `columns`, last first, that has those of fifteen states."""
     last = D + slow.slow_states - 1

@@ -1,10 +1,13 @@
-"""The filter's update: antenna position, baseline direction and feature directions at once.
+"""The filter's update: by all blocks of a measurement at once.
 
-See `ukf.py` for the form of the unscented transform and of the update. The stacked measurement is
-made of triples, all in I or B: r + R^T l_p, unit(R^T l_b), v + R^T (w x l_p), and for each feature
-unit(R (X - r) - l_c), for a direction in the camera frame differs from one in B by a fixed rotation
-only. A triple that a lane lacks is masked: its deviations and innovation are zero and its noise is
-one, which gives exactly the update without it. Triples that every lane lacks are left out.
+See `predict.py` for the form of the unscented transform. What a block measures, and what the filter
+expects of it, is in its file in `kernels/measurements/`; each has three rows of the stacked
+measurement. A block that a lane lacks is masked: its deviations and innovation are zero and its
+noise is one, which gives exactly the update without it. Blocks that every lane lacks are left out.
+
+The EKF shares everything with the UKF: where this one puts the half-differences of a pair of sigma
+points into a column, the EKF puts the derivative of the model times the column of L; the half-sums
+less the center, which carry the second order, are zero.
 """
 
 import math
@@ -12,12 +15,10 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.ekf import measure_columns
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.filter.expected import compare_center, measure_sigma_points
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
 from quad_gym.kernels.filter.recovery import raise_doubts
-from quad_gym.kernels.filter.slow import load_slow, measure_slow, shift_slow
+from quad_gym.kernels.filter.slow import load_slow, shift_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
@@ -29,16 +30,20 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load33,
     load_block,
+    load_column3,
     multiply,
     scale,
     scale33,
+    store3,
     store_block,
     sum_of_outers,
     sum_of_outers_of_rows,
     sum_of_squares,
 )
-from quad_gym.kernels.maths.rotation import euler_to_dcm
-from quad_gym.kernels.measurements.aid import expect_aids, judge_aids, measured_by_aids
+from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation
+from quad_gym.kernels.measurements.aid import count_aids, expect_aids
+from quad_gym.kernels.measurements.blocks import count, expect
+from quad_gym.kernels.measurements.rows import columns_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import FilterForm, FilterStatus
@@ -47,6 +52,23 @@ _EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
 _GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _GRADUAL = int(FilterForm.GRADUAL)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
+
+
+@kernel
+def _store_rows(a, m):
+    """Write a matrix some of whose elements are constants."""
+    store3(a[0], m[0])
+    store3(a[1], m[1])
+    store3(a[2], m[2])
+
+
+@kernel
+def _split_turns(flight, work, c):
+    """Fill work.odd and work.even with the turns of the sigma points."""
+    for j in range(9):
+        even, odd, _ = split_rotation(scale(c, load_column3(flight.L, E, j)))
+        _store_rows(work.odd[j], odd)
+        _store_rows(work.even[j], even)
 
 
 @kernel
@@ -82,7 +104,7 @@ _DOUBTS = (100.0, 100.0 / 9.0, 100.0 / 90.0)
 
 
 @kernel
-def update(flight, p, work, feature_count, mask, form=0, slow=None, stages=None):
+def update(flight, p, work, settings, mask, slow=None, stages=None):
     """Condition the estimate on the valid measurements of the present instant, where `mask`.
 
     A lane whose result is not finite keeps its state bit for bit, sets UPDATE_FAILED and counts it.
@@ -99,15 +121,14 @@ def update(flight, p, work, feature_count, mask, form=0, slow=None, stages=None)
         flight: Record; reads the measurements and their validity, changes the estimate.
         p: Parameters as the filter believes them.
         work: Workspace.
-        feature_count: Features in use.
+        settings: The filter's form and the features in use.
         mask: Which lanes.
-        form: A `FilterForm`.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
         stages: The table of stages, which has those of aiding sensors; None without slow errors.
     """
-    loose, first = mask & (p.sigma_spread < 0.0), 2  # nobody
-    if (form & _GRADUAL) != 0 and feature_count > 0:
-        loose = mask & _is_loose(flight, p, feature_count)
+    loose, first, form = mask & (p.sigma_spread < 0.0), 2, settings.form  # nobody
+    if (form & _GRADUAL) != 0 and settings.feature_count > 0:
+        loose = mask & _is_loose(flight, p, settings.feature_count)
         if any_of(loose):
             first = 0
     failures = flight.update_failures
@@ -115,7 +136,7 @@ def update(flight, p, work, feature_count, mask, form=0, slow=None, stages=None)
         doubt = select(loose, _DOUBTS[part], 1.0)
         well = flight.update_failures == failures  # a step that fails is the last
         taking, again = mask & well & (loose | (part == 2)), loose & (part > 0)
-        _update_by(flight, p, work, feature_count, taking, form, doubt, again, slow, stages)
+        _update_by(flight, p, work, settings, taking, doubt, again, slow, stages)
     if (form & _GRADUAL) != 0:
         flight.nis = select(loose, np.nan, flight.nis)
 
@@ -132,66 +153,34 @@ def _is_loose(flight, p, feature_count):
 
 
 @kernel
-def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, stages):
+def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     """Condition the estimate on the measurements with `doubt` times their noise, where `mask`.
 
     `again`: where these measurements were met before, with another doubt.
     """
-    use_position = any_of(flight.position_valid > 0.0)
-    use_baseline = any_of(flight.baseline_valid > 0.0)
-    use_velocity = any_of(flight.velocity_valid > 0.0)
-    states, columns = 15, 9  # of the state, and of L those that matter
+    work.measured, form = 0.0 * flight.tick, settings.form
+    first_of_aids = count(flight, p, work, settings, slow, 0)
+    n = first_of_aids
     if slow is not None:
-        states = 15 + slow.slow_states
-        columns = states
-    last = columns - 1
-    n = compare_center(
-        flight, p, work, feature_count, use_position, use_baseline, use_velocity, slow
-    )
-    first_of_aids = n
-    if slow is not None:
-        sensors, numbers = measured_by_aids(flight, slow)
-        n += 3 * sensors
+        n = count_aids(flight, work, slow, first_of_aids)
     if n == 0:
         return
-    measured = 3.0 * (flight.position_valid + flight.baseline_valid + flight.velocity_valid)
-    for i in range(feature_count):
-        measured = measured + 3.0 * flight.feature_valid[i]
+    states, estimated = 15, 15  # those that fill up the slow ones are not estimated
     if slow is not None:
-        measured = measured + numbers
-    estimated = 15 if slow is None else 15 + slow.slow_errors
+        states, estimated = 15 + slow.slow_states, 15 + slow.slow_errors
+    columns = columns_of(slow)
+    last, measured = columns - 1, work.measured
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
-    if (form & _EKF) != 0:
-        measure_columns(
-            flight, p, work, n, feature_count, use_position, use_baseline, use_velocity, last
-        )
-    else:
-        measure_sigma_points(
-            flight, p, work, feature_count, use_position, use_baseline, use_velocity, c, last
-        )
+    work.spread = c
+    if (form & _EKF) == 0:
+        _split_turns(flight, work, c)
+    expect(flight, p, work, settings, slow, 0)
     if slow is not None:
-        measure_slow(flight, slow, work, n, use_position)
-    if slow is not None:
-        expect_aids(flight, p, work, slow, stages, first_of_aids, c)
+        expect_aids(flight, p, work, slow, stages, first_of_aids)
     _innovate(work, n, c)
     if (form & _WATCH) != 0:
-        if slow is not None:
-            judge_aids(flight, p, work, slow, stages, first_of_aids, mask, again)
-        left_out = judge_innovations(
-            flight,
-            p,
-            work,
-            feature_count,
-            use_position,
-            use_baseline,
-            use_velocity,
-            form,
-            mask,
-            again,
-            columns,
-            slow,
-        )
-        measured = measured - left_out
+        judge_innovations(flight, p, work, settings, slow, stages, first_of_aids, mask, again)
+        measured = measured - work.left_out
     _sum_noise(p, work, n, doubt)
 
     # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
@@ -260,21 +249,21 @@ def _update_by(flight, p, work, feature_count, mask, form, doubt, again, slow, s
     )
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
     if (form & _WATCH) != 0 and any_of(failed):
-        mark_failed(flight, feature_count, failed, slow)
+        mark_failed(flight, p, work, settings, slow, failed)
     if (form & _GATE) != 0:
-        raise_doubts(flight, p, work, feature_count, mask & logical_not(failed), slow, stages)
+        doubting, features = mask & logical_not(failed), settings.feature_count
+        raise_doubts(flight, p, work, features, doubting, slow, stages)
 
 
 @stage
 def update_stage(flight, world, model, settings, work, stages, flag):
-    """Update the estimate with the valid measurements; `flag`: how many features are in use."""
+    """Update the estimate with the valid measurements."""
     scratch = lanes_of(work)
-    update(lanes_of(flight), lanes_of(model), scratch, flag, scratch.mask > 0.0, settings.form)
+    update(lanes_of(flight), lanes_of(model), scratch, settings, scratch.mask > 0.0)
 
 
 @stage
 def update_with_slow_stage(flight, world, model, settings, work, stages, flag):
     """The same by a filter that estimates slow errors of sensors."""
     flying, scratch = lanes_of(flight), lanes_of(work)
-    mask, form = scratch.mask > 0.0, settings.form
-    update(flying, lanes_of(model), scratch, flag, mask, form, settings, stages)
+    update(flying, lanes_of(model), scratch, settings, scratch.mask > 0.0, settings, stages)

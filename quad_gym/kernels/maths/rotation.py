@@ -7,6 +7,7 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import atan2, sin_cos, sin_cos_minus_one
+from quad_gym.kernels.maths.linalg import unit_or
 from quad_gym.kernels.simd.lanes import select
 
 
@@ -156,3 +157,14 @@ def quaternion_rate(q, w_B):
         0.5 * (w * w_B[1] + z * w_B[0] - x * w_B[2]),
         0.5 * (w * w_B[2] + x * w_B[1] - y * w_B[0]),
     )
+
+
+@kernel
+def level_attitude(v_B, v_I):
+    """The level attitude R_BI in which a vector in B has the heading that it has in I."""
+    zero = 0.0 * v_B[0]
+    east = (zero + 1.0, zero, zero)
+    b = unit_or((v_B[0], v_B[1], zero), east)
+    i = unit_or((v_I[0], v_I[1], zero), east)
+    c, s = b[0] * i[0] + b[1] * i[1], b[0] * i[1] - b[1] * i[0]
+    return ((c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0))

@@ -15,15 +15,14 @@ from quad_gym.kernels.maths.linalg import keep3, keep33, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.measurements.clock import first_wait
 from quad_gym.kernels.measurements.gate import (
-    count_in_row,
     covariance,
     decide,
     keep_block,
+    leave_out,
     mark_block,
-    mask_block,
     nis_of_triple,
 )
-from quad_gym.kernels.measurements.stamps import put_stamp
+from quad_gym.kernels.measurements.stamps import forget_stamps, put_stamp
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
     AID_BLOCKS,
@@ -35,6 +34,7 @@ from quad_gym.records import (
     DRAW_AID_MATRIX,
     DRAW_AID_PHASE,
     DRAW_SLOW,
+    SENSORS,
     Act,
     Aid,
     FaultKind,
@@ -43,7 +43,7 @@ from quad_gym.records import (
 )
 
 ACTS = len(Act)
-_EXPECT, _JUDGE = int(Act.EXPECT), int(Act.JUDGE)
+_EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _FIRST = int(Stage[Aid(0).name])
 _NUMBERS = tuple(map(float, AID_FREEDOMS))
 _LOSS = int(FaultKind[f"{Aid(0).name}_LOSS"])
@@ -67,15 +67,20 @@ def call_aids(flight, world, model, settings, work, stages, act):
 
 
 @kernel
-def measured_by_aids(flight, settings):
-    """How many sensors any lane has a measurement of, and how many numbers each lane has."""
-    sensors, numbers = 0, 0.0 * flight.tick
+def align_by_aid(flight, p, settings, work, stages):
+    """Let a sensor give the filter's start its heading, where `work.mask`."""
+    call_stage(stages, _FIRST + settings.heading_aid, flight, p, p, settings, work, _ALIGN)
+
+
+@kernel
+def count_aids(flight, work, settings, k):
+    """Count what is measured; return the row behind that of all sensors, which begin at k."""
     if settings.aids > 0:
         for s in range(AIDS):
             if settings.aid_on[s] > 0 and any_of(flight.aid_valid[s] > 0.0):
-                sensors += 1
-                numbers = numbers + _NUMBERS[s] * flight.aid_valid[s]
-    return sensors, numbers
+                work.measured = work.measured + _NUMBERS[s] * flight.aid_valid[s]
+                k += 3
+    return k
 
 
 @kernel
@@ -90,27 +95,50 @@ def _call_measured(flight, p, work, settings, stages, n, act):
 
 
 @kernel
-def expect_aids(flight, p, work, settings, stages, n, c):
+def expect_aids(flight, p, work, settings, stages, n):
     """Let the sensors fill their rows from n on: center, measured, noise, columns."""
-    work.spread = c
     _call_measured(flight, p, work, settings, stages, n, _EXPECT)
 
 
 @kernel
-def judge_aids(flight, p, work, settings, stages, n, mask, again):
+def judge_aids(flight, p, work, settings, stages, n):
     """Let the sensors keep their innovations and mask what is beyond the gate."""
-    zero = 0.0 * flight.tick
-    work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
-    work.judged_nis, work.judged_freedoms, work.left_out = zero, zero, zero
     _call_measured(flight, p, work, settings, stages, n, _JUDGE)
 
 
 @kernel
-def mark_failed_aids(flight, settings, failed):
-    """Say of the sensors' blocks in an update that failed as a whole that none was taken."""
+def mark_failed_aids(flight, work, settings):
+    """Say that the update failed that the sensors' blocks were part of, where `work.taking`."""
     if settings.aids > 0:
+        failed = work.taking > 0.0
         for s in range(AIDS):
             mark_block(flight, AID_BLOCKS + s, failed & (flight.aid_valid[s] > 0.0))
+
+
+@kernel
+def keep_valid_aids(flight, work, settings):
+    """Keep what is measured, for the turns of late measurements."""
+    if settings.aids > 0:
+        for s in range(AIDS):
+            work.kept_valid[AID_BLOCKS + s] = flight.aid_valid[s]
+
+
+@kernel
+def choose_aids(flight, work, settings, turn, present):
+    """Let the sensors be measured whose turn it is; what is not late has that of the present."""
+    if settings.aids > 0:
+        for s in range(AIDS):
+            its = turn == (SENSORS + s if settings.aid_delay[s] > 0 else present)
+            share = 1.0 if its else 0.0
+            flight.aid_valid[s] = share * work.kept_valid[AID_BLOCKS + s]
+
+
+@kernel
+def restore_valid_aids(flight, work, settings):
+    """Let be measured what was so before the turns."""
+    if settings.aids > 0:
+        for s in range(AIDS):
+            flight.aid_valid[s] = work.kept_valid[AID_BLOCKS + s]
 
 
 # ---- simulation ------------------------------------------------------------------------------
@@ -139,9 +167,7 @@ def begin_aid(flight, p, settings, s, mask):
     flight.aid_fresh[s] = select(mask, 0.0, flight.aid_fresh[s])
     flight.aid_valid[s] = select(mask, 0.0, flight.aid_valid[s])
     if settings.aid_delay[s] > 0:
-        for slot in range(DELAY_SLOTS):
-            tick = flight.aid_stamps[s, slot, 0]
-            flight.aid_stamps[s, slot, 0] = select(mask, np.nan, tick)
+        forget_stamps(flight.aid_stamps[s], mask)
 
 
 @kernel
@@ -192,6 +218,13 @@ def _exchange(flight, settings, s, mask, taken, values):
 
 
 @kernel
+def deliver_first(flight, s, mask, values):
+    """Keep the measurement of sensor s that starts the filter, which counts it but once."""
+    keep3(flight.aid_measurement[s], mask, values)
+    flight.aid_fresh[s] = select(mask, 1.0, flight.aid_fresh[s])
+
+
+@kernel
 def deliver(flight, settings, s, mask, due, values):
     """Hand to the filter what sensor s measures where it is `due`, now or after its latency."""
     if settings.faults:
@@ -229,7 +262,4 @@ def judge_aid(flight, p, work, settings, s, k):
     keep_block(flight, AID_BLOCKS + s, first, nu, sigma, nis, rejected, nowhere)
     work.judged_nis = work.judged_nis + select(first, nis, 0.0)
     work.judged_freedoms = work.judged_freedoms + select(first, _NUMBERS[s], 0.0)
-    if gating:
-        mask_block(work, k, rejected, columns)
-        count_in_row(flight, AID_GROUPS + s, has, rejected, again)
-        work.left_out = work.left_out + select(rejected, _NUMBERS[s], 0.0)
+    leave_out(flight, work, settings, k, AID_GROUPS + s, has, rejected, columns, _NUMBERS[s])

@@ -29,8 +29,9 @@ from quad_gym.kernels.maths.linalg import (
     unit_or,
 )
 from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import Gate
+from quad_gym.records import FilterForm, Gate
 
+_GATE = int(FilterForm.GATE)
 _REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
 _FAILED, _UNSURE = float(Gate.FAILED), float(Gate.UNSURE)
 
@@ -123,8 +124,9 @@ def decide(flight, s, has, wanting, again, decision):
 
 
 @kernel
-def judge_triple(flight, p, work, k, s, has, again, gating, columns):
+def judge_triple(flight, p, work, settings, k, s, has, columns):
     """Keep the innovation of a position or velocity; return where it is rejected, and its NIS."""
+    gating, again = (settings.form & _GATE) != 0, work.again > 0.0
     S = covariance(p, work, k, columns)
     nu = (work.z[k], work.z[k + 1], work.z[k + 2])
     nis = nis_of_triple(S, nu)
@@ -138,12 +140,13 @@ def judge_triple(flight, p, work, k, s, has, again, gating, columns):
 
 
 @kernel
-def judge_direction(flight, p, work, k, s, has, again, gating, columns, most):
+def judge_direction(flight, p, work, settings, k, s, has, columns, most):
     """Keep the innovation of a direction; return where it is rejected, and where too uncertain.
 
     Besides, its innovation in deviations, and its NIS. Too uncertain is one whose predicted
     variances add up to more than `most`.
     """
+    gating, again = (settings.form & _GATE) != 0, work.again > 0.0
     S = covariance(p, work, k, columns)
     u = (work.h[k], work.h[k + 1], work.h[k + 2])
     nu, S2 = across(u, S, (work.z[k], work.z[k + 1], work.z[k + 2]))
@@ -157,6 +160,15 @@ def judge_direction(flight, p, work, k, s, has, again, gating, columns, most):
     keep_block(flight, s, has, (nu[0], nu[1], none), sigma, nis, rejected, unsure)
     scaled = (nu[0] / sigma[0], nu[1] / sigma[1])
     return rejected, unsure, scaled, select(has & logical_not(unsure), nis, 0.0)
+
+
+@kernel
+def leave_out(flight, work, settings, k, group, has, rejected, columns, numbers):
+    """Mask the block at row k where it is `rejected`, and count that, if there is a gate."""
+    if (settings.form & _GATE) != 0:
+        mask_block(work, k, rejected, columns)
+        count_in_row(flight, group, has, rejected, work.again > 0.0)
+        work.left_out = work.left_out + select(rejected, numbers, 0.0)
 
 
 @kernel

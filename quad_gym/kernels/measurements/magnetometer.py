@@ -12,33 +12,53 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
+
+Where GNSS has one antenna, the field tells the heading of the filter's start, which is level or so:
+that in which the field points where it is seen to. With the vertical k, the level direction h of
+the field and s = k x h, all in B, the field's level and vertical share m_h and m_z, nothing of the
+innovation is left along s, so that the derivative ties the error of the heading to others:
+
+    m_h (k . e) = m_z (h . e) - m_h delta + s . b + s . v
 """
 
+import math
+
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.error_state import D, E
+from quad_gym.kernels.filter.error_state import BA, D, E, R, V
 from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add,
+    add33,
     add_outer,
     apply,
+    apply_transposed,
     cross,
+    keep3,
+    keep33,
     load3,
     load4,
     load33,
     load_block,
     load_column3,
+    multiply,
+    outer,
     scale,
     select3,
     store3,
     store_block,
+    sub,
+    sum_of_outers,
+    transpose,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm, split_rotation
+from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.measurements.aid import (
     ACTS,
     aid_due,
     begin_aid,
     deliver,
+    deliver_first,
     draw_matrix,
     judge_aid,
 )
@@ -48,7 +68,7 @@ from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Act, Aid, FilterF
 
 _S = int(Aid.MAGNETOMETER)
 _BEGIN, _SAMPLE = int(Act.BEGIN), int(Act.SAMPLE)
-_EXPECT, _JUDGE = int(Act.EXPECT), int(Act.JUDGE)
+_EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _EKF = int(FilterForm.EKF)
 
 
@@ -65,7 +85,97 @@ def _measure(flight, p, settings, mask, starting):
     field_B = add(field_B, apply(load33(flight.aid_matrix[_S]), field_B))
     noise = scale(p.aid_sigma[_S], (a, b, c))
     values = add(add(field_B, load3(flight.aid_vector[_S])), noise)
-    deliver(flight, settings, _S, mask, due, values)
+    if starting and settings.heading_aid == _S and settings.warm == 0:
+        deliver_first(flight, _S, mask, values)
+    else:
+        deliver(flight, settings, _S, mask, due, values)
+
+
+@kernel
+def _align(flight, p, work, settings, mask):
+    """Give the filter's start the heading of the field, and the covariance that comes with it."""
+    P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
+    m, z = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S])
+    R_BI = multiply(R_BI, level_attitude(apply_transposed(R_BI, z), m))
+    for i in range(0, D, 3):
+        for j in range(0, i + 3, 3):
+            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
+    for i in range(settings.slow_states):
+        for j in range(D + i):
+            P[D + i, j] = 0.0 * p.dt
+        sigma = p.slow_sigma[i]
+        P[D + i, D + i] = select(sigma > 0.0, sigma * sigma, 1.0)  # GNSS has not drifted yet
+    iron, delta = D + settings.aid_vector[_S], D + settings.aid_scalar[_S]
+    _tie_heading(p, P, m, R_BI, iron, delta)
+    _tie_position(p, P, R_BI, iron, delta)
+    cholesky(P, D + settings.slow_states, work.inverse_diagonal)
+    for i in range(D):
+        for j in range(i + 1):
+            L[i, j] = select(mask, P[i, j], L[i, j])
+    for i in range(settings.slow_states):
+        estimated = mask & (p.slow_sigma[i] > 0.0)
+        for j in range(D + i + 1):
+            kept = flight.L_slow[i, j]
+            flight.L_slow[i, j] = select(estimated, P[D + i, j], kept)
+    antenna_I = apply(load33(p.R_IG), load3(flight.gnss_position))
+    keep33(flight.R_hat, mask, R_BI)
+    keep3(flight.r_hat, mask, sub(antenna_I, apply_transposed(R_BI, load3(p.antenna))))
+
+
+@kernel
+def _tie_heading(p, P, m, R_BI, iron, delta):
+    """Replace the error of the heading in P by that of the field's heading, see above."""
+    zero = 0.0 * p.dt
+    level = math.sqrt(m[0] * m[0] + m[1] * m[1])
+    h, k = apply(R_BI, (m[0] / level, m[1] / level, zero)), apply(R_BI, (zero, zero, zero + 1.0))
+    s, steep = cross(k, h), m[2] / level
+    F = outer(k, sub(scale(steep, h), k))  # e = F e + ..., of which the tilt is all that counts
+    F = add33(((zero + 1.0, zero, zero), (zero, zero + 1.0, zero), (zero, zero, zero + 1.0)), F)
+    P_bb, P_dd = P[iron, iron], P[delta, delta]
+    white = p.initial_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
+    alone = P_dd + (white + P_bb) / (level * level)
+    P_ee = multiply(multiply(F, _full(P)), transpose(F))
+    store_block(P, E, E, add_outer(P_ee, scale(alone, k), k))
+    store_block(P, E, V, multiply(F, load_block(P, E, V)))
+    for i in range(BA, D, 3):
+        store_block(P, i, E, multiply(load_block(P, i, E), transpose(F)))
+    with_iron = scale(P_bb / level, s)
+    store3(P[iron, E : E + 3], scale(with_iron[0], k))
+    store3(P[iron + 1, E : E + 3], scale(with_iron[1], k))
+    store3(P[iron + 2, E : E + 3], scale(with_iron[2], k))
+    store3(P[delta, E : E + 3], scale(-P_dd, k))
+
+
+@kernel
+def _tie_position(p, P, R_BI, iron, delta):
+    """Let the position go with the attitude in P, as an antenna was measured: see `align.py`."""
+    zero = 0.0 * p.dt
+    x, y, z = load3(p.antenna)
+    J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
+    J_t = transpose(J)
+    with_attitude, s, k = multiply(_full(P), J_t), load3(p.gnss_sigma), p.initial_scale
+    white = (
+        (k * s[0] * s[0], zero, zero),
+        (zero, k * s[1] * s[1], zero),
+        (zero, zero, k * s[2] * s[2]),
+    )
+    store_block(P, R, R, add33(white, multiply(J, with_attitude)))
+    store_block(P, E, R, with_attitude)
+    store_block(P, V, R, multiply(transpose(load_block(P, E, V)), J_t))
+    for i in range(BA, D, 3):
+        store_block(P, i, R, multiply(load_block(P, i, E), J_t))
+    for i in (iron, iron + 1, iron + 2, delta):
+        store3(P[i], apply(J, load3(P[i, E : E + 3])))
+
+
+@kernel
+def _full(P):
+    """The covariance of the error angles, of which P has the lower triangle."""
+    return (
+        (P[E, E], P[E + 1, E], P[E + 2, E]),
+        (P[E + 1, E], P[E + 1, E + 1], P[E + 2, E + 1]),
+        (P[E + 2, E], P[E + 2, E + 1], P[E + 2, E + 2]),
+    )
 
 
 @kernel
@@ -108,7 +218,7 @@ def _expect(flight, p, work, settings, k):
             if (settings.form & _EKF) != 0:
                 straight = add(straight, cross(f_B, load_column3(L, E, j)))
             else:
-                even, odd, _ = split_rotation(scale(c, load_column3(L, E, j)))
+                odd, even = load33(work.odd[j]), load33(work.even[j])
                 bent = add(scale(1.0 / c, apply(odd, f_B)), apply(even, turned))
                 straight = add(straight, bent)
                 half_sum = add(scale(1.0 / c, apply(even, f_B)), apply(odd, turned))
@@ -144,5 +254,7 @@ def magnetometer_stage(flight, world, model, settings, work, stages, flag):
         _expect(flying, p, scratch, settings, k)
     elif act == _JUDGE:
         judge_aid(flying, p, scratch, settings, _S, k)
+    elif act == _ALIGN:
+        _align(flying, p, scratch, settings, mask)
     else:
         _doubt(flying, p, scratch, settings, scratch.taking > 0.0)

@@ -1,9 +1,18 @@
 """Time stamps: what the IMU had summed up when a measurement was taken, for the way back to it."""
 
+import numpy as np
+
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.linalg import keep3, keep33
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DELAY_SLOTS, STAMP
+
+
+@kernel
+def forget_stamps(stamps, mask):
+    """Begin an episode with nothing in transit, where `mask`."""
+    for slot in range(DELAY_SLOTS):
+        stamps[slot, 0] = select(mask, np.nan, stamps[slot, 0])
 
 
 @kernel

@@ -1,25 +1,18 @@
-"""What the sensors measure at the present instant: IMU, dual-antenna GNSS, camera.
+"""What the IMU measures at the present instant, and what a GNSS fix is made of.
 
 Every draw has a fixed number within its instant, so that a measurement does not depend on which
-others are taken. The noise-free parts are functions of their own, for the friendly classes and the
-tests.
+others are taken. What GNSS and camera measure is in `kernels/measurements/`.
 """
 
-import math
-
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import exp, log, sin_cos
+from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
-    apply_transposed,
-    cross,
-    dot,
     keep3,
     load3,
     load4,
     load33,
-    norm,
     scale,
     select3,
     sub,
@@ -27,8 +20,8 @@ from quad_gym.kernels.maths.linalg import (
 )
 from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of
 from quad_gym.kernels.maths.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
+from quad_gym.kernels.measurements import baseline, position
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.vehicle.dynamics import (
     accelerations,
     body_point_velocity,
@@ -37,12 +30,9 @@ from quad_gym.kernels.vehicle.dynamics import (
 )
 from quad_gym.records import (
     DRAW_BIAS,
-    DRAW_DRIFT,
-    DRAW_FEATURE,
     DRAW_GNSS,
     DRAW_IMU,
     DRAW_MARK,
-    DRAW_VELOCITY,
 )
 
 
@@ -118,60 +108,13 @@ def measure_imu_average(flight, p, start, mask):
 
 
 @kernel
-def noisy_baseline(r_b, normals, sigma_b, floor, length):
-    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, known length.
-
-    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section
-    3.1).
-    """
-    size = norm(r_b)
-    u = scale(1.0 / size, r_b)
-    b = math.sqrt(floor)
-    a = math.sqrt((size * sigma_b) * (size * sigma_b) + floor)
-    along = dot(u, normals)
-    noisy = add(add(r_b, scale(a, normals)), scale((b - a) * along, u))
-    return scale(length / norm(noisy), noisy)
-
-
-@kernel
-def drift_gnss(flight, p, mask, share):
-    """Step the slow error of GNSS positions from one measurement to the next, where `mask`.
-
-    The first measurement comes a `share` of the period after the start.
-    """
-    n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
-    d, s, whole = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_decay
-    decay = exp(share * log(whole))
-    root = math.sqrt((1.0 - decay) * (1.0 + decay) / ((1.0 - whole) * (1.0 + whole)))
-    drive = (root * s[0] * n[0], root * s[1] * n[1], root * s[2] * n[2])
-    keep3(flight.gnss_drift, mask, add(scale(decay, d), drive))
-
-
-@kernel
-def measure_gnss(flight, p, mask):
-    """Measure antenna position and baseline in G, where `mask`."""
-    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+def measure_gnss(flight, p, paired, mask):
+    """Measure antenna position, and the baseline if there is one (`paired`), in G, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
     n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
-    s = load3(p.gnss_sigma)
-    antenna_I = add(load3(flight.r), apply_transposed(R_BI, load3(p.antenna)))
-    noise_I = (s[0] * n_p[0], s[1] * n_p[1], s[2] * n_p[2])
-    noise_I = add(noise_I, load3(flight.gnss_drift))
-    keep3(flight.gnss_position, mask, apply_transposed(R_IG, add(antenna_I, noise_I)))
-    baseline_G = apply_transposed(R_IG, apply_transposed(R_BI, load3(p.baseline)))
-    measured = noisy_baseline(
-        baseline_G, n_b, p.baseline_sigma, p.direction_floor, p.baseline_length
-    )
-    keep3(flight.gnss_baseline, mask, measured)
-
-
-@kernel
-def measure_gnss_velocity(flight, p, mask):
-    """Measure the velocity of the antenna in G, where `mask`."""
-    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
-    n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
-    lever_B = cross(load3(flight.w), load3(p.antenna))
-    v_I = add(load3(flight.v), apply_transposed(R_BI, lever_B))
-    keep3(flight.gnss_velocity, mask, apply_transposed(R_IG, add(v_I, scale(p.velocity_sigma, n))))
+    position.measure(flight, p, R_BI, n_p, mask)
+    if paired:
+        baseline.measure(flight, p, R_BI, n_b, mask)
 
 
 @kernel
@@ -183,31 +126,6 @@ def look_along_mark(flight, p):
     n, _ = normal_pair(stream_of(flight), DRAW_MARK)
     s, c = sin_cos(p.heading_sigma * n)
     return (c * x_I[0] - s * x_I[1], s * x_I[0] + c * x_I[1], zero)
-
-
-@kernel
-def project(X_I, r_I, R_BI, p):
-    """Pixel of a point, and whether it is in front of the camera and inside the image."""
-    v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))
-    in_front = v_C[2] > 1e-9
-    per_depth = p.focal_length / select(in_front, v_C[2], 1.0)
-    x, y = per_depth * v_C[0], per_depth * v_C[1]
-    seen = in_front & (abs(x) <= p.half_image[0]) & (abs(y) <= p.half_image[1])
-    return x, y, seen
-
-
-@kernel
-def measure_features(flight, p, feature_count, mask):
-    """Project the features and mark those that the camera sees, where `mask`."""
-    stream = stream_of(flight)
-    R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
-    for i in range(feature_count):
-        x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
-        n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
-        seen = seen & mask
-        flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
-        flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
-        flight.feature_valid[i] = select(mask, select(seen, 1.0, 0.0), flight.feature_valid[i])
 
 
 @stage

@@ -3,14 +3,10 @@
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.elementary import minimum
 from quad_gym.kernels.maths.linalg import add, keep3, load3, store3
+from quad_gym.kernels.measurements import features, velocity
+from quad_gym.kernels.measurements.position import drift_gnss
 from quad_gym.kernels.sensors.faults import gnss_heard
-from quad_gym.kernels.sensors.measure import (
-    drift_gnss,
-    measure_features,
-    measure_gnss,
-    measure_gnss_velocity,
-    measure_imu,
-)
+from quad_gym.kernels.sensors.measure import measure_gnss, measure_imu
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 
@@ -46,7 +42,7 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
     if settings.faults and not sound:
         measured, paired = gnss_heard(flight, settings, due)
     if any_of(measured):
-        measure_gnss(flight, world, measured)
+        measure_gnss(flight, world, settings.gnss_baseline > 0, measured)
         if settings.heading_errs:
             work.mask = select(measured, 1.0, 0.0)
             call_stage(stages, _TURN_BASELINE, flight, world, world, settings, work, 0)
@@ -54,9 +50,11 @@ def _sample_gnss(flight, world, settings, work, stages, mask, starting):
             work.mask = select(measured, 1.0, 0.0)
             call_stage(stages, _CORRUPT_GNSS, flight, world, world, settings, work, 0)
         if settings.gnss_velocity > 0:
-            measure_gnss_velocity(flight, world, measured)
+            velocity.measure(flight, world, measured)
     wait = select(due, 1.0 * settings.gnss_ticks, flight.gnss_wait) - 1.0
     flight.gnss_wait = select(mask, wait, flight.gnss_wait)
+    if settings.gnss_baseline == 0:
+        paired = paired & logical_not(measured)
     fresh, alone = measured & (settings.gnss_ticks > 0), measured & logical_not(paired)
     fresh = fresh & (starting or settings.gnss_delay == 0)
     flight.position_fresh = select(fresh, 1.0, flight.position_fresh)
@@ -79,7 +77,7 @@ def _sample_camera(flight, world, settings, work, stages, mask):
     for i in range(settings.feature_count):
         flight.feature_valid[i] = select(mask, 0.0, flight.feature_valid[i])
     if any_of(due):
-        measure_features(flight, world, settings.feature_count, due)
+        features.measure(flight, world, settings.feature_count, due)
         if settings.camera_limited:
             work.mask = select(due, 1.0, 0.0)
             call_stage(stages, _LIMIT_CAMERA, flight, world, world, settings, work, 0)

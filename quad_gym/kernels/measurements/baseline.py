@@ -1,0 +1,181 @@
+"""GNSS baseline: the direction from the primary to the secondary antenna.
+
+It measures `z = unit(R^T l_b)` in I with noise across that direction. With a pair of sigma points,
+R(+-e) R_hat = (I + even +- odd) R_hat, that is R_hat^T odd^T u and R_hat^T even^T u, u = unit(l_b);
+the derivative along an offset is R_hat^T (de x u).
+"""
+
+import math
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.directions import direction_noise
+from quad_gym.kernels.filter.error_state import E
+from quad_gym.kernels.filter.recovery import camera_fits, follow_drift
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    keep3,
+    load3,
+    load33,
+    load_column3,
+    norm,
+    scale,
+    store3,
+)
+from quad_gym.kernels.measurements.gate import judge_direction, leave_out, mark_block
+from quad_gym.kernels.measurements.rows import (
+    clear_slow_columns,
+    columns_of,
+    put_noise,
+    put_three,
+)
+from quad_gym.kernels.measurements.waiting import exchange_three
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import BASELINE_BLOCK, FilterForm, Sensor
+
+SENSOR = Sensor.GNSS
+_GNSS, _EKF = int(SENSOR), int(FilterForm.EKF)
+
+# ---- simulation ------------------------------------------------------------------------------
+
+
+@kernel
+def noisy_baseline(r_b, normals, sigma_b, floor, length):
+    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, known length.
+
+    The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section
+    3.1).
+    """
+    size = norm(r_b)
+    u = scale(1.0 / size, r_b)
+    b = math.sqrt(floor)
+    a = math.sqrt((size * sigma_b) * (size * sigma_b) + floor)
+    along = dot(u, normals)
+    noisy = add(add(r_b, scale(a, normals)), scale((b - a) * along, u))
+    return scale(length / norm(noisy), noisy)
+
+
+@kernel
+def measure(flight, p, R_BI, normals, mask):
+    """Measure the baseline in G, where `mask`."""
+    baseline_G = apply_transposed(load33(p.R_IG), apply_transposed(R_BI, load3(p.baseline)))
+    measured = noisy_baseline(
+        baseline_G, normals, p.baseline_sigma, p.direction_floor, p.baseline_length
+    )
+    keep3(flight.gnss_baseline, mask, measured)
+
+
+# ---- update ----------------------------------------------------------------------------------
+
+
+@kernel
+def count(flight, p, work, settings, slow, k):
+    """Count what is measured; return the row behind it."""
+    if any_of(flight.baseline_valid > 0.0):
+        work.measured = work.measured + 3.0 * flight.baseline_valid
+        k += 3
+    return k
+
+
+@kernel
+def _center(flight, p, work, k, has, R_BI, unit_baseline):
+    """Fill the rows of what is expected, of what was measured, and of the noise."""
+    u_I = apply_transposed(R_BI, unit_baseline)
+    put_three(work.h, k, has, u_I)
+    measured = apply(load33(p.R_IG), load3(flight.gnss_baseline))
+    put_three(work.z, k, has, scale(1.0 / norm(measured), measured))
+    variance = p.baseline_noise * p.baseline_noise
+    put_noise(work, k, has, direction_noise(u_I, variance, p.direction_floor))
+
+
+@kernel
+def expect(flight, p, work, settings, slow, k):
+    """Fill the rows from k on, if any lane has a baseline; return the row behind them."""
+    if not any_of(flight.baseline_valid > 0.0):
+        return k
+    L, last, has = flight.L, columns_of(slow) - 1, flight.baseline_valid > 0.0
+    R_BI, inverse_c = load33(flight.R_hat), 1.0 / work.spread
+    unit_baseline = scale(1.0 / p.baseline_length, load3(p.baseline))
+    _center(flight, p, work, k, has, R_BI, unit_baseline)
+    clear_slow_columns(work, k, slow)
+    for j in range(9):
+        A, S = work.A[last - j], work.E[8 - j]
+        if (settings.form & _EKF) != 0:
+            turned = cross(load_column3(L, E, j), unit_baseline)
+            put_three(A, k, has, apply_transposed(R_BI, turned))
+            put_three(S, k, has, scale(0.0, turned))
+        else:
+            baseline_odd = scale(inverse_c, apply_transposed(load33(work.odd[j]), unit_baseline))
+            baseline_even = scale(inverse_c, apply_transposed(load33(work.even[j]), unit_baseline))
+            put_three(A, k, has, apply_transposed(R_BI, baseline_odd))
+            put_three(S, k, has, apply_transposed(R_BI, baseline_even))
+    return k + 3
+
+
+@kernel
+def judge(flight, p, work, settings, slow, k):
+    """Keep the innovation in the rows from k on, and mask it beyond the gate."""
+    if not any_of(flight.baseline_valid > 0.0):
+        return k
+    has, columns = (work.taking > 0.0) & (flight.baseline_valid > 0.0), columns_of(slow)
+    rejected, _, scaled, nis = judge_direction(
+        flight, p, work, settings, k, BASELINE_BLOCK, has, columns, np.inf
+    )
+    first = has & logical_not(work.again > 0.0)
+    follow_drift(flight, BASELINE_BLOCK, first, scaled[0], scaled[1], 0.0 * p.sigma_beta)
+    # as for positions, see there
+    counts = select(has & logical_not(rejected & camera_fits(flight, p)), 1.0, 0.0)
+    work.judged_nis = work.judged_nis + counts * nis
+    work.judged_freedoms = work.judged_freedoms + 2.0 * counts
+    leave_out(flight, work, settings, k, BASELINE_BLOCK, has, rejected, columns, 3.0)
+    return k + 3
+
+
+@kernel
+def mark_failed(flight, p, work, settings, slow, k):
+    """Say that the update failed that it was part of, where `work.taking`."""
+    mark_block(flight, BASELINE_BLOCK, (work.taking > 0.0) & (flight.baseline_valid > 0.0))
+    return k
+
+
+# ---- late measurements -----------------------------------------------------------------------
+
+
+@kernel
+def set_aside(flight, p, work, settings, slow, k):
+    """Keep what has arrived so far, before something new is measured."""
+    store3(work.kept_baseline, load3(flight.gnss_baseline))
+    return k
+
+
+@kernel
+def exchange(flight, p, work, settings, slow, starting):
+    """Let what is measured now wait, and what waited arrive."""
+    z, valid = flight.gnss_baseline, flight.baseline_valid
+    arrived = exchange_three(
+        flight, work, BASELINE_BLOCK, z, valid, flight.late_baseline, work.kept_baseline
+    )
+    flight.baseline_valid = select(work.mask > 0.0, arrived, valid)
+    if not starting:  # a first fix has started the filter
+        store3(flight.gnss_baseline, load3(work.kept_baseline))
+        flight.baseline_fresh = select(arrived > 0.0, 1.0, flight.baseline_fresh)
+    return starting
+
+
+@kernel
+def keep_valid(flight, p, work, settings, slow, k):
+    """Keep whether it is measured, for the turns of late measurements."""
+    work.kept_valid[BASELINE_BLOCK] = flight.baseline_valid
+    return k
+
+
+@kernel
+def choose(flight, p, work, settings, slow, k):
+    """Let it be measured only where its sensor has its turn."""
+    flight.baseline_valid = work.turn[_GNSS] * work.kept_valid[BASELINE_BLOCK]
+    return k

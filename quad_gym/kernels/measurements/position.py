@@ -1,0 +1,186 @@
+"""GNSS position: of the primary antenna.
+
+It measures `z = r + R^T l_p + d + v` in I, with white noise v and, where positions drift, a slow
+error d, which may be a state of the filter (`filter/slow.py`). With a pair of sigma points, R(+-e)
+R_hat = (I + even +- odd) R_hat, that is
+
+    odd:   dr + R_hat^T odd^T l_p + dd,   even:   R_hat^T even^T l_p,
+
+and the derivative along an offset is dr + R_hat^T (de x l_p) + dd.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.error_state import E, R
+from quad_gym.kernels.filter.recovery import camera_fits
+from quad_gym.kernels.maths.elementary import exp, log
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    cross,
+    keep3,
+    load3,
+    load33,
+    load_column3,
+    scale,
+    store3,
+)
+from quad_gym.kernels.maths.random import six_normals, stream_of
+from quad_gym.kernels.measurements.gate import judge_triple, leave_out, mark_block
+from quad_gym.kernels.measurements.rows import (
+    clear_slow_columns,
+    columns_of,
+    put_noise,
+    put_three,
+)
+from quad_gym.kernels.measurements.waiting import exchange_three
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, FilterForm, Sensor
+
+SENSOR = Sensor.GNSS
+_GNSS, _EKF = int(SENSOR), int(FilterForm.EKF)
+
+# ---- simulation ------------------------------------------------------------------------------
+
+
+@kernel
+def measure(flight, p, R_BI, normals, mask):
+    """Measure the antenna's position in G, where `mask`."""
+    s = load3(p.gnss_sigma)
+    antenna_I = add(load3(flight.r), apply_transposed(R_BI, load3(p.antenna)))
+    noise_I = (s[0] * normals[0], s[1] * normals[1], s[2] * normals[2])
+    noise_I = add(noise_I, load3(flight.gnss_drift))
+    keep3(flight.gnss_position, mask, apply_transposed(load33(p.R_IG), add(antenna_I, noise_I)))
+
+
+@kernel
+def drift_gnss(flight, p, mask, share):
+    """Step the slow error of GNSS positions from one measurement to the next, where `mask`.
+
+    The first measurement comes a `share` of the period after the start.
+    """
+    n, _ = six_normals(stream_of(flight), DRAW_DRIFT)
+    d, s, whole = load3(flight.gnss_drift), load3(p.drift_drive), p.drift_decay
+    decay = exp(share * log(whole))
+    root = math.sqrt((1.0 - decay) * (1.0 + decay) / ((1.0 - whole) * (1.0 + whole)))
+    drive = (root * s[0] * n[0], root * s[1] * n[1], root * s[2] * n[2])
+    keep3(flight.gnss_drift, mask, add(scale(decay, d), drive))
+
+
+# ---- update ----------------------------------------------------------------------------------
+
+
+@kernel
+def count(flight, p, work, settings, slow, k):
+    """Count what is measured; return the row behind it."""
+    if any_of(flight.position_valid > 0.0):
+        work.measured = work.measured + 3.0 * flight.position_valid
+        k += 3
+    return k
+
+
+@kernel
+def _center(flight, p, work, k, has, R_BI, slow):
+    """Fill the rows of what is expected, of what was measured, and of the noise."""
+    antenna_I = add(load3(flight.r_hat), apply_transposed(R_BI, load3(p.antenna)))
+    if slow is not None:
+        if slow.estimates_drift:
+            antenna_I = add(antenna_I, load3(flight.slow_hat))
+    put_three(work.h, k, has, antenna_I)
+    put_three(work.z, k, has, apply(load33(p.R_IG), load3(flight.gnss_position)))
+    s = load3(p.gnss_sigma)
+    zero = 0.0 * s[0]
+    noise = ((s[0] * s[0], zero, zero), (zero, s[1] * s[1], zero), (zero, zero, s[2] * s[2]))
+    put_noise(work, k, has, noise)
+
+
+@kernel
+def expect(flight, p, work, settings, slow, k):
+    """Fill the rows from k on, if any lane has a position; return the row behind them."""
+    if not any_of(flight.position_valid > 0.0):
+        return k
+    L, last, has = flight.L, columns_of(slow) - 1, flight.position_valid > 0.0
+    R_BI, antenna, inverse_c = load33(flight.R_hat), load3(p.antenna), 1.0 / work.spread
+    _center(flight, p, work, k, has, R_BI, slow)
+    clear_slow_columns(work, k, slow)
+    for j in range(9):
+        A, S = work.A[last - j], work.E[8 - j]
+        dr = load_column3(L, R, j)
+        if (settings.form & _EKF) != 0:
+            lever = cross(load_column3(L, E, j), antenna)
+            put_three(A, k, has, add(dr, apply_transposed(R_BI, lever)))
+            put_three(S, k, has, scale(0.0, dr))
+        else:
+            lever_odd = scale(inverse_c, apply_transposed(load33(work.odd[j]), antenna))
+            lever_even = scale(inverse_c, apply_transposed(load33(work.even[j]), antenna))
+            put_three(A, k, has, add(dr, apply_transposed(R_BI, lever_odd)))
+            put_three(S, k, has, apply_transposed(R_BI, lever_even))
+    if slow is not None:
+        if slow.estimates_drift:
+            for j in range(last + 1):
+                row = work.A[last - j]
+                for i in range(3):
+                    row[k + i] = row[k + i] + select(has, flight.L_slow[i, j], 0.0)
+    return k + 3
+
+
+@kernel
+def judge(flight, p, work, settings, slow, k):
+    """Keep the innovation in the rows from k on, and mask it beyond the gate."""
+    if not any_of(flight.position_valid > 0.0):
+        return k
+    has, columns = (work.taking > 0.0) & (flight.position_valid > 0.0), columns_of(slow)
+    rejected, nis = judge_triple(flight, p, work, settings, k, POSITION_BLOCK, has, columns)
+    # a fix that is rejected while the camera fits tells of GNSS, not of the filter
+    counts = select(has & logical_not(rejected & camera_fits(flight, p)), 1.0, 0.0)
+    work.judged_nis = work.judged_nis + counts * nis
+    work.judged_freedoms = work.judged_freedoms + 3.0 * counts
+    leave_out(flight, work, settings, k, POSITION_BLOCK, has, rejected, columns, 3.0)
+    return k + 3
+
+
+@kernel
+def mark_failed(flight, p, work, settings, slow, k):
+    """Say that the update failed that it was part of, where `work.taking`."""
+    mark_block(flight, POSITION_BLOCK, (work.taking > 0.0) & (flight.position_valid > 0.0))
+    return k
+
+
+# ---- late measurements -----------------------------------------------------------------------
+
+
+@kernel
+def set_aside(flight, p, work, settings, slow, k):
+    """Keep what has arrived so far, before something new is measured."""
+    store3(work.kept_position, load3(flight.gnss_position))
+    return k
+
+
+@kernel
+def exchange(flight, p, work, settings, slow, starting):
+    """Let what is measured now wait, and what waited arrive."""
+    z, valid = flight.gnss_position, flight.position_valid
+    arrived = exchange_three(
+        flight, work, POSITION_BLOCK, z, valid, flight.late_position, work.kept_position
+    )
+    flight.position_valid = select(work.mask > 0.0, arrived, valid)
+    if not starting:  # a first fix has started the filter
+        store3(flight.gnss_position, load3(work.kept_position))
+        flight.position_fresh = select(arrived > 0.0, 1.0, flight.position_fresh)
+    return starting
+
+
+@kernel
+def keep_valid(flight, p, work, settings, slow, k):
+    """Keep whether it is measured, for the turns of late measurements."""
+    work.kept_valid[POSITION_BLOCK] = flight.position_valid
+    return k
+
+
+@kernel
+def choose(flight, p, work, settings, slow, k):
+    """Let it be measured only where its sensor has its turn."""
+    flight.position_valid = work.turn[_GNSS] * work.kept_valid[POSITION_BLOCK]
+    return k

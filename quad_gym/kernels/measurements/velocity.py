@@ -1,0 +1,148 @@
+"""GNSS velocity: of the primary antenna.
+
+It measures `z = v + R^T (w x l_p) + v_noise` in I, with body rates w from the gyro. That the lever
+arm's share turns with the error angles is neglected, so that the model is linear: dz = dv.
+"""
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.error_state import V
+from quad_gym.kernels.maths.linalg import (
+    add,
+    add_to_diagonal,
+    apply,
+    apply_transposed,
+    cross,
+    keep3,
+    load3,
+    load4,
+    load33,
+    load_column3,
+    scale,
+    store3,
+    sub,
+)
+from quad_gym.kernels.maths.random import six_normals, stream_of
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.measurements.gate import judge_triple, leave_out, mark_block
+from quad_gym.kernels.measurements.rows import (
+    clear_slow_columns,
+    columns_of,
+    put_noise,
+    put_three,
+)
+from quad_gym.kernels.measurements.waiting import exchange_three
+from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK, Sensor
+
+SENSOR = Sensor.GNSS
+_GNSS = int(SENSOR)
+
+# ---- simulation ------------------------------------------------------------------------------
+
+
+@kernel
+def measure(flight, p, mask):
+    """Measure the antenna's velocity in G, where `mask`."""
+    R_BI, R_IG = quaternion_to_dcm(load4(flight.q)), load33(p.R_IG)
+    n, _ = six_normals(stream_of(flight), DRAW_VELOCITY)
+    lever_B = cross(load3(flight.w), load3(p.antenna))
+    v_I = add(load3(flight.v), apply_transposed(R_BI, lever_B))
+    keep3(flight.gnss_velocity, mask, apply_transposed(R_IG, add(v_I, scale(p.velocity_sigma, n))))
+
+
+# ---- update ----------------------------------------------------------------------------------
+
+
+@kernel
+def count(flight, p, work, settings, slow, k):
+    """Count what is measured; return the row behind it."""
+    if any_of(flight.velocity_valid > 0.0):
+        work.measured = work.measured + 3.0 * flight.velocity_valid
+        k += 3
+    return k
+
+
+@kernel
+def _center(flight, p, work, k, has):
+    """Fill the rows of what is expected, of what was measured, and of the noise."""
+    w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
+    lever_B = cross(w_B, load3(p.antenna))
+    lever_I = apply_transposed(load33(flight.R_hat), lever_B)
+    put_three(work.h, k, has, add(load3(flight.v_hat), lever_I))
+    put_three(work.z, k, has, apply(load33(p.R_IG), load3(flight.gnss_velocity)))
+    variance = p.velocity_sigma * p.velocity_sigma
+    zero = 0.0 * variance
+    nothing = (zero, zero, zero)
+    put_noise(work, k, has, add_to_diagonal((nothing, nothing, nothing), variance))
+
+
+@kernel
+def expect(flight, p, work, settings, slow, k):
+    """Fill the rows from k on, if any lane has a velocity; return the row behind them."""
+    if not any_of(flight.velocity_valid > 0.0):
+        return k
+    L, last, has = flight.L, columns_of(slow) - 1, flight.velocity_valid > 0.0
+    _center(flight, p, work, k, has)
+    clear_slow_columns(work, k, slow)
+    for j in range(9):
+        dv = load_column3(L, V, j)
+        put_three(work.A[last - j], k, has, dv)
+        put_three(work.E[8 - j], k, has, scale(0.0, dv))
+    return k + 3
+
+
+@kernel
+def judge(flight, p, work, settings, slow, k):
+    """Keep the innovation in the rows from k on, and mask it beyond the gate."""
+    if not any_of(flight.velocity_valid > 0.0):
+        return k
+    has, columns = (work.taking > 0.0) & (flight.velocity_valid > 0.0), columns_of(slow)
+    rejected, nis = judge_triple(flight, p, work, settings, k, VELOCITY_BLOCK, has, columns)
+    work.judged_nis = work.judged_nis + nis
+    work.judged_freedoms = work.judged_freedoms + select(has, 3.0, 0.0)
+    leave_out(flight, work, settings, k, VELOCITY_BLOCK, has, rejected, columns, 3.0)
+    return k + 3
+
+
+@kernel
+def mark_failed(flight, p, work, settings, slow, k):
+    """Say that the update failed that it was part of, where `work.taking`."""
+    mark_block(flight, VELOCITY_BLOCK, (work.taking > 0.0) & (flight.velocity_valid > 0.0))
+    return k
+
+
+# ---- late measurements -----------------------------------------------------------------------
+
+
+@kernel
+def set_aside(flight, p, work, settings, slow, k):
+    """Keep what has arrived so far, before something new is measured."""
+    store3(work.kept_velocity, load3(flight.gnss_velocity))
+    return k
+
+
+@kernel
+def exchange(flight, p, work, settings, slow, starting):
+    """Let what is measured now wait, and what waited arrive."""
+    z, valid = flight.gnss_velocity, flight.velocity_valid
+    arrived = exchange_three(
+        flight, work, VELOCITY_BLOCK, z, valid, flight.late_velocity, work.kept_velocity
+    )
+    flight.velocity_valid = select(work.mask > 0.0, arrived, valid)
+    if not starting:
+        store3(flight.gnss_velocity, load3(work.kept_velocity))
+    return starting
+
+
+@kernel
+def keep_valid(flight, p, work, settings, slow, k):
+    """Keep whether it is measured, for the turns of late measurements."""
+    work.kept_valid[VELOCITY_BLOCK] = flight.velocity_valid
+    return k
+
+
+@kernel
+def choose(flight, p, work, settings, slow, k):
+    """Let it be measured only where its sensor has its turn."""
+    flight.velocity_valid = work.turn[_GNSS] * work.kept_valid[VELOCITY_BLOCK]
+    return k

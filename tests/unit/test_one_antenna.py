@@ -1,0 +1,153 @@
+"""GNSS with one antenna: no baseline; the magnetometer tells the heading of the filter's start."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym import ExtendedKalmanFilter, FlightBatch, UnscentedKalmanFilter
+from quad_gym.frames import ecef_to_enu
+from quad_gym.packing.aids import slow_states
+from quad_gym.records import AID_BLOCKS, BASELINE_BLOCK, Aid
+from quad_gym.sensors import GnssReceiver
+from tests.field_flights import fly, small_euler_angles, state_errors, steps
+
+CONSUMER = quad_gym.sensor_suite("consumer")
+IMU, GNSS, MAGNETOMETER = CONSUMER.imu, CONSUMER.gnss, CONSUMER.magnetometer
+R_IG = ecef_to_enu(GNSS.reference_antenna_G)
+PLACES = slow_states(CONSUMER)
+IRON = PLACES.vectors[Aid.MAGNETOMETER]
+DELTA = PLACES.scalars[Aid.MAGNETOMETER]
+JOINT = [*range(15), *(15 + IRON + np.arange(3)), 15 + DELTA]
+
+
+def field_in_I(declination_error):
+    """The field whose declination is more by this, turned about the vertical by SciPy."""
+    return Rotation.from_euler("z", -declination_error).apply(MAGNETOMETER.field_I)
+
+
+def nees_of(errors, factors):
+    """Of states, hard iron and declination, from factors (n, 24, 24) of the joint covariance."""
+    P = (factors @ factors.transpose(0, 2, 1))[:, JOINT][:, :, JOINT]
+    return (errors * np.linalg.solve(P, errors[..., np.newaxis])[..., 0]).sum(axis=1)
+
+
+def factor_of(read):
+    L = np.zeros((24, 24))
+    L[:15, :15], L[15:] = read("L"), read("L_slow")
+    return L
+
+
+@pytest.mark.parametrize("by_accelerometer", [False, True], ids=["level", "tilted"])
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_a_start_is_as_good_as_its_covariance_says(kind, by_accelerometer):
+    """Errors of state, hard iron and declination together, over starts with any heading.
+
+    A tilt by half a radian for the accelerometer; the mean of 600 NEES deviates by 0.25.
+    """
+    rng, ukf, errors, factors = np.random.default_rng(7), kind(CONSUMER), [], []
+    tilt = 0.5 if by_accelerometer else CONSUMER.estimator.initial_tilt_sigma
+    for _ in range(600):
+        about_up = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
+        R_BI = (about_up * Rotation.from_euler("xy", rng.normal(0.0, tilt, 2))).inv().as_matrix()
+        b_a, b_g = rng.normal(0.0, [[IMU.accel_bias_sigma], [IMU.gyro_bias_sigma]], (2, 3))
+        iron = rng.normal(0.0, MAGNETOMETER.hard_iron_sigma, 3)
+        delta = rng.normal(0.0, MAGNETOMETER.declination_sigma)
+        v = rng.normal(0.0, np.sqrt(CONSUMER.estimator.initial_velocity_variance), 3)
+        r = rng.normal(0.0, 5.0, 3)
+        antenna = r + R_BI.T @ GNSS.primary_antenna_B
+        up = np.array([0.0, 0.0, CONSUMER.estimator.gravity])
+        accel = R_BI @ up + b_a + rng.normal(0.0, IMU.believed_accel_sigma, 3)
+        field = R_BI @ field_in_I(delta) + iron + rng.normal(0.0, MAGNETOMETER.noise_sigma, 3)
+        ukf.initialize(
+            R_IG.T @ (antenna + rng.normal(0.0, GNSS.position_sigma_I)),
+            accel=accel if by_accelerometer else None,
+            magnetometer=field,
+        )
+        angles = small_euler_angles((R_BI @ ukf.R_BI.T)[np.newaxis])[0]
+        biases = b_a - ukf.accel_bias, b_g - ukf.gyro_bias
+        found = r - ukf.position, v - ukf.velocity, angles, *biases, iron, [delta]
+        errors.append(np.concatenate(found))
+        factors.append(factor_of(ukf._read))
+    assert nees_of(np.array(errors), np.array(factors)).mean() == pytest.approx(19.0, abs=1.2)
+
+
+@pytest.mark.parametrize("start", ["ground", "hover"])
+def test_flights_start_as_well_as_their_covariance_says(start):
+    """The mean of 2,000 NEES deviates by 0.14 where errors are Gaussian."""
+    batch = fly(CONSUMER, 2000, task="hover", start=start)
+    errors = np.zeros((2000, 19))
+    errors[:, :15] = state_errors(batch)
+    errors[:, 15:18] = batch.read("aid_vector")[:, Aid.MAGNETOMETER]
+    errors[:, 18] = batch.read("aid_scalar")[:, Aid.MAGNETOMETER]
+    factors = np.zeros((2000, 24, 24))
+    factors[:, :15, :15], factors[:, 15:] = batch.read("L"), batch.read("L_slow")
+    heading = abs(errors[:, 8])
+    assert 0.03 < heading.mean() < 0.08
+    mean = nees_of(errors, factors).mean()
+    assert mean < 19.7
+    # standing vehicles are stiller and more level than the filter takes them for
+    assert mean > (18.3 if start == "hover" else 12.0)
+
+
+def test_the_sample_that_starts_a_filter_counts_once():
+    suite = CONSUMER.replace(
+        barometer=CONSUMER.barometer.replace(phase=0.0),
+        magnetometer=MAGNETOMETER.replace(phase=0.0),
+    )
+    for start, valid in (("cold", 0.0), ("warm", 1.0)):
+        batch = fly(suite, 16, filter_start=start)
+        assert (batch.read("aid_valid")[:, Aid.MAGNETOMETER] == valid).all()
+        assert (batch.read("aid_valid")[:, Aid.BAROMETER] == 1.0).all()
+        nis = batch.read("block_nis")[:, AID_BLOCKS + Aid.MAGNETOMETER]
+        assert np.isfinite(nis).all() == (start == "warm")
+
+
+def test_there_is_no_baseline_ever():
+    batch = fly(CONSUMER, 16)
+    for _ in range(30):
+        steps(batch, 0.05)
+        assert not batch.read("baseline_valid").any()
+        assert not batch.read("baseline_fresh").any()
+        assert not batch.read("gnss_baseline").any()
+    assert np.isnan(batch.read("block_nis")[:, BASELINE_BLOCK]).all()
+    assert np.isfinite(batch.read("block_nis")[:, 0]).all()
+
+
+def test_without_a_magnetometer_the_mark_of_the_start_tells_the_heading():
+    alone = CONSUMER.replace(magnetometer=None)
+    batch = fly(alone, 1000, task="hover")
+    heading = state_errors(batch)[:, 8]
+    sigma = alone.placement.heading_sigma
+    assert np.sqrt((heading**2).mean()) == pytest.approx(sigma, rel=0.15)
+    np.testing.assert_allclose(np.linalg.norm(batch.read("L")[:, 8], axis=1), sigma, rtol=1e-3)
+
+
+def test_a_receiver_with_one_antenna_measures_no_baseline():
+    receiver = GnssReceiver(GNSS, np.random.default_rng(1))
+    position, baseline = receiver.measure(np.zeros(3), np.eye(3))
+    assert np.isfinite(position).all()
+    assert np.isnan(baseline).all()
+
+
+def test_what_belongs_to_two_antennas_is_refused():
+    ukf, fix, field = UnscentedKalmanFilter(CONSUMER), np.zeros(3), MAGNETOMETER.field_I
+    with pytest.raises(ValueError, match="gnss_baseline_G must be None"):
+        ukf.initialize(fix, (1.0, 0.0, 0.0), magnetometer=field)
+    with pytest.raises(ValueError, match="magnetometer must have shape"):
+        ukf.initialize(fix, magnetometer=np.zeros(2))
+    with pytest.raises(RuntimeError):
+        _ = ukf.position
+    ukf.initialize(fix, magnetometer=field)
+    with pytest.raises(ValueError, match="gnss_baseline_G must be None"):
+        ukf.update(gnss_baseline_G=(1.0, 0.0, 0.0))
+    two = UnscentedKalmanFilter(quad_gym.sensor_suite("rtk"))
+    with pytest.raises(ValueError, match="magnetometer must not be given"):
+        two.initialize(fix, (1.0, 0.0, 0.0), magnetometer=field)
+    with pytest.raises(ValueError, match="secondary_antenna_B must be given"):
+        _ = GNSS.baseline_B
+    with pytest.raises(ValueError, match="GNSS with two antennas"):
+        FlightBatch(1, sensors=CONSUMER, randomization={"baseline_sigma": quad_gym.Uniform(0, 1)})
+    true = CONSUMER.replace(gnss=GNSS.replace(secondary_antenna_B=(0.1, 0.0, 0.05)))
+    with pytest.raises(ValueError, match="presence of a GNSS baseline"):
+        FlightBatch(1, sensors=CONSUMER, true_sensors=true)
