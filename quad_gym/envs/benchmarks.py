@@ -55,7 +55,7 @@ BENCHMARKS = {
             ground=0.0,
         ),
         {
-            "sensors": "consumer_barometer",
+            "sensors": "consumer",
             "world": "slalom",
             "faults": (GnssOutage(start=(2.0, 8.0), duration=(5.0, 15.0)),),
             "custom": "quad_gym.tasks.outage_dash:OutageDash",

@@ -149,7 +149,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
         sensors: "standard", "lab", "rtk", "consumer", "indoor", or a suite that belongs to one task
             (see `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is
-            "one_wall", that of `StaleRace` "stale", and that of `OutageDash` "consumer_barometer".
+            "one_wall", that of `StaleRace` "stale", and that of `OutageDash` "consumer".
             "standard" has the laboratory's sensors and a consistent filter; "lab"
             is the report's form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter

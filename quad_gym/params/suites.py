@@ -9,11 +9,10 @@
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, taken for fresh | as `rtk`, 10 ms late, likewise | as `rtk` |
-| `consumer_barometer` | as `consumer`, and a barometer | none | cheap MEMS |
 
-The last three belong to `QuadGym/LookAround-v0`, `StaleRace-v0` and `OutageDash-v0`, one each:
-nobody would choose sensors that see the way home in one direction alone, or a filter that ignores
-time stamps. They are not among SUITES, on which results for all tasks are based.
+The last two belong to `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: nobody would choose
+sensors that see the way home in one direction alone, or a filter that ignores time stamps, and they
+are not among SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so that cameras of 30 Hz run at 25 Hz, a whole division of it. Outside `lab`
 the phases of GNSS and camera are drawn anew in each episode, the fix that starts the filter is
@@ -250,10 +249,6 @@ STALE = RTK.replace(
 )
 """For `StaleRace`: `rtk` with a filter that takes late measurements for fresh."""
 
-CONSUMER_BAROMETER = CONSUMER.replace(barometer=BarometerParams())
-"""For `OutageDash`: `consumer` with the barometer that every hobby vehicle has, so that an outage
-of GNSS costs the position in the plane, and not the height."""
-
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
     # the laboratory's pixels are coarse, so that images need not be processed in steps, and no
@@ -280,7 +275,6 @@ _ALL = {
     **_SUITES,
     "one_wall": ONE_WALL,
     "stale": STALE,
-    "consumer_barometer": CONSUMER_BAROMETER,
 }
 
 ALL_SUITES = tuple(_ALL)

@@ -42,7 +42,7 @@ def test_what_the_task_is_by_default():
     flights = make(1).unwrapped.flights
     assert flights.name == "outage_dash"
     assert flights.batch.max_steps == 1000
-    assert flights.batch.sensors == quad_gym.sensor_suite("consumer_barometer")
+    assert flights.batch.sensors == quad_gym.sensor_suite("consumer")
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
     assert [f.name for f in flights.table] == ["last_action", *SHOWN]
     assert flights.space.shape == (25,)
