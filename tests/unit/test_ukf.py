@@ -79,7 +79,7 @@ def assert_equal(worst):
     assert worst["covariance"] < 1e-9
 
 
-@pytest.mark.parametrize("cycles", [150, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cycles", [100, pytest.param(1000, marks=pytest.mark.slow)])
 def test_the_filter_equals_the_plain_filter_over_many_cycles(cycles):
     worst, cases = compare(LAB, cycles, seed=3)
     assert_equal(worst)
@@ -105,7 +105,7 @@ def test_the_filter_equals_the_plain_filter_over_many_cycles(cycles):
     ids=str,
 )
 def test_the_filter_equals_the_plain_filter_with_other_choices(choices):
-    worst, _ = compare(estimator(**choices), 30, seed=4)
+    worst, _ = compare(estimator(**choices), 20, seed=4)
     assert_equal(worst)
 
 

@@ -89,7 +89,10 @@ def test_a_part_that_cannot_be_compiled_raises_in_the_parent(parts):
 
 
 @linux
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "how",
+    [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+)
 def test_no_worker_outlives_a_parent_that_is_told_to_end(parts, how):
     """Ctrl-C, a request to end, and a kill: no process and no damaged file is left."""
     process = parts.start(MOOD="dawdle")
