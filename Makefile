@@ -61,7 +61,7 @@ $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 		--editable ".[train,plot,render]" pytest hypothesis
 	touch $@
 
-test-slow: setup  ## the slow statistical and soak tests
+test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
 soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults
