@@ -4,14 +4,17 @@ JOBS ?= 2
 VENV := .venv
 OLDEST := .venv-oldest
 BIN := $(VENV)/bin
-INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+# files are compiled to bytecode when they are first imported: most of them never are
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
 .PHONY: setup demo circle animation compare study test test-oldest test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
-$(VENV)/.user: pyproject.toml constraints.txt
+$(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.user: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[plot]"
 	touch $@
 
@@ -19,9 +22,9 @@ $(VENV)/.trainer: $(VENV)/.user
 	$(INSTALL) ".[train,plot]"
 	touch $@
 
-$(VENV)/.developer: $(VENV)/.user
+$(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[train,plot,render,pandas,ulog,rerun,export,dev]"
-	touch $@
+	touch $(VENV)/.user $(VENV)/.trainer $@  # which it holds
 
 $(VENV)/.writer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,docs]"
@@ -58,7 +61,7 @@ $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 		--editable ".[train,plot,render]" pytest hypothesis
 	touch $@
 
-test-slow: setup  ## the slow statistical and soak tests
+test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
 soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults

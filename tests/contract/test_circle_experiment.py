@@ -120,10 +120,14 @@ def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
         assert found["sd"] is None
 
 
-def test_without_camera(tmp_path, capsys):
+def test_without_camera(tmp_path, capsys, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(script.plots, "save_figure", lambda figure, path: drawn.append(path) or [])
     summary = run(tmp_path, "--seeds 2 --duration 1 --no-camera")
     assert set(summary["cases"]) == {"truth", "estimate_without_camera"}
-    assert not (tmp_path / "path_estimate.png").exists()
+    names = {path.name for path in drawn}
+    assert "path_estimate_without_camera" in names
+    assert "path_estimate" not in names
     assert "Having the camera" not in capsys.readouterr().out
 
 

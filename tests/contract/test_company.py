@@ -11,7 +11,6 @@ import sys
 import threading
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
@@ -22,15 +21,11 @@ from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels.compiling import cores
 from tests.contract.comparing import actions_of, assert_same
+from tests.contract.hovering import SHORT, further, hover
 
 PATIENCE = 300
 """Seconds after which a process is taken to hang."""
-SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 STARTS = ["fork", "spawn"]
-
-
-def hover():
-    return gymnasium.make("quad_gym:QuadGym/Hover-v0", **SHORT)
 
 
 def expected_run(n, mode, seed=7, steps=40, batch_threads=1):
@@ -65,7 +60,10 @@ def test_gymnasiums_processes_fly_the_same(context):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("start_method", STARTS)
+@pytest.mark.parametrize(
+    "start_method",
+    ["fork", pytest.param("spawn", marks=pytest.mark.slow)],  # each process imports torch anew
+)
 def test_stable_baselines3s_processes_fly_the_same(start_method):
     env = SubprocVecEnv([hover] * 2, start_method=start_method)
     try:
@@ -137,16 +135,12 @@ def test_a_fork_after_the_first_step_flies_on_with_its_own_threads():
     assert_same(in_a_fork(fly_on), in_a_fork(fly_on))
 
 
-def further(env, k=3):
-    return [env.step(np.full((9, 4), 0.1))[:4] for _ in range(k)]
-
-
 def test_an_environment_travels_to_a_worker_in_mid_episode():
     env = QuadVectorEnv(9, "hover", threads=2)
     env.reset(seed=3)
     env.step(np.zeros((9, 4)))
     code = (
-        "import pickle, sys; from tests.contract.test_company import further;"
+        "import pickle, sys; from tests.contract.hovering import further;"
         "env = pickle.load(sys.stdin.buffer);"
         "sys.stdout.buffer.write(pickle.dumps(further(env)))"
     )
@@ -199,6 +193,7 @@ def test_a_kernel_is_compiled_once_and_loaded_ever_after(filled_cache):
     assert not outcome(start(filled_cache))
 
 
+@pytest.mark.slow  # as many at once, with smaller kernels: tests/unit/compiling/test_processes.py
 def test_two_processes_may_fill_an_empty_cache_at_once(tmp_path):
     both = [start(tmp_path) for _ in range(2)]
     outcomes = [outcome(process) for process in both]
@@ -206,6 +201,7 @@ def test_two_processes_may_fill_an_empty_cache_at_once(tmp_path):
     assert not outcome(start(tmp_path))
 
 
+@pytest.mark.slow  # in this process, and more kinds: tests/unit/compiling/test_cache.py
 @pytest.mark.parametrize("damage", ["emptied", "cut", "overwritten"])
 def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, damage):
     cache = tmp_path / "cache"
@@ -220,6 +216,7 @@ def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, damage):
     assert not outcome(start(cache))
 
 
+@pytest.mark.slow  # nine processes; which edits count is in tests/unit/compiling/test_digest.py
 def test_a_change_in_a_kernel_that_it_reaches_means_compiling_anew(tmp_path):
     copy = tmp_path / "quad_gym"
     source = Path(quad_gym.__file__).parent
@@ -258,6 +255,7 @@ def run_in(folder, begin):
         os.chdir(here)
 
 
+@pytest.mark.slow  # the same with smaller kernels: tests/unit/compiling/test_cache.py
 def test_without_any_writable_folder_kernels_are_compiled_in_every_process(tmp_path):
     source, blocked = Path(quad_gym.__file__).parent, tmp_path / "file"
     copy = tmp_path / "quad_gym"
@@ -292,11 +290,8 @@ def cores_in_a_process(code, **environment):
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no affinity on this system")
 def test_cores_are_limited_by_affinity_and_by_numbas_variable():
     one = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
-    everything = cores_in_a_process("pass")
     assert cores_in_a_process(one) == 1
     assert cores_in_a_process("pass", NUMBA_NUM_THREADS="1") == 1
-    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="999") == everything
-    assert cores_in_a_process("pass", NUMBA_NUM_THREADS="") == everything
 
 
 def test_cores_are_limited_by_a_containers_quota(monkeypatch):
@@ -305,7 +300,14 @@ def test_cores_are_limited_by_a_containers_quota(monkeypatch):
     for quota, expected in ((None, 16), (4, 4), (64, 16)):
         monkeypatch.setattr(cores, "_cgroup_cores", lambda quota=quota: quota)
         assert cores.available_cores() == expected
-    for limit, expected in (("3", 3), ("0", 16), ("-2", 16), ("many", 16)):
+    for limit, expected in (
+        ("3", 3),
+        ("999", 16),
+        ("", 16),
+        ("0", 16),
+        ("-2", 16),
+        ("many", 16),
+    ):
         monkeypatch.setattr(cores, "_cgroup_cores", lambda: None)
         monkeypatch.setenv("NUMBA_NUM_THREADS", limit)
         assert cores.available_cores() == expected

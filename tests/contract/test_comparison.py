@@ -5,10 +5,12 @@ import json
 import os
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
+from quad_gym.commands import compare as command
 from tests import console_commands
 from tests.console import plain
 from tests.console_commands import run
@@ -74,7 +76,7 @@ def compare(where, *more):
     return run("compare", *line, *more, where=where)
 
 
-def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
+def test_compare_reports_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     done = compare(tmp_path)
     assert done.returncode == 0, done.stderr
     for part in ("trained on the estimate", "PD, tuned", "One training seed proves nothing"):
@@ -87,7 +89,9 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
     kept = tmp_path / "out/runs/standard/truth/seed_0/best.zip"
     (tmp_path / "out/runs/standard/truth/seed_0/flown_on_truth.npz").unlink()
     before = kept.stat().st_mtime_ns
-    again = compare(tmp_path)
+    with monkeypatch.context() as patch:  # no further process that imports torch
+        patch.setattr(command, "ProcessPoolExecutor", lambda jobs, _: ThreadPoolExecutor(jobs))
+        again = compare(tmp_path)
     assert again.returncode == 0, again.stderr
     assert kept.stat().st_mtime_ns == before
     assert read_csv(tmp_path / "out/policies.csv") == policies
@@ -96,9 +100,11 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path):
     assert "holds another comparison" in other.stderr
 
 
+@pytest.mark.slow  # three processes with torch; a training that is killed: test_training.py
 def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind(tmp_path):
-    options = ["--steps", "300000", "--env", "duration=1.0", "--output", tmp_path / "out"]
-    line = console_commands.line("compare.py", "--seeds", "1", "--jobs", "2", *options)
+    options = ["--steps", "300000", "--env", "duration=0.2", "--output", tmp_path / "out"]
+    options += ["--seeds", "1", "--jobs", "2", "--train-on", "truth", "noisy"]
+    line = console_commands.line("compare.py", *options)
     process = subprocess.Popen(
         line, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
     )

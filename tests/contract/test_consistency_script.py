@@ -42,7 +42,8 @@ def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
     assert len(found["nees"]["state"]["mean"]) == len(found["rms_errors"]) == 21
 
 
-def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path):
+def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path, monkeypatch):
+    monkeypatch.setattr(script, "save_figure", lambda figure, stem: [])
     assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert not found["consistent"]

@@ -67,10 +67,14 @@ def test_at_every_tick_it_flies_the_circle_like_the_compiled_controller(action, 
     assert np.corrcoef(late.mean(axis=0), late_direct.mean(axis=0))[0, 1] > 0.9
 
 
+EPISODES = [200, pytest.param(1000, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("count", EPISODES)
 @pytest.mark.parametrize("gains", ["lab", "tuned"])
 @pytest.mark.parametrize("env_id", TRACKING)
-def test_it_flies_a_thousand_episodes_of_every_tracking_task_on_the_estimate(env_id, gains):
-    env = gymnasium.make_vec(env_id, num_envs=1000)
+def test_it_flies_every_episode_of_every_tracking_task_on_the_estimate(env_id, gains, count):
+    env = gymnasium.make_vec(env_id, num_envs=count)
     episodes = roll_out(PDPolicy(env, gains), env, seed=0)
     assert not episodes.crashed.any()
     assert (episodes.ending == "time_limit").all()
@@ -99,9 +103,10 @@ def test_it_flies_on_every_observation_of_a_state(observation, layout):
     assert episodes.late_error.mean() < 0.1
 
 
+@pytest.mark.parametrize("count", EPISODES)
 @pytest.mark.parametrize("gains", ["lab", "tuned"])
-def test_it_passes_all_gates(gains):
-    env = gymnasium.make_vec("QuadGym/Waypoints-v0", num_envs=1000)
+def test_it_passes_all_gates(gains, count):
+    env = gymnasium.make_vec("QuadGym/Waypoints-v0", num_envs=count)
     episodes = roll_out(PDPolicy(env, gains), env, seed=0)
     assert not episodes.crashed.any()
     assert (episodes.gates_passed == 5).all()

@@ -62,6 +62,7 @@ def worker_at(process, folder, rows=3):
     raise AssertionError("no evaluations")
 
 
+@pytest.mark.slow  # seven processes; what the driver does is in test_sweep.py
 def test_workers_and_the_sweep_itself_may_be_killed(tmp_path, undisturbed):
     runs = tmp_path / "out/runs"
     process = start(tmp_path, "--jobs", "1")

@@ -146,7 +146,10 @@ def wait_for(condition, process, seconds=1200.0):
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    [
+        signal.SIGKILL,
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGINT, signal.SIGTERM)),
+    ],
 )
 def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
     folder = tmp_path / "run"
@@ -173,8 +176,8 @@ def test_a_killed_run_loses_at_most_one_interval(tmp_path, number):
 
 
 def train_again(folder, steps, where):
-    line = script(folder, "--steps", steps, "--evaluations", "400", "--resume")
-    return subprocess.run(line, cwd=where, capture_output=True, text=True, timeout=240, check=False)
+    more = ("--steps", steps, "--evaluations", "400", "--resume")
+    return console_commands.run("train", *options(folder, *more), where=where)
 
 
 @pytest.mark.parametrize(

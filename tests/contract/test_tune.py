@@ -16,13 +16,13 @@ def tune(*options):
 
 
 def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
-    tiny = ["--candidates", 128, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
+    tiny = ["--candidates", 64, "--episodes", 4, "--fresh-episodes", 8, "--env", "duration=3.0"]
     done = tune("--env-ids", "hover", *tiny, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "gains.json").read_text())
     rows = (tmp_path / "search.csv").read_text().splitlines()
     errors = [float(row.split(",")[0]) for row in rows[1:]]
-    assert len(errors) == record["candidates"] == 128
+    assert len(errors) == record["candidates"] == 64
     assert errors[0] == 1.0  # the gains at the start are the first that fly
     assert min(errors) < 1.0
     best = rows[1:][errors.index(min(errors))].split(",")

@@ -1,8 +1,6 @@
 """What else takes a task: checkers, registration, policies, commands, rendering."""
 
 import json
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -15,6 +13,7 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym.evaluation import evaluate, roll_out
 from quad_gym.tasks import Observed
+from tests import console_commands
 from tests.contract.comparing import assert_same
 from tests.tasks.chase import Chase
 
@@ -186,14 +185,14 @@ def test_functions_have_to_have_the_names_of_methods():
 
 
 def test_the_command_line_flies_and_names_a_task_of_the_working_directory(tmp_path):
-    (tmp_path / "mine.py").write_text(
+    (tmp_path / "task_of_mine.py").write_text(
         "import numpy as np\nimport quad_gym\n"
         "One = quad_gym.Task.of(reward=lambda view: np.ones(view.count))\n"
     )
     words = "evaluate QuadGym/Hover-v0 --policy pd --observation estimate --episodes 2"
-    words += " --env custom=mine:One max_episode_steps=5 --output out"
-    command = [sys.executable, "-m", "quad_gym", *words.split()]
-    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    words += " --env custom=task_of_mine:One max_episode_steps=5 --output out"
+    done = console_commands.run(*words.split(), where=tmp_path)
+    assert done.returncode == 0, done.stderr
     (case,) = json.loads((tmp_path / "out/summary.json").read_text())["cases"]
     assert case["return"] == 5.0
 

@@ -101,10 +101,16 @@ def test_features_in_view_are_those_within_the_angles_of_the_camera():
     assert 0 < seen < 60 * 50 * 8
 
 
-def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not():
+@pytest.fixture(scope="module")
+def facing():
+    """Flights of the rule that always looks at the features."""
+    env = gymnasium.make_vec(ID, num_envs=60)
+    return fly(PDPolicy(env, faces="features"), env, 0)
+
+
+def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not(facing):
     env = gymnasium.make_vec(ID, num_envs=60)
     blind = fly(PDPolicy(env), env, 0)
-    facing = fly(PDPolicy(env, faces="features"), env, 0)
     # 64 % of 500 crash: of 60 at most 24 with a probability below 1e-4
     assert blind.crashed.mean() > 0.4
     assert not facing.crashed.any()
@@ -113,9 +119,8 @@ def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not
     assert facing.error.mean() < 0.1
 
 
-def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading():
+def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_covariance=True)
-    facing = fly(PDPolicy(env, faces="features"), env, 0)
     rule = fly(PDPolicy(env, faces="features_when_unsure"), env, 0)
     assert rule.returns.mean() > facing.returns.mean()
     assert UNSURE < np.nanmax(rule.sigma) < 3.0
@@ -172,12 +177,12 @@ def test_who_does_not_use_it_does_not_import_it():
     assert done.stdout.strip() == "[]"
 
 
-def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_faces_the_wall():
+def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_faces_the_wall(
+    facing,
+):
     shown = keywords_of_policy("pretrained", ID)
     env = gymnasium.make_vec(ID, num_envs=60, **shown)
     learned = fly(load_policy("pretrained", env), env, 0)
-    plain = gymnasium.make_vec(ID, num_envs=60)
-    facing = fly(PDPolicy(plain, faces="features"), plain, 0)
     assert learned.crashed.mean() < 0.1
     assert learned.returns.mean() > facing.returns.mean()
     assert learned.error.mean() < 0.25

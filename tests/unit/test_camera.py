@@ -81,13 +81,13 @@ def test_random_features_are_seen_as_an_independent_projection_says(seed):
 def test_pixel_noise_is_white_and_of_the_given_size():
     # the laboratory's two features, from above the circle
     position, R_BI = np.array([4.0, 0.0, 2.0]), Rotation.from_euler("z", np.pi).as_matrix().T
-    camera = Camera(LAB, np.random.default_rng(1))
-    pixels = np.array([camera.measure(position, R_BI) for _ in range(20_000)]).reshape(-1, 4)
+    camera, count = Camera(LAB, np.random.default_rng(1)), 6_000
+    pixels = np.array([camera.measure(position, R_BI) for _ in range(count)]).reshape(-1, 4)
     truth = picture(SHARP, position, R_BI).ravel()
     assert_normal(pixels, truth, 400.0 * np.eye(4))
     noise = pixels - truth
     serial = (noise[1:] * noise[:-1]).mean(axis=0) / 400.0
-    assert np.abs(serial).max() < 5.5 / np.sqrt(20_000)
+    assert np.abs(serial).max() < 5.5 / np.sqrt(count)
 
 
 def test_noise_may_carry_a_pixel_over_the_edge_but_decides_nothing():

@@ -28,7 +28,7 @@ MIDPOINT = {"integration": "midpoint", "covariance_reset": "turn"}
 )
 def test_the_filter_equals_the_plain_filter(choices):
     classes = {"filter_class": ExtendedKalmanFilter, "plain_class": PlainEKF}
-    worst, cases = compare(estimator(**choices), 60, seed=4, **classes)
+    worst, cases = compare(estimator(**choices), 40, seed=4, **classes)
     assert_equal(worst)
     assert len(cases) > 3
 

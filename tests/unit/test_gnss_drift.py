@@ -42,7 +42,7 @@ def with_filter(suite, **choices):
 def test_the_filter_equals_a_plain_one_with_the_slow_error_in_its_state(suite, kinds):
     """The plain one computes in 45 digits; measurements come and go."""
     ours_class, plain_class = kinds
-    ticks, seed = 40, 3
+    ticks, seed = 14, 3
     recording = record_circle(suite, ticks, seed)
     recording.gnss_position += np.linspace(0.0, 0.3, ticks)[:, np.newaxis]
     has = np.random.default_rng(seed).random((ticks, 2)) < 0.7

@@ -93,7 +93,7 @@ def specific_force(state, vehicle, lever):
 )
 def test_regression_on_the_true_force_recovers_scale_and_alignment(lever):
     """With exact sensors; the errors' standard deviations are those asked for."""
-    count, vehicle = 96, VehicleParams()
+    count, vehicle = 24, VehicleParams()
     suite = with_imu(LAB, **CALM_IMU, **ERRORS, lever_arm_B=lever)
     fast = {"start_velocity_I": quad_gym.Uniform(-5.0, 5.0)}  # so that there is drag
     flights = batch(suite, count, randomization=fast)

@@ -1,5 +1,7 @@
 """The IMU: lever arm, white noise and Gauss-Markov biases."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -96,6 +98,7 @@ def test_in_free_fall_nothing_is_felt():
     np.testing.assert_allclose(gyro, 0.0, rtol=0.0, atol=1e-12)
 
 
+@functools.cache
 def sampled(params, count, seed=1):
     """Readings of a hovering vehicle less the truth, and the biases before each of them."""
     imu, state = Imu(params, np.random.default_rng(seed), VEHICLE), resting()
@@ -105,7 +108,7 @@ def sampled(params, count, seed=1):
 
 
 def test_white_noise_has_the_density_of_the_laboratory():
-    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 20_000)
+    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 6_000)
     dt = 1.0 / 200.0
     noise = np.concatenate([gyro - gyro_bias, accel - accel_bias], axis=1)
     gyro_variance = (np.pi / 180.0 * 0.05) ** 2 / dt
@@ -118,7 +121,7 @@ def test_white_noise_has_the_density_of_the_laboratory():
 
 def test_each_step_of_a_bias_follows_equations_6_and_7():
     params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.02)
-    _, _, gyro_bias, accel_bias = sampled(params, 20_000)
+    _, _, gyro_bias, accel_bias = sampled(params, 6_000)
     for bias, tau, sigma in (
         (accel_bias, 0.05, params.accel_bias_sigma),
         (gyro_bias, 0.02, params.gyro_bias_sigma),
@@ -132,7 +135,7 @@ def test_each_step_of_a_bias_follows_equations_6_and_7():
 
 
 def test_what_drives_a_bias_is_independent_of_the_white_noise():
-    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 20_000, seed=5)
+    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 6_000)
     noise = np.concatenate([gyro - gyro_bias, accel - accel_bias], axis=1)
     driving = np.diff(np.concatenate([gyro_bias, accel_bias], axis=1), axis=0)
     noise, driving = noise / noise.std(axis=0), driving / driving.std(axis=0)
@@ -143,10 +146,11 @@ def test_what_drives_a_bias_is_independent_of_the_white_noise():
 
 def test_a_bias_keeps_its_stationary_variance_and_forgets_over_its_correlation_time():
     params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.05)
-    _, _, *biases = sampled(params, 30_000, seed=2)
+    count = 10_000
+    _, _, *biases = sampled(params, count, seed=2)
     alpha, lag = np.exp(-0.1), 10  # ten ticks are one correlation time
     # Bartlett: variance of the sample variance of a first-order process
-    deviation = np.sqrt(2.0 * (1.0 + alpha**2) / (1.0 - alpha**2) / 30_000)
+    deviation = np.sqrt(2.0 * (1.0 + alpha**2) / (1.0 - alpha**2) / count)
     for bias, sigma in zip(biases, (params.gyro_bias_sigma, params.accel_bias_sigma), strict=True):
         scaled = bias / sigma
         assert np.abs((scaled**2).mean(axis=0) - 1.0).max() < alarm_score(3) * deviation
@@ -156,7 +160,7 @@ def test_a_bias_keeps_its_stationary_variance_and_forgets_over_its_correlation_t
 
 def test_a_bias_begins_at_its_stationary_distribution():
     rng = np.random.default_rng(3)
-    imus = [Imu(LAB, rng) for _ in range(3_000)]
+    imus = [Imu(LAB, rng) for _ in range(1_000)]
     biases = np.array([np.append(imu.accel_bias, imu.gyro_bias) for imu in imus])
     variances = [LAB.accel_bias_sigma**2] * 3 + [LAB.gyro_bias_sigma**2] * 3
     assert_normal(biases, np.zeros(6), np.diag(variances))

@@ -27,7 +27,7 @@ def means(batch, seconds=3):
 
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
-@pytest.mark.parametrize("arm", [0.01, 0.02, 0.05])
+@pytest.mark.parametrize("arm", [0.01, pytest.param(0.02, marks=pytest.mark.slow), 0.05])
 @pytest.mark.parametrize("name", ["rtk", "indoor"])
 def test_a_known_lever_arm_leaves_the_filter_consistent(name, arm, kind):
     found = means(fly(mounted(name, (arm, -arm, arm), kind=kind), FLIGHTS, start="hover"))

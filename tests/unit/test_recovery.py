@@ -51,7 +51,7 @@ def test_without_inflated_biases_the_step_would_outlast_the_test():
     assert beyond(batch, 6.0).mean() > 0.99
 
 
-@pytest.mark.parametrize("speed", [0.1, 0.5])
+@pytest.mark.parametrize("speed", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_a_ramp_of_gnss_loses_no_flight_that_sees_markers(speed):
     batch = flown("rtk", GnssRamp(start=3.0, speed=speed), 23.0)
     assert batch.read("rejections")[:, 0].min() > 50

@@ -79,10 +79,12 @@ def assert_equal(worst):
     assert worst["covariance"] < 1e-9
 
 
-def test_the_filter_equals_the_plain_filter_over_a_thousand_cycles():
-    worst, cases = compare(LAB, 1000, seed=3)
+@pytest.mark.parametrize("cycles", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_the_filter_equals_the_plain_filter_over_many_cycles(cycles):
+    worst, cases = compare(LAB, cycles, seed=3)
     assert_equal(worst)
-    assert {features for *_, features in cases} == {0, 1, 2}
+    if cycles == 1000:  # half a circle
+        assert {features for *_, features in cases} == {0, 1, 2}
     assert len({(position, baseline) for position, baseline, _ in cases}) == 4
 
 
@@ -103,31 +105,31 @@ def test_the_filter_equals_the_plain_filter_over_a_thousand_cycles():
     ids=str,
 )
 def test_the_filter_equals_the_plain_filter_with_other_choices(choices):
-    worst, _ = compare(estimator(**choices), 60, seed=4)
+    worst, _ = compare(estimator(**choices), 20, seed=4)
     assert_equal(worst)
 
 
 def test_the_filter_equals_the_plain_filter_without_a_camera_and_at_another_rate():
-    worst, _ = compare(LAB.replace(camera=None).with_rates(imu=100.0), 100, seed=5)
+    worst, _ = compare(LAB.replace(camera=None).with_rates(imu=100.0), 50, seed=5)
     assert_equal(worst)
 
 
 def test_the_filter_equals_the_plain_filter_with_every_measurement_and_with_few():
-    assert_equal(compare(LAB, 60, seed=6, present=1.1)[0])
-    assert_equal(compare(LAB, 60, seed=7, present=0.1)[0])
+    assert_equal(compare(LAB, 30, seed=6, present=1.1)[0])
+    assert_equal(compare(LAB, 30, seed=7, present=0.1)[0])
 
 
 def test_the_filter_equals_the_plain_filter_with_many_features():
     rng = np.random.default_rng(8)
     features = tuple(map(tuple, rng.uniform((-1, -1, 0), (1, 1, 1), (16, 3))))
     sensors = LAB.replace(camera=LAB.camera.replace(features_I=features))
-    worst, cases = compare(sensors, 30, seed=9)
+    worst, cases = compare(sensors, 12, seed=9)
     assert_equal(worst)
     assert max(features for *_, features in cases) > 8
 
 
 def test_the_usual_weights_in_float64_are_a_thousand_times_less_accurate():
-    ours, _ = compare(LAB, 60, seed=3)
-    plain, _ = compare(LAB, 60, seed=3, filter_class=PlainUKF)
+    ours, _ = compare(LAB, 30, seed=3)
+    plain, _ = compare(LAB, 30, seed=3, filter_class=PlainUKF)
     assert plain["position"] > 1000 * ours["position"]
     assert plain["position"] < 1e-4

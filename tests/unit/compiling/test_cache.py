@@ -145,7 +145,7 @@ def test_where_the_package_cannot_be_written_the_users_folder_serves(parts):
     parts.cache.write_text("a file where the folder should be")
     elsewhere = parts.folder / "elsewhere"
     for _ in range(2):
-        output, said = parts.run(XDG_CACHE_HOME=str(elsewhere))
+        output, said = parts.run(processes=1, XDG_CACHE_HOME=str(elsewhere))
         assert output == RIGHT
         assert parts.compiled() == ["a", "b", "c"]
     assert said == ""
@@ -171,7 +171,7 @@ def test_a_full_disk_costs_one_line_and_the_cache(parts):
     assert "Traceback" not in said
     assert not parts.files("code")
     assert not parts.files("tmp")
-    assert parts.run()[0] == RIGHT
+    assert parts.run(processes=1)[0] == RIGHT
     assert len(parts.files("code")) == 3
 
 

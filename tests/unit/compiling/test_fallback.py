@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.unit.compiling.parts import RIGHT, Parts
+
 SCRIPT = """
 import sys
 import numpy as np
@@ -58,6 +60,16 @@ def computed(way, tmp_path, **environment):
     return done.stdout.split(), done.stderr
 
 
+def test_small_parts_compile_with_ordinary_numba(tmp_path):
+    parts = Parts(tmp_path)
+    output, said = parts.run(processes=1, QUAD_GYM_ORDINARY_NUMBA="1")
+    assert output == RIGHT
+    assert "compiling" in said
+    assert len(parts.files("code")) == 3
+    assert parts.compiled() == ["a", "b", "c"]
+
+
+@pytest.mark.slow  # compiles two large kernels in both ways
 def test_ordinary_numba_computes_the_same_to_the_bit(tmp_path):
     """An entry in floats and a stage in lanes; and neither finds what the other has cached."""
     lean, _ = computed("lean", tmp_path)
