@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.estimation.engine import Engine
 from quad_gym.estimation.headings import Moments, moments
+from quad_gym.estimation.samples import Measurement
 from quad_gym.packing.aids import blocks_of
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FilterStatus
@@ -33,7 +34,8 @@ class Estimate:
     _engine: Engine
     _log_weights: NDArray[np.float64] | None
     _moments: Moments | None
-    _report: Innovations
+    _report: Innovations | None
+    _reported: Measurement
     _running: bool
 
     @property
@@ -145,6 +147,8 @@ class Estimate:
     def last_update(self) -> Innovations:
         """What the last call of `update` measured, also where it came late; NaN for the rest."""
         self._require_start()
+        if self._report is None:  # it came in time: what it told still stands in memory
+            self._report = self._innovations(self._reported.blocks)
         return self._report
 
     def _innovations(self, measured: list[int]) -> Innovations:

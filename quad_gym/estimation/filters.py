@@ -5,7 +5,7 @@ import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.estimation.correlated import update_with_correlated
 from quad_gym.estimation.engine import Engine
@@ -40,8 +40,9 @@ class _KalmanFilter(Estimate):
         self._engine = Engine(sensors, self._kind)
         self._history = History(length, self._apply, self._copy, self._restore)
         self._log_weights, self._moments = None, None
+        self._gyro: NDArray[np.float64] | None = None
         self._awaited: Measurement | None = None
-        self._report = self._innovations([])
+        self._report, self._reported = None, Measurement()
         self._running = False
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -191,10 +192,9 @@ class _KalmanFilter(Estimate):
         step = tick
         if dt is not None:
             step = check.positive("dt", dt, least=1e-9, most=max(LONGEST_STEP, tick))
-        status, before = self.status, self._of_lane("w_before")
-        known = np.isfinite(before).all()
-        earlier = self._of_lane("w_meas") if known else rates
-        self._history.add(Sample(rates, force, step, earlier))
+        status, earlier = self._status_bits(), self._gyro
+        self._gyro = rates
+        self._history.add(Sample(rates, force, step, rates if earlier is None else earlier))
         self._warn_of_news(status)
 
     def update(
@@ -236,9 +236,8 @@ class _KalmanFilter(Estimate):
         measurement = checked_measurement(
             self.sensors, gnss_position_G, gnss_baseline_G, pixels, gnss_velocity_G, others
         )
-        status, now = self.status, self._history.time
+        status, now = self._status_bits(), self._history.time
         stamp = now if time is None else check.number("time", time)
-        self._awaited = measurement
         if stamp > now + SAME_TIME:
             raise ValueError(
                 f"time must not be later than the filter, which is at {now:.6f} s, got "
@@ -246,6 +245,7 @@ class _KalmanFilter(Estimate):
             )
         if stamp >= now - SAME_TIME:
             self._history.add(measurement)
+            self._report, self._reported = None, measurement
         elif stamp < self.oldest_time - SAME_TIME:
             raise ValueError(
                 f"time must be at least {self.oldest_time:.6f} s, as the filter remembers "
@@ -253,6 +253,7 @@ class _KalmanFilter(Estimate):
                 f"{stamp:.6f} s"
             )
         else:
+            self._awaited = measurement
             self._history.insert(measurement, stamp)
         self._warn_of_news(status)
 
@@ -271,7 +272,7 @@ class _KalmanFilter(Estimate):
     def _begin(self, time: float, flights: int = 1) -> None:
         """Forget everything, and make room for flights."""
         self._log_weights, self._moments = None, None
-        self._report = self._innovations([])
+        self._gyro, self._report, self._reported = None, None, Measurement()
         self._choose_form()
         if flights > 1 or len(self._engine.blocks) > 1:
             self._engine.allocate(flights)
@@ -321,10 +322,14 @@ class _KalmanFilter(Estimate):
             form &= ~_OF_GATES
         self._engine.settings["form"] = form
 
-    def _warn_of_news(self, before: FilterStatus) -> None:
+    def _status_bits(self) -> int:
+        return int(self._of_lane("filter_status"))
+
+    def _warn_of_news(self, before: int) -> None:
         """Warn of what has gone wrong since."""
-        news = self.status & ~before
-        if news:
+        bits = self._status_bits() & ~before
+        if bits:
+            news = FilterStatus(bits)
             warnings.warn(
                 f"The filter kept its last good state: {news.name}", RuntimeWarning, stacklevel=3
             )

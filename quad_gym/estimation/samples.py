@@ -118,7 +118,7 @@ def checked_measurement(
         ValueError: If one has another shape or is not finite, the suite lacks its sensor, or noise
             is given for what was not measured.
     """
-    aids = _checked_aids(sensors, others)
+    aids = _checked_aids(sensors, others) if others else {}
     if position_G is not None or baseline_G is not None:
         require_gnss(sensors, "update")
     position = baseline = velocity = image = None
@@ -133,6 +133,8 @@ def checked_measurement(
         if sensors.gnss is None or sensors.gnss.velocity_sigma is None:
             raise ValueError("the sensor suite has no GNSS velocity to update with")
         velocity = check.array("gnss_velocity_G", velocity_G, (3,))
+    if not others:
+        return Measurement(position, baseline, velocity, image)
     measured = {
         "gnss_sigma": position is not None,
         "baseline_sigma": baseline is not None,
