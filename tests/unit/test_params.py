@@ -25,6 +25,8 @@ CLASSES = [
     quad_gym.Clocks,
     quad_gym.TaskParams,
     quad_gym.WorldParams,
+    quad_gym.Wall,
+    quad_gym.Cylinder,
     quad_gym.BatteryParams,
 ]
 NO_NUMBERS = ["fast", None, float("nan"), float("inf"), [1.0, 2.0]]
@@ -183,6 +185,20 @@ BAD_VALUES = {
     ("WorldParams", "rotor_radius"): NOT_POSITIVE,
     ("WorldParams", "ground_height"): NO_NUMBERS,
     ("WorldParams", "battery"): ["full", 3.0],
+    ("WorldParams", "obstacles"): ["wall", [1.0], quad_gym.Wall()],
+    ("WorldParams", "vehicle_radius"): [*NOT_POSITIVE, 1e3],
+    ("WorldParams", "geofence"): ["here", 1.0, ((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))],
+    **{
+        (kind, name): [*NO_VECTORS, (0.0, 1e5, 0.0)]
+        for kind in ("Wall", "Cylinder")
+        for name in ("center_I", "shift_I")
+    },
+    ("Wall", "follows"): ["first", -1, 0.5],
+    ("Cylinder", "follows"): ["first", -1, 0.5],
+    ("Wall", "size"): [*NO_VECTORS, (1.0, 0.0, 1.0), (1.0, 1e5, 1.0)],
+    ("Wall", "yaw"): NO_NUMBERS,
+    ("Cylinder", "radius"): [*NOT_POSITIVE, 1e5],
+    ("Cylinder", "height"): [*NOT_POSITIVE, 1e5],
     ("BatteryParams", "energy"): NOT_POSITIVE,
     ("BatteryParams", "charge"): [*NOT_POSITIVE, 1.1],
     ("BatteryParams", "empty_voltage"): [*NOT_POSITIVE, 1.1],
