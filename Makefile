@@ -4,7 +4,8 @@ JOBS ?= 2
 VENV := .venv
 OLDEST := .venv-oldest
 BIN := $(VENV)/bin
-# files are compiled to bytecode when they are first imported: most of them never are
+# pip compiles to bytecode one file after the other, and the tests of all packages
+BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
 .PHONY: setup demo circle animation compare study test test-oldest test-slow soak golden lint benchmark docs wheel clean
@@ -16,18 +17,22 @@ $(BIN)/python:
 
 $(VENV)/.user: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[plot]"
+	$(BYTECODE)
 	touch $@
 
 $(VENV)/.trainer: $(VENV)/.user
 	$(INSTALL) ".[train,plot]"
+	$(BYTECODE)
 	touch $@
 
 $(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[train,plot,render,pandas,ulog,rerun,export,dev]"
+	$(BYTECODE)
 	touch $(VENV)/.user $(VENV)/.trainer $@  # which it holds
 
 $(VENV)/.writer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,docs]"
+	$(BYTECODE)
 	touch $@
 
 demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each, and compare: some minutes
