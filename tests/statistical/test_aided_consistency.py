@@ -30,9 +30,9 @@ def aided(suite, kind="ukf", late=False, gate=True, **sensors):
 
 
 SLOW = ("state", "attitude", "accel_bias", "gyro_bias")
-"""Of errors that hardly change in 10 s, all instants tell about as much as one, so that the share of
-those in the band of 95 % is likely to be 1, or 0, but not to be 0.95; the mean over all instants is
-judged by the deviation of one."""
+"""Of errors that hardly change in 10 s, all instants tell about as much as one, so that the share
+of those in the band of 95 % is likely to be 1, or 0, but not to be 0.95; the mean over all instants
+is judged by the deviation of one."""
 
 
 @pytest.mark.slow
