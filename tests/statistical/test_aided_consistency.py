@@ -29,6 +29,12 @@ def aided(suite, kind="ukf", late=False, gate=True, **sensors):
     return plain.replace(estimator=estimator, **both | sensors)
 
 
+SLOW = ("state", "attitude", "accel_bias", "gyro_bias")
+"""Of errors that hardly change in 10 s, all instants tell about as much as one, so that the share
+of those in the band of 95 % is likely to be 1, or 0, but not to be 0.95; the mean over all instants
+is judged by the deviation of one."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["cold", "warm"])
 @pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
@@ -53,7 +59,8 @@ def assert_consistent(sensors, start):
     assert findings.failed == 0
     assert 14.2 < findings.nees["state"].overall < 15.8
     for name, part in (findings.nees | findings.nis).items():
-        assert part.consistent, (name, part.share_inside, part.overall)
+        off = abs(part.overall - part.dimension) / np.sqrt(2.0 * part.dimension / 1000)
+        assert part.consistent or (name in SLOW and off < 3.5), (name, part.share_inside, off)
     for name, white in findings.whiteness.items():
         assert white.white, (name, white.largest)
 

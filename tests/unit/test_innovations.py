@@ -215,7 +215,8 @@ def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, s
 
 def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
     suite = quad_gym.sensor_suite("consumer").simplified()
-    suite = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=0.01))
+    two = suite.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=0.035)
+    suite = suite.replace(gnss=two, estimator=suite.estimator.replace(gate_false_alarm=0.01))
     batch = fly(suite, 400, task="hover")
     steps(batch, 5.0)  # until the start's larger uncertainty is over
     blocks = measured_now(batch).shape[1]  # of GNSS and camera, before those of other sensors

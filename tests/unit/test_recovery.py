@@ -45,6 +45,25 @@ def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
     assert (wrong & ~lost).mean() <= 0.01
 
 
+def test_whether_a_flight_is_lost_does_not_depend_on_who_flies_beside_it():
+    """Phases differ, so that flights of a block measure at different ticks."""
+    suite = quad_gym.sensor_suite("rtk").simplified()  # prompt ones, whose update is of all lanes
+    fault = GyroBiasStep(start=0.5, size=math.radians(3.0))
+
+    def lost(seed, count):
+        batch = fly(suite, count, seed=seed, task="hover", filter_start="warm", faults=fault)
+        found = []
+        for _ in range(600):
+            batch.step()
+            found.append(batch.read("lost"))
+        return np.array(found)
+
+    together = lost(0, 8)
+    assert (np.diff(together, axis=0) < 0.0).any()  # some are found again
+    for k in range(8):
+        np.testing.assert_array_equal(lost(k, 1)[:, 0], together[:, k])
+
+
 def test_without_inflated_biases_the_step_would_outlast_the_test():
     """The same fault with a gate that never reopens and never doubts: it takes everything."""
     batch = flown("rtk", STEP, 13.0, gate_false_alarm=0.0)

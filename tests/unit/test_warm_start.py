@@ -93,20 +93,18 @@ def test_the_estimated_biases_are_independent_of_their_errors(name):
 def test_the_covariance_is_that_of_a_filter_that_has_run_as_long(name):
     """Of other flights, under another controller.
 
-    Simplified, and without hard iron: a heading with a constant error is known better after the
-    moves of a flight than after hovering.
+    Simplified: a heading with a constant error is known better after the moves of a flight than
+    after hovering. So is hard iron, and with the heading tilt and level accelerometer bias.
     """
     suite = quad_gym.sensor_suite(name).simplified()
-    if suite.magnetometer is not None:
-        ironless = suite.magnetometer.replace(hard_iron_sigma=1e-9)
-        suite = suite.replace(magnetometer=ironless)
     cold = fly(suite, 40, task="hover")
     steps(cold, WARM_UP)
     warm = fly(suite, 40, task="hover", filter_start="warm")
     sigmas = [
         np.sqrt(np.diagonal(b.covariance(), axis1=1, axis2=2)).mean(axis=0) for b in (cold, warm)
     ]
-    np.testing.assert_allclose(sigmas[1], sigmas[0], rtol=0.35)
+    same = [*range(6), *range(11, 15)] if suite.magnetometer is not None else [*range(15)]
+    np.testing.assert_allclose(sigmas[1][same], sigmas[0][same], rtol=0.35)
     at_start = fly(suite, 40, task="hover").covariance()
     assert (sigmas[1][12:] < 0.9 * np.sqrt(np.diagonal(at_start, axis1=1, axis2=2))[0, 12:]).any()
 

@@ -39,7 +39,8 @@ def judge_innovations(flight, p, work, settings, slow, stages, first_of_aids, ma
     if slow is not None:
         judge_aids(flight, p, work, slow, stages, first_of_aids)
     judge(flight, p, work, settings, slow, 0)
-    follow_ratio(flight, p, work.judged_nis, work.judged_freedoms, mask & logical_not(again))
+    first = mask & (work.measured > 0.0) & logical_not(again)
+    follow_ratio(flight, p, work.judged_nis, work.judged_freedoms, first)
 
 
 @kernel
