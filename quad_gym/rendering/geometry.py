@@ -18,6 +18,10 @@ NEAR = 0.05
 """Nothing closer to a viewing camera than this is drawn [m]."""
 
 
+AROUND = 6.0
+"""Obstacles farther from reference and start than this need not be seen by a fixed view [m]."""
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A perspective view of the inertial frame."""
@@ -132,6 +136,11 @@ def fixed_view(flight: Flight, width: float, height: float) -> View:
     around = [stage.reference(times), start[np.newaxis], stage.gates_I, stage.features_I]
     around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # what lies below
     points = np.concatenate(around)
+    if len(stage.obstacles):  # all of them within the geofence, or else those around
+        low, high = points.min(axis=0) - AROUND, points.max(axis=0) + AROUND
+        low, high = stage.geofence_I if len(stage.geofence_I) else (low, high)
+        places = np.clip(stage.obstacles[:, 1:4], low, high)
+        points = np.concatenate([points, places * (1.0, 1.0, 0.0), places])
     pad = 0.45 * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
     corners = (points[:, np.newaxis] + pad).reshape(-1, 3)
     low = np.array([0.03 * width, 0.24 * height])  # legend and inset fill the upper corners

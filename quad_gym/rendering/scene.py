@@ -128,7 +128,8 @@ class Scene:
         view, canvas = self._view, self._canvas
         n = GRID_HALF_SIZE
         shift = np.zeros(3)
-        if self._moving:  # over a plane without an end, with the grid around the vehicle
+        wide = bool((np.abs(self._stage.obstacles[:, 1:3]) > n).any())
+        if self._moving or wide:  # over a plane without an end, with the grid around the vehicle
             shift[:2] = np.round(self._now["position"][:2])
             canvas.clear(SKY, bottom=view.horizon)
             canvas.clear(GROUND, top=view.horizon)

@@ -35,7 +35,7 @@ VIEW_FIELDS = (
     ViewField("gates_passed", "(n,) int", "-", "-", "in this episode"),
     ViewField("gate_passed", "(n,) bool", "-", "-", "whether this step passed one"),
     ViewField("features", "(m, 3)", "m", "I", "the markers that the camera sees, the same for all flights"),
-    ViewField("world", "", "-", "-", "its `WorldParams`, without draws and shifts"),
+    ViewField("world", "", "-", "-", "the `WorldParams`, without draws and shifts"),
     ViewField("obstacles", "(n, o, 3)", "m", "I", "where the middles of the world's obstacles are in this episode, in their order"),
     ViewField("observation", "(n, k)", "mixed", "mixed", "the shipped observation, less its privileged part"),
     # the truth, which `observe` may read only if the task is privileged

@@ -17,6 +17,7 @@ from quad_gym.rendering.geometry import (
     look_at,
 )
 from quad_gym.rendering.inset import inset_box, place_in_inset
+from quad_gym.rendering.solids import faces_of
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from quad_gym.sensors import Camera
 
@@ -221,3 +222,28 @@ def test_views_are_rotations():
         assert isinstance(view, View)
         np.testing.assert_allclose(view.R_VI @ view.R_VI.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(view.R_VI) == pytest.approx(1.0)
+
+
+def test_a_polygon_that_reaches_behind_the_eye_is_cut_off_in_front_of_it():
+    view = look_at(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 1.0]), 500.0, CENTER)
+    floor = np.array([[-1.0, -5.0, 0.0], [1.0, -5.0, 0.0], [1.0, 5.0, 0.0], [-1.0, 5.0, 0.0]])
+    outline = view.outline(floor)
+    assert outline.shape == (4, 2)
+    assert np.isfinite(outline).all()
+    assert (outline[:, 1] > view.horizon).all()  # the floor is below the horizon
+    ahead = view.project(floor[2:])[0]
+    assert all(np.abs(outline - corner).sum(axis=1).min() < 1e-9 for corner in ahead)
+    assert view.outline(floor - (0.0, 20.0, 0.0)).shape == (0, 2)
+    before = floor - (0.0, -9.0, 0.0)
+    np.testing.assert_array_equal(view.outline(before), view.project(before)[0])
+
+
+def test_the_faces_of_an_obstacle_that_are_seen_are_those_turned_to_the_eye():
+    wall = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 0.1, 1.0, 0.0, 1.0])  # its length points north
+    (face,) = faces_of(wall, np.array([5.0, 0.0, 1.0]))
+    np.testing.assert_allclose(face[:, 0], 0.1)
+    assert len(faces_of(wall, np.array([5.0, 9.0, 7.0]))) == 3
+    mast = np.array([1.0, 0.0, 0.0, 1.0, 0.3, 0.3, 1.0, 1.0, 0.0])
+    sides = faces_of(mast, np.array([100.0, 0.0, 1.0]))
+    assert 9 <= len(sides) <= 11  # about half of them, and no cap
+    assert len(faces_of(mast, np.array([0.0, 0.0, 1.0]))) == 22  # from within: all
