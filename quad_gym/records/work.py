@@ -40,6 +40,7 @@ WORK_FIELDS = (
     # what the blocks of a measurement are told of an update, and what they tell
     Field("measured", (), "-", "numbers that each lane has"),
     Field("spread", (), "-", "c of the sigma points"),
+    Field("inverse_spread", (), "-", "1 / c"),
     Field("taking", (), "0 or 1", "lanes that are updated"),
     Field("again", (), "0 or 1", "lanes that have met these measurements before"),
     Field("judged_nis", (), "-", "sum of their NIS"),

@@ -171,7 +171,7 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     columns = columns_of(slow)
     last, measured = columns - 1, work.measured
     c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
-    work.spread = c
+    work.spread, work.inverse_spread = c, 1.0 / c
     if (form & _EKF) == 0:
         _split_turns(flight, work, c)
     expect(flight, p, work, settings, slow, 0)

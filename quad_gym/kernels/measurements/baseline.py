@@ -99,7 +99,7 @@ def expect(flight, p, work, settings, slow, k):
     if not any_of(flight.baseline_valid > 0.0):
         return k
     L, last, has = flight.L, columns_of(slow) - 1, flight.baseline_valid > 0.0
-    R_BI, inverse_c = load33(flight.R_hat), 1.0 / work.spread
+    R_BI, inverse_c = load33(flight.R_hat), work.inverse_spread
     unit_baseline = scale(1.0 / p.baseline_length, load3(p.baseline))
     _center(flight, p, work, k, has, R_BI, unit_baseline)
     clear_slow_columns(work, k, slow)

@@ -134,7 +134,7 @@ def _center(flight, p, work, settings, k):
 def _column(flight, p, work, settings, k, j, A, S, R_BI):
     """Fill the rows of all features in column j, with a derivative or a pair of sigma points."""
     L, c, camera = flight.L, work.spread, load3(p.camera)
-    inverse_c, d, dr = 1.0 / c, load_column3(L, E, j), load_column3(L, R, j)
+    inverse_c, d, dr = work.inverse_spread, load_column3(L, E, j), load_column3(L, R, j)
     by_derivative = (settings.form & _EKF) != 0
     dr_B = apply(R_BI, dr) if by_derivative else apply(R_BI, scale(c, dr))
     odd, even = load33(work.odd[j]), load33(work.even[j])

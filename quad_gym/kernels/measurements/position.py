@@ -102,7 +102,7 @@ def expect(flight, p, work, settings, slow, k):
     if not any_of(flight.position_valid > 0.0):
         return k
     L, last, has = flight.L, columns_of(slow) - 1, flight.position_valid > 0.0
-    R_BI, antenna, inverse_c = load33(flight.R_hat), load3(p.antenna), 1.0 / work.spread
+    R_BI, antenna, inverse_c = load33(flight.R_hat), load3(p.antenna), work.inverse_spread
     _center(flight, p, work, k, has, R_BI, slow)
     clear_slow_columns(work, k, slow)
     for j in range(9):
