@@ -45,6 +45,7 @@ def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
     assert (wrong & ~lost).mean() <= 0.01
 
 
+@pytest.mark.slow  # what the fault does to another filter
 def test_without_inflated_biases_the_step_would_outlast_the_test():
     """The same fault with a gate that never reopens and never doubts: it takes everything."""
     batch = flown("rtk", STEP, 13.0, gate_false_alarm=0.0)
