@@ -144,7 +144,7 @@ def test_options_reach_the_flights(tmp_path, no_figures):
 
 def test_crashes_are_counted(tmp_path, capsys):
     weak = "--seeds 3 --duration 4 --position-gain 0 --velocity-gain 0 --attitude-gain 0 0 0"
-    summary = run(tmp_path, weak)
+    summary = run(tmp_path, f"--no-camera {weak}")
     for case in summary["cases"].values():
         assert (case["finished"], case["crashed"]) == (0, 3)
     with (tmp_path / "flights.csv").open() as stream:

@@ -189,6 +189,7 @@ def filled_cache(tmp_path_factory):
     return cache
 
 
+@pytest.mark.slow  # the same with smaller kernels: tests/unit/compiling/test_processes.py
 def test_a_kernel_is_compiled_once_and_loaded_ever_after(filled_cache):
     assert not outcome(start(filled_cache))
 

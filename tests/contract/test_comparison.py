@@ -72,7 +72,7 @@ def test_evaluate_refuses_nonsense(tmp_path, more, message):
 
 
 def compare(where, *more):
-    line = ["--quick", "--steps", 8192, "--output", where / "out", "--env", "duration=1.0"]
+    line = ["--quick", "--steps", 8192, "--output", where / "out", "--env", "duration=0.4"]
     return run("compare", *line, *more, where=where)
 
 

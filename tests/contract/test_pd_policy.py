@@ -83,7 +83,8 @@ def test_it_flies_every_episode_of_every_tracking_task_on_the_estimate(env_id, g
 
 @pytest.mark.parametrize("action", ACTIONS)
 def test_it_flies_with_every_action(action):
-    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=50, **keywords_for(action))
+    keywords = keywords_for(action, duration=10.0)
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=50, **keywords)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         policy = PDPolicy(env)

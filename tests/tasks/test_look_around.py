@@ -188,7 +188,7 @@ def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_f
     assert learned.error.mean() < 0.25
 
 
-@pytest.mark.parametrize("observation", ["truth", "estimate"])
+@pytest.mark.parametrize("observation", [pytest.param("truth", marks=pytest.mark.slow), "estimate"])
 def test_the_policy_that_ships_flies_by_command(observation, tmp_path, capsys):
     words = ["evaluate", ID, "--policy", "pd", "pretrained", "--observation", observation]
     assert main([*words, "--episodes", "3", "--output", str(tmp_path)]) == 0

@@ -146,7 +146,7 @@ def test_the_slow_error_is_estimated_as_well_as_claimed():
 
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 @pytest.mark.parametrize("start", ["cold", "warm"])
-@pytest.mark.parametrize("latency", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("latency", [0.0, pytest.param(0.1, marks=pytest.mark.slow), 0.2])
 def test_the_filter_is_consistent(kind, start, latency):
     """A mean over 300 flights has a deviation of 0.32; here are five of them."""
     suite = with_filter(CONSUMER, kind=kind)

@@ -108,7 +108,7 @@ def sampled(params, count, seed=1):
 
 
 def test_white_noise_has_the_density_of_the_laboratory():
-    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 6_000)
+    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 4_000)
     dt = 1.0 / 200.0
     noise = np.concatenate([gyro - gyro_bias, accel - accel_bias], axis=1)
     gyro_variance = (np.pi / 180.0 * 0.05) ** 2 / dt
@@ -121,7 +121,7 @@ def test_white_noise_has_the_density_of_the_laboratory():
 
 def test_each_step_of_a_bias_follows_equations_6_and_7():
     params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.02)
-    _, _, gyro_bias, accel_bias = sampled(params, 6_000)
+    _, _, gyro_bias, accel_bias = sampled(params, 4_000)
     for bias, tau, sigma in (
         (accel_bias, 0.05, params.accel_bias_sigma),
         (gyro_bias, 0.02, params.gyro_bias_sigma),
@@ -135,7 +135,7 @@ def test_each_step_of_a_bias_follows_equations_6_and_7():
 
 
 def test_what_drives_a_bias_is_independent_of_the_white_noise():
-    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 6_000)
+    gyro, accel, gyro_bias, accel_bias = sampled(LAB, 4_000)
     noise = np.concatenate([gyro - gyro_bias, accel - accel_bias], axis=1)
     driving = np.diff(np.concatenate([gyro_bias, accel_bias], axis=1), axis=0)
     noise, driving = noise / noise.std(axis=0), driving / driving.std(axis=0)
@@ -146,7 +146,7 @@ def test_what_drives_a_bias_is_independent_of_the_white_noise():
 
 def test_a_bias_keeps_its_stationary_variance_and_forgets_over_its_correlation_time():
     params = LAB.replace(accel_bias_tau=0.05, gyro_bias_tau=0.05)
-    count = 10_000
+    count = 6_000
     _, _, *biases = sampled(params, count, seed=2)
     alpha, lag = np.exp(-0.1), 10  # ten ticks are one correlation time
     # Bartlett: variance of the sample variance of a first-order process

@@ -69,7 +69,9 @@ def scipy_flight(vehicle, duration, start):
     return unpack(solution.y[:, -1])
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))]
+)
 @pytest.mark.parametrize("skewed", [False, True])
 def test_random_flights_agree_with_scipy(seed, skewed):
     vehicle = LAB.replace(inertia=SKEWED_INERTIA, disc_area=0.2) if skewed else LAB

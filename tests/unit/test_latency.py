@@ -183,7 +183,13 @@ def test_with_a_quiet_imu_the_covariance_is_the_same(kind, plain):
 
 
 @pytest.mark.parametrize(
-    ("gnss", "camera"), [(0.2, 0.08), (0.195, 0.075), (0.2, 0.06), (0.1, 0.08), (0.2, 0.0)]
+    ("gnss", "camera"),
+    [
+        (0.2, 0.08),
+        (0.2, 0.06),
+        (0.1, 0.08),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((0.195, 0.075), (0.2, 0.0))),
+    ],
 )
 def test_at_the_longest_latency_it_is_what_filtering_all_over_again_would_do(gnss, camera):
     """Exactly two periods: one measurement is taken at the instant at which another arrives."""

@@ -64,6 +64,7 @@ def test_whether_a_flight_is_lost_does_not_depend_on_who_flies_beside_it():
         np.testing.assert_array_equal(lost(k, 1)[:, 0], together[:, k])
 
 
+@pytest.mark.slow  # what the fault does to another filter
 def test_without_inflated_biases_the_step_would_outlast_the_test():
     """The same fault with a gate that never reopens and never doubts: it takes everything."""
     batch = flown("rtk", STEP, 13.0, gate_false_alarm=0.0)

@@ -162,6 +162,7 @@ def test_code_beside_the_package_is_found_by_those_who_cannot_write_there(parts,
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no limits on the size of files")
+@pytest.mark.slow  # five processes; folders that cannot be written are tested above
 def test_a_full_disk_costs_one_line_and_the_cache(parts):
     output, said = parts.run(FULL_DISK)
     assert output == RIGHT

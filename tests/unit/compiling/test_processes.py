@@ -59,7 +59,10 @@ def test_one_process_compiles_by_itself_and_says_as_much(parts):
     assert len(said.splitlines()) == 2
 
 
-@pytest.mark.parametrize("what", ["prepare(parts.NAMES, processes=2)", "pass"])
+@pytest.mark.parametrize(
+    "what",
+    ["prepare(parts.NAMES, processes=2)", pytest.param("pass", marks=pytest.mark.slow)],
+)
 def test_six_processes_that_begin_at_once_compile_each_part_once(parts, what):
     """By `prepare`, or by calls that find nothing prepared."""
     output, said = parts.run(MANY.replace("{what}", what))
@@ -91,7 +94,10 @@ def test_a_part_that_cannot_be_compiled_raises_in_the_parent(parts):
 @linux
 @pytest.mark.parametrize(
     "how",
-    [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    [
+        signal.SIGINT,
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGKILL)),
+    ],
 )
 def test_no_worker_outlives_a_parent_that_is_told_to_end(parts, how):
     """Ctrl-C, a request to end, and a kill: no process and no damaged file is left."""
