@@ -24,7 +24,7 @@ def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
     names = [cell.name for cell in cells]
     assert len(set(names)) == len(names)
     tasks = {(c.suite, c.task, c.start) for c in cells if c.condition == "as it is"}
-    assert len(tasks) == len(SUITES) * 5 * 2
+    assert len(tasks) == len(SUITES) * 6 * 2
     conditions = {c.condition for c in cells if c.suite == "rtk"}
     assert {"gnss_outage", "camera_occlusion", "two periods late", "lever arm"} <= conditions
     assert "gnss_ramp" not in conditions  # it does not end

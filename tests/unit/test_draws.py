@@ -25,7 +25,7 @@ def readings():
     for instant in range(COUNT):
         flight["instant"], flight["b_a"], flight["b_g"] = instant, 0.0, 0.0
         sense_imu(flight, params)
-        sense_gnss(flight, params)
+        sense_gnss(flight, params, True)
         sense_features(flight, params, len(features))
         step_biases(flight, params)
         names = ("accel", "gyro", "gnss_position", "gnss_baseline", "b_a", "b_g", "pixels")

@@ -12,8 +12,11 @@ from quad_gym.params.vehicle import VehicleParams
 from tests.level_flights import R_IG
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
-SUITE = quad_gym.sensor_suite("consumer").replace(
-    magnetometer=quad_gym.MagnetometerParams(), barometer=quad_gym.BarometerParams()
+SUITE = quad_gym.sensor_suite("consumer")
+SUITE = SUITE.replace(  # with every measurement that there is
+    gnss=SUITE.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=np.radians(2.0)),
+    magnetometer=quad_gym.MagnetometerParams(),
+    barometer=quad_gym.BarometerParams(),
 )
 STATE = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias", "covariance", "gnss_drift")
 TICK = SUITE.imu.dt
