@@ -45,6 +45,18 @@ def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
     assert (wrong & ~lost).mean() <= 0.01
 
 
+def test_a_magnetometer_tells_of_a_gyro_that_has_changed():
+    """It is all that watches the heading; what it says drifts before any of it is rejected."""
+    step = GyroBiasStep(start=3.0, size=math.radians(1.0))
+    batch = fly(
+        quad_gym.sensor_suite("consumer"), 128, task="circle", filter_start="warm", faults=step
+    )
+    steps(batch, 5.0)
+    assert beyond(batch, 6.0).mean() > 0.9
+    steps(batch, 13.0)
+    assert beyond(batch, 6.0).mean() <= 0.01
+
+
 def test_whether_a_flight_is_lost_does_not_depend_on_who_flies_beside_it():
     """Phases differ, so that flights of a block measure at different ticks."""
     suite = quad_gym.sensor_suite("rtk").simplified()  # prompt ones, whose update is of all lanes

@@ -244,12 +244,14 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
     camera = mask & (row[FEATURE_BLOCKS] >= patience)
     drifting = (_drifts(flight, POSITION_BLOCK) | _drifts(flight, BASELINE_BLOCK)) & free
     drifting = drifting | _drifts(flight, VELOCITY_BLOCK) | _drifts(flight, FEATURE_BLOCKS)
-    drifting = drifting & mask
-    doubtful = position | baseline | velocity | camera | drifting
+    rejecting = position | baseline | velocity | camera
     if slow is not None:
         if slow.aids > 0:
             for s in range(AIDS):
-                doubtful = doubtful | (mask & (row[AID_GROUPS + s] >= patience))
+                drifting = drifting | _drifts(flight, AID_GROUPS + s)
+                rejecting = rejecting | (mask & (row[AID_GROUPS + s] >= patience))
+    drifting = drifting & mask
+    doubtful = rejecting | drifting
     if not any_of(doubtful):
         return
     nu = flight.innovation

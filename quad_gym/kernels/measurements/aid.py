@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.recovery import follow_drift
 from quad_gym.kernels.maths.linalg import keep3, keep33, load3
 from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
 from quad_gym.kernels.measurements.clock import first_wait
@@ -255,10 +256,13 @@ def judge_aid(flight, p, work, settings, s, k):
     nis = nis_of_triple(S, nu)
     rejected = decide(flight, AID_BLOCKS + s, has, (nis > p.aid_gate[s]) & gating, again, _REJECTED)
     sigma = (math.sqrt(S[0][0]), math.sqrt(S[1][1]), math.sqrt(S[2][2]))
+    scaled = (nu[0] / sigma[0], nu[1] / sigma[1], nu[2] / sigma[2])
     if _NUMBERS[s] < 3.0:
         none = np.nan + 0.0 * nis
         nu, sigma = (nu[0], none, none), (sigma[0], none, none)
+        scaled = (scaled[0], 0.0 * nis, 0.0 * nis)
     nowhere, first = rejected & logical_not(rejected), has & logical_not(again)
+    follow_drift(flight, AID_GROUPS + s, first, scaled[0], scaled[1], scaled[2])
     keep_block(flight, AID_BLOCKS + s, first, nu, sigma, nis, rejected, nowhere)
     work.judged_nis = work.judged_nis + select(first, nis, 0.0)
     work.judged_freedoms = work.judged_freedoms + select(first, _NUMBERS[s], 0.0)
