@@ -105,37 +105,37 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     depend on the control rate: 16 for a perfect circle.
 
     ## Episode end
-    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m, `LookAround`: 8 m), tipped by more than 100
-    degrees, below -0.5 m (`LookAround`: -5 m), through the last gate, or, in a world that has any, where
-    the vehicle touches an obstacle or leaves the geofence. Truncated: at the time limit, when the
-    filter has failed (`info["filter_status"]`), or with `end_when_lost=True` when it finds that it is
-    lost. `info["ending"]` says which.
+    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m, `LookAround`: 8 m), tipped
+    by more than 100 degrees, below -0.5 m (`LookAround`: -5 m), through the last gate, or, in a
+    world that has any, where the vehicle touches an obstacle or leaves the geofence. Truncated: at
+    the time limit, when the filter has failed (`info["filter_status"]`), or with
+    `end_when_lost=True` when it finds that it is lost. `info["ending"]` says which.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking
     as wanted. A launch pad carries the vehicle until its thrust lifts it; with `pad=False`, as in
-    the report, it sinks while its rotors spin up. "hover": hovering, with standard deviations of 0.3 m, 0.03 m/s, 0.2 rad
-    in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5, for training: a policy that has learned
-    to hover then learns to take off. The filter starts from its first fix in each, or with
-    `filter_start="warm"` as if it had been running for 10 s, as before any real take-off.
-    `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these for one
-    episode.
+    the report, it sinks while its rotors spin up. "hover": hovering, with standard deviations of
+    0.3 m, 0.03 m/s, 0.2 rad in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5: a
+    policy that has learned to hover learns to take off. The filter starts from its first fix in
+    each, or with `filter_start="warm"` as if it had been running for 10 s, as before any real
+    take-off. `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these
+    for one episode.
 
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;
     `filter_status`, 0 while all is well; `filter_lost`, whether a filter that gates (or keeps
-    its innovations) finds that its covariance does not explain what it measures; `gates_passed`. With `randomization` also `drawn`, the
-    parameters of the episode by name. With `faults` also `faults`: whether each is there now, by
-    name. With `innovations=True` also `innovations`: the last innovations of the filter, their
+    its innovations) finds that its covariance does not explain what it measures; `gates_passed`.
+    With `randomization` also `drawn`, the parameters of the episode by name. With `faults` also
+    `faults`: whether each is there now, by name. With `innovations=True` also `innovations`: the last innovations of the filter, their
     squares (NIS) and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
 
     ## World
     By default the air is still and every episode flies the same vehicle with the same sensors.
-    `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C), linear
-    rotor drag, ground effect and a battery, walls, cylinders and a geofence; `randomization={"mass": Uniform(0.8, 1.2,
-    relative=True), "wind_speed": Uniform(0.0, 5.0)}` draws parameters anew for every episode. What
-    can be drawn is listed in `quad_gym.params.randomization.DRAWABLES`. The filter and the controller know
-    of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
+    `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C),
+    linear rotor drag, ground effect and a battery, walls, cylinders and a geofence;
+    `randomization={"mass": Uniform(0.8, 1.2, relative=True), "wind_speed": Uniform(0.0, 5.0)}`
+    draws parameters anew for every episode. What can be drawn is listed in
+    `quad_gym.params.randomization.DRAWABLES`. The filter and the controller know of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
     know all but the wind and the ground). With `privileged=True` the truth ends with the wind in
     the body frame and the draws, each less the middle of its distribution over its spread.
 
@@ -150,8 +150,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         sensors: "standard", "lab", "rtk", "consumer", "indoor", or a suite that belongs to one task
             (see `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is
             "one_wall", that of `StaleRace` "stale", and that of `OutageDash` "consumer".
-            "standard" has the laboratory's sensors and a consistent filter; "lab"
-            is the report's form to the letter, whose filter is overconfident.
+            "standard" has the laboratory's sensors and a consistent filter; "lab" is the report's
+            form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
             block by block; a suite whose filter gates keeps them for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
@@ -176,13 +176,13 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         true_sensors: What really measures, where the filter believes in `sensors`.
         world: "calm", "breeze", "fresh_breeze", "slalom" (of `OutageDash`), or `WorldParams`.
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
-        faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as "gnss_outage" or
-            "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
-        keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize, duration,
-            out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration, gate_count,
-            gate_radius, preview, trajectory; see `quad_gym.TaskParams`.
-        custom: A task of your own, laid over that of the id (in place of `LookAround`'s): a `quad_gym.Task`, its class, or
-            "module:name" of either.
+        faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as
+            "gnss_outage" or "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
+        keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize,
+            duration, out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration,
+            gate_count, gate_radius, preview, trajectory; see `quad_gym.TaskParams`.
+        custom: A task of your own, laid over that of the id (in place of the class of `LookAround`,
+            `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.
         render_size: Width and height of a frame [pixels].
@@ -193,9 +193,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Version history
     - v0: before the first release, rewards became sums over steps of the order of one each (they
-      were times the control period: `reward_per="second"`), and vehicles that start on the ground
-      stand on a launch pad (they fell while their rotors spun up: `pad=False`). Stable-Baselines3's
-      default settings did not learn the circle with the former.
+      were times the control period: `reward_per="second"`), vehicles that start on the ground stand
+      on a launch pad (they fell while their rotors spun up: `pad=False`), and half of the episodes
+      of the circle start hovering (all did on the ground: `start="ground"`). Stable-Baselines3's
+      default settings did not learn the circle before.
     """
 
     metadata: dict[str, Any] = RENDERING_METADATA
