@@ -53,8 +53,8 @@ def test_a_magnetometer_tells_of_a_gyro_that_has_changed():
     )
     steps(batch, 5.0)
     assert beyond(batch, 6.0).mean() > 0.9
-    steps(batch, 13.0)
-    assert beyond(batch, 6.0).mean() <= 0.01
+    steps(batch, 8.0)
+    assert beyond(batch, 6.0).mean() <= 0.1  # 0.35 if a drift doubted the bias no more than others
 
 
 def test_whether_a_flight_is_lost_does_not_depend_on_who_flies_beside_it():

@@ -127,8 +127,8 @@ def _squares(nu, mask):
 
 
 @kernel
-def _drifts(flight, group):
-    """Where the innovations of a group drift."""
+def drifts(flight, group):
+    """Where the innovations of a group of measurements drift."""
     largest = abs(flight.innovation_drift[group, 0])
     largest = maximum(largest, abs(flight.innovation_drift[group, 1]))
     largest = maximum(largest, abs(flight.innovation_drift[group, 2]))
@@ -242,13 +242,13 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
     baseline = mask & (row[BASELINE_BLOCK] >= patience) & free
     velocity = mask & (row[VELOCITY_BLOCK] >= patience)
     camera = mask & (row[FEATURE_BLOCKS] >= patience)
-    drifting = (_drifts(flight, POSITION_BLOCK) | _drifts(flight, BASELINE_BLOCK)) & free
-    drifting = drifting | _drifts(flight, VELOCITY_BLOCK) | _drifts(flight, FEATURE_BLOCKS)
+    drifting = (drifts(flight, POSITION_BLOCK) | drifts(flight, BASELINE_BLOCK)) & free
+    drifting = drifting | drifts(flight, VELOCITY_BLOCK) | drifts(flight, FEATURE_BLOCKS)
     rejecting = position | baseline | velocity | camera
     if slow is not None:
         if slow.aids > 0:
             for s in range(AIDS):
-                drifting = drifting | _drifts(flight, AID_GROUPS + s)
+                drifting = drifting | drifts(flight, AID_GROUPS + s)
                 rejecting = rejecting | (mask & (row[AID_GROUPS + s] >= patience))
     drifting = drifting & mask
     doubtful = rejecting | drifting

@@ -24,16 +24,19 @@ innovation is left along s, so that the derivative ties the error of the heading
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.error_state import BA, D, E, R, V
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.filter.recovery import drifts
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add,
     add33,
     add_outer,
+    add_to_diagonal,
     apply,
     apply_transposed,
     cross,
+    dot,
     keep3,
     keep33,
     load3,
@@ -70,6 +73,9 @@ _S = int(Aid.MAGNETOMETER)
 _BEGIN, _SAMPLE = int(Act.BEGIN), int(Act.SAMPLE)
 _EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _EKF = int(FilterForm.EKF)
+_DRIFT_TIME = 0.5
+"""Within such a time the magnetometer pulls the heading back [s]: less than it takes, so that the
+bias may be more than a drift says."""
 
 
 @kernel
@@ -228,14 +234,28 @@ def _expect(flight, p, work, settings, k):
 
 @kernel
 def _doubt(flight, p, work, settings, mask):
-    """Add the square of a rejected innovation to the variance of hard iron, and of the heading."""
+    """What the filter doubts where the field is not where it expects it.
+
+    The square of a rejected innovation is added to the variance of hard iron, and of the heading.
+    Where innovations drift, a gyro turns the attitude while the magnetometer pulls it back: the
+    square of their mean, as an angle, is added to the variances of the attitude, and as the turn of
+    `_DRIFT_TIME` to those of the gyro's biases.
+    """
     doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
     nu, k = load3(flight.innovation[AID_BLOCKS + _S]), D + settings.aid_vector[_S]
     m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
     square = nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2]
     angle = select(doubted, square / (m[0] * m[0] + m[1] * m[1]), 0.0)
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    store_block(P, E, E, add_outer(load_block(P, E, E), scale(angle, vertical), vertical))
+    tilted = add_outer(load_block(P, E, E), scale(angle, vertical), vertical)
+    mean = load3(flight.innovation_drift[AID_GROUPS + _S])
+    sigma = load3(flight.innovation_sigma[AID_BLOCKS + _S])
+    off = (mean[0] * sigma[0], mean[1] * sigma[1], mean[2] * sigma[2])
+    turned = dot(off, off) / (m[0] * m[0] + m[1] * m[1])
+    turned = select(mask & drifts(flight, AID_GROUPS + _S), turned, 0.0)
+    store_block(P, E, E, add_to_diagonal(tilted, turned))
+    rate = turned / (_DRIFT_TIME * _DRIFT_TIME)
+    store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), rate))
     for i in range(3):
         P[k + i, k + i] = P[k + i, k + i] + select(doubted, nu[i] * nu[i], 0.0)
 
