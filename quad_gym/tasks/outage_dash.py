@@ -53,12 +53,12 @@ class Gaps(NamedTuple):
 class OutageDash(Task):
     """Dash through the gaps of ten walls, while GNSS fails for 5 to 15 s.
 
-    The sensors are those of a hobby vehicle. With GNSS the filter knows the position to a
-    decimeter; without it the error is two decimeters after two seconds, a meter after five, and six
-    meters after twelve. Gaps are 3 to 6 m wide, walls 12 m apart. A controller that hurries on
-    through an outage hits a wall; one that waits for its end loses the course that it could have
-    flown, and drifts. How long to go on depends on how sure the filter is, and on how wide the next
-    gap is.
+    The sensors are those of a hobby vehicle (`consumer`). With GNSS the filter knows the position
+    to 0.2 m; without it the error is 0.25 m after two seconds, 0.8 m after five, 2 m after eight,
+    and 4 m after twelve (root mean square). Gaps are 3 to 6 m wide, walls 12 m apart. A controller
+    that hurries on through an outage hits a wall; one that waits for its end loses the course that
+    it could have flown, and drifts. How long to go on depends on how sure the filter is, and on how
+    wide the next gap is.
 
     ## Course
     It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
@@ -66,8 +66,7 @@ class OutageDash(Task):
     alternately 0.75 and 3.75 m north of the course's line, and the width uniformly in [3, 6] m: new
     for each episode. A geofence keeps the vehicle within 14 m of the line and below 12 m.
 
-    GNSS (position, velocity and the compass that comes with it) fails once, from a time in [2, 8] s
-    on, for a time in [5, 15] s.
+    GNSS (position and velocity) fails once, from a time in [2, 8] s on, for a time in [5, 15] s.
 
     ## Reward
     In each step, with the true speed v to the west [m/s] until the last gap is 12 m behind, the
