@@ -70,9 +70,9 @@ class OutageDash(Task):
 
     ## Reward
     In each step, with the true speed v to the west [m/s] until the last gap is 12 m behind, the
-    change of the action da and the body rates w
+    size d of the change of the action and the size w of the body rates [rad/s]
 
-        0.1 min(v, 5) - 0.02 |da|^2 - 0.002 |w|^2
+        0.1 min(v, 5) - 0.02 d^2 - 0.002 w^2
 
     At most 0.5 a step, so 500 in an episode of 1,000 steps. A crash forfeits the course: it costs
     50, and the sum of 0.1 min(v, 5) so far.

@@ -35,10 +35,10 @@ class StaleRace(Task):
     easy; that is the control.
 
     ## Reward
-    In each step, with the speed s toward the next gate [m/s], the change of the action da and the
-    body rates w [rad/s]
+    In each step, with the speed s toward the next gate [m/s], the size d of the change of the
+    action and the size w of the body rates [rad/s]
 
-        0.1 s - 0.02 |da|^2 - 0.002 |w|^2 + 1 (passed a gate) - 5 (crashed)
+        0.1 s - 0.02 d^2 - 0.002 w^2 + 1 (passed a gate) - 5 (crashed)
 
     ## Observation
     That of `Waypoints`: the next gate relative to the vehicle in the body frame that the source
