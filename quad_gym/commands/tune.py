@@ -1,6 +1,6 @@
 """Tune the gains of PD control on what it sees: the estimate, the truth, any sensors.
 
-    quad-gym tune                                         # the four tracking tasks
+    quad-gym tune                                         # all tasks of tracking
     quad-gym tune --env-ids circle --sensors consumer
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pd:results/tune/gains.json
 
