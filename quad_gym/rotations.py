@@ -5,9 +5,13 @@ about z, then roll about x, then pitch about y. Quaternions are Hamilton's (w, x
 inertial.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 
 def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -23,7 +27,14 @@ def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.flo
     return array
 
 
-def _dcms(turns: Rotation, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _rotations() -> "type[Rotation]":
+    """SciPy's rotations. Importing them takes 0.2 s, which a flight without them does not pay."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation
+
+
+def _dcms(turns: "Rotation", shape: tuple[int, ...]) -> NDArray[np.float64]:
     """R_BI of SciPy's rotations, which turn vectors from B to I."""
     return turns.as_matrix().transpose(0, 2, 1).reshape(*shape, 3, 3)  # type: ignore[no-any-return]
 
@@ -41,7 +52,7 @@ def euler_to_dcm(e: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `e` has another shape or is not finite.
     """
     angles = _rows("e", e, (3,))
-    turns = Rotation.from_euler("ZXY", angles.reshape(-1, 3)[:, [2, 0, 1]])
+    turns = _rotations().from_euler("ZXY", angles.reshape(-1, 3)[:, [2, 0, 1]])
     return _dcms(turns, angles.shape[:-1])
 
 
@@ -88,7 +99,7 @@ def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
     norms = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     if (norms < 1e-12).any():
         raise ValueError("q must not be zero")
-    turns = Rotation.from_quat((quaternions / norms).reshape(-1, 4), scalar_first=True)
+    turns = _rotations().from_quat((quaternions / norms).reshape(-1, 4), scalar_first=True)
     return _dcms(turns, quaternions.shape[:-1])
 
 
@@ -105,7 +116,7 @@ def dcm_to_quaternion(R_BI: ArrayLike) -> NDArray[np.float64]:
         ValueError: If `R_BI` has another shape or is not finite.
     """
     R = _rows("R_BI", R_BI, (3, 3))
-    turns = Rotation.from_matrix(R.reshape(-1, 3, 3).transpose(0, 2, 1))
+    turns = _rotations().from_matrix(R.reshape(-1, 3, 3).transpose(0, 2, 1))
     q = turns.as_quat(scalar_first=True)
     largest = np.take_along_axis(q, np.abs(q).argmax(axis=1)[:, np.newaxis], axis=1)
     return np.where(largest < 0.0, -q, q).reshape(*R.shape[:-2], 4)

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
+from quad_gym.packing.gates import gate_limit
 from quad_gym.params import checks as check
 from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import LEAST_DRIFT
@@ -86,7 +86,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
     for aid, params in sensors.aids.items():
         p["aid_scale"][aid] = params.scale
         p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.white_sigma, params.matrix_sigma
-        p["aid_gate"][aid] = special.chdtri(AID_FREEDOMS[aid], sensors.estimator.gate_false_alarm)
+        p["aid_gate"][aid] = gate_limit(AID_FREEDOMS[aid], sensors.estimator.gate_false_alarm)
         for name in ("vector", "scalar"):
             slow = getattr(params, f"slow_{name}")
             if slow is not None:

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import pack_aid_settings, pack_aids, phase_ticks
+from quad_gym.packing.gates import gate_limit
 from quad_gym.packing.world import pack_world
 from quad_gym.params import portable
 from quad_gym.params.clocks import Clocks
@@ -137,8 +137,8 @@ def params_record(
     p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
     p["gradual_above"] = estimator.gradual_above or 0.0
     alarm = estimator.gate_false_alarm
-    p["gate_position"] = special.chdtri(FREEDOMS[POSITION_BLOCK], alarm)
-    p["gate_direction"] = special.chdtri(FREEDOMS[BASELINE_BLOCK], alarm)
+    p["gate_position"] = gate_limit(FREEDOMS[POSITION_BLOCK], alarm)
+    p["gate_direction"] = gate_limit(FREEDOMS[BASELINE_BLOCK], alarm)
     p["gate_patience"] = estimator.gate_patience
     p["gate_uncertainty"] = np.inf if gnss is None else estimator.gate_direction_sigma**2
     noisy = sensors.noisy

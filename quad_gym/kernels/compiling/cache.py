@@ -19,14 +19,18 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite
+import llvmlite.binding as llvm
 import numba
 from numba.core import caching, compiler, config
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
 from quad_gym.kernels.compiling.digest import closure_of, digest_of_function
 from quad_gym.kernels.compiling.locks import locked, say
 from quad_gym.records import WIDTH
 
+_FORM = 2
+"""Of what a file holds; another number for another form, so that an old file is not found."""
 KEPT = 8
 """Files of a function that are kept: of other sources, processors or signatures, the latest."""
 _LOCATORS = (
@@ -39,6 +43,31 @@ _LOCATORS = (
 def cache_of(function: Callable[..., Any]) -> "CodeCache":
     """The cache of the compiled code of a function."""
     return CodeCache(function)
+
+
+@functools.lru_cache(maxsize=64)  # the records of a stage's arguments take milliseconds to write
+def _written(arguments: tuple[Any, ...]) -> str:
+    """The types of arguments in words."""
+    return str(arguments)
+
+
+def _compiler(context: Any) -> str:
+    """The compiler, its options, and the processor that it compiles for."""
+    from quad_gym.kernels.compiling.decorators import LEAN
+
+    options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
+    versions = f"{numba.__version__} {llvmlite.__version__}"
+    return f"{context.codegen().magic_tuple()} {versions} {_FORM} {LEAN} {WIDTH} {options}"
+
+
+def _needed(module: Any) -> tuple[str, ...]:
+    """The names outside a module that its code calls or reads; LLVM aborts where one is missing."""
+    return tuple(
+        value.name
+        for values in (module.functions, module.global_variables)
+        for value in values
+        if value.is_declaration and not value.name.startswith("llvm.")
+    )
 
 
 def where_cached(*folders: Path | None) -> str:
@@ -59,6 +88,8 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
+        self._found: dict[str, bytes] = {}
+        """what was read and not yet loaded, by the name of its file: each is read once"""
 
     @functools.cached_property
     def folder(self) -> Path | None:
@@ -103,16 +134,8 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     def _name(self, signature: Any, context: Any) -> str:
         """The name of the file of a signature."""
-        from quad_gym.kernels.compiling.decorators import LEAN
-
         arguments, _ = numba.core.sigutils.normalize_signature(signature)
-        options = (config.OPT, config.LOOP_VECTORIZE, config.SLP_VECTORIZE, config.BOUNDSCHECK)
-        parts = (
-            self._sources,
-            str(tuple(arguments)),
-            str(context.codegen().magic_tuple()),
-            f"{numba.__version__} {llvmlite.__version__} {LEAN} {WIDTH} {options}",
-        )
+        parts = (self._sources, _written(tuple(arguments)), _compiler(context))
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
         return f"{self._stem}.{digest[:32]}.code"
 
@@ -122,22 +145,28 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
             return None
         name = self._name(signature, context)
         for folder in self._folders:
+            if name in self._found:
+                break
             with contextlib.suppress(OSError):
                 content = (folder / name).read_bytes()
                 if hashlib.sha256(content[32:]).digest() == content[:32]:
-                    return content[32:]
-        return None
+                    self._found[name] = content[32:]
+        return self._found.get(name)
 
     # ---- what Numba calls -------------------------------------------------------------------
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled code of a signature, or None."""
-        target_context.refresh()
         content = self._content(sig, target_context)
+        self._found.clear()
         if content is None:
             return None
         try:
-            return compiler.CompileResult._rebuild(target_context, *pickle.loads(content))
+            needed, parts = pickle.loads(content)
+            rtsys.initialize(target_context)
+            if not all(map(llvm.address_of_symbol, needed)):
+                target_context.refresh()  # registers the rest of Numba, which takes 0.3 s
+            return compiler.CompileResult._rebuild(target_context, *parts)
         except Exception:  # whatever reading it raises, it is as good as none
             return None
 
@@ -146,7 +175,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
         if self.folder is None:
             return
         path = self.folder / self._name(sig, data.target_context)
-        content = dumps(data._reduce())
+        content = dumps((_needed(data.library._final_module), data._reduce()))
         temporary = path.with_suffix(f".{uuid.uuid4().hex[:12]}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -164,6 +193,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     def flush(self) -> None:
         """Delete the files of this function."""
+        self._found.clear()
         for path in self._files("code"):
             path.unlink(missing_ok=True)
 

@@ -62,6 +62,48 @@ def test_an_entry_is_called_and_found_in_the_cache():
     assert cache.holds(signature, single.wahba_of_vectors.targetctx)
 
 
+# ---- what cached code needs of Numba -----------------------------------------------------------
+
+DOT = """
+import numpy as np
+import dot_of_test
+x = np.array([0.0, 5.0])
+dot_of_test.squares(x)
+print(x[0])
+"""
+SQUARES = """
+import numpy as np
+from quad_gym.kernels.compiling import entry
+
+@entry
+def squares(x):
+    x[0] = np.dot(x, x)
+"""
+
+
+def test_cached_code_that_calls_blas_is_loaded_in_another_process(parts):
+    (parts.folder / "dot_of_test.py").write_text(SQUARES)
+    for said_something in (True, False):
+        output, said = parts.run(DOT)
+        assert output == "25.0"
+        assert bool(said) == said_something
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_rest_of_numba_is_registered_only_where_cached_code_needs_it(
+    module, parts, monkeypatch, known
+):
+    assert call(module.a) == 11.0
+    fresh = entry(module.sources["a"], module.SIGNATURE)
+    refreshed = []
+    monkeypatch.setattr(type(fresh.targetctx), "refresh", lambda self: refreshed.append(self))
+    monkeypatch.setattr(caches.llvm, "address_of_symbol", lambda name: 1 if known else None)
+    fresh.compile(module.SIGNATURE)
+    assert bool(refreshed) != known
+    assert call(fresh) == 11.0
+    assert parts.compiled() == ["a"]
+
+
 # ---- damaged and missing files -----------------------------------------------------------------
 
 
