@@ -76,7 +76,13 @@ class LookAround(Task):
         return self.pieces(view)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
-        """`features_direction`: (n, 3) unit vector to the middle of the markers, in B."""
+        """`features_direction`: (n, 3) unit vector to the middle of the markers, in B.
+
+        Raises:
+            ValueError: If there is no camera, so that there are no markers.
+        """
+        if len(view.features) == 0:
+            raise ValueError("LookAround needs a camera, expected camera=True, got False")
         gap = view.features.mean(axis=0) - view.seen.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
         return {"features_direction": (view.seen.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}
