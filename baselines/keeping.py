@@ -1,4 +1,4 @@
-"""Keeping a run, whichever engine trains: evaluations, the best policy, a calm end on Ctrl-C."""
+"""What is kept of a run, with either engine: evaluations, the best policy; Ctrl-C ends it cleanly."""
 
 import csv
 import io

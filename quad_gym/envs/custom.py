@@ -1,4 +1,4 @@
-"""From the keyword `custom` to flights under a task of a user's own."""
+"""From the keyword `custom` to flights with a user's task."""
 
 from collections.abc import Callable
 from functools import partial

@@ -1,4 +1,4 @@
-"""The one entry that flies: a step, or a reset, of the blocks of a batch."""
+"""The compiled entry that steps or resets the blocks of a batch."""
 
 from numba import types
 

@@ -1,4 +1,4 @@
-"""`TaskBatch`: flights that a task of a user's own judges, observes and begins."""
+"""`TaskBatch`: flights with the rewards, endings, observations and starts of a user's task."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

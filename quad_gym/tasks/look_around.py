@@ -1,4 +1,4 @@
-"""`LookAround`: a task in which a controller decides by looking what it knows."""
+"""`LookAround`: a task in which the position is known only as well as the camera looks."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""`OutageDash`: a task in which being unsure changes what is best to do."""
+"""`OutageDash`: a task in which uncertainty changes the best action."""
 
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple

@@ -1,4 +1,4 @@
-"""`Task`: reward, endings, observation and reset of one's own, over those that ship."""
+"""`Task`: a user's reward, endings, observation and reset, in place of the built-in ones."""
 
 import importlib
 import os

@@ -13,8 +13,8 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
 
-Where GNSS has one antenna, the field tells the heading of the filter's start, which is level or so:
-that in which the field points where it is seen to. With the vertical k, the level direction h of
+Where GNSS has one antenna, the field tells the heading of the filter's nearly level start: that at
+which the expected field has the measured direction. With the vertical k, the level direction h of
 the field and s = k x h, all in B, the field's level and vertical share m_h and m_z, nothing of the
 innovation is left along s, so that the derivative ties the error of the heading to others:
 
