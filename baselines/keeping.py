@@ -1,4 +1,4 @@
-"""What is kept of a run, with either engine: evaluations, the best policy; Ctrl-C ends it cleanly."""
+"""What is kept of a run, with either engine: evaluations and the best policy, on Ctrl-C, too."""
 
 import csv
 import io

@@ -1,8 +1,8 @@
 """A lock on the folder of a run, so that no two processes ever train in it.
 
 The system releases the lock when its process ends, however it ends. On a file system that several
-machines share, the lock holds between them, too, if the file system supports locks (NFS does, Lustre
-if it is mounted with `flock`).
+machines share, the lock holds between them, too, if the file system supports locks (NFS does, and
+Lustre if it is mounted with `flock`).
 """
 
 import os

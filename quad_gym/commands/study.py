@@ -62,7 +62,7 @@ class Args:
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as duration=30.0"""
     quick: bool = False
-    """two seeds of 300,000 steps and 100 episodes: shows that it works, proves nothing"""
+    """two seeds of 300,000 steps and 100 episodes: a check that it works, not a result"""
 
     episodes: int = 1000
     """of the test, the same for every policy"""

@@ -1,4 +1,4 @@
-"""The table of a sweep, made from its folders alone, so that it is the same however they were trained.
+"""The table of a sweep, made from its folders alone, however these were trained.
 
 It holds neither times nor paths. Of a training that is not finished it has the steps alone.
 """

@@ -20,8 +20,8 @@ counted once, and a gate of false alarm 1e-4 guards the filter.
 
 `rtk`, `consumer` and `indoor` also do what real sensors do beside noise and bias: measurements
 arrive late, accelerometer axes are not quite orthogonal, rotors shake the IMU, headings have a
-constant error, the camera blurs and has a limited range. Gyros have no error of scale or alignment by
-default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
+constant error, the camera blurs and has a limited range. Gyros have no error of scale or alignment
+by default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
 place (docs/sensors-and-filter.md says what it does).
 
 The noise of `observation="noisy"` is the size of each suite's own errors. Outside `lab` it is the

@@ -1,8 +1,8 @@
 r"""The number type of the kernels: float64 of several flights that fly together.
 
 A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it
-serves the classes for one vehicle and the tests; compiled for `Lanes` the same source flies WIDTH flights
-on the SIMD unit. This file teaches Numba three value types and the operations on them:
+serves the classes for one vehicle and the tests; compiled for `Lanes` the same source flies WIDTH
+flights on the SIMD unit. This file teaches Numba three value types and the operations on them:
 
 | type      | WIDTH of | plain counterpart | operations                                           |
 |-----------|----------|-------------------|------------------------------------------------------|
