@@ -1,4 +1,4 @@
-"""Variants of `LookAround` that arms of a study are trained in, and some are flown in."""
+"""Variants of `LookAround` for the arms of a study: for training, and some for evaluation."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING

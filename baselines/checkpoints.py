@@ -1,4 +1,4 @@
-"""Checkpoints of Stable-Baselines3's models, from which a run goes on exactly."""
+"""Checkpoints of Stable-Baselines3's models, from which a run resumes exactly."""
 
 import io
 import pickle

@@ -1,4 +1,4 @@
-"""Keeping a run, whichever engine trains: evaluations, the best policy, a calm end on Ctrl-C."""
+"""What is kept of a run, with either engine: evaluations and the best policy, on Ctrl-C, too."""
 
 import csv
 import io

@@ -1,8 +1,8 @@
 """A lock on the folder of a run, so that no two processes ever train in it.
 
-The system takes the lock away from a process that ends, however it ends. On a file system that
-several machines share, it holds between them, too, if the file system has locks at all (NFS does,
-Lustre where it is mounted with `flock`).
+The system releases the lock when its process ends, however it ends. On a file system that several
+machines share, the lock holds between them, too, if the file system supports locks (NFS does, and
+Lustre if it is mounted with `flock`).
 """
 
 import os

@@ -1,7 +1,7 @@
 """`MlpPolicy`: a trained network as plain arrays, flown with NumPy alone.
 
-A policy that ships needs no torch and no unpickling: it is a file of weights with its training
-record in it.
+A shipped policy needs neither torch nor unpickling: it is a file of weights that also holds the
+record of its training.
 """
 
 import json

@@ -1,8 +1,8 @@
 """Recipes: how each algorithm is trained on each task, all hyper-parameters in one place.
 
 A recipe is data. `scripts/train.py` and `scripts/compare.py` read it, and their options override
-it. The judged task is always that of the environment's id; `flights` says how the flights in
-training differ from it, such as a start that is easier to learn from.
+it. Policies are always evaluated on the task of the environment's id; `flights` says how the
+flights in training differ from it, such as a start that is easier to learn from.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Which flights training, validation and test may fly: blocks of seeds that never meet.
+"""Which flights training, validation and test may fly: blocks of seeds that never overlap.
 
 Flight i of an environment seeded with s is flight 0 of one seeded with s + 1, as is Gymnasium's
 convention. Trainings with seeds 0 and 4 would therefore share most of their flights, and an

@@ -12,7 +12,7 @@ The folder holds
 - `training.lock`: which process trains in it, or did last;
 - TensorBoard's files.
 
-A run that is resumed goes on exactly where the last evaluation left it.
+A resumed run continues exactly from its last evaluation.
 """
 
 import json

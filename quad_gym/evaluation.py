@@ -1,4 +1,4 @@
-"""Rolling out a policy, and what comes of it episode by episode."""
+"""Rolling out a policy, with results episode by episode."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol

@@ -1,4 +1,4 @@
-"""The learning half of PPO: epochs of minibatches, on as many threads as help."""
+"""The learning half of PPO: epochs of minibatches, on as many threads as pay off."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Actor and critic in one vector of parameters: where each layer lies, and its first values."""
+"""Actor and critic in one vector of parameters: the place of each layer, and its initial values."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise

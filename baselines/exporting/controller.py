@@ -1,4 +1,4 @@
-"""`Controller`: a trained network with everything that whoever runs it elsewhere has to know."""
+"""`Controller`: a trained network, with all that is needed to run it elsewhere."""
 
 import json
 from collections.abc import Mapping

@@ -1,1 +1,1 @@
-"""Metrics, filter consistency, figures and reports; what scripts make of flights."""
+"""Metrics, filter consistency, figures and reports, all computed from flights."""

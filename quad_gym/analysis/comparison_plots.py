@@ -1,4 +1,4 @@
-"""Figures that set controllers side by side: errors over time, learning curves, matrices, paths.
+"""Figures that compare controllers: errors over time, learning curves, matrices, paths.
 
 As in `plots`: no window opens, colors are those of Okabe and Ito, and every curve has a line style
 of its own too.

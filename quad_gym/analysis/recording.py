@@ -1,7 +1,7 @@
 """Fly a batch to the end and keep what tables and figures of a flight need.
 
-Nothing is kept of every instant of every flight but sums and percentiles, so that a hundred
-thousand flights fit into memory as well as ten.
+Of each instant, only sums and percentiles over all flights are kept, so that a hundred thousand
+flights fit into memory.
 """
 
 from collections.abc import Callable, Iterable, Sequence

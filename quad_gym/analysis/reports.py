@@ -1,4 +1,4 @@
-"""What experiments leave behind: tables on the screen, summaries as JSON, numbers as CSV."""
+"""Output of experiments: tables on the screen, summaries as JSON, numbers as CSV."""
 
 import csv
 import dataclasses

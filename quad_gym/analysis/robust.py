@@ -1,7 +1,7 @@
 """Statistics over few training seeds: interquartile means, bootstrap intervals, worst cases.
 
-What R. Agarwal and others, "Deep reinforcement learning at the edge of the statistical precipice",
-NeurIPS 2021, recommend where only a handful of trainings can be afforded. Numbers come as (s, e): a
+The methods that R. Agarwal and others, "Deep reinforcement learning at the edge of the statistical
+precipice", NeurIPS 2021, recommend for a handful of trainings. Numbers have the shape (s, e): a
 row for each training seed, a column for each episode; column i is the same episode in every row and
 in every arm.
 """

@@ -1,6 +1,6 @@
 """Calls of the compiled code that flies: addresses of a batch's memory, in words.
 
-Numba takes a third of a microsecond for every array that it is handed, more than a stage takes.
+Numba needs a third of a microsecond for each array argument, longer than a stage runs.
 """
 
 from collections.abc import Mapping, Sequence

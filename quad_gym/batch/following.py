@@ -1,4 +1,4 @@
-"""Flights that follow trajectories of a user's own: whether they can, and which one they follow."""
+"""Flights that follow users' trajectories: whether they can, and which one each follows."""
 
 import math
 from typing import TYPE_CHECKING, Any

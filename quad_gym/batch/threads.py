@@ -1,4 +1,4 @@
-"""The one place that knows of threads: shares a range of blocks among the cores.
+"""Threads, which share the blocks of a batch. No other module knows of threads.
 
 Kernels release the GIL, so plain threads run them side by side. A crew of threads belongs to the
 process that made it: after a fork the child makes its own, and a batch that is pickled or copied

@@ -1,9 +1,9 @@
 """Warm starts: the covariance that a filter has reached before a flight begins.
 
-Before any real take-off the filter has been running for a while. How sure it is then depends on the
-sensors and hardly on the flight, so that it is computed once for a configuration: flights hover
-where the task begins, each with noise of its own, and the mean of their covariances, turned to a
-common heading, is what every episode begins with.
+Before any real take-off the filter has been running for a while. Its covariance then depends on
+the sensors and hardly on the flight, so that it is computed once for a configuration: flights hover
+where the task begins, each with its own noise, and every episode begins with the mean of their
+covariances, turned to a common heading.
 """
 
 import functools

@@ -1,7 +1,7 @@
 """Ablation: what a wrong model, and each correction of the filter, do to its consistency.
 
-Flies the same seeds case by case, and tables the normalized estimation error squared (NEES) of the
-state and of each block, 15 and 3 where the covariance is right, beside the errors themselves.
+Flies the same seeds case by case, and tabulates the normalized estimation error squared (NEES) of
+the state and of each block, 15 and 3 where the covariance is right, beside the errors themselves.
 
   quad-gym ablation models    vehicle, world and sensors other than they are believed to be
   quad-gym ablation filters   UKF and EKF, and the filter without each correction

@@ -3,7 +3,7 @@
 A quadrotor starts at rest on the ground, below a point that moves on a horizontal circle, and a PD
 controller follows that point at every IMU sample. The controller is told either the true state or
 the estimate of an unscented Kalman filter that fuses GNSS, IMU and camera. What is lost by flying
-on the estimate, and does the camera help? Flights with the same seed meet the same noise and
+on the estimate, and does the camera help? Flights with the same seed have the same noise and
 biases, so cases are compared flight by flight.
 
 Prints a table, and writes figures (PNG and SVG), the numbers of every flight (flights.csv), and a

@@ -1,4 +1,4 @@
-"""What does a controller lose on the estimate, and does training on the estimate win it back?
+"""What does a controller lose on the estimate, and does training on the estimate recover it?
 
     quad-gym compare                         # the circle, 5 seeds
     quad-gym compare --quick                 # one seed, a few minutes
@@ -7,10 +7,10 @@
 For every seed, PPO is trained on the true state, on the true state with independent noise (what
 other packages offer as sensor noise), and on the filter's estimate. Each policy then flies the same
 episodes on the truth and on the estimate, and so does PD control with tuned gains. Prints the
-matrix of tracking errors and crash rates with 95 % intervals, says what they allow one to conclude,
+matrix of tracking errors and crash rates with 95 % intervals, says what can be concluded from them,
 and writes figures, numbers and a report (report.html) that opens without a network.
 
-A comparison that was stopped goes on where it stopped when it is started again.
+An interrupted comparison continues where it stopped when it is started again.
 """
 
 import multiprocessing

@@ -1,4 +1,4 @@
-"""What flying a policy many times has given, kept in a file so that it is flown once."""
+"""Results of flying a policy many times, kept in a file so that it is flown only once."""
 
 from dataclasses import dataclass
 from pathlib import Path

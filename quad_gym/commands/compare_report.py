@@ -153,7 +153,7 @@ def matrix_text(comparison: Comparison, suite: str) -> str:
 
 
 def conclusions(comparison: Comparison) -> list[str]:
-    """What the intervals allow one to conclude, and what they do not."""
+    """What can be concluded from the intervals, and what cannot."""
     setting = comparison.setting
     sentences = []
     for suite in setting.suites:

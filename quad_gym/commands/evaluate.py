@@ -1,4 +1,4 @@
-"""Fly policies on what they see, and measure how well by the true state.
+"""Fly policies on their observations, and evaluate them by the true state.
 
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pretrained
     quad-gym evaluate --policy results/train/circle/ppo_seed_0/best.zip --sensors rtk

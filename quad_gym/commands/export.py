@@ -5,7 +5,7 @@
     quad-gym export filter --sensors rtk
 
 A policy becomes one file of C99 that needs nothing else, or an ONNX model, which is compared with
-the policy in onnxruntime. Both hold observations within their bounds, and say what observation and
+the policy in onnxruntime. Both clip observations to their bounds, and say what observation and
 action are: names, units, frames, rate. A filter becomes JSON or a header of C, with the numbers
 that its equations take. docs/deployment.md says how to feed them.
 """

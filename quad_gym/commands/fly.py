@@ -6,9 +6,8 @@
     quad-gym fly --replay results/outage.npz --view chase
     quad-gym fly --replay results/outage.npz --output results/outage.rrd
 
-The blue vehicle is the truth. The orange ghost is where the filter believes it to be, with the
-ellipsoid that holds it with 3 sigma; the controller flies on that belief, unless --observation says
-otherwise.
+The blue vehicle is the truth. The orange ghost is the filter's estimate, with its 3-sigma
+ellipsoid; the controller flies on the estimate, unless --observation says otherwise.
 
 In the window: C and G switch camera and GNSS off and on, F makes the --faults come and go,
 V changes the view, the space bar stops time, R begins the next episode, and Q or Escape ends the

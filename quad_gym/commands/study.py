@@ -1,15 +1,15 @@
-"""Where does the estimate decide? Train arms with several seeds, and fly the same episodes.
+"""Where does the estimate matter? Train arms with several seeds, and fly the same episodes.
 
     quad-gym study                                   # LookAround, all arms, 5 seeds
     quad-gym study --arms truth sigma --seeds 10
-    quad-gym study --quick                           # minutes: shows that it works, proves nothing
+    quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
 Every arm of baselines/arms.py (or of a file like it) is trained with the compiled PPO, and every
 policy flies the same test episodes on the estimate. Prints a table with interquartile means over
-the seeds and bootstrap 95 % intervals, says what they allow one to conclude, and writes figures,
-numbers and a report. Each training is a folder: a study that was stopped goes on where it stopped,
-and a folder that is deleted is made again, and nothing else.
+the seeds and bootstrap 95 % intervals, says what can be concluded from them, and writes figures,
+numbers and a report. Each training is a folder: an interrupted study continues where it
+stopped, and a training whose folder was deleted is repeated, but no other.
 """
 
 import csv
@@ -62,7 +62,7 @@ class Args:
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as duration=30.0"""
     quick: bool = False
-    """two seeds of 300,000 steps and 100 episodes: shows that it works, proves nothing"""
+    """two seeds of 300,000 steps and 100 episodes: a check that it works, not a result"""
 
     episodes: int = 1000
     """of the test, the same for every policy"""

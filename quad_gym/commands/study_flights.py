@@ -1,4 +1,4 @@
-"""What flying a policy in a study has given: numbers of every episode, and a few in full."""
+"""Results of flying a policy in a study: numbers of every episode, and a few in full."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a study leaves behind: tables, figures, numbers, and a page."""
+"""Output of a study: tables, figures, numbers, and a page."""
 
 import base64
 import html

@@ -1,4 +1,4 @@
-"""What a study allows one to conclude, in words that are computed from its numbers."""
+"""Conclusions of a study, in words that are computed from its numbers."""
 
 from quad_gym.analysis.robust import Estimated
 from quad_gym.commands.study_results import Results

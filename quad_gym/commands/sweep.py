@@ -8,7 +8,7 @@
 Values separated by commas are tried one by one, as are lists in the file. Each training is a folder
 of what quad-gym train writes. Trainings run as processes of this machine, as jobs of Slurm (through
 submitit) or as tasks of Ray. One that dies starts again from its checkpoint; a sweep that was
-stopped, or killed, goes on when it is started again; two sweeps in one folder share the work. The
+stopped, or killed, continues when it is started again; two sweeps in one folder share the work. The
 tables, trainings.csv, groups.csv and table.txt, are made from the folders alone.
 """
 

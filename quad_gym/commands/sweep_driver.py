@@ -1,4 +1,4 @@
-"""Starts the trainings of a sweep, notices how each ends, and starts again what has died."""
+"""Starts the trainings of a sweep, notices how each ends, and restarts those that died."""
 
 import signal
 import time

@@ -1,7 +1,7 @@
 """Where the trainings of a sweep run: processes of this machine, Slurm through submitit, Ray.
 
-All run the same function, `work`, which locks the folder, trains, and says in a word how it ended.
-Each executor starts jobs, and its jobs know whether they have ended, however that came.
+All run the same function, `work`, which locks the folder, trains, and returns in one word how it
+ended. Each executor starts jobs, which know whether they have ended, for whatever reason.
 """
 
 import importlib

@@ -1,6 +1,6 @@
-"""The table of a sweep, made from its folders alone: the same however they came to be.
+"""The table of a sweep, made from its folders alone, however these were trained.
 
-Nothing in it is a time or a place. A training that is not finished has its steps, and nothing else.
+It holds neither times nor paths. Of a training that is not finished it has the steps alone.
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""Train a controller on what a filter estimates, on the truth, or on anything else it may see.
+"""Train a controller on a filter's estimate, on the truth, or on any other observation.
 
     quad-gym train QuadGym/Circle-v0
     quad-gym train QuadGym/Hover-v0 --algorithm sac --seed 3 --env observation=truth
@@ -7,7 +7,7 @@ The hyper-parameters are those of baselines/recipes.py for the task and the algo
 training, the policy is evaluated on the task itself, by its true position error, and kept: last.zip
 and best.zip (.npz with --engine compiled), which quad-gym evaluate flies, with training.json
 (everything needed to repeat the run), evaluations.csv, and TensorBoard's files. A run that was
-stopped, by Ctrl-C or otherwise, goes on with --resume, exactly where its last evaluation left it.
+interrupted, by Ctrl-C or otherwise, continues with --resume, exactly from its last evaluation.
 """
 
 import importlib.util

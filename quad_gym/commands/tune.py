@@ -1,12 +1,12 @@
-"""Tune the gains of PD control on what it sees: the estimate, the truth, any sensors.
+"""Tune the gains of PD control on its observations: the estimate or the truth, with any sensors.
 
-    quad-gym tune                                         # all tasks of tracking
+    quad-gym tune                                         # all tracking tasks
     quad-gym tune --env-ids circle --sensors consumer
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pd:results/tune/gains.json
 
 Differential evolution (scipy.optimize) searches gains between a third and three times those it
 starts from, for the smallest true position error: for each task relative to the gains at the start,
-geometric mean over the tasks, episodes that crash counted as far off. Every candidate flies the
+geometric mean over the tasks, where a crash counts as a large error. Every candidate flies the
 same episodes; at the end the best flies fresh ones, beside the gains at the start. Prints both,
 and writes gains.json and search.csv.
 """

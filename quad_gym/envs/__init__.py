@@ -34,12 +34,12 @@ def register_task(
     base: str = "QuadGym/Circle-v0",
     **keywords: Any,
 ) -> None:
-    """Register an environment with a task of one's own, for all three interfaces.
+    """Register an environment with your own task, for all three interfaces.
 
     Args:
         env_id: A new id, such as "Mine/Chase-v0".
         custom: The task, see `quad_gym.Task`.
-        base: The id over which it is laid.
+        base: The id of the environment that it changes.
         keywords: Those of `QuadEnv`, as defaults.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Tasks made of the general ones: a reference that ships, with sensors and a `Task` of its own."""
+"""Benchmark tasks: each is a built-in reference with sensors and a `Task` of its own."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""From the keyword `custom` to flights under a task of a user's own."""
+"""From the keyword `custom` to flights with a user's task."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +17,7 @@ Table = tuple[ObservationField, ...]
 def with_task(
     custom: Any, make: "partial[FlightBatch]", table: Table
 ) -> "tuple[partial[FlightBatch], Table]":
-    """What makes the flights, and the table of their observation, under a task of a user's own.
+    """What makes the flights, and the table of their observation, with a user's task.
 
     What `observe` returns is found by asking it once, of a flight of its own.
 

@@ -1,4 +1,4 @@
-"""What `info` says of a flight beside the judge's findings: faults, and innovations."""
+"""What `info` says of a flight besides errors and endings: faults, and innovations."""
 
 from typing import Any
 

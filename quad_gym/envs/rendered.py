@@ -1,4 +1,4 @@
-"""Rendering, as all interfaces of an environment do it; imports nothing until it is used."""
+"""Rendering, the same for all interfaces of an environment; imports nothing until it is used."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any

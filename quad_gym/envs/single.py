@@ -49,7 +49,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
     | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
     | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; unless given, a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; unless given, 10 s |
-    | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a price for looking at them | hovering near it | 15 s |
+    | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a cost of looking at them | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
     | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 20 s |
 
@@ -72,13 +72,13 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | 21:24 | preview_2 | reference in 0.4 s (the gate after) less the present one | m | B |
     | 24:28 | last_action | | - | - |
 
-    The body frame is the one that the controller's source believes in. `layout="absolute"` gives
+    The body frame is that of the attitude that the controller sees. `layout="absolute"` gives
     position, velocity, rotation matrix, biases and reference in the inertial frame;
     `observation="sensors"` gives the raw measurements of the step with flags (a measurement that
     was not taken is zero, its flag too), of the IMU the last sample and the mean over the step, and
     has that layout only.
     `quad_gym.observation_layout(...)` returns any of these tables, with bounds; observations are
-    held within them.
+    clipped to them.
 
     ## Action space
     `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal vehicle. The
@@ -126,7 +126,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     `filter_status`, 0 while all is well; `filter_lost`, whether a filter that gates (or keeps
     its innovations) finds that its covariance does not explain what it measures; `gates_passed`.
     With `randomization` also `drawn`, the parameters of the episode by name. With `faults` also
-    `faults`: whether each is there now, by name. With `innovations=True` also `innovations`: the last innovations of the filter, their
+    `faults`: whether each is active now, by name. With `innovations=True` also `innovations`: the last innovations of the filter, their
     squares (NIS) and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
 
     ## World
@@ -352,7 +352,7 @@ def limit_asked_of_make() -> int | None:
 
     Gymnasium keeps that argument to itself and wraps a `TimeLimit` around what it has made, which
     can only cut an episode short: an environment with a time limit of its own would end before a
-    longer one, and nobody would be told. So it is read where it is, in the frame of `make`; the
+    longer one, without a word. So it is read from the frame of `make`; the
     wrapper then cuts at the same step as the environment.
     """
     frame = inspect.currentframe()

@@ -61,6 +61,8 @@ class _KalmanFilter(Estimate):
         gnss_sigma: ArrayLike | None = None,
         velocity_sigma: float | None = None,
         tilt_sigma: float | None = None,
+        accel: ArrayLike | None = None,
+        accel_sigma: float | None = None,
         time: float = 0.0,
     ) -> None:
         """Start from a first fix.
@@ -71,9 +73,14 @@ class _KalmanFilter(Estimate):
 
         Without: the vehicle is taken as level, and its heading comes from the first of these that
         is given: `heading`, `magnetometer`, or with `course` the direction of `gnss_velocity_G`. If
-        none is, the heading may be any, and the motion tells it: see `heading_known`. The
-        covariance says how uncertain all of this is, and what hangs together: a tilt or hard iron
-        turns the magnetic heading, and the center of mass hangs below its antenna.
+        none is, the heading may be any, and the motion tells it: see `heading_known`.
+
+        With `accel`: roll and pitch are those of a vehicle at rest whose accelerometer measures
+        this, however tilted it stands. The heading comes from a baseline or from one of the above.
+
+        The covariance says how uncertain all of this is, and which errors depend on each other: a
+        tilt or hard iron turns the magnetic heading, a bias of the accelerometer tilts the start,
+        and the center of mass hangs below its antenna.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
@@ -91,6 +98,10 @@ class _KalmanFilter(Estimate):
             velocity_sigma: Noise of the velocity per axis [m/s]; None: as the suite says.
             tilt_sigma: Deviation of roll and pitch of a level start [rad]; None:
                 `FilterParams.initial_tilt_sigma`, or else LEVEL_SIGMA.
+            accel: (3,) specific force at rest in B, best the mean of many samples [m/s^2]; None:
+                the vehicle is taken as level.
+            accel_sigma: Its white noise per axis [m/s^2]; None: that of one sample. The bias counts
+                besides.
             time: Time stamp of the start [s]; others count from the same zero.
 
         Raises:
@@ -111,6 +122,8 @@ class _KalmanFilter(Estimate):
             gnss_sigma,
             velocity_sigma,
             tilt_sigma,
+            accel,
+            accel_sigma,
         )
         begin, engine = check.number("time", time), self._engine
         self._begin(begin, len(fix.starts))

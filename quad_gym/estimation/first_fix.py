@@ -12,11 +12,16 @@ from quad_gym.estimation.engine import Engine, Floats
 from quad_gym.estimation.headings import COUNT, SPACING, write_starts
 from quad_gym.estimation.samples import checked_baseline, gnss_noise, require_gnss
 from quad_gym.estimation.starts import (
+    LEVEL,
     LEVEL_SIGMA,
     FirstEstimate,
     Heading,
-    level_start,
+    Tilt,
+    baseline_heading,
+    known_heading,
     magnetic_heading,
+    resting_tilt,
+    still_start,
 )
 from quad_gym.frames import ecef_to_enu
 from quad_gym.params import checks as check
@@ -44,7 +49,7 @@ class FirstFix:
     x_I: Floats
     """level direction of the body x axis, beside a steep baseline; zero: not known"""
     starts: list[FirstEstimate] = field(default_factory=list)
-    """level starts, one or one for each heading; none where there is a baseline"""
+    """starts of a known tilt, one or one for each heading; none by Wahba's problem"""
 
     def write(self, engine: Engine) -> None:
         """Start the filters in an engine's memory."""
@@ -75,6 +80,8 @@ def checked_fix(
     gnss_sigma: ArrayLike | None,
     velocity_sigma: float | None,
     tilt_sigma: float | None,
+    accel: ArrayLike | None,
+    accel_sigma: float | None,
 ) -> FirstFix:
     """The arguments of `initialize`.
 
@@ -86,13 +93,14 @@ def checked_fix(
     _require_relative(position)
     sigmas, covariance = _position_noise(sensors, gnss_sigma)
     velocity, speeds = _first_velocity(sensors, gnss_velocity_G, velocity_sigma)
-    if gnss_baseline_G is not None:
-        baseline = checked_baseline(sensors, gnss_baseline_G)
+    baseline = None if gnss_baseline_G is None else checked_baseline(sensors, gnss_baseline_G)
+    if baseline is not None and accel is None:
         _refuse_beside_baseline(
             heading_sigma=heading_sigma,
             magnetometer=magnetometer,
             magnetometer_sigma=magnetometer_sigma,
             tilt_sigma=tilt_sigma,
+            accel_sigma=accel_sigma,
             course=course or None,
             **{"a covariance as gnss_sigma": covariance},
         )
@@ -102,12 +110,18 @@ def checked_fix(
             x_I[:2] = np.cos(angle), np.sin(angle)
         return FirstFix(position, sigmas, velocity, speeds, baseline, x_I)
 
-    tilt = sensors.estimator.initial_tilt_sigma or LEVEL_SIGMA
-    if tilt_sigma is not None:
-        tilt = check.positive("tilt_sigma", tilt_sigma, most=1.0)
-    told = [heading is not None, magnetometer is not None, check.flag("course", course)]
-    if sum(told) > 1:
-        raise ValueError("only one of heading, magnetometer and course must be given")
+    tilt = _first_tilt(sensors, tilt_sigma, accel, accel_sigma)
+    told = {
+        "heading": heading is not None,
+        "magnetometer": magnetometer is not None,
+        "course": check.flag("course", course),
+        "gnss_baseline_G": baseline is not None,
+    }
+    if sum(told.values()) > 1:
+        raise ValueError(
+            "only one of heading, magnetometer, course and a baseline must be given, got "
+            + " and ".join(name for name, given in told.items() if given)
+        )
     if magnetometer is None and magnetometer_sigma is not None:
         raise ValueError("magnetometer_sigma must come with magnetometer")
     own = sensors.placement.heading_sigma
@@ -117,18 +131,20 @@ def checked_fix(
         own = check.positive("heading_sigma", heading_sigma, most=math.pi)
 
     # by halves of the distance to the next one they overlap as one uniform distribution
-    headings = [Heading(k * SPACING, 0.5 * SPACING) for k in range(COUNT)]
+    headings = [known_heading(k * SPACING, 0.5 * SPACING, tilt) for k in range(COUNT)]
     if heading is not None:
-        headings = [Heading(check.number("heading", heading), own)]
+        headings = [known_heading(check.number("heading", heading), own, tilt)]
     elif magnetometer is not None:
-        headings = [_by_magnetometer(sensors, magnetometer, magnetometer_sigma)]
+        headings = [_by_magnetometer(sensors, magnetometer, magnetometer_sigma, tilt)]
     elif course:
-        headings = [_by_course(velocity, float(speeds[0]), own)]
+        headings = [_by_course(velocity, float(speeds[0]), own, tilt)]
+    elif baseline is not None:
+        headings = [_by_baseline(sensors, baseline, tilt)]
     assert sensors.gnss is not None
     antenna_I = ecef_to_enu(sensors.gnss.reference_antenna_G) @ position
     root = math.sqrt(sensors.estimator.initial_scale) * _root(sigmas, covariance)
     still = np.zeros(3) if velocity is None else velocity
-    starts = [level_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
+    starts = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
     return FirstFix(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), starts)
 
 
@@ -181,16 +197,55 @@ def _first_velocity(
     return ecef_to_enu(gnss.reference_antenna_G) @ v_G, np.full(3, noise)
 
 
-def _by_magnetometer(sensors: SensorSuite, magnetometer: ArrayLike, sigma: float | None) -> Heading:
+def _first_tilt(
+    sensors: SensorSuite,
+    tilt_sigma: float | None,
+    accel: ArrayLike | None,
+    accel_sigma: float | None,
+) -> Tilt:
+    """Level, or as an accelerometer at rest tells."""
+    if accel is None:
+        if accel_sigma is not None:
+            raise ValueError("accel_sigma must come with accel")
+        sigma = sensors.estimator.initial_tilt_sigma or LEVEL_SIGMA
+        if tilt_sigma is not None:
+            sigma = check.positive("tilt_sigma", tilt_sigma, most=1.0)
+        return LEVEL._replace(sigma=sigma)
+    if tilt_sigma is not None:
+        raise ValueError("tilt_sigma must not be given with accel, which tells the tilt")
+    white = sensors.imu.accel_noise_density / math.sqrt(sensors.imu.dt)
+    if accel_sigma is not None:
+        white = check.positive("accel_sigma", accel_sigma)
+    force = check.array("accel", accel, (3,))
+    return resting_tilt(force, white, sensors.estimator.gravity)
+
+
+def _by_magnetometer(
+    sensors: SensorSuite, magnetometer: ArrayLike, sigma: float | None, tilt: Tilt
+) -> Heading:
     if Aid.MAGNETOMETER not in sensors.aids:
         raise ValueError("the sensor suite has no magnetometer to initialize with")
     field_B = check.array("magnetometer", magnetometer, (3,))
     if sigma is not None:
         sigma = check.positive("magnetometer_sigma", sigma)
-    return magnetic_heading(sensors, field_B, sigma)
+    return magnetic_heading(sensors, field_B, sigma, tilt)
 
 
-def _by_course(velocity: Floats | None, sigma: float, own: float) -> Heading:
+def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> Heading:
+    gnss = sensors.gnss
+    assert gnss is not None
+    sigma = math.sqrt(sensors.estimator.initial_scale) * gnss.first_baseline_sigma
+    baseline_I = ecef_to_enu(gnss.reference_antenna_G) @ baseline_G
+    found = baseline_heading(np.array(gnss.baseline_B), baseline_I, sigma, tilt)
+    if found is None:
+        raise ValueError(
+            "gnss_baseline_G must not be within 12 degrees of the vertical where accel tells the "
+            "tilt: give a heading in its place"
+        )
+    return found
+
+
+def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) -> Heading:
     if velocity is None:
         raise ValueError("course must come with gnss_velocity_G")
     speed = math.hypot(velocity[0], velocity[1])
@@ -199,4 +254,5 @@ def _by_course(velocity: Floats | None, sigma: float, own: float) -> Heading:
             f"course must be that of a vehicle that moves, at least {LEAST_COURSE * sigma:g} m/s "
             f"over the ground, got {speed:g} m/s"
         )
-    return Heading(math.atan2(velocity[1], velocity[0]), math.hypot(own, sigma / speed))
+    angle = math.atan2(velocity[1], velocity[0])
+    return known_heading(angle, math.hypot(own, sigma / speed), tilt)

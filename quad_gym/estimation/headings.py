@@ -1,13 +1,13 @@
-"""A filter that does not know its heading: a sum of Gaussians, one for each of many headings.
+"""A filter whose heading is unknown: a sum of Gaussians, one for each of many headings.
 
-Linearized about one heading a filter that may look anywhere is lost. So each lane of some blocks
-starts from another heading, and from a deviation of half the distance to the next: together they
-are as good as uniform. Each measurement weighs them by how likely it was in each,
+A filter that linearizes about one heading fails if the true one is far from it. So each lane of
+some blocks starts from another heading, with half the distance to the next as its deviation: their
+sum is nearly uniform. Each measurement weighs them by its likelihood in each,
 
     log w += -(nu^T S^-1 nu + log det S) / 2,   det S = det R (det L- / det L+)^2,
 
-where R is the same in all. What the vehicle does tells the heading: without accelerating it never
-learns it. When the deviation of the heading is below `RESOLVED`, one Gaussian with the mean and the
+where R is the same in all. Acceleration reveals the heading; without it the heading stays
+unknown. When the deviation of the heading is below `RESOLVED`, one Gaussian with the mean and the
 covariance of the sum takes over.
 
 Source: D. L. Alspach and H. W. Sorenson, IEEE Trans. Automatic Control 17(4), 1972.

@@ -1,11 +1,11 @@
-"""What a filter was given within its window of time, so that a late measurement is not too late.
+"""What a filter was given within its window of time, so that it can include late measurements.
 
 A late measurement is put where it belongs by its time stamp, and everything since then is filtered
 again: the result is, to the bit, that of the same samples and measurements in the order of their
 stamps. A sample of the IMU in whose time a stamp lies is split there, the same sample on both
 sides.
 
-Flights in an environment go back by another way, `kernels/filter/late.py`: they keep what the IMU
+Flights in an environment use another method, `kernels/filter/late.py`: they keep what the IMU
 has summed up, and carry estimate and covariance back over it. That costs less, but needs stamps on
 ticks and sensors whose measurements arrive in order, and it is exact to first order alone.
 """

@@ -1,9 +1,9 @@
 """Logs: what sensors measured in a flight, and the columns of tables that hold it.
 
 A table has a row per sample or measurement, or several in one row where they have the same time
-stamp. What a row does not hold is NaN, or empty in a file. Rows stand in the order in which they
-arrived, unless a column `received` tells it: a row whose `time` is earlier than that of the IMU
-sample above it has come late.
+stamp. What a row does not hold is NaN, or empty in a file. Rows are in the order in which they
+arrived, unless a column `received` tells when they did: a row whose `time` is earlier than that of
+the IMU sample above it has come late.
 """
 
 from dataclasses import dataclass, field

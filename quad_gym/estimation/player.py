@@ -1,4 +1,4 @@
-"""A filter that goes through a log, event by event, in the order in which they arrived."""
+"""A filter that processes a log event by event, in the order of arrival."""
 
 import bisect
 import math

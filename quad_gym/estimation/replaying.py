@@ -1,4 +1,4 @@
-"""Replay: a filter goes through a log as it would have gone through the flight."""
+"""Replay: a filter processes a log as it would have processed the flight."""
 
 from collections.abc import Mapping
 from typing import Any

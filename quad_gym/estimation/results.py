@@ -1,4 +1,4 @@
-"""What a filter has made of a log."""
+"""What a filter computed from a log: estimates and innovations."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Starts from one fix without a second antenna: level, the heading from elsewhere or nowhere.
+"""Starts from one fix without Wahba's problem: level, or tilted as an accelerometer at rest tells.
 
 All that is uncertain at the start is a linear function of independent errors s,
 
@@ -7,7 +7,18 @@ All that is uncertain at the start is a linear function of independent errors s,
 so that `L L^T = G diag(s^2) G^T` follows from a QR factorization, also where it is singular. The
 position hangs on the attitude, as the antenna was measured and not the center of mass: with r =
 antenna - R^T l its error is that of the fix and J e, J = R_hat^T [l x]. The heading hangs on what
-tells it (`magnetic_heading`).
+tells it (`magnetic_heading`, `baseline_heading`).
+
+R_hat is T level(heading): T turns the level frame, whose x axis is the body's without its vertical
+part, into B. Errors are taken in the level frame and turned, e = T e_L. A resting accelerometer
+measures `f = g k + g k x e + b_a + v` with the vertical k = T e3, so that
+
+    e_L = e3 x T^T (b_a + v) / g + (0, 0, error of the heading).
+
+An accelerometer is so good that an error theta of the heading matters to higher orders: the error
+angles of a turn by theta about k are `theta k + theta^2 q / 2 + ...`, q = (k_y k_z, -k_x k_z,
+-k_x k_y), while those of a level vehicle are theta alone. `still_start` counts the term with q as
+an error of its own with the same mean square, and bounds the third order by theta^3 / 6.
 """
 
 import math
@@ -26,6 +37,17 @@ LEVEL_SIGMA = 0.03
 """Of roll and pitch of a vehicle put down or hovering, where the suite says nothing [rad]; as in
 `quad_gym.params.suites`."""
 
+MOST_MOTION = 0.1
+"""Share of gravity by which the specific force of a vehicle at rest may differ from it: twice what
+the bias of a cheap accelerometer does."""
+
+STEEPEST_NOSE = 0.05
+"""Level share of the x axis below which nobody could say where it points."""
+
+STEEP = 0.2
+"""Level share of a baseline, 12 degrees from the vertical, that tells no heading; as in
+`kernels/filter/align.py`."""
+
 _R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
 
 
@@ -37,9 +59,24 @@ class Heading(NamedTuple):
     sigma: float
     """of what is its own [rad]"""
     of_tilt: tuple[float, float] = (0.0, 0.0)
-    """by which it errs per error of roll and pitch [-]"""
+    """by which it errs per error of the tilt, about the first two axes of the level frame [-]"""
     of_slow: dict[int, float] = {}  # noqa: RUF012  (a NamedTuple's default is not changed)
     """by which it errs per slow error, by its place [rad per unit]"""
+
+
+class Tilt(NamedTuple):
+    """Where the vertical is in the body, and on what that depends."""
+
+    T: Floats
+    """(3, 3) from the level frame to B"""
+    sigma: float
+    """of what is its own, about each level axis [rad]"""
+    of_bias: float = 0.0
+    """by which it errs per accelerometer bias across the vertical [rad s^2/m]"""
+
+
+LEVEL = Tilt(np.eye(3), 0.0)
+"""Not tilted at all."""
 
 
 class FirstEstimate(NamedTuple):
@@ -61,29 +98,65 @@ def level(angle: float) -> Floats:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def magnetic_heading(sensors: SensorSuite, field_B: Floats, sigma: float | None) -> Heading:
-    """The heading of a level vehicle by its magnetometer.
+def resting_tilt(accel: Floats, sigma: float, gravity: float) -> Tilt:
+    """The tilt of a vehicle at rest by its accelerometer.
 
-    To first order `m = f + f x e + delta g + b + v` in B with f = R_hat m_I and g = R_hat (m_I x
-    e3). The heading makes the part of m across the level field f_h u vanish, along t = e3 x u:
+    Args:
+        accel: (3,) measured specific force in B [m/s^2].
+        sigma: White noise per axis [m/s^2].
+        gravity: As the filter believes it [m/s^2].
 
-        e_z = (f_z u . e + delta t . g + t . b + t . v) / f_h
+    Raises:
+        ValueError: If the vehicle does not rest, by what is measured, or its x axis is vertical.
+    """
+    size = float(np.linalg.norm(accel))
+    if abs(size - gravity) > MOST_MOTION * gravity:
+        raise ValueError(
+            f"accel must be that of a vehicle at rest, within {100 * MOST_MOTION:g} % of gravity, "
+            f"{gravity:g} m/s^2, got {size:g} m/s^2"
+        )
+    k = accel / size
+    x = np.array([1.0, 0.0, 0.0]) - k[0] * k
+    share = float(np.linalg.norm(x))
+    if share < STEEPEST_NOSE:
+        raise ValueError(f"accel must be that of a vehicle whose x axis is not vertical, got {k}")
+    x /= share
+    return Tilt(np.column_stack([x, np.cross(k, x), k]), sigma / gravity, 1.0 / gravity)
+
+
+def known_heading(angle: float, sigma: float, tilt: Tilt) -> Heading:
+    """A heading of the body x axis, which a roll changes where that axis is not level."""
+    return Heading(angle, sigma, (float(tilt.T[0, 2] / tilt.T[0, 0]), 0.0))
+
+
+def magnetic_heading(
+    sensors: SensorSuite, field_B: Floats, sigma: float | None, tilt: Tilt = LEVEL
+) -> Heading:
+    """The heading of a vehicle of known tilt by its magnetometer.
+
+    To first order `m = f + f x e + delta g + T^T b + v` in the level frame with f = R m_I and g = R
+    (m_I x e3), where R is the turn by the heading. The heading makes the part of m across the level
+    field f_h u vanish, along t = e3 x u:
+
+        e_z = (f_z u . e + delta t . g + T t . b + t . v) / f_h
 
     Args:
         sensors: A suite with a magnetometer.
         field_B: (3,) measured [T].
         sigma: White noise per axis [T]; None: as the suite says.
+        tilt: Of the vehicle.
 
     Raises:
         ValueError: If the measured field has no level part.
     """
     magnetometer = sensors.magnetometer
     assert magnetometer is not None
+    field = tilt.T.T @ field_B
     m_I = np.array(magnetometer.field_I)
-    strength = math.hypot(field_B[0], field_B[1])
+    strength = math.hypot(field[0], field[1])
     if strength < 1e-3 * magnetometer.strength:
         raise ValueError(f"magnetometer must measure a level part of the field, got {field_B}")
-    angle = math.atan2(m_I[1], m_I[0]) - math.atan2(field_B[1], field_B[0])
+    angle = math.atan2(m_I[1], m_I[0]) - math.atan2(field[1], field[0])
     R_hat = level(angle)
     f, g = R_hat @ m_I, R_hat @ np.cross(m_I, (0.0, 0.0, 1.0))
     f_h = math.hypot(f[0], f[1])
@@ -91,23 +164,45 @@ def magnetic_heading(sensors: SensorSuite, field_B: Floats, sigma: float | None)
     t = np.array([-u[1], u[0], 0.0])
     states = slow_states(sensors)
     iron, declination = states.vectors[Aid.MAGNETOMETER], states.scalars[Aid.MAGNETOMETER]
-    of_slow = {iron + i: float(t[i] / f_h) for i in range(2)}
+    of_slow = {iron + i: float(by / f_h) for i, by in enumerate(tilt.T @ t)}
     of_slow[declination] = float(t @ g / f_h)
     white = magnetometer.white_sigma if sigma is None else sigma
-    tilt = (float(f[2] * u[0] / f_h), float(f[2] * u[1] / f_h))
-    return Heading(angle, white / f_h, tilt, of_slow)
+    of_tilt = (float(f[2] * u[0] / f_h), float(f[2] * u[1] / f_h))
+    return Heading(angle, white / f_h, of_tilt, of_slow)
 
 
-def level_start(
+def baseline_heading(
+    baseline_B: Floats, baseline_I: Floats, sigma: float, tilt: Tilt
+) -> Heading | None:
+    """The heading of a vehicle of known tilt by two antennas; None where they stand too steep.
+
+    As for a magnetic field of a direction that is measured in I.
+
+    Args:
+        baseline_B: (3,) primary to secondary antenna in B.
+        baseline_I: (3,) the same, measured in I.
+        sigma: Of its direction [rad].
+        tilt: Of the vehicle.
+    """
+    f = tilt.T.T @ (baseline_B / np.linalg.norm(baseline_B))
+    f_h = math.hypot(f[0], f[1])
+    if f_h < STEEP or math.hypot(baseline_I[0], baseline_I[1]) == 0.0:
+        return None
+    angle = math.atan2(baseline_I[1], baseline_I[0]) - math.atan2(f[1], f[0])
+    slope = f[2] / f_h
+    return Heading(angle, sigma / f_h, (float(slope * f[0] / f_h), float(slope * f[1] / f_h)))
+
+
+def still_start(
     sensors: SensorSuite,
     antenna_I: Floats,
     position_root: Floats,
     velocity: Floats,
     velocity_sigma: Floats,
-    tilt_sigma: float,
+    tilt: Tilt,
     heading: Heading,
 ) -> FirstEstimate:
-    """The first estimate of a level vehicle, and the factor of its covariance.
+    """The first estimate of a vehicle of known tilt, and the factor of its covariance.
 
     Args:
         sensors: A suite with GNSS.
@@ -115,29 +210,38 @@ def level_start(
         position_root: (3, 3) a root of the covariance of this [m].
         velocity: (3,) in I [m/s].
         velocity_sigma: (3,) deviations of this.
-        tilt_sigma: Of roll and pitch [rad].
-        heading: Of the body x axis.
+        tilt: Level, or as an accelerometer tells.
+        heading: Of the level frame.
     """
     assert sensors.gnss is not None
     imu, slow = sensors.imu, slow_states(sensors).first_sigmas
     n = _D + len(slow)
-    R_BI = level(heading.angle)
+    R_BI = tilt.T @ level(heading.angle)
     lever = np.array(sensors.gnss.primary_antenna_B)
-    G = np.zeros((n, n))
+    G = np.zeros((n, n + 1))  # the last is of second order, see above
     G[_R : _R + 3, _R : _R + 3] = position_root
     G[_V : _V + 3, _V : _V + 3] = np.diag(velocity_sigma)
-    e = np.zeros((3, n))  # the error angles, by independent errors
-    e[0, _E] = e[1, _E + 1] = tilt_sigma
-    e[2, _E : _E + 2] = tilt_sigma * np.array(heading.of_tilt)
+    e = np.zeros((3, n + 1))  # the error angles in the level frame, by independent errors
+    bias = tilt.of_bias * imu.accel_bias_sigma
+    e[0, _BA : _BA + 3], e[1, _BA : _BA + 3] = -bias * tilt.T[:, 1], bias * tilt.T[:, 0]
+    e[0, _E] = e[1, _E + 1] = tilt.sigma
+    e[2] = heading.of_tilt[0] * e[0] + heading.of_tilt[1] * e[1]
     e[2, _E + 2] = heading.sigma
     for place, gain in heading.of_slow.items():
         e[2, _D + place] = gain * slow[place]
+    variance, k = float(e[2] @ e[2]), tilt.T[:, 2]
+    turned = bias * math.sqrt(variance)  # an error of the tilt by one of the heading
+    third = math.sqrt(15.0 * variance**3) / 6.0 * math.hypot(k[0], k[1])
+    e[0, _E] = e[1, _E + 1] = math.hypot(tilt.sigma, turned, third)
+    e = tilt.T @ e
+    q = np.array([k[1] * k[2], -k[0] * k[2], -k[0] * k[1]])
+    e[:, n] = math.sqrt(0.75) * variance * q
     G[_E : _E + 3] = e
     x, y, z = lever
     G[_R : _R + 3] += R_BI.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ e
     for first, sigma in ((_BA, imu.accel_bias_sigma), (_BG, imu.gyro_bias_sigma)):
         G[first : first + 3, first : first + 3] = sigma * np.eye(3)
-    G[_D:, _D:] = np.diag(slow)
+    G[_D:, _D:n] = np.diag(slow)
     return FirstEstimate(antenna_I - R_BI.T @ lever, velocity, R_BI, lower_factor(G))
 
 

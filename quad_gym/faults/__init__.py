@@ -1,4 +1,4 @@
-"""Faults: what sensors and rotors suffer in the field, and when; frozen parameters with sources.
+"""Faults of sensors and rotors, and when they occur; frozen parameters with sources.
 
 Every environment and `FlightBatch` take `faults=`: one fault, several, or the names of presets. ::
 
@@ -10,14 +10,14 @@ Every environment and `FlightBatch` take `faults=`: one fault, several, or the n
     gymnasium.make("QuadGym/Circle-v0", sensors="rtk", faults="gnss_outliers+rotor_loss")
     FlightBatch(1000, sensors="rtk", faults=(
         GnssOutage(start=20.0, duration=60.0),           # scheduled
-        CameraOcclusion(start=(18.0, 20.0), duration=62.0),  # from some instant between
+        CameraOcclusion(start=(18.0, 20.0), duration=62.0),  # from a drawn instant on
         GnssOutliers(share=0.05, size=(10.0, 100.0)),    # all the time
         WrongAssociations(rate=0.1, duration=1.0),       # now and then: a Poisson process
     ))
 
 Which faults are active is told by `info["faults"]` (name: True or False), by
 `FlightBatch.active_faults()`, and by the fields of a flight's record, such as "fault_active",
-"outlier" and "feature_mistaken", for `FlightBatch.read`. Neither filter nor controller knows.
+"outlier" and "feature_mistaken", for `FlightBatch.read`. Filter and controller are not told.
 """
 
 from quad_gym.faults.aids import SensorLoss

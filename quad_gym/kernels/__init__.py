@@ -1,1 +1,1 @@
-"""The compiled core: every number that flies is computed here."""
+"""The compiled core: everything in a flight is computed here."""

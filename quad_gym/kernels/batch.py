@@ -1,4 +1,4 @@
-"""The one entry that flies: a step, or a reset, of the blocks of a batch."""
+"""The compiled entry that steps or resets the blocks of a batch."""
 
 from numba import types
 
@@ -141,7 +141,7 @@ def _write_results(call, flight, index):
 
 @kernel
 def _show(call, index, flight, world, model, settings, work, stages):
-    """Show the present instant to a task of a user's own."""
+    """Show the present instant to a user's task."""
     call_stage(stages, _SHOW, flight, world, model, settings, work, 0)
     here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
     for k in range(SHOWN_SIZE):

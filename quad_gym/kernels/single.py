@@ -1,10 +1,10 @@
-"""Entries for one flight, behind the friendly classes: of sensors and vehicle the scalar instances.
+"""Entries for the classes of one vehicle: scalar instances of the kernels of sensors and vehicle.
 
-A filter runs the stages of flights instead, on a block of its own: they take long to compile, and
-the scalar instances of them would take longer.
+A filter runs the stages of flights on a block of its own instead, as scalar instances of them would
+take even longer to compile.
 
 Each entry has a signature, so that it can be compiled ahead; arrays in another order of memory are
-taken, too, and compiled for when they come.
+accepted, too, and compiled for on their first use.
 """
 
 import numpy as np

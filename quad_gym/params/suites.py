@@ -10,9 +10,9 @@
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, taken for fresh | as `rtk`, 10 ms late, likewise | as `rtk` |
 
-The last two belong to `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: nobody would choose
-sensors that see the way home in one direction alone, or a filter that ignores time stamps, and they
-are not among SUITES, on which results for all tasks are based.
+The last two were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in one
+direction alone, and a filter that ignores time stamps. They are not among SUITES, on which results
+for all tasks are based.
 
 The IMU runs at 200 Hz, so that cameras of 30 Hz run at 25 Hz, a whole division of it. Outside `lab`
 the phases of GNSS and camera are drawn anew in each episode, the fix that starts the filter is
@@ -20,8 +20,8 @@ counted once, and a gate of false alarm 1e-4 guards the filter.
 
 `rtk`, `consumer` and `indoor` also do what real sensors do beside noise and bias: measurements
 arrive late, accelerometer axes are not quite orthogonal, rotors shake the IMU, headings have a
-constant error, the camera blurs and does not see far. Gyros have no error of scale or alignment by
-default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
+constant error, the camera blurs and has a limited range. Gyros have no error of scale or alignment
+by default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
 place (docs/sensors-and-filter.md says what it does).
 
 The noise of `observation="noisy"` is the size of each suite's own errors. Outside `lab` it is the

@@ -1,4 +1,4 @@
-"""Trajectories of a user's own as records: one table, which all flights of a batch share.
+"""Users' trajectories as records: one table, which all flights of a batch share.
 
 A path is a row of PATH; its segments are rows of PIECE, one after the other.
 """

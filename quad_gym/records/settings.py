@@ -50,7 +50,7 @@ SETTINGS_FIELDS = (
     Field("layout", (), "-", "of the observation, see Layout", "i8"),
     Field("include_covariance", (), "0 or 1", "whether the observation holds standard deviations", "i8"),
     Field("privileged", (), "0 or 1", "whether the observation ends with the truth", "i8"),
-    Field("shown", (), "0 or 1", "whether flights are shown to a task of a user's own", "i8"),
+    Field("shown", (), "0 or 1", "whether flights are shown to a user's task", "i8"),
     Field("autoreset", (), "-", "see Autoreset", "i8"),
     Field("start", (), "-", "how episodes begin, see Start", "i8"),
     Field("pad", (), "0 or 1", "whether a launch pad carries vehicles that start on the ground", "i8"),

@@ -1,4 +1,4 @@
-"""What a task of a user's own is shown of a flight at the end of a step: a row for each number."""
+"""What a user's task is shown of a flight at the end of a step: a row for each number."""
 
 from quad_gym.records.sizes import Field
 

@@ -8,7 +8,7 @@ from quad_gym.records.width import WIDTH as WIDTH
 MAX_HARMONICS = 6
 """Terms of the Fourier series of a reference."""
 FOLLOWED = -1
-"""In place of that number: the reference is a trajectory of a user's own."""
+"""In place of that number: the reference is a user's trajectory."""
 TERMS = 8
 """Coefficients of a segment of such a trajectory, of degree 7."""
 HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY, HEADING_GIVEN = 0.0, 1.0, 2.0, 3.0

@@ -1,4 +1,4 @@
-"""`TaskBatch`: flights that a task of a user's own judges, observes and begins."""
+"""`TaskBatch`: flights with the rewards, endings, observations and starts of a user's task."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -43,9 +43,9 @@ class Part(NamedTuple):
 
 
 class TaskBatch(ReadableBatch):
-    """Flights of one configuration under a task of a user's own.
+    """Flights of one configuration with a user's task.
 
-    The kernels fly, judge and observe as ever; then the task's methods replace what they replace.
+    The kernels fly, judge and observe as usual; then the task's methods replace their part of it.
     Episodes begin in the kernel where it flies by the next-step mode, and by masked resets
     otherwise, so that the flights' random streams go on as without a task.
 

@@ -1,4 +1,4 @@
-"""Random numbers for tasks: a stream per flight, whoever flies beside it.
+"""Random numbers for tasks: a stream per flight, independent of the other flights.
 
 Threefry-2x64 with 13 rounds, as in `quad_gym.kernels.maths.random`, on NumPy arrays of keys. The
 key is the flight's, changed so that no draw is one of the kernels'; the counter is the instant and

@@ -1,4 +1,4 @@
-"""Who is terminated and truncated under a task of a user's own, and why."""
+"""Which flights a user's task terminates and truncates, and why."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""The groups of a view: truth, estimate, what is seen, what was measured, what ships."""
+"""The groups of a view: truth, estimate, what is seen, what was measured, built-in results."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""Arrays that are made when they are first read, and forgotten when the flights go on."""
+"""Arrays that are computed when they are first read, and dropped at the next step."""
 
 from collections.abc import Callable
 from types import MappingProxyType

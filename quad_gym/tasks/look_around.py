@@ -1,4 +1,4 @@
-"""`LookAround`: a task in which a controller decides by looking what it knows."""
+"""`LookAround`: a task in which the position is known only as well as the camera looks."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -25,12 +25,12 @@ CRASH_COST = 2.0
 
 
 class LookAround(Task):
-    """Follow a random trajectory, and look where it is paid for, without losing oneself.
+    """Follow a random trajectory and look in the rewarded direction, without getting lost.
 
     There is no GNSS. All eight markers hang on one wall, 8 m west of the origin, the camera sees 60
     degrees, and the IMU is a cheap one: within seconds of looking away, the filter's position is
-    off by decimeters, and after ten by meters. The reward has a price for looking: it pays for a
-    heading that is drawn for each episode. What a controller does decides what it knows.
+    off by decimeters, and after ten by meters. Looking at the markers costs reward, which pays
+    for a heading that is drawn for each episode.
 
     ## Reward
     In each step, with the true position error e [m] and the alignment h of body x with the wanted
@@ -41,15 +41,15 @@ class LookAround(Task):
     At most 0.35 a step, so 262.5 in an episode of 750 steps.
 
     ## Observation
-    What ships, and then `features_direction` (3): the unit vector from the vehicle to the middle of
-    the markers in the body frame, both as the controller's source believes.
+    The built-in one, and then `features_direction` (3): the unit vector from the vehicle to the middle of
+    the markers in the body frame, both as the controller sees them.
 
     ## Endings
     Those of `QuadEnv`, with 8 m to the reference as the bound: a controller that is mistaken about
-    its position gets the time to find it again. There is no ground above -5 m.
+    its position has time to find it again. There is no ground above -5 m.
 
-    What ignores the question fails: PD control of the wanted heading loses itself in two thirds of
-    the episodes, and PD control that faces the wall gives up what the heading pays.
+    Simple rules fail: PD control of the wanted heading gets lost in two thirds of the episodes, and
+    PD control that faces the wall forgoes the reward of the heading.
 
     Args:
         heading_weight: Of h in the reward.
@@ -76,7 +76,13 @@ class LookAround(Task):
         return self.pieces(view)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
-        """`features_direction`: (n, 3) unit vector to the middle of the markers, in B."""
+        """`features_direction`: (n, 3) unit vector to the middle of the markers, in B.
+
+        Raises:
+            ValueError: If there is no camera, so that there are no markers.
+        """
+        if len(view.features) == 0:
+            raise ValueError("LookAround needs a camera, expected camera=True, got False")
         gap = view.features.mean(axis=0) - view.seen.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
         return {"features_direction": (view.seen.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}

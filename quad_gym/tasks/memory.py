@@ -1,4 +1,4 @@
-"""Flights whose memory a view reads, and a task writes its judgment to."""
+"""Flights whose memory a view reads, and to which a task writes its rewards and endings."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`OutageDash`: a task in which being unsure changes what is best to do."""
+"""`OutageDash`: a task in which uncertainty changes the best action."""
 
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
@@ -57,8 +57,8 @@ class OutageDash(Task):
     to 0.2 m; without it the error is 0.25 m after two seconds, 0.8 m after five, 2 m after eight,
     and 4 m after twelve (root mean square). Gaps are 3 to 6 m wide, walls 12 m apart. A controller
     that hurries on through an outage hits a wall; one that waits for its end loses the course that
-    it could have flown, and drifts. How long to go on depends on how sure the filter is, and on how
-    wide the next gap is.
+    it could have flown, and drifts. How far to go on depends on the filter's uncertainty and on the
+    width of the next gap.
 
     ## Course
     It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
@@ -78,7 +78,7 @@ class OutageDash(Task):
     50, and the sum of 0.1 min(v, 5) so far.
 
     ## Observation
-    In the place of what ships, as the controller's source believes:
+    In place of the built-in observation, as the controller sees it:
 
     | name | meaning | unit | frame |
     |---|---|---|---|

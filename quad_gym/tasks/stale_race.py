@@ -27,9 +27,9 @@ class StaleRace(Task):
 
     Eight gates lie on a course that is drawn for each episode, as in `Waypoints`; one is passed
     within 0.6 m of its center. GNSS is 40 ms late and images are 10 ms late, which is little, and
-    the filter takes both for fresh, as many do. What that costs depends on the controller: at rest
-    a late measurement is right, at 4 m/s it is off by 16 cm, many times what the filter expects, so
-    that attitude and biases go wrong as well. Who hurries knows less.
+    the filter takes both for fresh, as many do. The cost depends on the controller: at rest a late
+    measurement is right, at 4 m/s it is off by 16 cm, many times what the filter expects, so that
+    attitude and biases go wrong as well. The faster the flight, the worse the estimate.
 
     With `sensors` whose filter uses the time stamps (`late_measurements="rewind"`) the same race is
     easy; that is the control.
@@ -41,8 +41,8 @@ class StaleRace(Task):
         0.1 s - 0.02 d^2 - 0.002 w^2 + 1 (passed a gate) - 5 (crashed)
 
     ## Observation
-    That of `Waypoints`: the next gate relative to the vehicle in the body frame that the source
-    believes in, and the two gates after it.
+    That of `Waypoints`: the next gate relative to the vehicle in the body frame as the controller
+    sees it, and the two gates after it.
 
     ## Endings
     Those of `Waypoints`: the last gate, 20 s, and 12 m from the next gate.

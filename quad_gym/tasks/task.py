@@ -1,4 +1,4 @@
-"""`Task`: reward, endings, observation and reset of one's own, over those that ship."""
+"""`Task`: a user's reward, endings, observation and reset, in place of the built-in ones."""
 
 import importlib
 import os
@@ -40,7 +40,7 @@ class Observed(NamedTuple):
 
 
 class Task:
-    """Reward, endings, observation and reset of one's own; what it leaves out, the id's task does.
+    """Your own reward, endings, observation and reset; the id's task does what it leaves out.
 
     Each method is called once in a control step, for all flights at once, with a `View` whose arrays
     have one row per flight. `gymnasium.make(id, custom=Mine())`, `make_vec` and `make_sb3_vec_env`

@@ -27,9 +27,9 @@ class View(Group):
 
     Arrays have one row per flight, are made when they are first read, and cannot be written to.
     `quad_gym.tasks.fields.VIEW_FIELDS` lists them all with shapes, units and frames. They are in
-    groups: `truth`, `estimate` (of the filter), `seen` (what the controller goes by), `measured`,
-    `shipped` (what the id's task says). `view.position` is short for `view.truth.position`, as are
-    the other states. `view.state` holds what the task keeps.
+    groups: `truth`, `estimate` (of the filter), `seen` (what the controller sees), `measured`,
+    `shipped` (built-in reward and endings). `view.position` is short for `view.truth.position`,
+    likewise the other states. `view.state` holds what the task keeps.
     """
 
     __slots__ = ("_hidden", "_truth")
@@ -59,7 +59,7 @@ class View(Group):
         )
 
     def forget(self) -> None:
-        """Forget what the flights are like; what is said of their step stays."""
+        """Drop the arrays of the present instant; those of the step stay."""
         mine = self.__dict__
         kept = {name: mine[name] for name in _GROUPS}
         mine.clear()
@@ -92,13 +92,13 @@ class View(Group):
 
     @property
     def truth(self) -> Truth:
-        """What is so; `observe` reads it only if the task is privileged."""
+        """The true state; `observe` reads it only if the task is privileged."""
         self._open("truth")
         return self._truth
 
     @property
     def shipped(self) -> Shipped:
-        """What the id's task says of the step: it follows from the truth."""
+        """Built-in reward and endings of the step, which follow from the truth."""
         self._open("shipped")
         return self.own_shipped
 

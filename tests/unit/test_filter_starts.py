@@ -8,6 +8,8 @@ from scipy.stats import chi2
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.records import Aid
+from tests.field_flights import fly
 from tests.level_flights import MAGNETIC, R_IG, LevelFlight
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
@@ -15,6 +17,7 @@ DRAWS = 300
 STEADY = MAGNETIC.replace(  # so that biases do not change in a flight, as in these they do not
     imu=MAGNETIC.imu.replace(accel_bias_tau=1e7, gyro_bias_tau=1e7)
 )
+ONE_ANTENNA = MAGNETIC.replace(gnss=MAGNETIC.gnss.replace(secondary_antenna_B=None))
 
 
 def start(flight, kf, how):
@@ -101,6 +104,27 @@ def test_the_magnetic_heading_hangs_on_tilt_and_iron():
     variance += (by_turn * m.declination_sigma) ** 2
     variance += (m.noise_sigma / math.hypot(*m.field_I[:2])) ** 2
     np.testing.assert_allclose(P[8, 8], variance, rtol=1e-3)
+
+
+@pytest.mark.parametrize("suite", [ONE_ANTENNA, quad_gym.sensor_suite("consumer")])
+def test_flights_and_filters_alone_take_the_same_heading_from_a_field(suite):
+    """Kernels start a flight's filter, NumPy one alone: same attitude, position and covariance."""
+    batch, kf = fly(suite, 4, task="hover", seed=3), UnscentedKalmanFilter(suite)
+    read = {
+        name: batch.read(name)
+        for name in ("R_hat", "r_hat", "v_hat", "L", "L_slow", "gnss_position", "aid_measurement")
+    }
+    states = int(kf._engine.settings["slow_states"][0])
+    for n in range(4):
+        field = read["aid_measurement"][n, Aid.MAGNETOMETER]
+        kf.initialize(read["gnss_position"][n], magnetometer=field)
+        np.testing.assert_allclose(kf.R_BI, read["R_hat"][n], atol=1e-12)
+        np.testing.assert_allclose(kf.position, read["r_hat"][n], atol=1e-12)
+        np.testing.assert_allclose(kf.velocity, read["v_hat"][n], atol=1e-12)
+        np.testing.assert_allclose(kf._engine.read("L")[0], read["L"][n], atol=1e-12)
+        ours, theirs = kf._engine.read("L_slow")[0][:states], read["L_slow"][n][:states]
+        scale = 1e-30 + np.sqrt((theirs**2).sum(axis=1, keepdims=True))
+        np.testing.assert_allclose(ours / scale, theirs / scale, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)

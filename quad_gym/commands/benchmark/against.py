@@ -1,7 +1,7 @@
 """Two checkouts compared: the same environments by turns, each in a process of its own.
 
-Whatever else the machine does slows both alike, and the best of all turns counts, so that ratios
-hold even where times do not.
+Other load on the machine slows both alike, and the best of all turns counts, so that ratios are
+valid even where times are not.
 """
 
 import json

@@ -1,7 +1,7 @@
 """The compiler's part of the benchmark: how long the first flight waits.
 
-A copy of the package flies in a temporary folder, which has the cache beside the kernels: so each
-configuration begins with an empty one, and sources can be edited.
+It measures a copy of the package in a temporary folder, with the cache beside the kernels: each
+configuration begins with an empty cache, and sources can be edited.
 """
 
 import compileall

@@ -1,6 +1,6 @@
 """Measure what quad_gym costs: filter, tick, options, environments, memory, pictures, compiling.
 
-Every figure is the best of some repeats, as whatever else the machine does can only slow it down;
+Every figure is the best of some repeats, as other load on the machine can only slow it down;
 "spread" is how much longer the median of the repeats took. All ratios are taken within one run.
 
 Compiling is measured by `--only compile` alone, as it takes minutes. `--against DIR` compares the

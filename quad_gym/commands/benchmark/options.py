@@ -1,6 +1,6 @@
 """The options' part of the benchmark: what each costs, over a tick with all of them off.
 
-Batches take turns, so that whatever else the machine does slows all of them alike.
+Batches take turns, so that other load on the machine slows all of them alike.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""The stages of this process, and a table of those that a batch needs: compiled or loaded then."""
+"""The stages of this process, compiled or loaded on demand, and a table of those a batch needs."""
 
 import threading
 from collections.abc import Sequence

@@ -2,7 +2,7 @@
 
 Numba makes a library of every jitted function: it links what the function calls, optimizes the
 whole, and emits machine code and two wrappers for it, even if nothing but other jitted functions
-ever calls it. Nested kernels are so optimized and emitted once for every level above them. Here the
+ever calls it. So nested kernels are optimized and emitted once for every level above them. Here the
 library of a kernel is its unoptimized IR. An entry, the only thing that Python calls, links each
 kernel that it reaches once, and is the only thing that is optimized and emitted.
 

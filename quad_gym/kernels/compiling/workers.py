@@ -1,8 +1,8 @@
 """Compiling side by side: what is missing in the cache, in processes of its own.
 
 A worker takes names of compiled functions from its standard input, compiles each into the cache,
-and says so on its standard output. It outlives nobody: when its input closes it ends, and what it
-was compiling is not in the cache then.
+and says so on its standard output. It ends when its input closes, so that it never outlives its
+parent; what it was compiling is then not in the cache.
 """
 
 import gc

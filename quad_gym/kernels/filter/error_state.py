@@ -1,7 +1,7 @@
-"""The filters' error state (r_I, v_I, e, b_a, b_g), and what becomes of it when e is set to zero.
+"""The filters' error state (r_I, v_I, e, b_a, b_g), and its covariance when e is reset to zero.
 
 e are the error Euler angles about the estimated attitude, R_BI = R(e) R_hat. After a step whose
-mean error is m, R_hat becomes R(m) R_hat and e is counted anew: R(e_new) R(m) = R(e). Since
+mean error is m, R_hat becomes R(m) R_hat and e is counted from there: R(e_new) R(m) = R(e). Since
 `de = S(e) w` turns body rates into Euler rates and S(0) is the identity,
 
     e_new = S(m)^-1 (e - m) + O(e - m)^2,

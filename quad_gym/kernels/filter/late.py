@@ -2,11 +2,11 @@
 
 A measurement waits in a flight's record, with what the IMU had summed up when it was taken. When
 it arrives, the estimate is taken back to that instant over the IMU's samples since then
-(`preintegration.py`), updated as ever, and taken on again. For the covariance the white noise of
-these samples is taken out on the way back and put in on the way on: it has nothing to do with the
-measurement. That neglects what measurements taken in between have told about this noise, and the
-drift of the biases in the meantime; filtering all over again from the time stamp, with every sample
-stored, would not.
+(`preintegration.py`), updated as usual, and carried forward again. For the covariance the white
+noise of these samples is removed on the way back and added on the way forward, as it is independent
+of the measurement. That neglects the drift of the biases in the meantime, and what measurements
+taken in between have told about this noise. Storing every sample and filtering again from the time
+stamp would neglect nothing.
 
 Source: Y. Bar-Shalom, H. Chen and M. Mallick, "One-step solution for the multistep out-of-sequence-
 measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 40(1), 2004.

@@ -1,4 +1,4 @@
-"""The specific force at the center of mass, from that of an accelerometer that is not there.
+"""The specific force at the center of mass, from an accelerometer that is mounted elsewhere.
 
 The accelerometer at l_B feels the acceleration of its own point (report section 2.3),
 

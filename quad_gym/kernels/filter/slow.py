@@ -13,12 +13,12 @@ Kalman Filtering, section on colored measurement noise.)
 
 There can be the drift of GNSS positions (three states in I, the first three of d), and what aiding
 sensors have (`kernels/measurements/`): three numbers each, then one number each. As blocks are 3 x
-3, their number is a multiple of three; what fills it up is constant, of variance one, and measured
-by nothing.
+3, their number is a multiple of three; the states that fill it up are constant, of variance one,
+and never measured.
 
 The factor of the joint covariance has the rows of `flight.L` and below them those of
 `flight.L_slow`. As d comes last, the first fifteen rows are the factor of the covariance of the
-fifteen states, as ever, and the prediction of these does not know of d. Kernels of the filter take
+fifteen states, as without d, and their prediction does not depend on d. Kernels of the filter take
 `slow`, which is the settings record, or None where no sensor has a slow error: what is under `slow
 is None` is decided as they are compiled, so that a filter without d has none of this.
 """

@@ -1,7 +1,7 @@
 """Late measurements in transit: GNSS fixes and images wait in a flight's record until they arrive.
 
-With each waits its time stamp: what the IMU had summed up when it was taken. What becomes of those
-that arrive is in `late.py`. Aiding sensors do the same by themselves (`measurements/aid.py`).
+With each waits its time stamp: what the IMU had summed up when it was taken. `late.py` updates the
+filter with those that arrive. Aiding sensors do the same by themselves (`measurements/aid.py`).
 """
 
 from quad_gym.kernels.compiling import kernel, stage

@@ -1,9 +1,9 @@
 """What aiding sensors share: clocks, errors that last, latency, the gate, and their stages' calls.
 
-An aiding sensor is one stage, in a file of its own, that is called with an `Act` and, for its part
-in an update, with the first of its three rows in the stacked measurement (`flag_of`). Sensors with
-fewer numbers leave the other rows masked. Suites without aiding sensors know nothing of them, as
-only filters with slow errors among their states (`filter/slow.py`) call them.
+An aiding sensor is one stage, in a file of its own (`aid_stage.py`), that is called with an `Act`
+and, for its part in an update, with the first of its three rows in the stacked measurement. Sensors
+with fewer numbers leave the other rows masked. Suites without aiding sensors know nothing of them,
+as only filters with slow errors among their states (`filter/slow.py`) call them.
 """
 
 import math

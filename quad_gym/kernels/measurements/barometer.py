@@ -5,17 +5,15 @@ and the sensor's temperature change: a Gauss-Markov process of first order, whic
 filter (`filter/slow.py`). The model is linear, so that sigma points and derivatives agree.
 """
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
 from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.measurements.aid import ACTS, aid_due, begin_aid, deliver, judge_aid
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.measurements.aid import aid_due, begin_aid, deliver
+from quad_gym.kernels.measurements.aid_stage import aid_stage
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Act, Aid
+from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid
 
 _S = int(Aid.BAROMETER)
-_BEGIN, _SAMPLE = int(Act.BEGIN), int(Act.SAMPLE)
-_EXPECT, _JUDGE = int(Act.EXPECT), int(Act.JUDGE)
 
 
 @kernel
@@ -62,18 +60,4 @@ def _doubt(flight, p, work, settings, mask):
     work.P[R + 2, R + 2] = work.P[R + 2, R + 2] + more
 
 
-@stage
-def barometer_stage(flight, world, model, settings, work, stages, flag):
-    """An `Act` of the barometer; see `aid.py` for `flag`."""
-    flying, scratch, act, k = lanes_of(flight), lanes_of(work), flag % ACTS, flag // ACTS
-    p, mask = lanes_of(model), scratch.mask > 0.0
-    if act == _BEGIN:
-        begin_aid(flying, lanes_of(world), settings, _S, mask)
-    elif act == _SAMPLE:
-        _measure(flying, lanes_of(world), settings, mask, k > 0)
-    elif act == _EXPECT:
-        _expect(flying, p, scratch, settings, k)
-    elif act == _JUDGE:
-        judge_aid(flying, p, scratch, settings, _S, k)
-    else:
-        _doubt(flying, p, scratch, settings, scratch.taking > 0.0)
+barometer_stage = aid_stage(Aid.BAROMETER, begin_aid, _measure, _expect, _doubt)

@@ -25,21 +25,24 @@ from quad_gym.kernels.maths.linalg import (
     load_column3,
     norm,
     scale,
-    store3,
 )
-from quad_gym.kernels.measurements.gate import judge_direction, leave_out, mark_block
+from quad_gym.kernels.measurements.gate import judge_direction, leave_out
 from quad_gym.kernels.measurements.rows import (
     clear_slow_columns,
     columns_of,
     put_noise,
     put_three,
 )
-from quad_gym.kernels.measurements.waiting import exchange_three
+from quad_gym.kernels.measurements.triples import triple_functions
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import BASELINE_BLOCK, FilterForm, Sensor
 
 SENSOR = Sensor.GNSS
-_GNSS, _EKF = int(SENSOR), int(FilterForm.EKF)
+_EKF = int(FilterForm.EKF)
+
+count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
+    "baseline", BASELINE_BLOCK
+)
 
 # ---- simulation ------------------------------------------------------------------------------
 
@@ -71,15 +74,6 @@ def measure(flight, p, R_BI, normals, mask):
 
 
 # ---- update ----------------------------------------------------------------------------------
-
-
-@kernel
-def count(flight, p, work, settings, slow, k):
-    """Count what is measured; return the row behind it."""
-    if any_of(flight.baseline_valid > 0.0):
-        work.measured = work.measured + 3.0 * flight.baseline_valid
-        k += 3
-    return k
 
 
 @kernel
@@ -134,48 +128,3 @@ def judge(flight, p, work, settings, slow, k):
     work.judged_freedoms = work.judged_freedoms + 2.0 * counts
     leave_out(flight, work, settings, k, BASELINE_BLOCK, has, rejected, columns, 3.0)
     return k + 3
-
-
-@kernel
-def mark_failed(flight, p, work, settings, slow, k):
-    """Say that the update failed that it was part of, where `work.taking`."""
-    mark_block(flight, BASELINE_BLOCK, (work.taking > 0.0) & (flight.baseline_valid > 0.0))
-    return k
-
-
-# ---- late measurements -----------------------------------------------------------------------
-
-
-@kernel
-def set_aside(flight, p, work, settings, slow, k):
-    """Keep what has arrived so far, before something new is measured."""
-    store3(work.kept_baseline, load3(flight.gnss_baseline))
-    return k
-
-
-@kernel
-def exchange(flight, p, work, settings, slow, starting):
-    """Let what is measured now wait, and what waited arrive."""
-    z, valid = flight.gnss_baseline, flight.baseline_valid
-    arrived = exchange_three(
-        flight, work, BASELINE_BLOCK, z, valid, flight.late_baseline, work.kept_baseline
-    )
-    flight.baseline_valid = select(work.mask > 0.0, arrived, valid)
-    if not starting:  # a first fix has started the filter
-        store3(flight.gnss_baseline, load3(work.kept_baseline))
-        flight.baseline_fresh = select(arrived > 0.0, 1.0, flight.baseline_fresh)
-    return starting
-
-
-@kernel
-def keep_valid(flight, p, work, settings, slow, k):
-    """Keep whether it is measured, for the turns of late measurements."""
-    work.kept_valid[BASELINE_BLOCK] = flight.baseline_valid
-    return k
-
-
-@kernel
-def choose(flight, p, work, settings, slow, k):
-    """Let it be measured only where its sensor has its turn."""
-    flight.baseline_valid = work.turn[_GNSS] * work.kept_valid[BASELINE_BLOCK]
-    return k

@@ -4,8 +4,8 @@ A block is a position, a baseline, a velocity, a feature, or what an aiding sens
 the columns A and E of `filter/update.py` and the block's measurement noise R its innovation has the
 covariance `S = A A^T + E E^T + (beta - alpha^2) mu mu^T + R` (3 x 3). A direction has two degrees
 of freedom: its innovation is taken across the predicted direction, for along it the length of a
-unit vector tells nothing. A block whose normalized innovation squared, chi-square in a filter that
-is right, lies beyond the gate is masked as if the flight lacked it.
+unit vector tells nothing. A block whose normalized innovation squared, chi-square in a consistent
+filter, lies beyond the gate is masked as if the flight lacked it.
 
 Source: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, section 5.4.

@@ -13,8 +13,8 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
 
-Where GNSS has one antenna, the field tells the heading of the filter's start, which is level or so:
-that in which the field points where it is seen to. With the vertical k, the level direction h of
+Where GNSS has one antenna, the field tells the heading of the filter's nearly level start: that at
+which the expected field has the measured direction. With the vertical k, the level direction h of
 the field and s = k x h, all in B, the field's level and vertical share m_h and m_z, nothing of the
 innovation is left along s, so that the derivative ties the error of the heading to others:
 
@@ -23,7 +23,7 @@ innovation is left along s, so that the derivative ties the error of the heading
 
 import math
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
 from quad_gym.kernels.filter.recovery import drifts
 from quad_gym.kernels.maths.elementary import sin_cos
@@ -57,25 +57,28 @@ from quad_gym.kernels.maths.linalg import (
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.measurements.aid import (
-    ACTS,
     aid_due,
     begin_aid,
     deliver,
     deliver_first,
     draw_matrix,
-    judge_aid,
 )
-from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.measurements.aid_stage import aid_stage
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Act, Aid, FilterForm
+from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm
 
 _S = int(Aid.MAGNETOMETER)
-_BEGIN, _SAMPLE = int(Act.BEGIN), int(Act.SAMPLE)
-_EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _EKF = int(FilterForm.EKF)
 _DRIFT_TIME = 0.5
 """Within such a time the magnetometer pulls the heading back [s]: less than it takes, so that the
 bias may be more than a drift says."""
+
+
+@kernel
+def _begin(flight, p, settings, s, mask):
+    """Begin an episode, where `mask`."""
+    begin_aid(flight, p, settings, s, mask)
+    draw_matrix(flight, p, s, mask)
 
 
 @kernel
@@ -260,21 +263,4 @@ def _doubt(flight, p, work, settings, mask):
         P[k + i, k + i] = P[k + i, k + i] + select(doubted, nu[i] * nu[i], 0.0)
 
 
-@stage
-def magnetometer_stage(flight, world, model, settings, work, stages, flag):
-    """An `Act` of the magnetometer; see `aid.py` for `flag`."""
-    flying, scratch, act, k = lanes_of(flight), lanes_of(work), flag % ACTS, flag // ACTS
-    p, mask = lanes_of(model), scratch.mask > 0.0
-    if act == _BEGIN:
-        begin_aid(flying, lanes_of(world), settings, _S, mask)
-        draw_matrix(flying, lanes_of(world), _S, mask)
-    elif act == _SAMPLE:
-        _measure(flying, lanes_of(world), settings, mask, k > 0)
-    elif act == _EXPECT:
-        _expect(flying, p, scratch, settings, k)
-    elif act == _JUDGE:
-        judge_aid(flying, p, scratch, settings, _S, k)
-    elif act == _ALIGN:
-        _align(flying, p, scratch, settings, mask)
-    else:
-        _doubt(flying, p, scratch, settings, scratch.taking > 0.0)
+magnetometer_stage = aid_stage(Aid.MAGNETOMETER, _begin, _measure, _expect, _doubt, _align)

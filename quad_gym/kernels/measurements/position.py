@@ -25,22 +25,25 @@ from quad_gym.kernels.maths.linalg import (
     load33,
     load_column3,
     scale,
-    store3,
 )
 from quad_gym.kernels.maths.random import six_normals, stream_of
-from quad_gym.kernels.measurements.gate import judge_triple, leave_out, mark_block
+from quad_gym.kernels.measurements.gate import judge_triple, leave_out
 from quad_gym.kernels.measurements.rows import (
     clear_slow_columns,
     columns_of,
     put_noise,
     put_three,
 )
-from quad_gym.kernels.measurements.waiting import exchange_three
+from quad_gym.kernels.measurements.triples import triple_functions
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, FilterForm, Sensor
 
 SENSOR = Sensor.GNSS
-_GNSS, _EKF = int(SENSOR), int(FilterForm.EKF)
+_EKF = int(FilterForm.EKF)
+
+count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
+    "position", POSITION_BLOCK
+)
 
 # ---- simulation ------------------------------------------------------------------------------
 
@@ -70,15 +73,6 @@ def drift_gnss(flight, p, mask, share):
 
 
 # ---- update ----------------------------------------------------------------------------------
-
-
-@kernel
-def count(flight, p, work, settings, slow, k):
-    """Count what is measured; return the row behind it."""
-    if any_of(flight.position_valid > 0.0):
-        work.measured = work.measured + 3.0 * flight.position_valid
-        k += 3
-    return k
 
 
 @kernel
@@ -139,48 +133,3 @@ def judge(flight, p, work, settings, slow, k):
     work.judged_freedoms = work.judged_freedoms + 3.0 * counts
     leave_out(flight, work, settings, k, POSITION_BLOCK, has, rejected, columns, 3.0)
     return k + 3
-
-
-@kernel
-def mark_failed(flight, p, work, settings, slow, k):
-    """Say that the update failed that it was part of, where `work.taking`."""
-    mark_block(flight, POSITION_BLOCK, (work.taking > 0.0) & (flight.position_valid > 0.0))
-    return k
-
-
-# ---- late measurements -----------------------------------------------------------------------
-
-
-@kernel
-def set_aside(flight, p, work, settings, slow, k):
-    """Keep what has arrived so far, before something new is measured."""
-    store3(work.kept_position, load3(flight.gnss_position))
-    return k
-
-
-@kernel
-def exchange(flight, p, work, settings, slow, starting):
-    """Let what is measured now wait, and what waited arrive."""
-    z, valid = flight.gnss_position, flight.position_valid
-    arrived = exchange_three(
-        flight, work, POSITION_BLOCK, z, valid, flight.late_position, work.kept_position
-    )
-    flight.position_valid = select(work.mask > 0.0, arrived, valid)
-    if not starting:  # a first fix has started the filter
-        store3(flight.gnss_position, load3(work.kept_position))
-        flight.position_fresh = select(arrived > 0.0, 1.0, flight.position_fresh)
-    return starting
-
-
-@kernel
-def keep_valid(flight, p, work, settings, slow, k):
-    """Keep whether it is measured, for the turns of late measurements."""
-    work.kept_valid[POSITION_BLOCK] = flight.position_valid
-    return k
-
-
-@kernel
-def choose(flight, p, work, settings, slow, k):
-    """Let it be measured only where its sensor has its turn."""
-    flight.position_valid = work.turn[_GNSS] * work.kept_valid[POSITION_BLOCK]
-    return k

@@ -18,24 +18,26 @@ from quad_gym.kernels.maths.linalg import (
     load33,
     load_column3,
     scale,
-    store3,
     sub,
 )
 from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
-from quad_gym.kernels.measurements.gate import judge_triple, leave_out, mark_block
+from quad_gym.kernels.measurements.gate import judge_triple, leave_out
 from quad_gym.kernels.measurements.rows import (
     clear_slow_columns,
     columns_of,
     put_noise,
     put_three,
 )
-from quad_gym.kernels.measurements.waiting import exchange_three
+from quad_gym.kernels.measurements.triples import triple_functions
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK, Sensor
 
 SENSOR = Sensor.GNSS
-_GNSS = int(SENSOR)
+
+count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
+    "velocity", VELOCITY_BLOCK
+)
 
 # ---- simulation ------------------------------------------------------------------------------
 
@@ -51,15 +53,6 @@ def measure(flight, p, mask):
 
 
 # ---- update ----------------------------------------------------------------------------------
-
-
-@kernel
-def count(flight, p, work, settings, slow, k):
-    """Count what is measured; return the row behind it."""
-    if any_of(flight.velocity_valid > 0.0):
-        work.measured = work.measured + 3.0 * flight.velocity_valid
-        k += 3
-    return k
 
 
 @kernel
@@ -102,47 +95,3 @@ def judge(flight, p, work, settings, slow, k):
     work.judged_freedoms = work.judged_freedoms + select(has, 3.0, 0.0)
     leave_out(flight, work, settings, k, VELOCITY_BLOCK, has, rejected, columns, 3.0)
     return k + 3
-
-
-@kernel
-def mark_failed(flight, p, work, settings, slow, k):
-    """Say that the update failed that it was part of, where `work.taking`."""
-    mark_block(flight, VELOCITY_BLOCK, (work.taking > 0.0) & (flight.velocity_valid > 0.0))
-    return k
-
-
-# ---- late measurements -----------------------------------------------------------------------
-
-
-@kernel
-def set_aside(flight, p, work, settings, slow, k):
-    """Keep what has arrived so far, before something new is measured."""
-    store3(work.kept_velocity, load3(flight.gnss_velocity))
-    return k
-
-
-@kernel
-def exchange(flight, p, work, settings, slow, starting):
-    """Let what is measured now wait, and what waited arrive."""
-    z, valid = flight.gnss_velocity, flight.velocity_valid
-    arrived = exchange_three(
-        flight, work, VELOCITY_BLOCK, z, valid, flight.late_velocity, work.kept_velocity
-    )
-    flight.velocity_valid = select(work.mask > 0.0, arrived, valid)
-    if not starting:
-        store3(flight.gnss_velocity, load3(work.kept_velocity))
-    return starting
-
-
-@kernel
-def keep_valid(flight, p, work, settings, slow, k):
-    """Keep whether it is measured, for the turns of late measurements."""
-    work.kept_valid[VELOCITY_BLOCK] = flight.velocity_valid
-    return k
-
-
-@kernel
-def choose(flight, p, work, settings, slow, k):
-    """Let it be measured only where its sensor has its turn."""
-    flight.velocity_valid = work.turn[_GNSS] * work.kept_valid[VELOCITY_BLOCK]
-    return k

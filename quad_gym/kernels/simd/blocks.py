@@ -11,7 +11,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, typing
 from numba.core.datamodel import models
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import (
@@ -112,3 +112,21 @@ def _set_field(context, builder, sig, args, name):  # type: ignore[no-untyped-de
     kind = block.field(name)
     vector = vector_of(context, builder, value, source, kind)
     builder.store(vector, _field_pointer(builder, block, pointer, name, kind), align=8)
+
+
+@intrinsic(prefer_literal=True)
+def set_field(typing_context, block, name, value):  # type: ignore[no-untyped-def]
+    """Write a field of the lanes of a block, for functions made for fields of several names.
+
+    `getattr` reads such a field; as there, the name is a constant.
+    """
+    if not isinstance(block, LaneRecord) or not isinstance(name, types.StringLiteral):
+        return None
+    field = name.literal_value
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        stored = typing.signature(types.none, block, value)
+        _set_field(context, builder, stored, (args[0], args[2]), field)
+        return context.get_dummy_value()
+
+    return types.none(block, name, value), lower

@@ -1,8 +1,8 @@
 r"""The number type of the kernels: float64 of several flights that fly together.
 
 A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it
-serves the friendly classes and the tests; compiled for `Lanes` the same source flies WIDTH flights
-on the SIMD unit. This file teaches Numba three value types and the operations on them:
+serves the classes for one vehicle and the tests; compiled for `Lanes` the same source flies WIDTH
+flights on the SIMD unit. This file teaches Numba three value types and the operations on them:
 
 | type      | WIDTH of | plain counterpart | operations                                           |
 |-----------|----------|-------------------|------------------------------------------------------|
@@ -11,7 +11,7 @@ on the SIMD unit. This file teaches Numba three value types and the operations o
 | `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `bits.py`            |
 
 There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never
-sees its neighbors, so what a flight does is independent of who flies beside it, NaN included.
+sees its neighbors, so a flight does not depend on the flights in its block, NaN included.
 
 Results are defined by the source alone. A product that is added or subtracted in the same
 expression is fused into a multiply-add, always, and nothing else is: no fast-math flag lets LLVM

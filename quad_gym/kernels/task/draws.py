@@ -1,8 +1,8 @@
 """Domain randomization: a flight's own parameters, drawn when an episode begins.
 
 `flight.drawn` holds the drawn numbers, in the columns of `quad_gym.params.randomization`; the
-parameters that follow from them are put together anew whenever flights are stepped, so that a
-flight's record stays all that a flight is.
+parameters that follow from them are computed anew whenever flights are stepped, so that a
+flight is nothing but its record.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""Trajectories of a user's own: piecewise polynomials, looked up flight by flight.
+"""Users' trajectories: piecewise polynomials, looked up flight by flight.
 
-The stage sets what is asked of the reference at the present instant: `reference.py` reads it from
-the flight's record. Each lane finds its own segment, by itself, and copies its coefficients to the
-workspace; from there on lanes fly together.
+The stage sets the reference of the present instant: `reference.py` reads it from
+the flight's record. Each lane finds its own segment and copies its coefficients to the
+workspace; from there on the lanes are computed together.
 """
 
 import math

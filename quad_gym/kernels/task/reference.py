@@ -45,7 +45,7 @@ def heading(flight, r_ref, v_ref):
 
 @kernel
 def _followed(flight):
-    """(r*, v*, a*, x*) that a trajectory of a user's own has at the present instant."""
+    """(r*, v*, a*, x*) of a user's trajectory at the present instant."""
     return (
         load3(flight.path_r),
         load3(flight.path_v),

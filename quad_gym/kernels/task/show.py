@@ -1,4 +1,4 @@
-"""What a task of a user's own is shown of flights, for the views of `quad_gym.tasks`."""
+"""What a user's task is shown of flights, for the views of `quad_gym.tasks`."""
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3, load4, load33

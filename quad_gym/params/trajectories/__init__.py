@@ -1,4 +1,4 @@
-"""References of a user's own: trajectories, how they are made, and whether a vehicle can fly them.
+"""Users' references: trajectories, how they are made, and whether a vehicle can fly them.
 
 | file | what |
 |---|---|

@@ -1,0 +1,144 @@
+"""Starts of a vehicle that rests on a slope: roll and pitch from the accelerometer."""
+
+import math
+
+import numpy as np
+import pytest
+
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.rotations import euler_to_dcm
+from tests.level_flights import GRAVITY, MAGNETIC, R_IG, LevelFlight
+from tests.unit.test_filter_starts import share
+
+SAMPLES = 100
+"""Of which the mean is taken."""
+WHITE = MAGNETIC.imu.accel_noise_density / math.sqrt(MAGNETIC.imu.dt * SAMPLES)
+BASELINE = MAGNETIC.gnss.baseline_B
+FIX = np.zeros(3)
+UPRIGHT = MAGNETIC.gnss.replace(
+    primary_antenna_B=(0.0, 0.0, 0.0), secondary_antenna_B=(0.0, 0.0, 0.2)
+)
+
+
+def resting(seed, roll=0.6, pitch=-0.4):
+    """A vehicle on a steep slope, with a heading of its own."""
+    flight = LevelFlight(MAGNETIC, np.random.default_rng(seed), amplitude=0.0)
+    flight.R = euler_to_dcm([roll, pitch, flight.yaw])
+    return flight
+
+
+def force(flight, white=WHITE):
+    return flight.R @ [0.0, 0.0, GRAVITY] + flight.b_a + flight.rng.normal(0.0, white, 3)
+
+
+def nose(R):
+    """Heading of the body x axis."""
+    return math.atan2(R[0, 1], R[0, 0])
+
+
+def start(kf, flight, how):
+    position, _ = flight.gnss(0.0)
+    told = {}
+    if how == "heading":
+        told = {"heading": nose(flight.R) + flight.rng.normal(0.0, 0.05), "heading_sigma": 0.05}
+    elif how == "magnetometer":
+        told = {"magnetometer": flight.field()}
+    elif how == "baseline":
+        u = flight.R.T @ BASELINE / np.linalg.norm(BASELINE)
+        noise = flight.rng.normal(0.0, MAGNETIC.gnss.first_baseline_sigma, 3)
+        told = {"gnss_baseline_G": R_IG.T @ (u + noise - u * (u @ noise))}
+    elif how == "course":
+        angle = nose(flight.R) + flight.rng.normal(0.0, 0.1)
+        flight.drift = 6.0 * np.array([math.cos(angle), math.sin(angle), 0.0])
+        flight.speed = np.zeros(3)
+        told = {"gnss_velocity_G": flight.gnss(0.0)[1], "course": True, "heading_sigma": 0.1}
+    kf.initialize(position, accel=force(flight), accel_sigma=WHITE, **told)
+    return kf
+
+
+@pytest.mark.parametrize("how", ["heading", "magnetometer", "baseline", "course"])
+def test_errors_of_a_tilted_start_are_as_large_as_the_covariance_says(how):
+    """Mean NEES of the state and its first three parts over 300 draws; each fails 1 in 1,000."""
+    squares, kf = [], UnscentedKalmanFilter(MAGNETIC)
+    for seed in range(300):
+        flight = resting(seed)
+        start(kf, flight, how)
+        error, P = flight.error(kf, 0.0), kf.covariance
+        parts = [slice(0, 15), slice(0, 3), slice(3, 6), slice(6, 9)]
+        squares.append([error[i] @ np.linalg.solve(P[i, i], error[i]) for i in parts])
+    for mean, dimension in zip(np.mean(squares, axis=0), (15, 3, 3, 3), strict=True):
+        low, high = share(dimension, 300)
+        assert low < mean < high
+    assert kf.heading_known
+
+
+@pytest.mark.parametrize("how", ["heading", "magnetometer", "baseline"])
+def test_without_errors_the_attitude_is_exact(how):
+    flight = resting(1)
+    flight.b_a, flight.iron, flight.turn = np.zeros(3), np.zeros(3), 0.0
+    told = {
+        "heading": {"heading": nose(flight.R)},
+        "magnetometer": {"magnetometer": flight.R @ MAGNETIC.magnetometer.field_I},
+        "baseline": {"gnss_baseline_G": R_IG.T @ flight.R.T @ BASELINE},
+    }[how]
+    kf = ExtendedKalmanFilter(MAGNETIC)
+    kf.initialize(FIX, accel=force(flight, white=0.0), **told)
+    np.testing.assert_allclose(kf.R_BI, flight.R, atol=1e-12)
+    antenna = kf.position + kf.R_BI.T @ MAGNETIC.gnss.primary_antenna_B
+    np.testing.assert_allclose(antenna, 0.0, atol=1e-12)
+
+
+def test_level_and_resting_starts_agree_where_the_vehicle_is_level():
+    level, resting = UnscentedKalmanFilter(MAGNETIC), UnscentedKalmanFilter(MAGNETIC)
+    level.initialize(FIX, heading=0.7)
+    resting.initialize(FIX, heading=0.7, accel=[0.0, 0.0, GRAVITY])
+    np.testing.assert_allclose(resting.R_BI, level.R_BI, atol=1e-15)
+    np.testing.assert_allclose(resting.position, level.position, atol=1e-15)
+    claimed = math.sqrt(resting.covariance[6, 6]) * GRAVITY
+    imu = MAGNETIC.imu
+    one_sample = imu.accel_noise_density / math.sqrt(imu.dt)
+    assert claimed == pytest.approx(math.hypot(imu.accel_bias_sigma, one_sample), rel=2e-3)
+
+
+def test_motion_tells_the_heading_of_a_tilted_vehicle_too():
+    flight = resting(3, roll=0.3, pitch=0.2)
+    flight.amplitude = 0.5
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    kf.initialize(flight.gnss(0.0)[0], accel=force(flight), accel_sigma=WHITE)
+    assert not kf.heading_known
+    for k in range(1, 126):
+        kf.predict(*flight.sample(0.02 * (k - 1), 0.02), dt=0.02)
+        if k % 5 == 0:
+            position, velocity = flight.gnss(0.02 * k)
+            kf.update(position, gnss_velocity_G=velocity)
+    assert kf.heading_known
+    assert flight.nees(kf, 2.5) < 40.0  # of 15, once in 2,000
+    assert abs(nose(kf.R_BI) - nose(flight.R)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"accel": [0.0, 0.0, 12.0]}, "accel must be that of a vehicle at rest"),
+        ({"accel": [0.0, 0.0, 0.0]}, "accel must be that of a vehicle at rest"),
+        ({"accel": [GRAVITY, 0.0, 0.0]}, "x axis is not vertical"),
+        ({"accel": [0.0, GRAVITY]}, "accel must have shape"),
+        ({"accel_sigma": 0.1}, "accel_sigma must come with accel"),
+        ({"accel": [0.0, 0.0, GRAVITY], "accel_sigma": 0.0}, "accel_sigma"),
+        ({"accel": [0.0, 0.0, GRAVITY], "tilt_sigma": 0.1}, "tilt_sigma must not be given with"),
+        (
+            {"accel": [0.0, 0.0, GRAVITY], "gnss_baseline_G": [0.1, 0.0, 0.0], "heading": 0.1},
+            "got heading and gnss_baseline_G",
+        ),
+    ],
+)
+def test_bad_tilted_starts_raise(given, message):
+    kf = UnscentedKalmanFilter(MAGNETIC)
+    with pytest.raises(ValueError, match=message):
+        kf.initialize(FIX, **given)
+
+
+def test_a_baseline_that_stands_upright_tells_no_heading():
+    rtk = UnscentedKalmanFilter(MAGNETIC.replace(gnss=UPRIGHT))
+    with pytest.raises(ValueError, match="within 12 degrees of the vertical"):
+        rtk.initialize(FIX, R_IG.T @ [0.0, 0.0, 0.2], accel=[0.0, 0.0, GRAVITY])
