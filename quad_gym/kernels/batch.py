@@ -34,7 +34,7 @@ from quad_gym.records import (
 
 _IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
 _JUDGE, _OBSERVE, _SHOW = int(Stage.JUDGE), int(Stage.OBSERVE), int(Stage.SHOW)
-_JUDGE_CONTACTS = int(Stage.JUDGE_CONTACTS)
+_JUDGE_CONTACTS, _JUDGE_LANDING = int(Stage.JUDGE_CONTACTS), int(Stage.JUDGE_LANDING)
 _REWARD = int(Result.REWARD)
 _TERMINATED = int(Result.TERMINATED)
 _TRUNCATED = int(Result.TRUNCATED)
@@ -180,6 +180,8 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
     flight.instant = select(resetting, instant, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)
     call_stage(stages, _JUDGE, flight, world, model, settings, work, 0)
+    if settings.grounded:
+        call_stage(stages, _JUDGE_LANDING, flight, world, model, settings, work, 0)
     if settings.contacts:
         call_stage(stages, _JUDGE_CONTACTS, flight, world, model, settings, work, 0)
     done = (flight.terminated + flight.truncated) > 0.0

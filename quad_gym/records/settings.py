@@ -104,6 +104,10 @@ SETTINGS_FIELDS = (
     Field("vehicle_radius", (), "m", "distance from an obstacle at which the vehicle touches it"),
     Field("fenced", (), "0 or 1", "whether there is a geofence", "i8"),
     Field("fence", (2, 3), "m", "lowest and highest corner of the geofence in I"),
+    Field("grounded", (), "0 or 1", "whether the ground carries vehicles", "i8"),
+    Field("friction", (), "-", "of the feet on the ground"),
+    Field("hard_speed", (), "m/s", "of a foot that meets the ground, from which it is a crash"),
+    Field("hard_up", (), "-", "least cosine of the tilt at which the ground may be touched"),
     # what is drawn
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
     Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),

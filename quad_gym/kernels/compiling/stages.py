@@ -80,6 +80,10 @@ class Stage(IntEnum):
     TOUCH = auto()
     JUDGE_CONTACTS = auto()
     HIDE_FEATURES = auto()
+    BEGIN_GROUND = auto()
+    STAND = auto()
+    FEEL_GROUND = auto()
+    JUDGE_LANDING = auto()
     PREDICT_WITH_SLOW = auto()
     UPDATE_WITH_SLOW = auto()
     LATE_UPDATE_WITH_SLOW = auto()
@@ -151,7 +155,11 @@ def _raw(s: Any) -> bool:
 
 
 def _pad(s: Any) -> bool:
-    return bool(s["pad"] and s["start"] != Start.HOVER)
+    return bool(s["pad"] and s["start"] != Start.HOVER and not s["grounded"])
+
+
+def _grounded(s: Any) -> bool:
+    return bool(s["grounded"])
 
 
 def _contacts(s: Any) -> bool:
@@ -234,6 +242,12 @@ SOURCES = {
     Stage.BEGIN_CONTACTS: Source("obstacles.contact", "begin_contacts_stage", _contacts),
     Stage.TOUCH: Source("obstacles.contact", "touch_stage", _contacts),
     Stage.JUDGE_CONTACTS: Source("obstacles.contact", "judge_contacts_stage", _contacts),
+    Stage.BEGIN_GROUND: Source("vehicle.ground", "begin_ground_stage", _grounded),
+    Stage.STAND: Source("vehicle.ground", "stand_stage", _grounded),
+    Stage.FEEL_GROUND: Source(
+        "vehicle.ground", "feel_ground_stage", lambda s: _grounded(s) and _filter(s)
+    ),
+    Stage.JUDGE_LANDING: Source("vehicle.ground", "judge_landing_stage", _grounded),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
     Stage.SUM_IMU: Source("sensors.sample", "sum_imu_stage", _raw),
@@ -253,6 +267,7 @@ def used_parts(settings: Any) -> frozenset[str]:
     """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
     watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
     uses = {
+        "ground": _grounded(settings),
         "contacts": _contacts(settings),
         "path": _follows(settings),
         "faults": _faults(settings),
