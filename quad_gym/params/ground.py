@@ -35,8 +35,8 @@ class GroundParams(Checked):
     friction: float = 0.6
     """Coulomb's coefficient, sticking and sliding; rubber on concrete has 0.6 to 0.85; 0: ice"""
     max_touchdown_speed: float = 1.5
-    """speed of a foot toward the ground at which a touchdown is a crash [m/s]; a free fall from
-    0.11 m"""
+    """speed of the center of mass toward the ground beyond which a touchdown is a crash [m/s]; that
+    of a free fall from 0.11 m"""
     max_touchdown_tilt: float = math.radians(30.0)
     """angle between the body z axis and the vertical at which touching the ground is a crash
     [rad]; touching it with a rotor always is"""

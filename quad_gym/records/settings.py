@@ -106,7 +106,7 @@ SETTINGS_FIELDS = (
     Field("fence", (2, 3), "m", "lowest and highest corner of the geofence in I"),
     Field("grounded", (), "0 or 1", "whether the ground carries vehicles", "i8"),
     Field("friction", (), "-", "of the feet on the ground"),
-    Field("hard_speed", (), "m/s", "of a foot that meets the ground, from which it is a crash"),
+    Field("hard_speed", (), "m/s", "of a vehicle toward the ground that it meets, beyond which it crashes"),
     Field("hard_up", (), "-", "least cosine of the tilt at which the ground may be touched"),
     # what is drawn
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),

@@ -56,6 +56,7 @@ VIEW_FIELDS = (
     ViewField("truth.features_in_view", "(n, m) bool", "-", "-", "whether the camera faces a marker, as the vehicle and the sensors are nominally, and no obstacle hides it"),
     ViewField("truth.obstacle_distance", "(n,)", "m", "-", "from the nearest obstacle's surface, negative inside, infinite where there is none; `view.obstacle_distance`"),
     ViewField("truth.obstacle_vector", "(n, 3)", "m", "I", "to that surface's nearest point"),
+    ViewField("truth.on_ground", "(n,) bool", "-", "-", "whether the ground pushes a foot, in a world whose ground carries vehicles"),
     ViewField("truth.faults", "dict of (n,) bool", "-", "-", "which are there now, by name"),
     ViewField("truth.drawn", "dict of (n, ...)", "mixed", "mixed", "parameters of the episode, by name, see `randomization`"),
     # what the filter estimates

@@ -126,6 +126,11 @@ class Truth(Group):
         return self._flights.rows("obstacle_vector")
 
     @Lazy
+    def on_ground(self) -> Truths:
+        """(n,) whether the ground pushes a foot; nowhere in a world whose ground carries nobody."""
+        return np.asarray(self._flights.columns("footing") > 0.0)
+
+    @Lazy
     def faults(self) -> Any:
         """Which are there now: (n,) bool by name."""
         return self._flights.active_faults()

@@ -126,6 +126,10 @@ def cases():
                 geofence=((-6.0, -6.0, -1.0), (6.0, 6.0, 3.0)),
             ),
         },
+        "ground": {
+            "sensors": "rtk",
+            "world": quad_gym.WorldParams(ground=quad_gym.GroundParams(), wind_I=(2.0, 0.0, 0.0)),
+        },
         "battery": rtk | {"world": quad_gym.WorldParams(battery=quad_gym.BatteryParams())},
         "randomization": rtk | {"randomization": RANDOMIZATION},
         "randomization known": rtk

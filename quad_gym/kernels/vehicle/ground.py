@@ -83,7 +83,8 @@ def _prepare(work, p, R_BI, spread_I, height):
         x = _resistance(arm, (one, zero, zero), spread_I, inverse_mass)
         y = _resistance(arm, (zero, one, zero), spread_I, inverse_mass)
         z = _resistance(arm, (zero, zero, one), spread_I, inverse_mass)
-        store3(work.ground_resistance[i], (x, y, z))
+        # one for all level directions, so that friction opposes the sliding
+        store3(work.ground_resistance[i], (minimum(x, y), minimum(x, y), z))
         store3(work.ground_impulse[i], (zero, zero, zero))
         work.ground_gap[i] = height + arm[2]
 
@@ -117,16 +118,26 @@ def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
 
 
 @kernel
-def _at_most_as_fast(v_before, w_before, v_after, w_after, mass, J):
-    """Share of a change of velocity (I) and body rates (B) that does not gain kinetic energy.
+def _share_without_gain(before, after, raised, p):
+    """Share of the impulses with which a vehicle has no more energy than it would without any.
 
-    It is quadratic in the share: no more than at first up to twice the share at which it is least.
+    Kinetic and potential energy at the end of the tick are quadratic in the share s: less those of
+    free flight, `a s^2 / 2 + b s + c`. The largest share in [0, 1] for which they are not positive.
+
+    Args:
+        before: Velocity (I) and body rates (B) without impulses.
+        after: Likewise with them.
+        raised: By how much the way at the velocity of the end is above that of free flight [m].
+        p: Parameters as they are.
     """
-    dv, dw = sub(v_after, v_before), sub(w_after, w_before)
-    change = mass * dot(dv, dv) + dot(dw, apply(J, dw))
-    along = mass * dot(v_before, dv) + dot(w_before, apply(J, dw))
-    changes = change > 1e-300
-    return clip(-2.0 * along / select(changes, change, 1.0), 0.0, 1.0)
+    J = load33(p.inertia)
+    dv, dw = sub(after[0], before[0]), sub(after[1], before[1])
+    a = p.mass * dot(dv, dv) + dot(dw, apply(J, dw))
+    b = p.mass * (dot(before[0], dv) + p.gravity * p.dt * dv[2]) + dot(before[1], apply(J, dw))
+    c = p.mass * p.gravity * raised
+    changes = a > 1e-300
+    root = math.sqrt(maximum(b * b - 2.0 * a * c, 0.0))
+    return clip((root - b) / select(changes, a, 1.0), 0.0, 1.0)
 
 
 @kernel
@@ -165,17 +176,17 @@ def _can_hold(work, F, T, friction):
 
 
 @kernel
-def carry(flight, p, settings, work, pose, rates, free):
+def carry(p, settings, work, pose, rates, free, raised):
     """Let the ground push for one tick.
 
     Args:
-        flight: Record.
         p: Parameters as they are.
         settings: Friction, and what a crash is.
         work: Workspace.
         pose: Position in I and attitude quaternion at the tick's start.
         rates: Velocity in I and body rates in B at its start.
         free: Likewise at its end, as without the ground.
+        raised: See `_share_without_gain`.
 
     Returns:
         Velocity in I and body rates in B at its end; which lanes the ground pushes, which of them
@@ -193,11 +204,10 @@ def carry(flight, p, settings, work, pose, rates, free):
         low = work.ground_gap[i] + p.dt * down < 0.0
         meets = meets | low
         if i < _FEET:
-            hard = hard | (low & (down < -settings.hard_speed))
             still = still & (abs(work.ground_gap[i]) <= STILL_GAP)
         else:
             hard = hard | low
-    hard = hard | (meets & (R_BI[2][2] < settings.hard_up))
+    hard = hard | (R_BI[2][2] < settings.hard_up) | (v_start[2] < -settings.hard_speed)
     v, w, feet = v_free, w_free, zero
     stays = meets & still & (dot(v_start, v_start) <= STILL_SPEED * STILL_SPEED)
     stays = stays & (dot(w_start, w_start) <= STILL_RATE * STILL_RATE)
@@ -208,7 +218,7 @@ def carry(flight, p, settings, work, pose, rates, free):
         for _ in range(SWEEPS):
             v_I, w_I = _sweep(work, v_I, w_I, spread_I, inverse_mass, settings.friction, rate)
         w_B = apply(R_BI, w_I)
-        share = _at_most_as_fast(v_free, w_free, v_I, w_B, p.mass, J)
+        share = _share_without_gain(free, (v_I, w_B), raised, p)
         v = add(v_free, scale(share, sub(v_I, v_free)))
         w = add(w_free, scale(share, sub(w_B, w_free)))
         for i in range(_FEET):
@@ -250,7 +260,9 @@ def stand(flight, p, settings, work, start):
     """
     r_I, v_I, q, w_B, _ = start
     free = load3(flight.v), load3(flight.w)
-    v, w, meets, stays, crashes, feet = carry(flight, p, settings, work, (r_I, q), (v_I, w_B), free)
+    raised = r_I[2] + p.dt * free[0][2] - flight.r[2]
+    pose = (r_I, q)
+    v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
     flight.footing = feet
     flight.crashed = select(crashes, 1.0, flight.crashed)
     if any_of(meets):
@@ -299,7 +311,8 @@ def begin_on_ground(flight, p, settings, work, mask):
     a_I, dw_B = _free_accelerations(flight, p, R_BI)
     free = add(v_I, scale(h, a_I)), add(w_B, scale(h, dw_B))
     pose = load3(flight.r), load4(flight.q)
-    v, w, meets, _, _, feet = carry(flight, p, settings, work, pose, (v_I, w_B), free)
+    raised = 0.5 * h * (free[0][2] - v_I[2])
+    v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
     before = load3(flight.ground_push)
     gained = scale(1.0 / h, sub(v, v_I)), scale(1.0 / h, sub(w, w_B))
     _feel(flight, p, R_BI, gained, meets)
