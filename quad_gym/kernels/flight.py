@@ -37,6 +37,7 @@ _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
 _BEGIN_FAULTS = int(Stage.BEGIN_FAULTS)
 _BEGIN_CONTACTS, _TOUCH = int(Stage.BEGIN_CONTACTS), int(Stage.TOUCH)
 _FOLLOW = int(Stage.FOLLOW)
+_PLACE_FEATURES = int(Stage.PLACE_FEATURES)
 _BEGIN_GROUND, _STAND = int(Stage.BEGIN_GROUND), int(Stage.STAND)
 
 _BEGIN_AID, _SAMPLE_AID = int(Act.BEGIN), int(Act.SAMPLE)
@@ -158,6 +159,8 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.randomized:
         call_stage(stages, _DRAW, flight, world, nominal, settings, work, 0)
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
+    if settings.features_drawn:
+        call_stage(stages, _PLACE_FEATURES, flight, world, model, settings, work, 1)
     if settings.action_delays > 0:
         call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
     if settings.run_filter and settings.late > 0:

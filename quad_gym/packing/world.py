@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.ground import GroundParams
-from quad_gym.params.randomization import DrawingTable, Randomization
+from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import BatteryParams, WorldParams
@@ -69,6 +69,24 @@ def pack_options(
     pack_obstacles(s, world)
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))
+
+
+def pack_places(
+    s: Any, draws: DrawingTable, true_sensors: SensorSuite, sensors: SensorSuite
+) -> None:
+    """Write into a settings record whether features are drawn, and where they are without draws.
+
+    Args:
+        s: The settings.
+        draws: What is drawn.
+        true_sensors: As they are.
+        sensors: As the filter believes.
+    """
+    s["features_drawn"] = bool(set(FEATURE_DRAWS) & set(draws.names))
+    if s["features_drawn"]:
+        for k, suite in enumerate((true_sensors, sensors)):
+            assert suite.camera is not None
+            s["feature_places"][k, : len(suite.camera.features_I)] = suite.camera.features_I
 
 
 def pack_obstacles(s: Any, world: WorldParams) -> None:

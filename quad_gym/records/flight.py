@@ -61,6 +61,10 @@ _FAULT_FIELDS = (
     Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
     Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
 )
+_PLACE_FIELDS = (
+    # where the features are in this episode
+    Field("feature_place", (MAX_FEATURES, 3), "m", "places of the features in I, as the filter believes"),
+)
 _DRAW_FIELDS = (
     # parameters
     Field("drawn", (DRAWN_SIZE,), "mixed", "parameters of this episode, see `quad_gym.params.randomization`"),
@@ -228,6 +232,7 @@ PARTS = (
     ("contacts", _CONTACT_FIELDS),
     ("path", _PATH_FIELDS),
     ("faults", _FAULT_FIELDS),
+    ("places", _PLACE_FIELDS),
     ("draws", _DRAW_FIELDS),
     ("actions", _ACTION_FIELDS),
     ("raw", _RAW_FIELDS),

@@ -4,6 +4,7 @@ from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
     AIDS,
     FAULT_KINDS,
+    MAX_FEATURES,
     MAX_OBSTACLES,
     MAX_STATES,
     WARM_DRAWS,
@@ -111,6 +112,8 @@ SETTINGS_FIELDS = (
     # what is drawn
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
     Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),
+    Field("features_drawn", (), "0 or 1", "whether each episode has features at places of its own", "i8"),
+    Field("feature_places", (2, MAX_FEATURES, 3), "m", "nominal places of the features in I: as they are, and as the filter believes"),
     Field("known", (), "0 or 1", "whether filter and controller know the world as it is", "i8"),
     Field("draw_kind", (DRAWN_SIZE,), "-", "how a column is drawn, see `quad_gym.params.distributions`", "i8"),
     Field("draw_a", (DRAWN_SIZE,), "mixed", "of the distribution"),

@@ -34,7 +34,7 @@ VIEW_FIELDS = (
     ViewField("gates", "(n, gates, 3)", "m", "I", "of a course, in order"),
     ViewField("gates_passed", "(n,) int", "-", "-", "in this episode"),
     ViewField("gate_passed", "(n,) bool", "-", "-", "whether this step passed one"),
-    ViewField("features", "(m, 3)", "m", "I", "the markers that the camera sees, the same for all flights"),
+    ViewField("features", "(n, m, 3)", "m", "I", "the markers that the camera sees, where the filter knows them to be in this episode"),
     ViewField("world", "", "-", "-", "the `WorldParams`, without draws and shifts"),
     ViewField("obstacles", "(n, o, 3)", "m", "I", "where the middles of the world's obstacles are in this episode, in their order"),
     ViewField("observation", "(n, k)", "mixed", "mixed", "the shipped observation, less its privileged part"),

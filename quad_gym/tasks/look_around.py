@@ -77,6 +77,6 @@ class LookAround(Task):
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
         """`features_direction`: (n, 3) unit vector to the middle of the markers, in B."""
-        gap = view.features.mean(axis=0) - view.seen.position
+        gap = view.features.mean(axis=1) - view.seen.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
         return {"features_direction": (view.seen.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}

@@ -3,7 +3,7 @@
 import math
 import statistics
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -69,10 +69,14 @@ def time_own_task(effort: Effort, threads: int) -> list[Row]:
     """
     rows: list[Row] = []
     for count in COUNTS:
-        options = {"control_rate": 50.0, "observation": "estimate", "threads": threads}
+        options: dict[str, Any] = {
+            "control_rate": 50.0,
+            "observation": "estimate",
+            "threads": threads,
+        }
         steps = []
         for custom in (None, OwnCircle()):
-            more = {} if custom is None else {"custom": custom}
+            more: dict[str, Any] = {} if custom is None else {"custom": custom}
             env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **options, **more)
             env.reset(seed=0)
             steps.append((env, random_actions(count)))

@@ -73,6 +73,7 @@ class Stage(IntEnum):
     DRAW = auto()
     IMPOSE = auto()
     LOOK = auto()
+    PLACE_FEATURES = auto()
     JUDGE = auto()
     OBSERVE = auto()
     SHOW = auto()
@@ -174,6 +175,10 @@ def _follows(s: Any) -> bool:
     return bool(s["harmonics"] == FOLLOWED)
 
 
+def _places(s: Any) -> bool:
+    return bool(s["features_drawn"])
+
+
 def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
@@ -198,6 +203,7 @@ SOURCES = {
     Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
     Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
     Stage.IMPOSE: Source("task.draws", "impose_stage", _drawn),
+    Stage.PLACE_FEATURES: Source("task.places", "place_features_stage", _places),
     Stage.BEGIN: Source("task.episode", "begin_stage", _always),
     Stage.MOVE_IN_AIR: Source("vehicle.air", "move_in_air_stage", _air),
     Stage.ALIGN: Source("filter.align", "align_stage", _filter),
@@ -272,6 +278,7 @@ def used_parts(settings: Any) -> frozenset[str]:
         "path": _follows(settings),
         "faults": _faults(settings),
         "draws": _drawn(settings),
+        "places": _places(settings),
         "filter": _filter(settings),
         "actions": bool(settings["action_delays"] > 0),
         "raw": _raw(settings),
