@@ -71,7 +71,6 @@ def time_own_task(effort: Effort, threads: int) -> list[Row]:
     for count in COUNTS:
         options: dict[str, Any] = {
             "control_rate": 50.0,
-            "observation": "estimate",
             "threads": threads,
         }
         steps = []
