@@ -15,6 +15,7 @@ from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.distributions import LogUniform, Normal, Uniform
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
+from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
@@ -81,6 +82,7 @@ __all__ = [
     "Cylinder",
     "FilterParams",
     "GnssParams",
+    "GroundParams",
     "ImuParams",
     "LogUniform",
     "MagnetometerParams",

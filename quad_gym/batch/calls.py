@@ -21,7 +21,7 @@ class Calls:
         room: Which fields they have.
         shared: Arrays that all threads see.
         numbers: Words that are no addresses.
-        own, work: Arrays of each thread.
+        own, believed, work: Arrays of each thread.
         kept: Arrays whose addresses others hold.
     """
 
@@ -32,10 +32,11 @@ class Calls:
         shared: Mapping[Call, NDArray[Any]],
         numbers: Mapping[Call, int],
         own: Sequence[NDArray[Any]],
+        believed: Sequence[NDArray[Any]],
         work: Sequence[NDArray[Any]],
         kept: Sequence[NDArray[Any]] = (),
     ) -> None:
-        self._memory = (blocks, dict(shared), own, work, kept)
+        self._memory = (blocks, dict(shared), own, believed, work, kept)
         self._words = np.zeros((len(own), len(Call)), np.int64)
         self._words[:, Call.BLOCKS] = address_of(blocks) - room.skipped
         self._words[:, Call.PITCH] = room.dtype.itemsize
@@ -44,6 +45,7 @@ class Calls:
         for word, number in numbers.items():
             self._words[:, word] = number
         self._words[:, Call.OWN] = [address_of(array) for array in own]
+        self._words[:, Call.BELIEVED] = [address_of(array) for array in believed]
         self._words[:, Call.WORK] = [address_of(array) for array in work]
         self._rows = list(self._words)
 

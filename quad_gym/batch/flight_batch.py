@@ -26,7 +26,7 @@ from quad_gym.packing.flight import (
     settings_record,
 )
 from quad_gym.packing.paths import pack_paths
-from quad_gym.packing.world import pack_options
+from quad_gym.packing.world import pack_options, pack_places
 from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
@@ -193,6 +193,7 @@ class FlightBatch(FlightMemory):
         true["action_delay"] = self.action_delay
         self._model, self._world = params_block(model), params_block(true)
         self._own = [self._world.copy() for _ in range(self.threads)]
+        self._believed = [self._model.copy() for _ in range(self.threads)]
         self._settings = settings_record(
             self.task,
             self.clocks,
@@ -219,6 +220,7 @@ class FlightBatch(FlightMemory):
         self._settings["action_delays"] = longest_delay
         self._paths = pack_paths(self.task.trajectories)
         self._settings["path_count"] = len(self._paths[0])
+        pack_places(self._settings[0], draws, true_sensors, self.sensors)
         pack_faults(self._settings[0], self.faults, self.sensors.imu.dt)
         pack_latency(self._settings[0], true_sensors, self.clocks, self.sensors)
         pack_imperfections(self._settings[0], true_sensors)
@@ -352,7 +354,8 @@ class FlightBatch(FlightMemory):
             Call.RESULT_PITCH: self._results.strides[0],
         }
         self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
-        return Calls(self._blocks, self._room, shared, numbers, self._own, self._work, self._paths)
+        threads = (self._own, self._believed, self._work)
+        return Calls(self._blocks, self._room, shared, numbers, *threads, self._paths)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""

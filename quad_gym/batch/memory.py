@@ -98,8 +98,22 @@ class FlightMemory:
         for name in self.randomization.names:
             values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
             values = values.reshape(-1, values.shape[-1])[: self.count].copy()
-            found[name] = values[:, 0] if values.shape[1] == 1 else values
+            if name == "feature_offsets_I" and self.sensors.camera is not None:
+                count = len(self.sensors.camera.features_I)
+                values = values[:, : 3 * count].reshape(-1, count, 3)
+            found[name] = values[:, 0] if values.shape[1:] == (1,) else values
         return found
+
+    def feature_places(self) -> NDArray[np.float64]:
+        """(count, m, 3) where the camera's features are in the present episodes, in I [m].
+
+        As the filter believes.
+        """
+        camera = self.sensors.camera
+        nominal = np.array([] if camera is None else camera.features_I).reshape(-1, 3)
+        if self._room.holds("feature_place"):
+            return np.ascontiguousarray(self.read("feature_place")[:, : len(nominal)])
+        return np.broadcast_to(nominal, (self.count, *nominal.shape))
 
     def active_faults(self) -> dict[str, NDArray[np.bool_]]:
         """Which of the faults that can come are there now, by name: (count,) each."""

@@ -94,7 +94,7 @@ def hidden_points(
         obstacles: Any number.
         centers: (n, obstacles, 3) where they are in I [m].
         eyes: (n, 3) in I [m].
-        points: (m, 3) in I [m].
+        points: (m, 3) or (n, m, 3) in I [m].
     """
     along_I = points - eyes[:, np.newaxis]
     end = 1.0 - AT_THE_END / np.maximum(_length(along_I), AT_THE_END)

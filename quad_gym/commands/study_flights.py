@@ -79,7 +79,10 @@ class _Watch:
         self.seen += in_view & flying
         self.steps += flying
         k = min(TRACED, view.count)
-        forward, to_wall = view.truth.forward[:k], view.features.mean(axis=0) - view.position[:k]
+        forward, to_wall = (
+            view.truth.forward[:k],
+            view.features[:k].mean(axis=1) - view.position[:k],
+        )
         row = [
             _angle(to_wall, forward),
             _angle(view.reference_heading[:k], forward),

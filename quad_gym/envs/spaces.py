@@ -113,10 +113,11 @@ def _sensor_fields(
     return (*fields, *_REFERENCE)
 
 
-def _world_fields(drawn: Sequence[str]) -> tuple[Part, ...]:
+def _world_fields(drawn: Sequence[str], feature_count: int) -> tuple[Part, ...]:
     for name in drawn:
         check.choice("drawn", name, tuple(COLUMNS))
     sizes = {name: columns.stop - columns.start for name, columns in COLUMNS.items()}
+    sizes["feature_offsets_I"] = 3 * feature_count
     return (
         ("wind", 3, "m/s", "B", 100.0),
         *(
@@ -181,7 +182,7 @@ def observation_layout(
             for name, unit, frame in zip(STATE_NAMES, units, frames, strict=True)
         )
     if privileged:
-        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn))
+        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, feature_count))
     return tuple(_table(parts, 0))
 
 

@@ -338,7 +338,7 @@ class FlightRecorder:
             camera_rate=camera.rate if camera else 0.0,
             focal_length=float(model["focal_length"]),
             half_image=np.array(model["half_image"]),
-            features_I=np.array(camera.features_I if camera else np.zeros((0, 3))),
+            features_I=np.array(batch.feature_places()[self._which[0]]),
             gates_I=self._read("gates")[:gate_count],
             gate_radius=batch.task.gate_radius,
             reference_omega=float(self._read("ref_omega")),

@@ -34,7 +34,7 @@ from quad_gym.records import (
 
 _IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
 _JUDGE, _OBSERVE, _SHOW = int(Stage.JUDGE), int(Stage.OBSERVE), int(Stage.SHOW)
-_JUDGE_CONTACTS = int(Stage.JUDGE_CONTACTS)
+_JUDGE_CONTACTS, _JUDGE_LANDING = int(Stage.JUDGE_CONTACTS), int(Stage.JUDGE_LANDING)
 _REWARD = int(Result.REWARD)
 _TERMINATED = int(Result.TERMINATED)
 _TRUNCATED = int(Result.TRUNCATED)
@@ -52,6 +52,7 @@ _FILTER_LOST = int(Result.FILTER_LOST)
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
 _WORLD, _OWN, _MODEL = int(Call.WORLD), int(Call.OWN), int(Call.MODEL)
+_BELIEVED, _PLACE_FEATURES = int(Call.BELIEVED), int(Stage.PLACE_FEATURES)
 _SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
 _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
@@ -180,6 +181,8 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
     flight.instant = select(resetting, instant, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)
     call_stage(stages, _JUDGE, flight, world, model, settings, work, 0)
+    if settings.grounded:
+        call_stage(stages, _JUDGE_LANDING, flight, world, model, settings, work, 0)
     if settings.contacts:
         call_stage(stages, _JUDGE_CONTACTS, flight, world, model, settings, work, 0)
     done = (flight.terminated + flight.truncated) > 0.0
@@ -195,6 +198,8 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
     observing, written = call[_SIZE] > 0, False
     if settings.randomized:
         call_stage(stages, _IMPOSE, flight, true, nominal, settings, work, 0)
+    if settings.features_drawn:
+        call_stage(stages, _PLACE_FEATURES, flight, true, believed, settings, work, 0)
     if settings.faults:
         call_stage(stages, _MEET_ROTORS, flight, true, believed, settings, work, 0)
     if command == Command.RESET:
@@ -245,7 +250,8 @@ def fly(call, board, number, command, serving):
     stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
     differ = settings.randomized > 0 or settings.faults > 0
     true = _params_at(call[_OWN] if differ else call[_WORLD])
-    believed = true if settings.known else _params_at(call[_MODEL])
+    model = call[_BELIEVED] if settings.features_drawn else call[_MODEL]
+    believed = true if settings.known else _params_at(model)
     if not serving and command >= 0:
         post(board, command)
     while True:  # once, where nobody serves

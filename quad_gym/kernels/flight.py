@@ -37,6 +37,8 @@ _BEGIN_IN_AIR, _BEGIN_LATE = int(Stage.BEGIN_IN_AIR), int(Stage.BEGIN_LATE)
 _BEGIN_FAULTS = int(Stage.BEGIN_FAULTS)
 _BEGIN_CONTACTS, _TOUCH = int(Stage.BEGIN_CONTACTS), int(Stage.TOUCH)
 _FOLLOW = int(Stage.FOLLOW)
+_PLACE_FEATURES = int(Stage.PLACE_FEATURES)
+_BEGIN_GROUND, _STAND = int(Stage.BEGIN_GROUND), int(Stage.STAND)
 
 _BEGIN_AID, _SAMPLE_AID = int(Act.BEGIN), int(Act.SAMPLE)
 _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
@@ -107,7 +109,7 @@ def tick(flight, world, model, settings, work, stages, last):
         call_stage(stages, _SUPPLY, flight, world, model, settings, work, 0)
     flight.instant = flight.instant + _ONE
     resting = settings.pad > 0 and settings.start != Start.HOVER and any_of(flight.on_pad > 0.0)
-    if settings.imu_averages or resting:
+    if settings.imu_averages or resting or settings.grounded:
         _store_start(flight, work)
     if settings.air:
         call_stage(stages, _MOVE_IN_AIR, flight, world, model, settings, work, 0)
@@ -115,6 +117,8 @@ def tick(flight, world, model, settings, work, stages, last):
         call_stage(stages, _MOVE, flight, world, model, settings, work, 0)
     if resting:
         call_stage(stages, _REST_ON_PAD, flight, world, model, settings, work, 0)
+    if settings.grounded:
+        call_stage(stages, _STAND, flight, world, model, settings, work, 0)
     if settings.contacts:
         call_stage(stages, _TOUCH, flight, world, model, settings, work, 0)
     if settings.run_filter:
@@ -155,6 +159,8 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     if settings.randomized:
         call_stage(stages, _DRAW, flight, world, nominal, settings, work, 0)
         call_stage(stages, _IMPOSE, flight, world, nominal, settings, work, 0)
+    if settings.features_drawn:
+        call_stage(stages, _PLACE_FEATURES, flight, world, model, settings, work, 1)
     if settings.action_delays > 0:
         call_stage(stages, _DELAY_ACTION, flight, world, model, settings, work, 1)
     if settings.run_filter and settings.late > 0:
@@ -168,6 +174,8 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:
         call_stage(stages, _BEGIN_FAULTS, flight, world, model, settings, work, 0)
+    if settings.grounded:
+        call_stage(stages, _BEGIN_GROUND, flight, world, model, settings, work, 0)
     if settings.contacts:
         call_stage(stages, _BEGIN_CONTACTS, flight, world, model, settings, work, 0)
     sense(flight, world, model, settings, work, stages, mask, 1, 0)

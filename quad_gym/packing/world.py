@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.params.randomization import DrawingTable, Randomization
+from quad_gym.params.ground import GroundParams
+from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import BatteryParams, WorldParams
@@ -22,6 +23,7 @@ def pack_world(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
     p["wind_speed"], p["wind_direction"] = math.hypot(east, north), math.atan2(north, east)
     p["linear_drag"], p["rotor_drag"] = world.linear_drag_B, world.rotor_drag_B
     p["rotor_radius"], p["ground_height"] = world.rotor_radius, world.ground_height
+    p["feet"] = (GroundParams() if world.ground is None else world.ground).feet_B
     battery = BatteryParams() if world.battery is None else world.battery
     p["battery_charge"], p["battery_energy"] = battery.charge, battery.energy
     p["battery_empty"], p["battery_resistance"] = battery.empty_voltage, battery.resistance
@@ -69,6 +71,24 @@ def pack_options(
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))
 
 
+def pack_places(
+    s: Any, draws: DrawingTable, true_sensors: SensorSuite, sensors: SensorSuite
+) -> None:
+    """Write into a settings record whether features are drawn, and where they are without draws.
+
+    Args:
+        s: The settings.
+        draws: What is drawn.
+        true_sensors: As they are.
+        sensors: As the filter believes.
+    """
+    s["features_drawn"] = bool(set(FEATURE_DRAWS) & set(draws.names))
+    if s["features_drawn"]:
+        for k, suite in enumerate((true_sensors, sensors)):
+            assert suite.camera is not None
+            s["feature_places"][k, : len(suite.camera.features_I)] = suite.camera.features_I
+
+
 def pack_obstacles(s: Any, world: WorldParams) -> None:
     """Write into a settings record what stands in a world."""
     s["obstacle_count"] = len(world.obstacles)
@@ -80,6 +100,10 @@ def pack_obstacles(s: Any, world: WorldParams) -> None:
         s["obstacle_follows"][k] = -1 if obstacle.follows is None else obstacle.follows
     if world.geofence is not None:
         s["fenced"], s["fence"] = True, world.geofence
+    if world.ground is not None:
+        s["grounded"], s["friction"] = True, world.ground.friction
+        s["hard_speed"] = world.ground.max_touchdown_speed
+        s["hard_up"] = math.cos(world.ground.max_touchdown_tilt)
     s["contacts"] = bool(world.obstacles) or world.geofence is not None
 
 

@@ -25,6 +25,9 @@ from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL
 FAST = 100.0
 """Vehicles fly slower than this [m/s]."""
 
+FEATURE_DRAWS = ("features_yaw", "features_shift_I", "feature_offsets_I")
+"""Draws that move the camera's features; the filter knows where they are."""
+
 Given = Distribution | Sequence[Distribution | None]
 
 
@@ -34,13 +37,14 @@ class Randomization:
 
     The names are those of `quad_gym.params.randomization.DRAWABLES`. Of a parameter with several
     components each is drawn by itself, from the same distribution or from those of a sequence,
-    where None keeps a component.
+    where None keeps a component. `feature_offsets_I` has three for each of the camera's features,
+    and a sequence holds those of x, y and z.
 
     Args:
         parameters: Distributions by name.
         known: Whether the filter and the controller know the vehicle and the sensors as they are,
             draws included. By default they believe the nominal parameters. Of wind and ground they
-            never know.
+            never know. Where the camera's features are the filter always knows.
 
     Raises:
         ValueError: If a name is unknown, or something is no distribution.
@@ -90,6 +94,8 @@ class Randomization:
     def distributions(self, name: str) -> tuple[Distribution | None, ...]:
         """The distribution of each component of a parameter; None: it is not drawn."""
         size = COLUMNS[name].stop - COLUMNS[name].start
+        if name == "feature_offsets_I":
+            size = 3
         given = self.parameters.get(name)
         if given is None or isinstance(given, Distribution):
             if name in self.parameters and given is None:
@@ -137,7 +143,10 @@ class DrawingTable:
         for drawable in DRAWABLES:
             if drawable.name in self.names:
                 first = COLUMNS[drawable.name].start
-                for k, part in enumerate(randomization.distributions(drawable.name)):
+                parts = randomization.distributions(drawable.name)
+                if drawable.name == "feature_offsets_I" and sensors.camera is not None:
+                    parts = parts * len(sensors.camera.features_I)
+                for k, part in enumerate(parts):
                     self._fill(drawable, first + k, part, nominal[first + k])
         _check_hovering(self, vehicle, world)
         if "inertia" in self.names:
@@ -205,6 +214,9 @@ _FARTHEST = {
     "start_position_I": 1e6,
     "start_velocity_I": 1e4,
     "start_body_rates": 1e3,
+    "features_yaw": 1e4,
+    "features_shift_I": 1e4,
+    "feature_offsets_I": 1e4,
 }
 """What can be drawn at most, either way, where larger numbers are mistakes."""
 
@@ -220,7 +232,10 @@ def _range_in_words(drawable: Drawable) -> str:
     return f"{' and '.join(words)} {'' if drawable.unit == '-' else drawable.unit}".strip()
 
 
-_CAMERA = ("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length")
+_CAMERA = (
+    *("pixel_sigma", "camera_position_B", "camera_rotation", "focal_length"),
+    *FEATURE_DRAWS,
+)
 _GNSS = ("position_sigma_I", "primary_antenna_B")
 _BASELINE = ("baseline_sigma", "secondary_antenna_B")
 _MISSING = (
@@ -251,6 +266,7 @@ def nominal_values(
         "camera_rotation": math.nan if camera is None else 0.0,
         "pixel_sigma": math.nan if camera is None else camera.pixel_sigma,
         "focal_length": math.nan if camera is None else camera.focal_length,
+        **dict.fromkeys(FEATURE_DRAWS, math.nan if camera is None else 0.0),
         **(dict.fromkeys(_GNSS, math.nan) if gnss is None else {}),
         **(dict.fromkeys(_BASELINE, math.nan) if gnss is None or not gnss.has_baseline else {}),
     }

@@ -11,6 +11,7 @@ import numpy as np
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Matrix, Vector
+from quad_gym.params.ground import GroundParams
 from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
 from quad_gym.records import MAX_OBSTACLES
 
@@ -77,8 +78,11 @@ class WorldParams(Checked):
     rotor_radius: float = 0.127
     """[m]; ten-inch propellers"""
     ground_height: float = -0.1
-    """height of the ground in I, for ground effect and gusts [m]; the center of mass of a vehicle
-    that stands on its legs is at height 0"""
+    """height of the ground in I, for contact, ground effect and gusts [m]; the center of mass of a
+    vehicle that stands on its legs is at height 0"""
+    ground: GroundParams | None = None
+    """the ground as a plane at `ground_height` that carries a vehicle anywhere, and crashes one
+    that meets it too fast or too tilted; None: only a launch pad carries vehicles, at the start"""
     battery: BatteryParams | None = None
     """None: always full voltage"""
     obstacles: tuple[Obstacle, ...] = ()
@@ -106,6 +110,8 @@ class WorldParams(Checked):
                 raise ValueError(
                     f"WorldParams.{name} must be at least 0, got {getattr(self, name)}"
                 )
+        if self.ground is not None:
+            check.instance("WorldParams.ground", self.ground, GroundParams)
         if self.battery is not None:
             check.instance("WorldParams.battery", self.battery, BatteryParams)
         self._check_room()

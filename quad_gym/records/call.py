@@ -21,6 +21,9 @@ class Call(IntEnum):
     put together if they draw some, or if their rotors can fail."""
     MODEL = auto()
     """PARAMS_BLOCK: parameters as the filter and the controller believe them."""
+    BELIEVED = auto()
+    """PARAMS_BLOCK of this thread: a copy of MODEL, where the features of the flights at hand are
+    put if each episode has its own."""
     SETTINGS = auto()
     """SETTINGS."""
     WORK = auto()

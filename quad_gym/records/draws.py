@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from quad_gym.records.sizes import MAX_ACTION_DELAY
+from quad_gym.records.sizes import MAX_ACTION_DELAY, MAX_FEATURES
 
 FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3
 """How a parameter is drawn."""
@@ -74,6 +74,10 @@ DRAWABLES = (
     Drawable("start_yaw", 1, "rad", "added to the start's yaw"),
     # what actions meet
     Drawable("action_delay", 1, "steps", "of actions, in control steps", 0.0, most=MAX_ACTION_DELAY),
+    # where the camera's features are, which the filter knows
+    Drawable("features_yaw", 1, "rad", "turn of all features about the vertical through the origin"),
+    Drawable("features_shift_I", 3, "m", "shift of all features, after the turn"),
+    Drawable("feature_offsets_I", 3 * MAX_FEATURES, "m", "offset of each feature by itself, before the turn"),
 )
 # fmt: on
 """Every parameter that can be drawn; the columns of a flight's field `drawn`, in this order."""

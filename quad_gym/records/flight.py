@@ -29,6 +29,12 @@ _CONTACT_FIELDS = (
     Field("collided", (), "0 or 1", "whether the vehicle has touched an obstacle in this episode"),
     Field("left_fence", (), "0 or 1", "whether it has left the geofence in this episode"),
 )
+_GROUND_FIELDS = (
+    # contact with the ground
+    Field("ground_push", (3,), "m/s^2", "specific force of the ground at the accelerometer, in B, over the last tick"),
+    Field("footing", (), "-", "how many feet the ground pushes"),
+    Field("crashed", (), "0 or 1", "whether the vehicle has crashed into the ground in this episode"),
+)
 _PATH_FIELDS = (
     # the trajectory of this episode, and what it says of the present instant
     Field("path", (), "-", "which one, in the order in which they were given"),
@@ -54,6 +60,10 @@ _FAULT_FIELDS = (
     Field("feature_hidden", (MAX_FEATURES,), "0 or 1", "whether an occlusion hides a feature"),
     Field("feature_mistaken", (MAX_FEATURES,), "0 or 1", "whether a feature of the last image is another one"),
     Field("rotor_gain", (4,), "-", "thrust of each rotor over that of a working one; only where rotors can fail"),
+)
+_PLACE_FIELDS = (
+    # where the features are in this episode
+    Field("feature_place", (MAX_FEATURES, 3), "m", "places of the features in I, as the filter believes"),
 )
 _DRAW_FIELDS = (
     # parameters
@@ -218,9 +228,11 @@ _LATE_AID_FIELDS = (
 )
 # fmt: on
 PARTS = (
+    ("ground", _GROUND_FIELDS),
     ("contacts", _CONTACT_FIELDS),
     ("path", _PATH_FIELDS),
     ("faults", _FAULT_FIELDS),
+    ("places", _PLACE_FIELDS),
     ("draws", _DRAW_FIELDS),
     ("actions", _ACTION_FIELDS),
     ("raw", _RAW_FIELDS),

@@ -29,6 +29,7 @@ PARAMS_FIELDS = (
     Field("rotor_drag", (3,), "N s/m per rad/s", "linear drag in B per rotor speed"),
     Field("rotor_radius", (), "m", "radius of the rotors"),
     Field("ground_height", (), "m", "height of the ground in I"),
+    Field("feet", (4, 3), "m", "soles of the feet in B"),
     Field("battery_charge", (), "-", "charge at the start"),
     Field("battery_energy", (), "J", "energy of a full battery"),
     Field("battery_empty", (), "-", "voltage of an empty over that of a full battery"),

@@ -4,6 +4,7 @@ from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
     AIDS,
     FAULT_KINDS,
+    MAX_FEATURES,
     MAX_OBSTACLES,
     MAX_STATES,
     WARM_DRAWS,
@@ -104,9 +105,15 @@ SETTINGS_FIELDS = (
     Field("vehicle_radius", (), "m", "distance from an obstacle at which the vehicle touches it"),
     Field("fenced", (), "0 or 1", "whether there is a geofence", "i8"),
     Field("fence", (2, 3), "m", "lowest and highest corner of the geofence in I"),
+    Field("grounded", (), "0 or 1", "whether the ground carries vehicles", "i8"),
+    Field("friction", (), "-", "of the feet on the ground"),
+    Field("hard_speed", (), "m/s", "of a vehicle toward the ground that it meets, beyond which it crashes"),
+    Field("hard_up", (), "-", "least cosine of the tilt at which the ground may be touched"),
     # what is drawn
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
     Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),
+    Field("features_drawn", (), "0 or 1", "whether each episode has features at places of its own", "i8"),
+    Field("feature_places", (2, MAX_FEATURES, 3), "m", "nominal places of the features in I: as they are, and as the filter believes"),
     Field("known", (), "0 or 1", "whether filter and controller know the world as it is", "i8"),
     Field("draw_kind", (DRAWN_SIZE,), "-", "how a column is drawn, see `quad_gym.params.distributions`", "i8"),
     Field("draw_a", (DRAWN_SIZE,), "mixed", "of the distribution"),

@@ -86,9 +86,6 @@ class TaskBatch(ReadableBatch):
             self._kept = np.array(kept, np.intp)
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
-        camera = self.sensors.camera
-        self.features = np.array([] if camera is None else camera.features_I).reshape(-1, 3)
-        self.features.flags.writeable = False
         self._state = State(self.count, custom.state)
         self._nobody = np.zeros(self.count, bool)
         self._failed = self._nobody.copy()

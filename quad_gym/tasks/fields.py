@@ -34,7 +34,7 @@ VIEW_FIELDS = (
     ViewField("gates", "(n, gates, 3)", "m", "I", "of a course, in order"),
     ViewField("gates_passed", "(n,) int", "-", "-", "in this episode"),
     ViewField("gate_passed", "(n,) bool", "-", "-", "whether this step passed one"),
-    ViewField("features", "(m, 3)", "m", "I", "the markers that the camera sees, the same for all flights"),
+    ViewField("features", "(n, m, 3)", "m", "I", "the markers that the camera sees, where the filter knows them to be in this episode"),
     ViewField("world", "", "-", "-", "the `WorldParams`, without draws and shifts"),
     ViewField("obstacles", "(n, o, 3)", "m", "I", "where the middles of the world's obstacles are in this episode, in their order"),
     ViewField("observation", "(n, k)", "mixed", "mixed", "the shipped observation, less its privileged part"),
@@ -56,6 +56,7 @@ VIEW_FIELDS = (
     ViewField("truth.features_in_view", "(n, m) bool", "-", "-", "whether the camera faces a marker, as the vehicle and the sensors are nominally, and no obstacle hides it"),
     ViewField("truth.obstacle_distance", "(n,)", "m", "-", "from the nearest obstacle's surface, negative inside, infinite where there is none; `view.obstacle_distance`"),
     ViewField("truth.obstacle_vector", "(n, 3)", "m", "I", "to that surface's nearest point"),
+    ViewField("truth.on_ground", "(n,) bool", "-", "-", "whether the ground pushes a foot, in a world whose ground carries vehicles"),
     ViewField("truth.faults", "dict of (n,) bool", "-", "-", "which are there now, by name"),
     ViewField("truth.drawn", "dict of (n, ...)", "mixed", "mixed", "parameters of the episode, by name, see `randomization`"),
     # what the filter estimates

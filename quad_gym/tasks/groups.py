@@ -126,6 +126,11 @@ class Truth(Group):
         return self._flights.rows("obstacle_vector")
 
     @Lazy
+    def on_ground(self) -> Truths:
+        """(n,) whether the ground pushes a foot; nowhere in a world whose ground carries nobody."""
+        return np.asarray(self._flights.columns("footing") > 0.0)
+
+    @Lazy
     def faults(self) -> Any:
         """Which are there now: (n,) bool by name."""
         return self._flights.active_faults()
@@ -325,7 +330,9 @@ class Measured(Group):
     def features_seen(self) -> Truths:
         """(n, m) whether an image of this step has the feature."""
         self._need_sensors()
-        return self._flights.rows("feature_fresh")[:, : len(self._flights.features)] > 0.0
+        camera = self._flights.sensors.camera
+        count = 0 if camera is None else len(camera.features_I)
+        return self._flights.rows("feature_fresh")[:, :count] > 0.0
 
     def _in_I(self, name: str, valid: Truths) -> Floats:
         """A vector in G turned to I, where it was measured."""

@@ -81,8 +81,8 @@ class LookAround(Task):
         Raises:
             ValueError: If there is no camera, so that there are no markers.
         """
-        if len(view.features) == 0:
+        if view.features.shape[1] == 0:
             raise ValueError("LookAround needs a camera, expected camera=True, got False")
-        gap = view.features.mean(axis=0) - view.seen.position
+        gap = view.features.mean(axis=1) - view.seen.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
         return {"features_direction": (view.seen.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}

@@ -228,10 +228,10 @@ class View(Group):
         """(n,) whether this step passed a gate."""
         return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
 
-    @property
+    @Lazy
     def features(self) -> Floats:
-        """(m, 3) markers that the camera sees, in I [m]."""
-        return self._flights.features  # type: ignore[no-any-return]
+        """(n, m, 3) markers that the camera sees, in I [m], as the filter knows them."""
+        return self._flights.feature_places()
 
     @property
     def world(self) -> "WorldParams":

@@ -28,6 +28,7 @@ CLASSES = [
     quad_gym.Wall,
     quad_gym.Cylinder,
     quad_gym.BatteryParams,
+    quad_gym.GroundParams,
 ]
 NO_NUMBERS = ["fast", None, float("nan"), float("inf"), [1.0, 2.0]]
 BELOW_ZERO = [-1.0, *NO_NUMBERS]
@@ -199,6 +200,11 @@ BAD_VALUES = {
     ("Wall", "yaw"): NO_NUMBERS,
     ("Cylinder", "radius"): [*NOT_POSITIVE, 1e5],
     ("Cylinder", "height"): [*NOT_POSITIVE, 1e5],
+    ("WorldParams", "ground"): [True, "contact", 1.0],
+    ("GroundParams", "feet_B"): [*NO_MATRICES, np.zeros((4, 3)), np.full((4, 3), -0.1)],
+    ("GroundParams", "friction"): BELOW_ZERO,
+    ("GroundParams", "max_touchdown_speed"): [*NOT_POSITIVE, 0.1],
+    ("GroundParams", "max_touchdown_tilt"): [*NOT_POSITIVE, 4.0],
     ("BatteryParams", "energy"): NOT_POSITIVE,
     ("BatteryParams", "charge"): [*NOT_POSITIVE, 1.1],
     ("BatteryParams", "empty_voltage"): [*NOT_POSITIVE, 1.1],

@@ -223,7 +223,8 @@ def assert_alike(left, right, flight=0):
         )
 
 
-OTHERS = {"rotor_efficiency", "camera_rotation", "action_delay"}
+FEATURES = {"features_yaw", "features_shift_I", "feature_offsets_I"}
+OTHERS = {"rotor_efficiency", "camera_rotation", "action_delay", *FEATURES}
 TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startswith("start_")]
 
 

@@ -29,6 +29,7 @@ CHOICES = {
     "late and gated": {"sensors": late("rtk")},
 }
 MORE = {
+    "ground": {"world": quad_gym.WorldParams(ground=quad_gym.GroundParams())},
     "plain": {},
     "trajectory": {"task": quad_gym.TaskParams(kind="trajectory", start="hover")},
     "drawn": {"randomization": {"mass": Uniform(0.7, 0.8)}},

@@ -30,6 +30,7 @@ from quad_gym.commands.benchmark.compiling import compile_table, time_compile
 from quad_gym.commands.benchmark.filter import filter_table, time_filter
 from quad_gym.commands.benchmark.interfaces import interfaces_table, time_interfaces
 from quad_gym.commands.benchmark.options import options_table, time_options
+from quad_gym.commands.benchmark.own_task import own_task_table, time_own_task
 from quad_gym.commands.benchmark.rendering import rendering_table, time_rendering
 from quad_gym.commands.benchmark.stages import tick_table, time_tick
 from quad_gym.commands.benchmark.timing import Effort, Row
@@ -39,7 +40,7 @@ from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.records import WIDTH
 
 Section = Literal[
-    "all", "filter", "tick", "options", "interfaces", "memory", "rendering", "compile"
+    "all", "filter", "tick", "options", "interfaces", "tasks", "memory", "rendering", "compile"
 ]
 
 
@@ -183,6 +184,7 @@ SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str
         lambda args: time_interfaces(args.envs, args.most_threads, args.effort),
         interfaces_table,
     ),
+    "tasks": (lambda args: time_own_task(args.effort, args.most_threads), own_task_table),
     "memory": (measure_memory, memory_table),
     "rendering": (lambda args: time_rendering(args.effort), rendering_table),
     "compile": (lambda args: time_compile(args.quick), compile_table),

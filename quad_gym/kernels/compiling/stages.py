@@ -73,6 +73,7 @@ class Stage(IntEnum):
     DRAW = auto()
     IMPOSE = auto()
     LOOK = auto()
+    PLACE_FEATURES = auto()
     JUDGE = auto()
     OBSERVE = auto()
     SHOW = auto()
@@ -80,6 +81,10 @@ class Stage(IntEnum):
     TOUCH = auto()
     JUDGE_CONTACTS = auto()
     HIDE_FEATURES = auto()
+    BEGIN_GROUND = auto()
+    STAND = auto()
+    FEEL_GROUND = auto()
+    JUDGE_LANDING = auto()
     PREDICT_WITH_SLOW = auto()
     UPDATE_WITH_SLOW = auto()
     LATE_UPDATE_WITH_SLOW = auto()
@@ -151,7 +156,11 @@ def _raw(s: Any) -> bool:
 
 
 def _pad(s: Any) -> bool:
-    return bool(s["pad"] and s["start"] != Start.HOVER)
+    return bool(s["pad"] and s["start"] != Start.HOVER and not s["grounded"])
+
+
+def _grounded(s: Any) -> bool:
+    return bool(s["grounded"])
 
 
 def _contacts(s: Any) -> bool:
@@ -164,6 +173,10 @@ def _hides(s: Any) -> bool:
 
 def _follows(s: Any) -> bool:
     return bool(s["harmonics"] == FOLLOWED)
+
+
+def _places(s: Any) -> bool:
+    return bool(s["features_drawn"])
 
 
 def _drawn(s: Any) -> bool:
@@ -190,6 +203,7 @@ SOURCES = {
     Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
     Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
     Stage.IMPOSE: Source("task.draws", "impose_stage", _drawn),
+    Stage.PLACE_FEATURES: Source("task.places", "place_features_stage", _places),
     Stage.BEGIN: Source("task.episode", "begin_stage", _always),
     Stage.MOVE_IN_AIR: Source("vehicle.air", "move_in_air_stage", _air),
     Stage.ALIGN: Source("filter.align", "align_stage", _filter),
@@ -234,6 +248,12 @@ SOURCES = {
     Stage.BEGIN_CONTACTS: Source("obstacles.contact", "begin_contacts_stage", _contacts),
     Stage.TOUCH: Source("obstacles.contact", "touch_stage", _contacts),
     Stage.JUDGE_CONTACTS: Source("obstacles.contact", "judge_contacts_stage", _contacts),
+    Stage.BEGIN_GROUND: Source("vehicle.ground", "begin_ground_stage", _grounded),
+    Stage.STAND: Source("vehicle.ground", "stand_stage", _grounded),
+    Stage.FEEL_GROUND: Source(
+        "vehicle.ground", "feel_ground_stage", lambda s: _grounded(s) and _filter(s)
+    ),
+    Stage.JUDGE_LANDING: Source("vehicle.ground", "judge_landing_stage", _grounded),
     Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
     Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
     Stage.SUM_IMU: Source("sensors.sample", "sum_imu_stage", _raw),
@@ -253,10 +273,12 @@ def used_parts(settings: Any) -> frozenset[str]:
     """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
     watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
     uses = {
+        "ground": _grounded(settings),
         "contacts": _contacts(settings),
         "path": _follows(settings),
         "faults": _faults(settings),
         "draws": _drawn(settings),
+        "places": _places(settings),
         "filter": _filter(settings),
         "actions": bool(settings["action_delays"] > 0),
         "raw": _raw(settings),

@@ -13,6 +13,7 @@ from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 _DISTURB_IMU, _TURN_BASELINE = int(Stage.DISTURB_IMU), int(Stage.TURN_BASELINE)
 _LIMIT_CAMERA, _HIDE_FEATURES = int(Stage.LIMIT_CAMERA), int(Stage.HIDE_FEATURES)
 _SATURATE_IMU = int(Stage.SATURATE_IMU)
+_FEEL_GROUND = int(Stage.FEEL_GROUND)
 _CORRUPT_GNSS, _CORRUPT_FEATURES = int(Stage.CORRUPT_GNSS), int(Stage.CORRUPT_FEATURES)
 
 
@@ -21,6 +22,8 @@ def _sample_imu(flight, world, settings, work, stages, mask, starting):
     """Sample the IMU, where `mask`."""
     measure_imu(flight, world, mask)
     work.mask = select(mask, 1.0, 0.0)
+    if settings.grounded:
+        call_stage(stages, _FEEL_GROUND, flight, world, world, settings, work, 0)
     if settings.imu_errs + settings.imu_vibrates > 0:
         call_stage(stages, _DISTURB_IMU, flight, world, world, settings, work, 0)
     if starting:

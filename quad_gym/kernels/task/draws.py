@@ -154,6 +154,10 @@ def _impose_body(flight, nominal, own, settings):
         own.rotors[i, 0] = nominal.rotors[i, 0] - x
         own.rotors[i, 1] = nominal.rotors[i, 1] - y
         own.rotors[i, 2] = nominal.rotors[i, 2] - z
+        if settings.grounded:
+            own.feet[i, 0] = nominal.feet[i, 0] - x
+            own.feet[i, 1] = nominal.feet[i, 1] - y
+            own.feet[i, 2] = nominal.feet[i, 2] - z
 
     own.kF, own.kN = kF, kN
     own.action_delay = _value(flight, settings, _ACTION_DELAY, nominal.action_delay)

@@ -1,0 +1,116 @@
+"""A task of a user's own in the benchmark: the circle written anew in NumPy, beside what ships."""
+
+import math
+import statistics
+import time
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.analysis.reports import text_table
+from quad_gym.commands.benchmark.interfaces import random_actions
+from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
+from quad_gym.tasks.task import Task
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.view import View
+
+COUNTS = (8, 1024)
+"""Flights in the batches."""
+LEAST_UP = math.cos(math.radians(100.0))
+"""Of the body z axis, below which an episode ends."""
+
+
+class OwnCircle(Task):
+    """The circle's reward, endings and observation, as a user writes them."""
+
+    replaces_observation = True
+
+    def reward(self, view: "View") -> NDArray[np.float64]:
+        """(n,) closeness and heading less changes of the action and body rates, a second."""
+        error, change, rates = view.position_error, view.action - view.last_action, view.body_rates
+        facing = np.einsum("ni,ni->n", view.truth.forward, view.reference_heading)
+        costs = 0.02 * np.einsum("ni,ni->n", change, change)
+        costs += 0.002 * np.einsum("ni,ni->n", rates, rates)
+        return np.exp(-2.0 * error) + 0.5 * np.exp(-20.0 * error) + 0.1 * facing - costs
+
+    def terminated(self, view: "View") -> NDArray[np.bool_]:
+        """(n,) too far from the reference, tipped over, or on the ground."""
+        tipped = view.R_BI[:, 2, 2] < LEAST_UP
+        return (view.position_error > 3.0) | tipped | (view.position[:, 2] < -0.5)
+
+    def truncated(self, view: "View") -> NDArray[np.bool_]:
+        """(n,) out of time, or with a filter that has failed."""
+        return (view.step >= 500) | (view.estimate.status != 0)
+
+    def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
+        """Errors, directions, rates, reference and action, in the body frame."""
+        seen = view.seen
+        return {
+            "position_error": seen.position_error,
+            "velocity_error": seen.velocity_error,
+            "up": seen.up,
+            "heading": seen.heading,
+            "body_rates": seen.body_rates,
+            "reference_acceleration": seen.reference_acceleration,
+            "preview": seen.preview.reshape(-1, 6),
+            "last_action": view.action,
+        }
+
+
+def time_own_task(effort: Effort, threads: int) -> list[Row]:
+    """Steps of both, by turns, at 50 Hz on the estimate.
+
+    Args:
+        effort: How long to measure.
+        threads: Threads to use.
+    """
+    rows: list[Row] = []
+    for count in COUNTS:
+        options: dict[str, Any] = {
+            "control_rate": 50.0,
+            "threads": threads,
+        }
+        steps = []
+        for custom in (None, OwnCircle()):
+            more: dict[str, Any] = {} if custom is None else {"custom": custom}
+            env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **options, **more)
+            env.reset(seed=0)
+            steps.append((env, random_actions(count)))
+        times: list[list[float]] = [[], []]
+        calls = 1
+        for turn in range(4 * effort.repeats):
+            for (env, actions), found in zip(steps, times, strict=True):
+                began = time.perf_counter()
+                for _ in range(calls):
+                    env.step(next(actions))
+                found.append((time.perf_counter() - began) / calls)
+            if turn == 2:  # the first turns warm up
+                calls = max(1, round(effort.seconds / 4.0 / min(times[0])))
+                times = [[], []]
+        for env, _ in steps:
+            env.close()
+        shipped, own = (min(found) for found in times)
+        for name, found, best in (("shipped", times[0], shipped), ("own, in NumPy", times[1], own)):
+            timing = Timing(best, statistics.median(found) / best - 1.0).per(count)
+            rows.append(
+                report(f"circle {name}, {count} flights", timing, envs=count, share=shipped / best)
+            )
+    return rows
+
+
+def own_task_table(rows: list[Row]) -> str:
+    """The figures of tasks of a user's own."""
+    cells = [
+        (
+            r["name"],
+            f"{1.0 / r['seconds']:,.0f}",
+            percent(r["spread"]),
+            f"{r['share']:.2f}",
+        )
+        for r in rows
+    ]
+    heading = "The circle, shipped and as a task of one's own, 50 Hz, estimate"
+    return text_table({heading: ["task", "steps/s", "spread", "of shipped"]}, cells)

@@ -1,0 +1,357 @@
+"""The ground as a level plane that carries a vehicle: contact of its feet and rotor hubs.
+
+Each tick is flown freely first. Where a point would be below the plane at its end, impulses at all
+points take its place: with the gap g_i and the velocity u_i of point i, and the tick h,
+
+    u_iz >= -g_i / h,   j_iz >= 0,   |(j_ix, j_iy)| <= friction j_iz,
+
+found by Gauss-Seidel sweeps; then r+ = r + h v+ and q+ = q exp(h w+). The set of velocities that
+the plane allows contains rest, so that the projection onto it never gains energy; a last scaling of
+the impulses makes sure of that where the sweeps have not converged. A vehicle that is at rest, and
+that normal forces and static friction can hold so, stays exactly where it is.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    keep3,
+    load3,
+    load4,
+    load33,
+    multiply,
+    scale,
+    select3,
+    store3,
+    sub,
+    transpose,
+)
+from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.kernels.vehicle.dynamics import accelerations, load_start
+from quad_gym.records import Ending
+
+SWEEPS = 24
+"""Of all points; in each a point meets what the others have changed."""
+STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
+"""Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest."""
+_FEET, _POINTS = 4, 8
+_ON_THE_GROUND = float(Ending.ON_THE_GROUND)
+
+
+@kernel
+def _free_accelerations(flight, p, R_BI):
+    """Acceleration in I and angular acceleration in B that the ground has no part in."""
+    v_air_I = sub(load3(flight.v), load3(flight.wind))
+    d_I = add(load3(flight.disturbance), load3(flight.air_force))
+    W = load4(flight.rotor_speeds)
+    a_I, dw_B = accelerations(R_BI, v_air_I, load3(flight.w), W, d_I, p)
+    return a_I, add(dw_B, apply(load33(p.inertia_inverse), load3(flight.air_torque)))
+
+
+@kernel
+def _resistance(arm, along, spread_I, inverse_mass):
+    """1 / (velocity along a direction that a unit impulse along it gives to a point)."""
+    turn = cross(arm, along)
+    return 1.0 / (inverse_mass + dot(turn, apply(spread_I, turn)))
+
+
+@kernel
+def _prepare(work, p, R_BI, spread_I, height):
+    """Set arms in I, resistances and gaps of all points; no impulses as yet.
+
+    Args:
+        work: Workspace.
+        p: Parameters as they are.
+        R_BI: Attitude.
+        spread_I: Inverse of the inertia in I.
+        height: Of the center of mass above the plane [m].
+    """
+    zero, inverse_mass = 0.0 * height, 1.0 / p.mass
+    one = zero + 1.0
+    for i in range(_POINTS):
+        l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
+        arm = apply_transposed(R_BI, l_B)
+        store3(work.ground_arm[i], arm)
+        x = _resistance(arm, (one, zero, zero), spread_I, inverse_mass)
+        y = _resistance(arm, (zero, one, zero), spread_I, inverse_mass)
+        z = _resistance(arm, (zero, zero, one), spread_I, inverse_mass)
+        # one for all level directions, so that friction opposes the sliding
+        store3(work.ground_resistance[i], (minimum(x, y), minimum(x, y), z))
+        store3(work.ground_impulse[i], (zero, zero, zero))
+        work.ground_gap[i] = height + arm[2]
+
+
+@kernel
+def _pushed(v_I, w_I, arm, j_I, spread_I, inverse_mass):
+    """Velocity and body rates in I after an impulse at the end of an arm."""
+    return add(v_I, scale(inverse_mass, j_I)), add(w_I, apply(spread_I, cross(arm, j_I)))
+
+
+@kernel
+def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
+    """One sweep over all points; returns velocity and body rates in I after it."""
+    zero = 0.0 * v_I[0]
+    for i in range(_POINTS):
+        arm, resistance = load3(work.ground_arm[i]), load3(work.ground_resistance[i])
+        old = load3(work.ground_impulse[i])
+        floor = -maximum(work.ground_gap[i], zero) * rate
+        u = add(v_I, cross(w_I, arm))
+        up = maximum(old[2] + resistance[2] * (floor - u[2]), zero)
+        v_I, w_I = _pushed(v_I, w_I, arm, (zero, zero, up - old[2]), spread_I, inverse_mass)
+        u = add(v_I, cross(w_I, arm))
+        x, y = old[0] - resistance[0] * u[0], old[1] - resistance[1] * u[1]
+        size, most = math.sqrt(x * x + y * y), friction * up
+        share = select(size > most, most / select(size > most, size, 1.0), 1.0)
+        x, y = share * x, share * y
+        aside = (x - old[0], y - old[1], zero)
+        v_I, w_I = _pushed(v_I, w_I, arm, aside, spread_I, inverse_mass)
+        store3(work.ground_impulse[i], (x, y, up))
+    return v_I, w_I
+
+
+@kernel
+def _share_without_gain(before, after, raised, p):
+    """Share of the impulses with which a vehicle has no more energy than it would without any.
+
+    Kinetic and potential energy at the end of the tick are quadratic in the share s: less those of
+    free flight, `a s^2 / 2 + b s + c`. The largest share in [0, 1] for which they are not positive.
+
+    Args:
+        before: Velocity (I) and body rates (B) without impulses.
+        after: Likewise with them.
+        raised: By how much the way at the velocity of the end is above that of free flight [m].
+        p: Parameters as they are.
+    """
+    J = load33(p.inertia)
+    dv, dw = sub(after[0], before[0]), sub(after[1], before[1])
+    a = p.mass * dot(dv, dv) + dot(dw, apply(J, dw))
+    b = p.mass * (dot(before[0], dv) + p.gravity * p.dt * dv[2]) + dot(before[1], apply(J, dw))
+    c = p.mass * p.gravity * raised
+    changes = a > 1e-300
+    root = math.sqrt(maximum(b * b - 2.0 * a * c, 0.0))
+    return clip((root - b) / select(changes, a, 1.0), 0.0, 1.0)
+
+
+@kernel
+def _can_hold(work, F, T, friction):
+    """Whether the feet can give an impulse F and an angular impulse T, both in I.
+
+    Normal forces are those of least squares among the four; static friction is that of the whole
+    vehicle, as if the feet shared the load.
+    """
+    zero = 0.0 * F[0]
+    c_x, c_y, c_z = zero, zero, zero
+    n, y, x, yy, xx, xy = zero, zero, zero, zero, zero, zero
+    for i in range(_FEET):
+        arm = load3(work.ground_arm[i])
+        c_x, c_y, c_z = c_x + 0.25 * arm[0], c_y + 0.25 * arm[1], c_z + 0.25 * arm[2]
+        n, y, x = n + 1.0, y + arm[1], x - arm[0]
+        yy, xx, xy = yy + arm[1] * arm[1], xx + arm[0] * arm[0], xy - arm[0] * arm[1]
+    # sum g_i g_i^T m = b with g_i = (1, y_i, -x_i), and the normal impulses are g_i . m
+    first, second, third = (n, y, x), (y, yy, xy), (x, xy, xx)
+    b = (F[2], T[0] + c_z * F[1], T[1] - c_z * F[0])
+    across = cross(second, third)
+    m = add(
+        add(scale(b[0], across), scale(b[1], cross(third, first))),
+        scale(b[2], cross(first, second)),
+    )
+    m = scale(1.0 / dot(first, across), m)
+    least, reach = zero + math.inf, zero + math.inf
+    for i in range(_FEET):
+        arm = load3(work.ground_arm[i])
+        least = minimum(least, m[0] + arm[1] * m[1] - arm[0] * m[2])
+        dx, dy = arm[0] - c_x, arm[1] - c_y
+        reach = minimum(reach, dx * dx + dy * dy)
+    turn = abs(T[2] - (c_x * F[1] - c_y * F[0])) / math.sqrt(maximum(reach, 1e-12))
+    aside = math.sqrt(F[0] * F[0] + F[1] * F[1])
+    return (F[2] > 0.0) & (least >= 0.0) & (aside + turn <= friction * F[2])
+
+
+@kernel
+def carry(p, settings, work, pose, rates, free, raised):
+    """Let the ground push for one tick.
+
+    Args:
+        p: Parameters as they are.
+        settings: Friction, and what a crash is.
+        work: Workspace.
+        pose: Position in I and attitude quaternion at the tick's start.
+        rates: Velocity in I and body rates in B at its start.
+        free: Likewise at its end, as without the ground.
+        raised: See `_share_without_gain`.
+
+    Returns:
+        Velocity in I and body rates in B at its end; which lanes the ground pushes, which of them
+        stay as they are, which crash; how many feet carry.
+    """
+    (r_I, q), (v_start, w_start), (v_free, w_free) = pose, rates, free
+    R_BI, rate, J = quaternion_to_dcm(q), 1.0 / p.dt, load33(p.inertia)
+    spread_I = multiply(transpose(R_BI), multiply(load33(p.inertia_inverse), R_BI))
+    inverse_mass, zero = 1.0 / p.mass, 0.0 * r_I[0]
+    w_I = apply_transposed(R_BI, w_free)
+    _prepare(work, p, R_BI, spread_I, r_I[2] - p.ground_height)
+    meets, hard, still = zero > 1.0, zero > 1.0, zero < 1.0
+    for i in range(_POINTS):
+        down = v_free[2] + cross(w_I, load3(work.ground_arm[i]))[2]
+        low = work.ground_gap[i] + p.dt * down < 0.0
+        meets = meets | low
+        if i < _FEET:
+            still = still & (abs(work.ground_gap[i]) <= STILL_GAP)
+        else:
+            hard = hard | low
+    hard = hard | (R_BI[2][2] < settings.hard_up) | (v_start[2] < -settings.hard_speed)
+    v, w, feet = v_free, w_free, zero
+    stays = meets & still & (dot(v_start, v_start) <= STILL_SPEED * STILL_SPEED)
+    stays = stays & (dot(w_start, w_start) <= STILL_RATE * STILL_RATE)
+    T_I = apply_transposed(R_BI, scale(-1.0, apply(J, w_free)))
+    stays = stays & _can_hold(work, scale(-p.mass, v_free), T_I, settings.friction)
+    if any_of(meets & logical_not(stays)):
+        v_I = v_free
+        for _ in range(SWEEPS):
+            v_I, w_I = _sweep(work, v_I, w_I, spread_I, inverse_mass, settings.friction, rate)
+        w_B = apply(R_BI, w_I)
+        share = _share_without_gain(free, (v_I, w_B), raised, p)
+        v = add(v_free, scale(share, sub(v_I, v_free)))
+        w = add(w_free, scale(share, sub(w_B, w_free)))
+        for i in range(_FEET):
+            feet = feet + select(work.ground_impulse[i, 2] > 0.0, 1.0, 0.0)
+    nothing = (zero, zero, zero)
+    v, w = select3(stays, nothing, v), select3(stays, nothing, w)
+    feet = select(meets, select(stays, 4.0, feet), 0.0)
+    return v, w, meets, stays, meets & hard, feet
+
+
+@kernel
+def _feel(flight, p, R_BI, gained, mask):
+    """Keep what the accelerometer feels of the ground: of an acceleration in I, and angular in B.
+
+    Args:
+        flight: Record, at the end of the tick.
+        p: Parameters as they are.
+        R_BI: Attitude there.
+        gained: Mean acceleration and angular acceleration over the tick.
+        mask: Lanes that the ground pushes; others feel nothing.
+    """
+    a_I, dw_B = _free_accelerations(flight, p, R_BI)
+    push = apply(R_BI, sub(gained[0], a_I))
+    push = add(push, cross(sub(gained[1], dw_B), load3(p.imu_lever_arm)))
+    zero = 0.0 * p.dt
+    store3(flight.ground_push, select3(mask, push, (zero, zero, zero)))
+
+
+@kernel
+def stand(flight, p, settings, work, start):
+    """Let the ground carry a vehicle over the tick that has just been flown.
+
+    Args:
+        flight: Record, after the tick's free motion.
+        p: Parameters as they are.
+        settings: Friction, and what a crash is.
+        work: Workspace.
+        start: The true state at the tick's start, as of `load_start`.
+    """
+    r_I, v_I, q, w_B, _ = start
+    free = load3(flight.v), load3(flight.w)
+    raised = r_I[2] + p.dt * free[0][2] - flight.r[2]
+    pose = (r_I, q)
+    v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
+    flight.footing = feet
+    flight.crashed = select(crashes, 1.0, flight.crashed)
+    if any_of(meets):
+        half = 0.5 * p.dt * math.sqrt(dot(w, w))
+        sine, cosine = sin_cos(half)
+        turns = half > 1e-100
+        per = select(turns, 0.5 * p.dt * sine / select(turns, half, 1.0), 0.5 * p.dt)
+        a, (x, y, z) = q[0], (q[1], q[2], q[3])
+        d = scale(per, w)
+        turned = normalize_quaternion(
+            (
+                a * cosine - x * d[0] - y * d[1] - z * d[2],
+                x * cosine + a * d[0] + y * d[2] - z * d[1],
+                y * cosine + a * d[1] + z * d[0] - x * d[2],
+                z * cosine + a * d[2] + x * d[1] - y * d[0],
+            )
+        )
+        keep3(flight.r, meets, select3(stays, r_I, add(r_I, scale(p.dt, v))))
+        keep3(flight.v, meets, v)
+        keep3(flight.w, meets, w)
+        for i in range(4):
+            flight.q[i] = select(meets, select(stays, q[i], turned[i]), flight.q[i])
+        rate = 1.0 / p.dt
+        gained = scale(rate, sub(v, v_I)), scale(rate, sub(w, w_B))
+        _feel(flight, p, quaternion_to_dcm(load4(flight.q)), gained, meets)
+    else:
+        zero = 0.0 * p.dt
+        store3(flight.ground_push, (zero, zero, zero))
+
+
+@kernel
+def begin_on_ground(flight, p, settings, work, mask):
+    """Put a vehicle that starts on the ground onto it, and lift one that is in it, where `mask`."""
+    R_BI, height = quaternion_to_dcm(load4(flight.q)), flight.r[2] - p.ground_height
+    lowest = height + math.inf
+    for i in range(_POINTS):
+        l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
+        lowest = minimum(lowest, height + apply_transposed(R_BI, l_B)[2])
+    given = flight.start_given[2]
+    placed = (flight.on_pad > 0.0) & logical_not(given == given)
+    moved = mask & (placed | (lowest < 0.0))
+    flight.r[2] = select(moved, flight.r[2] - lowest, flight.r[2])
+    flight.on_pad = select(mask, 0.0, flight.on_pad)
+    flight.crashed = select(mask, 0.0, flight.crashed)
+    v_I, w_B, h = load3(flight.v), load3(flight.w), p.dt
+    a_I, dw_B = _free_accelerations(flight, p, R_BI)
+    free = add(v_I, scale(h, a_I)), add(w_B, scale(h, dw_B))
+    pose = load3(flight.r), load4(flight.q)
+    raised = 0.5 * h * (free[0][2] - v_I[2])
+    v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
+    before = load3(flight.ground_push)
+    gained = scale(1.0 / h, sub(v, v_I)), scale(1.0 / h, sub(w, w_B))
+    _feel(flight, p, R_BI, gained, meets)
+    keep3(flight.ground_push, logical_not(mask), before)
+    flight.footing = select(mask, feet, flight.footing)
+
+
+@kernel
+def judge_landing(flight, active):
+    """End the episodes of those who have crashed into the ground, where `active`."""
+    over, flying = active & (flight.crashed > 0.0), logical_not(flight.terminated > 0.0)
+    flight.ending = select(over & flying, _ON_THE_GROUND, flight.ending)
+    flight.terminated = select(over, 1.0, flight.terminated)
+    flight.truncated = select(over, 0.0, flight.truncated)
+
+
+@stage
+def stand_stage(flight, world, model, settings, work, stages, flag):
+    """Let the ground carry a vehicle over the tick that has just been flown."""
+    scratch = lanes_of(work)
+    stand(lanes_of(flight), lanes_of(world), settings, scratch, load_start(scratch))
+
+
+@stage
+def begin_ground_stage(flight, world, model, settings, work, stages, flag):
+    """Put vehicles that start on the ground onto it."""
+    scratch = lanes_of(work)
+    mask = scratch.mask > 0.0
+    begin_on_ground(lanes_of(flight), lanes_of(world), settings, scratch, mask)
+
+
+@stage
+def feel_ground_stage(flight, world, model, settings, work, stages, flag):
+    """Add to the IMU's sample what the accelerometer feels of the ground."""
+    flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
+    keep3(flying.accel, mask, add(load3(flying.accel), load3(flying.ground_push)))
+
+
+@stage
+def judge_landing_stage(flight, world, model, settings, work, stages, flag):
+    """End the episodes of those who have crashed into the ground."""
+    judge_landing(lanes_of(flight), lanes_of(work).mask > 0.0)

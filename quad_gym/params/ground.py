@@ -1,0 +1,60 @@
+"""The ground that carries a vehicle: its feet, friction, and what counts as a crash."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from quad_gym.params import checks as check
+from quad_gym.params.checks import Checked, Matrix
+
+FARTHEST_FOOT = 10.0
+"""No foot is farther from the center of mass [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundParams(Checked):
+    """A level plane at `WorldParams.ground_height` that carries a vehicle anywhere.
+
+    Four feet and the four rotor hubs can touch it. Contact is a constraint on velocities, solved
+    once in a tick: a point does not go below the plane, the plane pushes and never pulls, impacts
+    are inelastic, and friction is Coulomb's. There is no stiffness, so that every step is stable
+    (J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", 1988; D. E.
+    Stewart, J. C. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic
+    collisions and Coulomb friction", Int. J. Numerical Methods in Engineering 39, 1996).
+    """
+
+    feet_B: Matrix = (
+        (0.15, -0.15, -0.1),
+        (0.15, 0.15, -0.1),
+        (-0.15, 0.15, -0.1),
+        (-0.15, -0.15, -0.1),
+    )
+    """(4, 3) soles of the feet relative to the center of mass, in B [m]; legs 0.1 m long under the
+    arms of the laboratory's vehicle, whose hubs are 0.21 m out along both axes"""
+    friction: float = 0.6
+    """Coulomb's coefficient, sticking and sliding; rubber on concrete has 0.6 to 0.85; 0: ice"""
+    max_touchdown_speed: float = 1.5
+    """speed of the center of mass toward the ground beyond which a touchdown is a crash [m/s]; that
+    of a free fall from 0.11 m"""
+    max_touchdown_tilt: float = math.radians(30.0)
+    """angle between the body z axis and the vertical at which touching the ground is a crash
+    [rad]; touching it with a rotor always is"""
+
+    def __post_init__(self) -> None:
+        self._check(check.matrix, "feet_B", rows=4, columns=3)
+        feet = np.array(self.feet_B)
+        if np.abs(feet).max() > FARTHEST_FOOT:
+            raise ValueError(
+                f"GroundParams.feet_B must be within {FARTHEST_FOOT:g} m, got {self.feet_B}"
+            )
+        if np.linalg.svd(feet[:, :2] - feet[:, :2].mean(axis=0))[1][1] < 1e-3 or not (
+            np.ptp(feet[:, 2]) <= 1e-9 and feet[0, 2] < 0.0
+        ):
+            raise ValueError(
+                "GroundParams.feet_B must be four points of a level plane below the center of "
+                f"mass, not all on one line, got {self.feet_B}"
+            )
+        self._check(check.number, "friction", least=0.0, most=100.0)
+        self._check(check.positive, "max_touchdown_speed", least=0.2)
+        self._check(check.positive, "max_touchdown_tilt", most=math.pi)

@@ -1,0 +1,191 @@
+"""Features that are elsewhere in each episode, and a filter that knows where."""
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym import Cylinder, FlightBatch, Randomization, TaskParams, Uniform, Wall, WorldParams
+from quad_gym.batch.surroundings import hidden_points
+from quad_gym.flights.record import FlightRecorder
+from quad_gym.rotations import quaternion_to_dcm
+from tests.field_flights import nees
+from tests.unit.alarms import alarm_score
+
+INDOOR = quad_gym.sensor_suite("indoor").simplified()
+NOMINAL = np.array(INDOOR.camera.features_I)
+DRAWS = {
+    "features_yaw": Uniform(-np.pi, np.pi),
+    "features_shift_I": (Uniform(-1.0, 1.0), Uniform(0.0, 2.0), Uniform(-0.2, 0.2)),
+    "feature_offsets_I": (Uniform(-0.3, 0.3), None, Uniform(-0.4, 0.4)),
+}
+TASK = TaskParams(kind="circle", start="hover", duration=0.0)
+
+
+def batch(count=4, **options):
+    options = {"sensors": INDOOR, "randomization": DRAWS, "task": TASK} | options
+    flights = FlightBatch(count, **options)
+    flights.reset(seeds=range(count))
+    return flights
+
+
+def places(drawn, nominal=NOMINAL):
+    """(n, m, 3) by the formula."""
+    yaw, zero = drawn["features_yaw"], np.zeros(len(drawn["features_yaw"]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]])
+    moved = nominal + drawn["feature_offsets_I"]
+    return np.einsum("ijn,nmj->nmi", R, moved) + drawn["features_shift_I"][:, None]
+
+
+def test_draws_are_those_of_their_distributions():
+    flights = batch(2000, run_filter=False, source=quad_gym.records.Source.TRUTH)
+    drawn = flights.drawn()
+    offsets = drawn["feature_offsets_I"]
+    assert offsets.shape == (2000, len(NOMINAL), 3)
+    samples = {
+        "yaw": (drawn["features_yaw"], stats.uniform(-np.pi, 2.0 * np.pi)),
+        "north": (drawn["features_shift_I"][:, 1], stats.uniform(0.0, 2.0)),
+        "first": (offsets[:, 0, 0], stats.uniform(-0.3, 0.6)),
+        "last": (offsets[:, -1, 2], stats.uniform(-0.4, 0.8)),
+    }
+    for name, (values, distribution) in samples.items():
+        assert stats.kstest(values, distribution.cdf).pvalue > 1e-6, name
+    assert (offsets[:, :, 1] == 0.0).all()
+    both = np.hstack([offsets[:, :, 0], offsets[:, :, 2], drawn["features_shift_I"]])
+    correlation = np.corrcoef(both.T) - np.eye(both.shape[1])
+    assert np.abs(correlation).max() < 6.0 / np.sqrt(2000)
+    np.testing.assert_allclose(flights.feature_places(), places(drawn), atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_flight_that_draws_features_is_the_flight_that_has_them(known):
+    flights = batch(3, randomization=Randomization(DRAWS, known=known))
+    for _ in range(100):
+        flights.step()
+    place = tuple(map(tuple, flights.feature_places()[1]))
+    told = INDOOR.replace(camera=INDOOR.camera.replace(features_I=place))
+    alone = batch(2, sensors=told, randomization=None)
+    for _ in range(100):
+        alone.step()
+    for name in ("pixels", "r", "r_hat", "R_hat", "b_a_hat", "L"):
+        np.testing.assert_allclose(
+            flights.read(name)[1], alone.read(name)[1], rtol=1e-7, atol=1e-9, err_msg=name
+        )
+
+
+def test_each_episode_draws_its_own_and_seeds_repeat_them():
+    flights = batch()
+    first = flights.feature_places()
+    flights.reset()
+    assert (flights.feature_places() != first).any(axis=(1, 2)).all()
+    flights.reset(mask=[True, False, False, True])
+    flights.reset(seeds=range(4))
+    assert (flights.feature_places() == first).all()
+    assert (batch(9).feature_places()[:4] == first).all()
+
+
+def test_an_error_of_the_map_turns_with_it():
+    """All markers hang 0.2 m from where the filter believes: what the camera measures says so."""
+    wrong = NOMINAL + np.array([0.2, 0.0, 0.0])
+    camera = INDOOR.camera.replace(features_I=tuple(map(tuple, wrong)), pixel_sigma=1e-3)
+    flights = batch(6, true_sensors=INDOOR.replace(camera=camera))
+    for _ in range(10):
+        flights.step()
+    seen = flights.read("feature_valid")[:, : len(NOMINAL)] > 0.0
+    assert seen.any()
+    true = places(flights.drawn(), wrong)
+    R_BI = quaternion_to_dcm(flights.read("q"))
+    v_B = np.einsum("nij,nmj->nmi", R_BI, true - flights.read("r")[:, None])
+    v_C = (v_B - INDOOR.camera.position_B) @ np.array(flights._model["R_CB"][0, ..., 0]).T
+    pixels = INDOOR.camera.focal_length * v_C[..., :2] / v_C[..., 2:]
+    np.testing.assert_allclose(
+        flights.read("pixels")[:, : len(NOMINAL)][seen], pixels[seen], atol=0.01
+    )
+    np.testing.assert_allclose(flights.feature_places(), places(flights.drawn()), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"sensors": "indoor"}, {"filter_start": "warm"}, {"sensors": INDOOR.replace(
+        estimator=INDOOR.estimator.replace(kind="ekf"))}],
+    ids=["cold", "late and imperfect", "warm", "ekf"],
+)  # fmt: skip
+def test_the_filter_stays_consistent(options):
+    """NEES of 15 degrees of freedom, mean over 400 flights: 15 +- 0.27."""
+    flights = batch(400, **options)
+    for _ in range(600):
+        flights.step()
+    found = nees(flights).mean()
+    assert 12.0 < found < 15.0 + alarm_score(1) * np.sqrt(30.0 / 400), found
+
+
+def test_obstacles_hide_features_where_they_are():
+    world = WorldParams(
+        obstacles=(
+            Wall(center_I=(5.0, 0.0, 1.0), size=(0.2, 6.0, 4.0), shift_I=(0.0, 2.0, 0.0)),
+            Cylinder(center_I=(-6.0, 2.0, 1.5), radius=0.6),
+        ),
+        vehicle_radius=0.1,
+    )
+    flights, hid, saw = batch(64, world=world), 0, 0
+    for _ in range(60):
+        flights.step()
+        R_BI, r = quaternion_to_dcm(flights.read("q")), flights.read("r")
+        eyes = r + np.einsum("nji,j->ni", R_BI, np.array(INDOOR.camera.position_B))
+        centers = flights.read("obstacle_center")[:, :2]
+        hidden = hidden_points(world.obstacles, centers, eyes, flights.feature_places())
+        seen = flights.read("feature_valid")[:, : len(NOMINAL)] > 0.0
+        assert not (seen & hidden).any()
+        hid, saw = hid + int(hidden.sum()), saw + int(seen.sum())
+    assert hid > 100
+    assert saw > 100
+
+
+def test_every_interface_flies_the_same_and_a_task_is_told():
+    class Told(quad_gym.Task):
+        def observe(self, view):
+            return {"nearest": (view.features - view.seen.position[:, None])[:, 0]}
+
+    made = {"sensors": "indoor", "randomization": DRAWS, "privileged": True, "custom": Told()}
+    together = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, **made)
+    alone = gymnasium.make("QuadGym/Hover-v0", **made)
+    many, infos = together.reset(seed=[4, 5, 6])
+    one, info = alone.reset(seed=5)
+    drawn = info["drawn"]["feature_offsets_I"]
+    assert (infos["drawn"]["feature_offsets_I"][1] == drawn).all()
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        for part in many:
+            assert (many[part][1] == one[part]).all()
+        action = np.float32(rng.uniform(-0.1, 0.1, 4))
+        many, *_ = together.step(np.tile(action, (3, 1)))
+        one, *_ = alone.step(action)
+    kept = together.unwrapped.flights.batch.snapshot()
+    ends = []
+    for _ in range(2):
+        together.unwrapped.flights.batch.restore(kept)
+        ends.append(together.step(np.zeros((3, 4)))[0])
+    assert all((ends[0][part] == ends[1][part]).all() for part in ends[0])
+
+
+def test_a_record_has_the_features_of_its_episode():
+    flights = batch(3)
+    recorder = FlightRecorder(flights, 2)
+    recorder.keep()
+    np.testing.assert_array_equal(recorder.flight().stage.features_I, flights.feature_places()[2])
+
+
+@pytest.mark.parametrize(
+    ("draws", "options", "message"),
+    [
+        ({"features_yaw": Uniform(-1.0, 1.0)}, {"sensors": INDOOR.replace(camera=None)}, "camera"),
+        ({"feature_offsets_I": (Uniform(0, 1), None)}, {}, "feature_offsets_I.*3 of them"),
+        ({"features_shift_I": Uniform(0.0, 1e6)}, {}, "features_shift_I.*within"),
+        ({"features_yaw": Uniform(0.5, 1.0, relative=True)}, {}, "features_yaw.*relative"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(draws, options, message):
+    with pytest.raises(ValueError, match=message):
+        FlightBatch(1, **{"sensors": INDOOR, **options}, randomization=draws)

@@ -1,0 +1,379 @@
+"""The ground that carries a vehicle: contact against closed forms, and what it must not do."""
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym import FlightBatch, GroundParams, TaskParams, WorldParams, vehicle_params
+from quad_gym.records import Control, Ending, Source
+from quad_gym.rotations import quaternion_to_dcm
+from tests.field_flights import nees
+
+GRAVITY, TICK, FLOOR = 9.8, 1.0 / 200.0, -0.1
+CALM = vehicle_params("lab").replace(drag_coefficient=0.0)
+TOUGH = {"max_touchdown_speed": 50.0, "max_touchdown_tilt": math.pi}
+
+
+def batch(count=1, world=None, ground=None, task=None, **options):
+    task = {"kind": "circle", "start": "hover", "duration": 0.0, "out_of_bounds": 1e3} | (
+        task or {}
+    )
+    options = {"sensors": "lab", "source": Source.TRUTH, "control_rate": 200.0} | options
+    world = WorldParams(ground=GroundParams(**(ground or {})), **(world or {}))
+    task = TaskParams(max_tilt=math.pi, ground=-1e3, **task)
+    options = {"control": Control.MOTOR, "vehicle": CALM} | options
+    return FlightBatch(count, task=task, world=world, **options)
+
+
+def stopped(flights):
+    return np.full((flights.count, 4), -1.0)  # voltage 0
+
+
+def put(flights, **fields):
+    """Set the true state of all flights."""
+    snapshot = flights.snapshot()
+    for name, values in fields.items():
+        lanes = np.zeros((len(snapshot) * snapshot[name].shape[-1], *np.shape(values)[1:]))
+        lanes[: flights.count] = values
+        blocks = lanes.reshape(len(snapshot), -1, *lanes.shape[1:])
+        snapshot[name] = np.moveaxis(blocks, 1, -1)
+    flights.restore(snapshot)
+
+
+def resting_rotors(flights):
+    put(flights, rotor_speeds=np.zeros((flights.count, 4)))
+
+
+def at_random(flights, rng, height=(0.05, 0.3)):
+    """Any attitude, tumbling, a little above the ground; rotors at rest."""
+    n = flights.count
+    q = rng.normal(size=(n, 4))
+    put(
+        flights,
+        q=q / np.linalg.norm(q, axis=1, keepdims=True),
+        r=np.column_stack([np.zeros((n, 2)), FLOOR + 0.3 + rng.uniform(*height, n)]),
+        v=rng.normal(0.0, 1.0, (n, 3)),
+        w=rng.normal(0.0, 3.0, (n, 3)),
+        rotor_speeds=np.zeros((n, 4)),
+    )
+
+
+def points(flights):
+    """(n, 8, 3) feet and hubs in I."""
+    R_BI = quaternion_to_dcm(flights.read("q"))
+    p_B = np.vstack([GroundParams().feet_B, CALM.rotor_positions_B])
+    return flights.read("r")[:, None] + p_B @ R_BI
+
+
+def energy(flights):
+    v, w, J = flights.read("v"), flights.read("w"), np.array(CALM.inertia)
+    turning = 0.5 * np.einsum("ni,ij,nj->n", w, J, w)
+    return 0.5 * CALM.mass * (v**2).sum(1) + turning + CALM.mass * GRAVITY * flights.read("r")[:, 2]
+
+
+@pytest.mark.parametrize("wind", [0.0, 3.0])
+def test_a_vehicle_stands_still_for_a_minute(wind):
+    world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.3, 0.3, 0.3)}
+    flights = batch(3, world=world, run_filter=True, task={"start": "ground"})
+    flights.reset(seeds=[1, 2, 3])
+    before = {name: flights.read(name) for name in ("r", "q")}
+    actions = np.full((3, 4), -0.4)  # the rotors carry a part of the weight
+    for _ in range(60 * 200):
+        flights.step(actions)
+    for name, value in before.items():
+        assert (flights.read(name) == value).all(), name
+    assert (flights.read("v") == 0.0).all()
+    assert (flights.read("footing") == 4.0).all()
+    assert (flights.read("needs_reset") == 0.0).all()
+
+
+@pytest.mark.parametrize("sensors", ["lab", "standard"])
+def test_the_accelerometer_reads_gravity(sensors):
+    flights = batch(128, sensors=sensors, run_filter=True, task={"start": "ground"})
+    flights.reset(seeds=range(128))
+    f, w = np.zeros((2, 128, 3))
+    for _ in range(100):
+        flights.step(stopped(flights))
+        f += (flights.read("accel") - flights.read("b_a")) / 100
+        w += (flights.read("gyro") - flights.read("b_g")) / 100
+    imu = quad_gym.sensor_suite(sensors).imu
+    for mean, density in (
+        (f - [0.0, 0.0, GRAVITY], imu.accel_noise_density),
+        (w, imu.gyro_noise_density),
+    ):
+        deviations = mean / (density * math.sqrt(imu.rate) / 10.0)
+        assert np.abs(deviations.mean(0)).max() < 5.0 / math.sqrt(128)
+
+
+def test_a_level_fall_ends_at_rest_where_it_touches():
+    flights = batch()
+    flights.reset(seeds=[0], position=[0.0, 0.0, 0.05], velocity=[0.0, 0.0, 0.0], yaw=0.3)
+    put(flights, q=flights.read("q") * [[1, 0, 0, 1]], w=np.zeros((1, 3)))
+    put(flights, q=flights.read("q") / np.linalg.norm(flights.read("q")))
+    resting_rotors(flights)
+    ticks = 0
+    while flights.read("footing")[0] == 0.0:
+        flights.step(stopped(flights))
+        ticks += 1
+    fall = math.sqrt(2.0 * 0.05 / GRAVITY)
+    assert abs(ticks * TICK - fall) <= TICK
+    for _ in range(20):
+        flights.step(stopped(flights))
+    assert np.abs(flights.read("v")).max() == 0.0
+    assert abs(flights.read("r")[0, 2]) < 1e-5
+    assert flights.read("crashed")[0] == 0.0
+
+
+def test_contact_never_gains_energy_and_nothing_sinks_in():
+    flights = batch(96, ground=TOUGH)
+    flights.reset(seeds=range(96))
+    at_random(flights, np.random.default_rng(0))
+    had, deepest = energy(flights), 0.0
+    for _ in range(3 * 200):
+        flights.step(stopped(flights))
+        has = energy(flights)
+        assert (has <= had + 1e-9).all(), (has - had).max()
+        had = has
+        deepest = min(deepest, (points(flights)[..., 2] - FLOOR).min())
+    assert deepest > -0.01  # turned by a tick of some 20 rad/s
+    # upright, upside down, or on an edge of both: all have come to rest
+    assert np.linalg.norm(flights.read("v"), axis=1).max() < 0.02
+
+
+def test_without_friction_horizontal_momentum_stays():
+    flights = batch(64, ground={"friction": 0.0, **TOUGH})
+    flights.reset(seeds=range(64))
+    at_random(flights, np.random.default_rng(1))
+    before = flights.read("v")[:, :2]
+    for _ in range(200):
+        flights.step(stopped(flights))
+    np.testing.assert_allclose(flights.read("v")[:, :2], before, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5])
+def test_it_slides_to_a_stop_as_coulomb_says(friction):
+    """With a = friction g it stops after v / a, having slid v^2 / (2 a)."""
+    flights = batch(ground={"friction": friction})
+    flights.reset(seeds=[0])
+    put(
+        flights,
+        q=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        r=np.zeros((1, 3)),
+        v=np.array([[1.0, 0.5, 0.0]]),
+        w=np.zeros((1, 3)),
+        rotor_speeds=np.zeros((1, 4)),
+    )
+    speed, slowing = math.hypot(1.0, 0.5), friction * GRAVITY
+    ticks = 0
+    while np.linalg.norm(flights.read("v")) > 0.0:
+        flights.step(stopped(flights))
+        ticks += 1
+    assert abs(ticks * TICK - speed / slowing) < 4 * TICK
+    slid = flights.read("r")[0]
+    np.testing.assert_allclose(
+        slid[:2], np.array([1.0, 0.5]) * speed / (2.0 * slowing), atol=speed * TICK
+    )
+    assert abs(slid[2]) < 1e-4
+
+
+def test_wind_beyond_friction_pushes_it_along():
+    """Linear drag k v against friction: it stands below v = friction m g / k, slides above."""
+    for wind, moves in ((9.0, False), (15.0, True)):
+        world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.2, 0.2, 0.0)}
+        flights = batch(world=world, ground={"friction": 0.3}, task={"start": "ground"})
+        flights.reset(seeds=[0])
+        start = flights.read("r")
+        for _ in range(200):
+            flights.step(stopped(flights))
+        assert (np.linalg.norm(flights.read("r") - start) > 0.01) == moves
+
+
+def test_it_lifts_off_when_thrust_exceeds_weight():
+    lab = vehicle_params("lab")
+    flights = batch(task={"start": "ground"}, vehicle=lab)
+    flights.reset(seeds=[0])
+    voltage = 1.2 * lab.hover_voltage
+    expected = -lab.motor_time_constant * math.log(1.0 - lab.hover_voltage / voltage)
+    ticks = 0
+    while flights.read("footing")[0] > 0.0:
+        flights.step(np.full((1, 4), 0.2))
+        ticks += 1
+    assert abs(ticks * TICK - expected) <= 2.0 * TICK
+    assert abs(flights.read("r")[0, 2]) < 1e-3
+
+
+def test_thrust_on_one_side_tips_it_over():
+    """About the right feet, 0.15 m from the middle: thrust on the left beyond m g 0.15 / 0.36."""
+    lab, tipped = vehicle_params("lab"), []
+    for share in (0.9, 1.1):
+        flights = batch(task={"start": "ground"}, vehicle=lab)
+        flights.reset(seeds=[0])
+        force = share * lab.mass * GRAVITY * 0.15 / (0.15 + 0.21) / 2.0
+        volts = math.sqrt(force / lab.thrust_coefficient) / lab.motor_speed_per_volt
+        action = np.full((1, 4), -1.0)
+        action[0, [1, 2]] = volts / lab.hover_voltage - 1.0
+        for _ in range(300):
+            flights.step(action)
+        tipped.append(bool(flights.read("needs_reset")[0]))
+    assert tipped == [False, True]
+
+
+@pytest.mark.parametrize("samples", ["average", "instant"])
+def test_the_imu_feels_all_that_changes_the_velocity(samples):
+    """Specific force less gravity, summed up over a landing, is the change of the velocity."""
+    suite = quad_gym.sensor_suite("lab")
+    tiny = dict.fromkeys(("accel_noise_density", "gyro_noise_density"), 1e-12)
+    tiny |= dict.fromkeys(("accel_bias_sigma", "gyro_bias_sigma"), 1e-12)
+    imu = suite.imu.replace(samples=samples, lever_arm_B=(0.0, 0.0, 0.0), **tiny)
+    estimator = suite.estimator.replace(integration="midpoint")
+    sensors = suite.replace(imu=imu, estimator=estimator)
+    flights = batch(16, sensors=sensors, run_filter=True)
+    flights.reset(seeds=range(16), position=[0.0, 0.0, 0.03], velocity=[0.2, 0.0, -0.3])
+    resting_rotors(flights)
+    v, gained = flights.read("v"), np.zeros((16, 3))
+    for _ in range(100):
+        before = flights.read("q")
+        flights.step(stopped(flights))
+        after = flights.read("q")
+        middle = before + after if samples == "average" else after
+        R_BI = quaternion_to_dcm(middle / np.linalg.norm(middle, axis=1, keepdims=True))
+        f_I = np.einsum("nji,nj->ni", R_BI, flights.read("accel"))
+        gained += TICK * (f_I - [0.0, 0.0, GRAVITY])
+    assert (flights.read("v") == 0.0).all()
+    # in free flight an instantaneous sample is not the mean over its tick
+    np.testing.assert_allclose(gained, -v, atol=1e-8 if samples == "average" else 0.02)
+
+
+@pytest.mark.parametrize(
+    ("start", "crashes"),
+    [
+        ({"v": (0.0, 0.0, -0.5)}, False),
+        ({"v": (0.0, 0.0, -2.0)}, True),
+        ({"q": (math.cos(0.1), math.sin(0.1), 0.0, 0.0)}, False),
+        ({"q": (math.cos(0.3), math.sin(0.3), 0.0, 0.0)}, True),
+        ({"q": (0.0, 1.0, 0.0, 0.0)}, True),
+    ],
+)
+def test_a_hard_landing_is_the_end(start, crashes):
+    flights = batch(2)
+    flights.reset(seeds=[0, 1])
+    state = {"q": (1.0, 0.0, 0.0, 0.0), "r": (0.0, 0.0, 0.06), "v": (0.0, 0.0, 0.0)} | start
+    put(flights, w=np.zeros((2, 3)), rotor_speeds=np.zeros((2, 4)))
+    put(flights, **{name: np.tile(value, (2, 1)) for name, value in state.items()})
+    ended = np.zeros(2)
+    for _ in range(60):
+        flights.step(stopped(flights))
+        ended = np.maximum(ended, flights.result("ending"))
+        if crashes and ended.any():
+            break
+    assert (ended == (float(Ending.ON_THE_GROUND) if crashes else 0.0)).all()
+
+
+def test_a_start_in_the_ground_is_lifted_and_one_on_it_stands():
+    flights = batch(3, world={"ground_height": -0.3}, task={"start": "ground"})
+    flights.reset(seeds=[0, 1, 2])
+    np.testing.assert_allclose(flights.read("r")[:, 2], -0.2, atol=1e-12)
+    assert (flights.read("footing") == 4.0).all()
+    flights.reset(seeds=[0, 1, 2], position=[0.0, 0.0, -0.7])
+    np.testing.assert_allclose(flights.read("r")[:, 2], -0.2, atol=1e-12)
+    flights.reset(seeds=[0, 1, 2], position=[0.0, 0.0, 1.0])
+    assert (flights.read("r")[:, 2] == 1.0).all()
+    assert (flights.read("footing") == 0.0).all()
+
+
+def test_it_stands_on_ground_of_its_own_center_of_mass():
+    flights = batch(
+        16,
+        task={"start": "ground"},
+        randomization={"center_of_mass_B": quad_gym.Uniform(-0.02, 0.02)},
+    )
+    flights.reset(seeds=range(16))
+    z, shift = flights.read("r")[:, 2], flights.read("center_of_mass_B")[:, 2]
+    np.testing.assert_allclose(z, shift, atol=1e-12)
+    for _ in range(100):
+        flights.step(stopped(flights))
+    assert (flights.read("v") == 0.0).all()
+
+
+def test_a_flight_is_the_same_in_any_batch():
+    found = []
+    for count, threads in ((1, 1), (19, 2)):
+        flights = batch(count, threads=threads, run_filter=True, ground=TOUGH)
+        flights.reset(seeds=range(count), position=[0.0, 0.0, 0.3])
+        for _ in range(150):
+            flights.step(np.full((count, 4), -0.6))
+        found.append([flights.read(name)[0] for name in ("r", "v", "q", "w", "accel", "r_hat")])
+    for one, other in zip(*found, strict=True):
+        assert (one == other).all()
+
+
+def test_a_snapshot_brings_a_landing_back():
+    flights = batch(4, run_filter=True)
+    flights.reset(seeds=range(4), position=[0.0, 0.0, 0.05])
+    for _ in range(30):
+        flights.step(stopped(flights))
+    kept = flights.snapshot()
+    ends = []
+    for _ in range(2):
+        flights.restore(kept)
+        for _ in range(60):
+            flights.step(stopped(flights))
+        ends.append(flights.read("L"))
+    assert (ends[0] == ends[1]).all()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"friction": -0.1},
+        {"max_touchdown_speed": 0.1},
+        {"max_touchdown_tilt": 4.0},
+        {"feet_B": ((0.1, 0.1, -0.1),) * 3},
+        {"feet_B": ((0.1, 0.1, -0.1),) * 4},
+        {"feet_B": ((0.1, -0.1, 0.1), (0.1, 0.1, 0.1), (-0.1, 0.1, 0.1), (-0.1, -0.1, 0.1))},
+        {"feet_B": ((0.1, -0.1, -0.1), (0.1, 0.1, -0.2), (-0.1, 0.1, -0.1), (-0.1, -0.1, -0.1))},
+    ],
+)
+def test_what_is_no_ground_is_refused(wrong):
+    with pytest.raises(ValueError, match=f"GroundParams.{next(iter(wrong))}"):
+        GroundParams(**wrong)
+
+
+def test_a_world_refuses_what_is_no_ground():
+    with pytest.raises(ValueError, match=r"WorldParams\.ground"):
+        WorldParams(ground=True)
+
+
+@pytest.mark.parametrize("suite", ["standard", "indoor"])
+def test_the_filter_is_consistent_while_the_vehicle_stands(suite):
+    """NEES of 15 degrees of freedom, mean over 256 flights: 15 +- 0.34, of which 5 deviations.
+
+    Filters of suites with several errors believe in somewhat larger ones than there are.
+    """
+    flights = batch(256, sensors=suite, source=Source.ESTIMATE, task={"start": "ground"})
+    flights.reset(seeds=range(256))
+    for _ in range(5 * 200):
+        flights.step(np.full((256, 4), -0.3))
+    assert (flights.read("footing") == 4.0).all()
+    assert 10.0 < nees(flights).mean() < 15.0 + 5.0 * 0.34
+
+
+def test_every_interface_lands_the_same():
+    world = WorldParams(ground=GroundParams())
+    made = {"world": world, "start": "ground", "action": "motor", "sensors": "indoor"}
+    together = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, **made)
+    alone = gymnasium.make("QuadGym/Hover-v0", **made)
+    together.reset(seed=[4, 5, 6])
+    alone.reset(seed=5)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        action = np.float32(rng.uniform(-0.6, 0.7, 4))
+        many, rewards, *_ = together.step(np.tile(action, (3, 1)))
+        one, reward, terminated, _, _ = alone.step(action)
+        assert (many[1] == one).all()
+        assert rewards[1] == reward
+        if terminated:
+            break
