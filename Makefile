@@ -3,12 +3,13 @@ PYTHON ?= python3
 JOBS ?= 2
 VENV := .venv
 OLDEST := .venv-oldest
+CLIENTS := .venv-clients
 BIN := $(VENV)/bin
 # pip compiles to bytecode one file after the other, and the tests of all packages
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare study test test-oldest test-slow soak golden lint benchmark docs wheel clean
+.PHONY: setup demo circle animation compare study test test-oldest test-clients test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
@@ -66,6 +67,15 @@ $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 		--editable ".[train,plot,render]" pytest hypothesis
 	touch $@
 
+test-clients: $(CLIENTS)/.tester  ## examples of docs/libraries.md: RLlib, TorchRL, Minari and others
+	$(CLIENTS)/bin/python -m pytest -q tests/clients "tests/contract/test_documentation.py::test_programs_run[libraries.md]"
+
+$(CLIENTS)/.tester: pyproject.toml constraints-clients.txt
+	$(PYTHON) -m venv $(CLIENTS)
+	$(CLIENTS)/bin/python -m pip install --quiet --constraint constraints-clients.txt \
+		--editable ".[clients]" pytest hypothesis
+	touch $@
+
 test-slow: setup  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
@@ -96,4 +106,4 @@ wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they ho
 	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
-	rm -rf $(VENV) $(OLDEST) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) $(CLIENTS) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis

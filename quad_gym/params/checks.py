@@ -32,7 +32,8 @@ def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
     for name in sorted(set(given) - set(known)):
         close = difflib.get_close_matches(name, known, n=1)
         meant = f"did you mean {close[0]}?" if close else f"it takes {', '.join(known)}"
-        raise UnknownKeywordError(f"{name} is not a keyword of {of}; {meant}")
+        words = f"unexpected keyword argument '{name}'"  # Python's, for which libraries look
+        raise UnknownKeywordError(f"{name} is not a keyword of {of} ({words}); {meant}")
 
 
 def _no_number(value: Any) -> bool:

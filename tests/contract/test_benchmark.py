@@ -8,7 +8,7 @@ import gymnasium
 import pytest
 
 import quad_gym
-from quad_gym.commands.benchmark import against, interfaces, rendering, stages
+from quad_gym.commands.benchmark import against, interfaces, learning, rendering, stages
 from quad_gym.commands.benchmark import main as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
@@ -164,7 +164,22 @@ def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(tmp_path)
     assert rows["full"]["seconds"] < rows["empty"]["seconds"]
 
 
-def test_all_sections_are_those_that_do_not_compile():
+def test_the_learning_section_says_when_the_policy_was_better_than_pd(tmp_path, capsys):
+    rows = run(tmp_path, "--only", "learning", "--seeds", "2")["sections"]["learning"]
+    assert [row["seed"] for row in rows] == [0]  # quick
+    assert rows[0]["steps"] == 16_384
+    assert rows[0]["steps_to_pd"] is None
+    assert rows[0]["error"] > rows[0]["pd_error"] > 0.0
+    assert "0 of 1 below tuned PD" in capsys.readouterr().out
+    names = ("steps", "training_seconds", "mean_error", "crash_rate")
+    flown = [(0, 0.0, 0.05, 0.5), (10, 1.0, 0.08, 0.0), (20, 2.0, 0.06, 0.0), (30, 3.0, 0.05, 0.0)]
+    found = learning.summary([dict(zip(names, row, strict=True)) for row in flown], pd=0.07)
+    assert (found["steps_to_pd"], found["seconds_to_pd"], found["error"]) == (20, 2.0, 0.05)
+    better = {**rows[0], **found}
+    assert "1 of 2 below tuned PD, the last after 2.0 s" in learning.learning_table([*rows, better])
+
+
+def test_all_sections_are_those_that_take_no_minutes():
     chosen = script.chosen_sections(parse(script.Args, []))
     assert chosen == [
         *("filter", "tick", "options", "interfaces"),
@@ -179,6 +194,7 @@ def test_all_sections_are_those_that_do_not_compile():
         ["--batch", "0"],
         ["--n-envs", "0"],
         ["--repeats", "0"],
+        ["--seeds", "0"],
         ["--seconds", "0"],
         ["--seconds", "nan"],
         ["--threads", "0"],

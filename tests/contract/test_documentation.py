@@ -6,6 +6,7 @@ how it is run; on the page nobody sees it:
     <!-- test: skip, REASON -->           not at all
     <!-- test: replace OLD by NEW -->     with another text, such as fewer steps of a training
     <!-- test: slow, REASON -->           only with the slow tests, and so its whole page
+    <!-- test: needs MODULE -->           only where it can be imported
 """
 
 import importlib
@@ -28,7 +29,7 @@ BLOCK = re.compile(
     r"(?P<text>.*?)^(?P=indent)```$",
     re.MULTILINE | re.DOTALL,
 )
-NOTE = re.compile(r"<!-- test: (skip|slow|replace)(?:, | )(.+?) -->")
+NOTE = re.compile(r"<!-- test: (skip|slow|replace|needs)(?:, | )(.+?) -->")
 REPLACEMENT = re.compile(r"(.+) by (.+)")
 
 
@@ -50,10 +51,18 @@ def programs():
             yield pytest.param(page, marks=marks, id=page.name)
 
 
+def importable(module):
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        return False
+    return True
+
+
 def as_run(line, text, notes):
     """The text of a block as its notes want it, after as many lines as are above it; None: skip."""
     for kind, what in notes:
-        if kind == "skip":
+        if kind == "skip" or (kind == "needs" and not importable(what)):
             return None
         if kind == "replace":
             old, new = REPLACEMENT.fullmatch(what).groups()
@@ -66,6 +75,7 @@ def as_run(line, text, notes):
 def test_programs_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # windows without a screen
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     namespace = {"__name__": "__documentation__"}
     for line, text, notes in blocks(page, "python"):
         program = as_run(line, text, notes)

@@ -3,9 +3,10 @@
 Every figure is the best of some repeats, as other load on the machine can only slow it down;
 "spread" is how much longer the median of the repeats took. All ratios are taken within one run.
 
-Compiling is measured by `--only compile` alone, as it takes minutes. `--against DIR` compares the
-environments with those of another checkout, by turns in one run: on a machine that others use, too,
-two runs cannot be compared.
+Compiling and learning are measured by `--only compile` and `--only learning` alone, as they take
+minutes: `learning` trains the compiled PPO with ten seeds, until it flies better than tuned PD
+control and to the end. `--against DIR` compares the environments with those of another
+checkout, by turns in one run: on a machine that others use, too, two runs cannot be compared.
 
 Progress goes to stderr, tables go to stdout, and everything goes to benchmark.json with the
 configuration, the versions and the processor. Run it on an idle machine.
@@ -29,6 +30,7 @@ from quad_gym.commands.benchmark.against import against_table, time_against
 from quad_gym.commands.benchmark.compiling import compile_table, time_compile
 from quad_gym.commands.benchmark.filter import filter_table, time_filter
 from quad_gym.commands.benchmark.interfaces import interfaces_table, time_interfaces
+from quad_gym.commands.benchmark.learning import learning_table, time_learning
 from quad_gym.commands.benchmark.options import options_table, time_options
 from quad_gym.commands.benchmark.own_task import own_task_table, time_own_task
 from quad_gym.commands.benchmark.rendering import rendering_table, time_rendering
@@ -40,8 +42,19 @@ from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.records import WIDTH
 
 Section = Literal[
-    "all", "filter", "tick", "options", "interfaces", "tasks", "memory", "rendering", "compile"
+    "all",
+    "filter",
+    "tick",
+    "options",
+    "interfaces",
+    "tasks",
+    "memory",
+    "rendering",
+    "compile",
+    "learning",
 ]
+ALONE = ("compile", "learning")
+"""Sections that take minutes."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +64,7 @@ class Args:
     FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--envs": "--n-envs"}
 
     only: Section = "all"
-    """section to run; all: every one but compile, minutes"""
+    """section to run; all: every one but compile and learning, minutes"""
     against: Path | None = None
     """folder of another checkout to compare the environments with, instead of the sections"""
     batch: int = 256
@@ -60,6 +73,10 @@ class Args:
     """environments in the interfaces' batches"""
     threads: int | None = None
     """most threads to use; if not given, one per core"""
+    seeds: int = 10
+    """training seeds of learning"""
+    steps: int | None = None
+    """environment steps of each training of learning; if not given, the recipe's"""
     quick: bool = False
     """2 short repeats in place of --repeats and --seconds: to see that it runs"""
     repeats: int = 7
@@ -71,7 +88,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        for name in ("batch", "envs", "repeats", "threads"):
+        for name in ("batch", "envs", "repeats", "seeds", "steps", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 option = {"envs": "n-envs"}.get(name, name)
@@ -188,14 +205,19 @@ SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str
     "memory": (measure_memory, memory_table),
     "rendering": (lambda args: time_rendering(args.effort), rendering_table),
     "compile": (lambda args: time_compile(args.quick), compile_table),
+    "learning": (
+        lambda args: time_learning(args.seeds, args.steps, args.most_threads, args.quick),
+        learning_table,
+    ),
 }
 
 
 def chosen_sections(args: Args) -> list[str]:
-    """The sections to run: all are those that do not compile."""
+    """The sections to run: all are those that take no minutes by themselves."""
     if args.against is not None:
         return ["against"]
-    return [name for name in SECTIONS if args.only in (name, "all" if name != "compile" else name)]
+    whole = args.only == "all"
+    return [name for name in SECTIONS if args.only == name or (whole and name not in ALONE)]
 
 
 def compare(args: Args) -> list[Row]:
