@@ -1,4 +1,4 @@
-"""Variants of `LookAround` for the arms of a study: for training, and some for evaluation."""
+"""Variants of tasks for the arms of a study: for training, and some for evaluation."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from baselines.pd import MARGIN, SIGMAS
 from quad_gym.tasks.look_around import LookAround
+from quad_gym.tasks.outage_dash import OutageDash, gaps_behind, gaps_of, westward
+from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import Observed
 
 if TYPE_CHECKING:
@@ -25,6 +28,12 @@ REMEMBERED = 4
 _SEEN = 18
 """What is remembered of each: errors of position and velocity, vertical, heading, body rates and
 the direction of the features."""
+
+RECALLED_EVERY = 5
+"""Steps between what is recalled in a race: 0.1 s."""
+
+_RECALLED = 12
+"""What is recalled of each: errors of position and velocity, vertical, body rates."""
 
 Parts = dict[str, NDArray[np.float64]]
 
@@ -89,3 +98,72 @@ class Paid(LookAround):
 
 class Sure(Paid, Doubting):
     """`Doubting` that also pays for a sure filter, as `Paid` does."""
+
+
+class RecallingRace(StaleRace):
+    """`StaleRace` whose observation also has what was observed 0.1, 0.2, 0.3 and 0.4 s ago.
+
+    What a late measurement does to the estimate depends on how the vehicle has been moving. At the
+    start of an episode, the past is zero.
+    """
+
+    state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _RECALLED))}
+    observes: Mapping[str, Observed] = {"past": Observed("mixed", "B")}
+
+    def update(self, view: "View", rng: "FlightRandom") -> None:
+        """Every so often, remember the present, and forget the oldest."""
+        due = (view.step % RECALLED_EVERY == 0)[:, np.newaxis, np.newaxis]
+        seen = view.seen
+        now = [seen.position_error, seen.velocity_error, seen.up, seen.body_rates]
+        latest = np.concatenate(now, axis=1)[:, np.newaxis]
+        past = view.state.past
+        view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
+
+    def observe(self, view: "View") -> Parts:
+        """`past` (n, 48)."""
+        return {"past": view.state.past.reshape(view.count, -1)}
+
+
+class Wary(OutageDash):
+    """`OutageDash` whose observation also says how unsure the filter is for the next two gaps.
+
+    As log2(2 sigma / room), sigma the largest standard deviation of the position, and room what is
+    left beside a vehicle in the middle of the gap: half its width, less 0.5 m. Above 0, two
+    standard deviations do not fit through.
+    """
+
+    observes: Mapping[str, Observed] = {
+        **OutageDash.observes,
+        "doubt": Observed("log2", "-", -8.0, 8.0),
+    }
+
+    def observe(self, view: "View") -> Parts:
+        """As `OutageDash`, and `doubt` (n, 2)."""
+        parts = super().observe(view)
+        widths = np.stack([parts["gap_width"], parts["next_width"]], axis=1)
+        return {**parts, "doubt": doubts(view, widths)}
+
+
+class Waiting(Wary):
+    """`Wary` that in training pays for no progress where the next gap is too narrow.
+
+    That is while `doubt` is above 0. Who hurries on then has nothing but the risk of it.
+    """
+
+    def reward(self, view: "View") -> NDArray[np.float64]:
+        """(n,) see the class."""
+        gaps = gaps_of(view)
+        through = gaps_behind(gaps, view.seen.position)
+        width = gaps.widths[np.arange(view.count), through]
+        unsure = doubts(view, width[:, np.newaxis])[:, 0] > 0.0
+        return super().reward(view) - self._weight * np.where(unsure, westward(view), 0.0)
+
+
+def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, k) log2(2 sigma / room) for gaps of widths (n, k) [m]; see `Wary`."""
+    try:
+        sigma = view.estimate.position_sigma.max(axis=1)
+    except ValueError:  # no filter runs: who sees the truth has no doubt
+        sigma = np.zeros(view.count)
+    ratio = SIGMAS * sigma[:, np.newaxis] / (0.5 * widths - MARGIN)
+    return np.asarray(np.log2(np.maximum(ratio, 2.0**-8)))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from quad_gym import sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 
@@ -24,6 +25,8 @@ class Arm(Checked):
     """for people"""
     policy: str | None = None
     """by name (`baselines.policies.load_policy`), one that is not trained; None: trained"""
+    flies: str | None = None
+    """name of a trained arm whose policies it flies elsewhere: a control"""
     environment: Mapping[str, Any] = field(default_factory=dict)
     """keywords of the environment in which it flies the test, such as what is observed"""
     training: Mapping[str, Any] = field(default_factory=dict)
@@ -41,8 +44,18 @@ class Arm(Checked):
         for name in ("environment", "training", "learning", "parameters"):
             check.instance(f"Arm.{name}", getattr(self, name), Mapping)
             self._set(name, MappingProxyType(dict(getattr(self, name))))
-        if self.policy is not None and (self.training or self.learning or self.parameters):
-            raise ValueError(f"Arm {self.name} must not be trained, as its policy is {self.policy}")
+        given = self.policy if self.flies is None else f"that of {self.flies}"
+        if given is not None and (self.training or self.learning or self.parameters):
+            raise ValueError(f"Arm {self.name} must not be trained, as its policy is {given}")
+        if self.policy is not None and self.flies is not None:
+            raise ValueError(
+                f"Arm {self.name} must have a policy, or fly that of another, not both"
+            )
+
+    @property
+    def trained(self) -> bool:
+        """Whether it is trained."""
+        return self.policy is None and self.flies is None
 
 
 _FAR_SIGHTED = {"gamma": 0.995}
@@ -87,3 +100,64 @@ ARMS = (
     ),
 )
 """Those of `QuadGym/LookAround-v0`."""
+
+_TRUTH = {"observation": "truth"}
+_SIGMAS = {"include_covariance": True}
+_STALE = sensor_suite("stale")
+_STAMPED = {
+    "sensors": _STALE.replace(estimator=_STALE.estimator.replace(late_measurements="rewind"))
+}
+"""The same sensors, and a filter that knows how old their measurements are."""
+_RECALLING = {"custom": "baselines.arm_tasks:RecallingRace", **_SIGMAS}
+
+STALE_RACE = (
+    Arm(name="pd", label="PD", policy="pd"),
+    Arm(name="truth", label="truth", training=_TRUTH),
+    Arm(name="covariance", label="estimate + 15 standard deviations", environment=_SIGMAS),
+    Arm(
+        name="recalling",
+        label="estimate + 15 standard deviations + memory",
+        environment=_RECALLING,
+    ),
+    Arm(name="truth_on_truth", label="truth, flown on it", flies="truth", environment=_TRUTH),
+    Arm(
+        name="truth_stamped",
+        label="truth, flown with time stamps",
+        flies="truth",
+        environment=_STAMPED,
+    ),
+    Arm(
+        name="covariance_stamped",
+        label="estimate + 15 standard deviations, flown with time stamps",
+        flies="covariance",
+        environment={**_SIGMAS, **_STAMPED},
+    ),
+)
+"""Those of `QuadGym/StaleRace-v0`."""
+
+_WARY = {"custom": "baselines.arm_tasks:Wary"}
+
+OUTAGE_DASH = (
+    Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
+    Arm(name="pd_slow", label="PD at 2.4 m/s", policy="pd:slow"),
+    Arm(
+        name="pd_waiting",
+        label="PD that waits when unsure",
+        policy="pd:waiting",
+        environment=_SIGMAS,
+    ),
+    Arm(name="truth", label="truth", training=_TRUTH),
+    Arm(name="covariance", label="estimate + 15 standard deviations", environment=_SIGMAS),
+    Arm(name="wary", label="estimate + doubt", environment=_WARY),
+    Arm(
+        name="waiting",
+        label="estimate + doubt, unpaid while unsure",
+        environment=_WARY,
+        learning={"custom": "baselines.arm_tasks:Waiting"},
+    ),
+    Arm(name="truth_on_truth", label="truth, flown on it", flies="truth", environment=_TRUTH),
+)
+"""Those of `QuadGym/OutageDash-v0`."""
+
+ARMS_OF = {"look_around": ARMS, "stale_race": STALE_RACE, "outage_dash": OUTAGE_DASH}
+"""By task."""

@@ -39,6 +39,21 @@ class Glance(NamedTuple):
     """[m]"""
 
 
+class Pace(NamedTuple):
+    """One episode of one policy in a race, (t,) each."""
+
+    time: Floats
+    """[s]"""
+    speed: Floats
+    """[m/s]"""
+    sigma: Floats
+    """largest standard deviation of the position that the filter states [m]"""
+    estimation_error: Floats
+    """[m]"""
+    outage: Floats | None = None
+    """1 where GNSS fails, else 0; None: it does not"""
+
+
 def returns_figure(
     curves: Mapping[str, Sequence[tuple[Floats, Floats]]], levels: Mapping[str, float]
 ) -> Any:
@@ -103,6 +118,46 @@ def glance_figure(episodes: Mapping[str, Glance], half_view: float) -> Any:
     return figure
 
 
+def pace_figure(episodes: Mapping[str, Pace]) -> Any:
+    """How fast policies fly in the same episode, how sure the filter is, and how right.
+
+    Args:
+        episodes: By the label of the policy.
+
+    Returns:
+        matplotlib Figure.
+    """
+    with house_style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(4.3 * len(episodes), 4.6), layout="constrained")
+        grid = figure.subplots(2, len(episodes), sharex=True, sharey="row", squeeze=False)
+        for column, (label, episode) in enumerate(episodes.items()):
+            above, below = grid[:, column]
+            above.set_title(label)
+            above.plot(episode.time, episode.speed, color=BLUE, label="speed")
+            _draw_knowledge(below, episode)
+            out = episode.outage
+            if out is not None and np.nansum(out) > 0:
+                failed = episode.time[np.nan_to_num(out) > 0]
+                for axes in (above, below):
+                    axes.axvspan(
+                        *(failed[0], failed[-1]), color=GREY, alpha=0.2, linewidth=0,
+                        label="no GNSS" if axes is above else "_",
+                    )  # fmt: skip
+            _mark_end(below, episode.time, episode.speed, "end")
+        grid[0, 0].set_ylabel("[m/s]")
+        grid[1, 0].set_ylabel("[m]")
+        grid[0, 0].set_ylim(bottom=0.0)
+        last = max(float(e.time[np.isfinite(e.speed)][-1]) for e in episodes.values())
+        grid[0, 0].set_xlim(0.0, last)
+        for row in grid:
+            row[0].yaxis.set_tick_params(labelleft=True)
+            handles, labels = row[0].get_legend_handles_labels()
+            row[-1].legend(handles, labels, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
 def _draw_angles(axes: Any, episode: Glance, half_view: float) -> None:
     """Where body x points, and where it should for the reward, as seen from the features."""
     span = math.degrees(half_view)
@@ -116,24 +171,34 @@ def _draw_angles(axes: Any, episode: Glance, half_view: float) -> None:
 
 def _draw_errors(axes: Any, episode: Glance) -> None:
     """What the filter states, what is so, and how far off the vehicle is."""
+    _draw_knowledge(axes, episode)
+    axes.plot(episode.time, episode.position_error, color=VERMILLION, label="error of the position")
+    _mark_end(axes, episode.time, episode.position_error, "crash")
+
+
+def _draw_knowledge(axes: Any, episode: Glance | Pace) -> None:
+    """What the filter states of its error, and what is so."""
     axes.plot(episode.time, 3.0 * episode.sigma, color=PALE, label="_")
     axes.fill_between(
         episode.time, 1e-3, 3.0 * episode.sigma, color=GREEN, alpha=0.2, linewidth=0,
         label="filter: 3 sigma",
     )  # fmt: skip
     axes.plot(episode.time, episode.estimation_error, color=GREEN, label="error of the estimate")
-    axes.plot(episode.time, episode.position_error, color=VERMILLION, label="error of the position")
-    over = ~np.isfinite(episode.position_error)
-    if over.any():
-        end = episode.time[int(np.argmax(over))]
-        axes.axvline(end, color=INK, linewidth=1.0)
-        axes.annotate(
-            "crash", (end, 0.03), xytext=(4, 0), textcoords="offset points",
-            xycoords=("data", "axes fraction"), color=INK,
-        )  # fmt: skip
     axes.set_yscale("log")
     axes.set_ylim(3e-3, 10.0)
     axes.set_xlabel("time [s]")
+
+
+def _mark_end(axes: Any, time: Floats, values: Floats, what: str) -> None:
+    """A line where an episode has ended, if it has."""
+    over = ~np.isfinite(values)
+    if over.any():
+        end = time[int(np.argmax(over))]
+        axes.axvline(end, color=INK, linewidth=1.0)
+        axes.annotate(
+            what, (end, 0.03), xytext=(4, 0), textcoords="offset points",
+            xycoords=("data", "axes fraction"), color=INK,
+        )  # fmt: skip
 
 
 def _unbroken(degrees: Floats) -> Floats:

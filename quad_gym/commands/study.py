@@ -1,12 +1,13 @@
 """Where does the estimate matter? Train arms with several seeds, and fly the same episodes.
 
-    quad-gym study                                   # LookAround, all arms, 5 seeds
-    quad-gym study --arms truth sigma --seeds 10
+    quad-gym study                                   # LookAround, 5 seeds
+    quad-gym study stale_race
+    quad-gym study outage_dash --arms pd_waiting truth wary --seeds 10
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
-Every arm of baselines/arms.py (or of a file like it) is trained with the compiled PPO, and every
-policy flies the same test episodes on the estimate. Prints a table with interquartile means over
+Arms of baselines/arms.py (or of a file like it) are trained with the compiled PPO, and every policy
+flies the same test episodes on the estimate. Prints a table with interquartile means over
 the seeds and bootstrap 95 % intervals, says what can be concluded from them, and writes figures,
 numbers and a report. Each training is a folder: an interrupted study continues where it
 stopped, and a training whose folder was deleted is repeated, but no other.
@@ -15,14 +16,15 @@ stopped, and a training whose folder was deleted is repeated, but no other.
 import csv
 import runpy
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from baselines.arms import ARMS, Arm
+from baselines.arms import Arm
 from baselines.keeping import EVALUATIONS, RunError
 from baselines.plans import Plan
 from baselines.recipes import recipe
@@ -34,14 +36,13 @@ from quad_gym.commands.options import EnvId, Keywords, leave, usage_errors
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
+from quad_gym.commands.study_tasks import STUDIED, WITHIN, StudiedTask, stays
 from quad_gym.commands.study_words import conclusions
 from quad_gym.params import checks as check
 
 EVALUATED = 9
 """How often a policy is evaluated over its training, to keep the best one."""
 QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
-STUDIED = ("look_around",)
-"""Tasks that arms and figures of a study are made for."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Args:
 
     env_id: EnvId = "QuadGym/LookAround-v0"
     arms: tuple[str, ...] = ()
-    """names of arms; if not given, all of the file"""
+    """names of arms; if not given, those that carry the conclusions, or all of --arms-file"""
     arms_file: Path | None = None
     """a file with a tuple ARMS, as baselines/arms.py has; if not given, that one"""
     seeds: int = 5
@@ -68,9 +69,9 @@ class Args:
     """of the test, the same for every policy"""
     seed: int = 0
     """of the first test episode, and of the first training"""
-    success_within: float = 0.5
-    """an episode is a success if it is flown to the end, and its mean position error in the second
-    half is below this [m]"""
+    success_within: float | None = None
+    """of LookAround: an episode is a success if it is flown to the end, and its mean position error
+    in the second half is below this [m]; if not given, 0.5"""
     threads: int | None = None
     """of flights and learning; if not given, one per core; no result depends on them"""
     page: Path | None = None
@@ -80,25 +81,52 @@ class Args:
     """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
 
 
+def studied(args: Args) -> StudiedTask:
+    """What is known of the task, with the options that change it.
+
+    Raises:
+        ValueError: If it is not studied, or an option does not belong to it.
+    """
+    ids = {env_id: task for env_id, task in IDS.items() if task in STUDIED}
+    if args.env_id not in ids:
+        raise ValueError(f"ENV_ID must be one of {', '.join(ids)}, got {args.env_id!r}")
+    about = STUDIED[ids[args.env_id]]
+    if args.success_within is None:
+        return about
+    within = check.positive("--success-within", args.success_within)
+    if about.success is not stays:
+        raise ValueError(f"--success-within belongs to LookAround, got it with {args.env_id!r}")
+    meaning = about.meaning.replace(f"{WITHIN:g} m", f"{within:g} m")
+    return replace(about, success=partial(stays, within=within), meaning=meaning)
+
+
 def arms_of(args: Args) -> tuple[Arm, ...]:
     """The arms that are asked for, in the order of their file.
 
     Raises:
         ValueError: If there is no such file or arm.
     """
-    known: Any = ARMS
+    about = studied(args)
+    known: Any = about.arms
+    wanted = args.arms or about.carrying
     if args.arms_file is not None:
         if not args.arms_file.is_file():
             raise ValueError(f"--arms-file must be a Python file, got {args.arms_file}")
         known = runpy.run_path(str(args.arms_file)).get("ARMS")
         if not (isinstance(known, tuple) and all(isinstance(arm, Arm) for arm in known)):
             raise ValueError(f"--arms-file {args.arms_file} must have a tuple ARMS of Arm")
+        wanted = args.arms or tuple(arm.name for arm in known)
     names = [arm.name for arm in known]
     if len(set(names)) != len(names):
         raise ValueError(f"arms must have different names, got {', '.join(names)}")
-    for name in args.arms:
+    for name in wanted:
         check.choice("--arms", name, tuple(names))
-    return tuple(arm for arm in known if not args.arms or arm.name in args.arms)
+    found = tuple(arm for arm in known if arm.name in wanted)
+    trained = [arm.name for arm in found if arm.trained]
+    for arm in found:
+        if arm.flies is not None and arm.flies not in trained:
+            raise ValueError(f"--arms must name {arm.flies}, whose policies {arm.name} flies")
+    return found
 
 
 def configure(args: Args) -> Study:
@@ -112,14 +140,10 @@ def configure(args: Args) -> Study:
     from baselines.compiled_ppo.run import make_compiled
 
     plots.require_matplotlib()
-    studied = [env_id for env_id, task in IDS.items() if task in STUDIED]
-    if args.env_id not in studied:
-        known = ", ".join(studied)
-        raise ValueError(f"ENV_ID must be one of {known}, got {args.env_id!r}")
+    about = studied(args)
     for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    check.positive("--success-within", args.success_within)
     leave(args.env, {"observation": "--arms", "threads": "--threads"})
     chosen = recipe(args.env_id)
     steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
@@ -133,12 +157,12 @@ def configure(args: Args) -> Study:
         environment=dict(args.env),
         episodes=QUICK_EPISODES if args.quick else args.episodes,
         first_episode=first_seed("test", args.seed, args.episodes),
-        within=args.success_within,
+        about=about,
         folder=args.output or Path("results/study") / (f"{task}_quick" if args.quick else task),
         threads=args.threads,
     )
     for arm in study.arms:
-        if arm.policy is None:
+        if arm.trained:
             plan = plan_of(study, arm, study.seeds[0])
             make_compiled(plan).env.close()
             plan.make_judge().close()
@@ -164,8 +188,8 @@ def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
 
 
 def test_flights(study: Study, arm: Arm, count: int) -> Any:
-    """The environment of the test: on the estimate."""
-    keywords = {**study.environment, **arm.environment, "observation": "estimate"}
+    """The environment of the test: on the estimate, unless the arm says otherwise."""
+    keywords = {"observation": "estimate", **study.environment, **arm.environment}
     return gymnasium.make_vec(study.env_id, num_envs=count, threads=study.threads, **keywords)
 
 
@@ -178,7 +202,7 @@ def train_all(study: Study) -> None:
     """
     from baselines.training import train
 
-    wanted = [(seed, arm) for seed in study.seeds for arm in study.arms if arm.policy is None]
+    wanted = [(seed, arm) for seed in study.seeds for arm in study.arms if arm.trained]
     for done, (seed, arm) in enumerate(wanted, 1):
         folder = study.run_folder(arm, seed)
         training = train(
@@ -204,8 +228,9 @@ def fly_all(study: Study) -> dict[Any, Flown]:
             file = study.run_folder(arm, seed) / f"flown_{study.test_digest(arm)}.npz"
             if not file.exists():
                 env = env or test_flights(study, arm, study.episodes)
-                name = arm.policy or str(study.run_folder(arm, seed) / "best.npz")
-                fly(load_policy(name, env), env, study.first_episode).save(file)
+                name = arm.policy or str(study.policy_folder(arm, seed) / "best.npz")
+                policy = load_policy(name, env)
+                fly(policy, env, study.first_episode, study.about.traced).save(file)
             flown[arm.name, seed] = Flown.load(file)
     return flown
 
@@ -215,7 +240,7 @@ def curves_of(study: Study) -> dict[Any, Any]:
     found = {}
     for arm in study.arms:
         for seed in study.seeds_of(arm):
-            if arm.policy is None:
+            if arm.trained:
                 file = study.run_folder(arm, seed) / EVALUATIONS
                 with file.open(encoding="utf-8", newline="") as stream:
                     rows = [(float(r["steps"]), float(r["return"])) for r in csv.DictReader(stream)]
@@ -229,7 +254,7 @@ def main(args: Args) -> None:
     began = time.perf_counter()
     with usage_errors():
         study = configure(args)
-    trained = sum(arm.policy is None for arm in study.arms)
+    trained = sum(arm.trained for arm in study.arms)
     print(
         f"{study.env_id}: {len(study.arms)} arms, {trained * len(study.seeds)} trainings of "
         f"{study.recipe.steps:,} steps, {study.episodes:,} episodes with each policy; into "

@@ -3,6 +3,7 @@
 import base64
 import html
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +11,24 @@ import numpy as np
 
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import text_table, versions, write_csv, write_json
-from quad_gym.analysis.study_plots import Glance, glance_figure, returns_figure
+from quad_gym.analysis.study_plots import (
+    Glance,
+    Pace,
+    glance_figure,
+    pace_figure,
+    returns_figure,
+)
 from quad_gym.commands.study_flights import Flown
 from quad_gym.commands.study_results import Results
+from quad_gym.commands.study_tasks import ALWAYS, Column
 from quad_gym.commands.study_words import conclusions, number, share
 
-HEADINGS = (
-    "arm",
-    "return",
-    "worst tenth",
-    "success",
-    "crashed",
-    "position error [m]",
-    "features in view",
-)
 CAPTIONS = {
     "learning": "Return of the evaluations while training, each arm on what it is trained on; "
     "thin lines are single seeds, bold ones their median.",
     "glance": "The same episode, flown on the estimate. Above, where the vehicle looks; below, "
+    "what the filter states and what is so.",
+    "pace": "The same episode, flown on the estimate. Above, how fast the vehicle flies; below, "
     "what the filter states and what is so.",
 }
 _STYLE = """
@@ -40,33 +41,48 @@ figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #666; 
 """
 
 
+def columns_of(results: Results) -> dict[str, Column]:
+    """The columns of the table, in their order."""
+    about = results.study.about
+    always = dict(ALWAYS)
+    success = Column(heading="success", of=about.success)
+    return {
+        **{name: always[name] for name in ("return", "worst")},
+        "success": success,
+        "crashed": always["crashed"],
+        **about.columns,
+    }
+
+
+def headings(results: Results) -> tuple[str, ...]:
+    """Those of the table, for people."""
+    return ("arm", *(column.heading for column in columns_of(results).values()))
+
+
 def cells(results: Results) -> list[list[str]]:
     """The table's rows, for people."""
-    found = []
-    for arm in results.study.arms:
-        row = results.rows[arm.name]
-        found.append(
-            [
-                arm.label,
-                number(row["return"], 1),
-                number(row["worst"], 1),
-                share(row["success"]),
-                share(row["crashed"]),
-                number(row["error"], 3),
-                share(row["in_view"]),
-            ]
-        )
-    return found
+    columns = columns_of(results)
+
+    def cell(row: Any, name: str) -> str:
+        digits = columns[name].digits
+        return share(row[name]) if digits is None else number(row[name], digits)
+
+    return [
+        [arm.label, *(cell(results.rows[arm.name], name) for name in columns)]
+        for arm in results.study.arms
+    ]
 
 
 def table_text(results: Results) -> str:
     """The table for the screen."""
-    return text_table({"": HEADINGS[:1], "flown on the estimate": HEADINGS[1:]}, cells(results))
+    heads = headings(results)
+    return text_table({"": heads[:1], "flown on the estimate": heads[1:]}, cells(results))
 
 
 def table_markdown(results: Results) -> str:
     """The table for a page."""
-    lines = [HEADINGS, ("---", *["---:"] * (len(HEADINGS) - 1)), *cells(results)]
+    heads = headings(results)
+    lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *cells(results)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
@@ -86,6 +102,9 @@ def write_report(results: Results) -> list[Path]:
                 "position_error": flown.error,
                 "late_error": flown.late_error,
                 "features_in_view": flown.in_view,
+                "gates_passed": flown.gates,
+                "speed": flown.speed,
+                "success": results.study.about.success(flown),
             }
             for name, values in block.items():
                 columns.setdefault(name, []).extend(values)
@@ -135,8 +154,7 @@ def page_text(results: Results) -> str:
     return "\n".join(
         [
             f"Training seeds: {len(study.seeds)}, of {study.recipe.steps:,} steps each; "
-            f"{study.episodes:,} test episodes with each policy. Success: flown to the end, with a "
-            f"mean position error below {study.within:g} m in the second half.",
+            f"{study.episodes:,} test episodes with each policy. Success: {study.about.meaning}.",
             "",
             table_markdown(results),
             "",
@@ -182,15 +200,13 @@ def _figures(results: Results) -> dict[str, Any]:
         found["learning"] = returns_figure(curves, levels)
     if "truth" in results.trained() and len(results.trained()) > 1:
         best = results.best([name for name in results.trained() if name != "truth"])
-        pair = {name: results.flown[name, study.seeds[0]] for name in ("truth", best)}
-        k = _telling(pair[best])
-        found["glance"] = glance_figure(
-            {
-                f"trained on {results.arm(name).label}".replace(", ", ",\n"): _glance(flown, k)
-                for name, flown in pair.items()
-            },
-            half_view_of(study.env_id),
-        )
+        pair = {
+            f"trained on {results.arm(name).label}".replace(", ", ",\n"): results.flown[
+                name, study.seeds[0]
+            ]
+            for name in ("truth", best)
+        }
+        found[study.about.figure] = _FIGURES[study.about.figure](study.env_id, pair)
     return found
 
 
@@ -204,24 +220,43 @@ def half_view_of(env_id: str) -> float:
     return math.atan(0.5 * camera.image_size[0] / camera.focal_length)
 
 
+def _glances(env_id: str, pair: Mapping[str, Flown]) -> Any:
+    """Where two policies look, in the first episode that shows a difference."""
+    k = _telling(list(pair.values())[-1])
+    return glance_figure(
+        {label: Glance(run.time, **_traces(run, k)) for label, run in pair.items()},
+        half_view_of(env_id),
+    )
+
+
+def _paces(env_id: str, pair: Mapping[str, Flown]) -> Any:
+    """How fast two policies fly, in the first episode that the first ends with a crash."""
+    first = next(iter(pair.values()))
+    k = int(np.argmax(first.crashed[: first.traces["speed"].shape[1]]))
+    return pace_figure({label: Pace(run.time, **_traces(run, k)) for label, run in pair.items()})
+
+
+_FIGURES = {"glance": _glances, "pace": _paces}
+
+
+def _traces(flown: Flown, k: int) -> dict[str, Any]:
+    return {name: values[:, k] for name, values in flown.traces.items()}
+
+
 def _telling(flown: Flown) -> int:
     """The first traced episode in which the rewarded heading is well away from the features.
 
     Elsewhere there is nothing to see: a policy that looks where it is paid sees them anyway.
     """
-    off = np.abs(np.angle(np.exp(1j * (flown.off_wall - flown.off_reward))))
+    off_wall, off_reward = (flown.traces[name] for name in ("off_wall", "off_reward"))
+    off = np.abs(np.angle(np.exp(1j * (off_wall - off_reward))))
     away = np.nanmean(off, axis=0)
     return int(np.argmax(away > math.radians(100.0)))
 
 
-def _glance(flown: Flown, k: int) -> Glance:
-    names = Glance._fields[1:]
-    return Glance(flown.time, *(getattr(flown, name)[:, k] for name in names))
-
-
 def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
     study = results.study
-    rows = [f"<tr>{''.join(f'<th>{html.escape(h)}</th>' for h in HEADINGS)}</tr>"]
+    rows = [f"<tr>{''.join(f'<th>{html.escape(h)}</th>' for h in headings(results))}</tr>"]
     rows += [
         f"<tr>{''.join(f'<td>{html.escape(c)}</td>' for c in line)}</tr>" for line in cells(results)
     ]
@@ -229,8 +264,8 @@ def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
         f"<h1>{html.escape(study.env_id)}</h1>",
         f"<p>{len(study.seeds)} training seeds of {study.recipe.steps:,} steps, {study.episodes:,} "
         "episodes with each policy, flown on the estimate. Interquartile means over seeds; in "
-        "brackets bootstrap 95 % intervals over seeds and episodes. Success: flown to the end, "
-        f"with a mean position error below {study.within:g} m in the second half.</p>",
+        "brackets bootstrap 95 % intervals over seeds and episodes. Success: "
+        f"{study.about.meaning}.</p>",
         f"<table>{''.join(rows)}</table><ul>",
         *[f"<li>{html.escape(sentence)}</li>" for sentence in conclusions(results)],
         "</ul>",

@@ -18,9 +18,9 @@ from quad_gym.analysis.robust import (
     estimated,
     mean,
     probability_of_improvement,
-    worst_tenth,
 )
 from quad_gym.commands.study_flights import Flown
+from quad_gym.commands.study_tasks import ALWAYS, StudiedTask
 
 Floats = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ class Study:
     environment: Mapping[str, Any]
     episodes: int
     first_episode: int
-    within: float
-    """mean position error in the second half that is a success [m]"""
+    about: StudiedTask
+    """of the task: success, columns, what is kept"""
     folder: Path
     threads: int | None
 
@@ -50,16 +50,23 @@ class Study:
         place = self.folder / "runs" / arm.name
         return place if seed is None else place / f"seed_{seed}"
 
+    def policy_folder(self, arm: Arm, seed: int | None) -> Path:
+        """Where the training is kept whose policy an arm flies."""
+        name = arm.flies or arm.name
+        return self.folder / "runs" / name / f"seed_{seed}"
+
     def test_digest(self, arm: Arm) -> str:
         """Of what the test of an arm depends on, beside its policy."""
         about = {**self.environment, **arm.environment}
-        given = as_json([self.env_id, about, self.episodes, self.first_episode, arm.policy])
+        flight = [self.env_id, about, self.episodes, self.first_episode, arm.policy]
+        given = as_json([*flight, self.about.traced])
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
 
     def description(self) -> dict[str, Any]:
         """Everything that the results depend on, as JSON has it."""
         names = ("env_id", "arms", "seeds", "recipe", "environment", "episodes")
-        about = {name: getattr(self, name) for name in (*names, "first_episode", "within")}
+        about = {name: getattr(self, name) for name in (*names, "first_episode")}
+        about["success"] = self.about.meaning
         return as_json(about)  # type: ignore[no-any-return]
 
     def results(self, flown: Mapping[Any, Flown], curves: Mapping[Any, Any]) -> "Results":
@@ -70,16 +77,10 @@ class Study:
         """Every column of the table."""
         runs = [flown[arm.name, seed] for seed in self.seeds_of(arm)]
 
-        def of(number: Any, score: Any = mean) -> Estimated:
-            return estimated([number(run) for run in runs], score)
-
-        return {
-            "return": of(lambda run: run.returns),
-            "worst": of(lambda run: run.returns, worst_tenth),
-            "success": of(lambda run: run.succeeded(self.within)),
-            "crashed": of(lambda run: run.crashed),
-            "error": of(lambda run: run.error),
-            "in_view": of(lambda run: run.in_view),
+        success = {"success": estimated([self.about.success(run) for run in runs], mean)}
+        return success | {
+            name: estimated([column.of(run) for run in runs], column.score)
+            for name, column in {**ALWAYS, **self.about.columns}.items()
         }
 
 
@@ -113,8 +114,8 @@ class Results:
         return [arm.name for arm in self.study.arms if arm.policy is not None]
 
     def trained(self) -> list[str]:
-        """Names of the others."""
-        return [arm.name for arm in self.study.arms if arm.policy is None]
+        """Names of those that are."""
+        return [arm.name for arm in self.study.arms if arm.trained]
 
     def best(self, names: list[str]) -> str:
         """The arm of the largest return."""

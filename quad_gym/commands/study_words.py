@@ -1,5 +1,7 @@
 """Conclusions of a study, in words that are computed from its numbers."""
 
+from collections.abc import Mapping
+
 from quad_gym.analysis.robust import Estimated
 from quad_gym.commands.study_results import Results
 
@@ -42,7 +44,7 @@ def conclusions(results: Results) -> list[str]:
 
 def _label(results: Results, name: str) -> str:
     arm = results.arm(name)
-    return arm.label if arm.policy is not None else f"training on {arm.label}"
+    return f"training on {arm.label}" if arm.trained else arm.label
 
 
 def _against_truth(results: Results, best: str) -> list[str]:
@@ -50,17 +52,31 @@ def _against_truth(results: Results, best: str) -> list[str]:
     ours, truth = results.rows[best], results.rows["truth"]
     apart = ours["success"].apart(truth["success"])
     verdict = "the intervals are apart" if apart else "the intervals overlap"
-    ratio = truth["error"].value / ours["error"].value
     return [
         f"Flown on the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
         f"training on truth in {share(truth['success'])}: {verdict}.",
-        f"It crashes in {share(ours['crashed'])} against {share(truth['crashed'])}, and its mean "
-        f"position error is {ours['error'].value:.3f} m against {truth['error'].value:.3f} m, "
-        f"{ratio:.1f} times smaller."
-        if ratio > 1.0
-        else f"Its mean position error is {ours['error'].value:.3f} m, not smaller than "
-        f"{truth['error'].value:.3f} m.",
+        _how(results, ours, truth),
     ]
+
+
+def _how(results: Results, ours: Mapping[str, Estimated], truth: Mapping[str, Estimated]) -> str:
+    """What else tells two arms apart, by the task's column for it."""
+    telling = results.study.about.telling
+    crashes = f"It crashes in {share(ours['crashed'])} against {share(truth['crashed'])}"
+    if telling != "error":
+        column = results.study.about.columns[telling]
+        a, b = (number(row[telling], column.digits or 0) for row in (ours, truth))
+        return f"{crashes}; {column.heading}: {a} against {b}."
+    ratio = truth["error"].value / ours["error"].value
+    if ratio > 1.0:
+        return (
+            f"{crashes}, and its mean position error is {ours['error'].value:.3f} m against "
+            f"{truth['error'].value:.3f} m, {ratio:.1f} times smaller."
+        )
+    return (
+        f"Its mean position error is {ours['error'].value:.3f} m, not smaller than "
+        f"{truth['error'].value:.3f} m."
+    )
 
 
 def _against_rules(results: Results, best: str) -> str:

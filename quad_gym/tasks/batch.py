@@ -87,6 +87,7 @@ class TaskBatch(ReadableBatch):
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self._state = State(self.count, custom.state)
+        self._counts_gates = "gates_passed" in custom.state
         self._nobody = np.zeros(self.count, bool)
         self._failed = self._nobody.copy()
         self.began, self.began_some = self._nobody, False
@@ -238,6 +239,10 @@ class TaskBatch(ReadableBatch):
         for result, values in judged.items():
             self._results[result, : self.count] = values
             self.write(result.name.lower(), values)
+        if self._counts_gates:
+            passed = np.where(self.began, 0.0, self._state.gates_passed)
+            self._results[Result.GATES_PASSED, : self.count] = passed
+            self.write("gate_next", passed)
         if Result.ENDING in judged:
             self.write("needs_reset", judged[Result.TERMINATED] + judged[Result.TRUNCATED])
         if self.began_some:

@@ -60,6 +60,9 @@ class OutageDash(Task):
     it could have flown, and drifts. How far to go on depends on the filter's uncertainty and on the
     width of the next gap.
 
+    There is time to wait: at 5 m/s the course takes 27 s of the 35 s, and nothing is paid for time
+    that is left. With 20 s, as in the first version, waiting paid hardly more than hurrying on.
+
     ## Course
     It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
     -60 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
@@ -74,8 +77,8 @@ class OutageDash(Task):
 
         0.1 min(v, 5) - 0.02 d^2 - 0.002 w^2
 
-    At most 0.5 a step, so 500 in an episode of 1,000 steps. A crash forfeits the course: it costs
-    50, and the sum of 0.1 min(v, 5) so far.
+    At most 0.5 a step, so 660 for the course of 132 m. A crash forfeits the course: it costs 50,
+    and the sum of 0.1 min(v, 5) so far.
 
     ## Observation
     In place of the built-in observation, as the controller sees it:
@@ -97,8 +100,9 @@ class OutageDash(Task):
     behind the vehicle; after the last one comes the finish, 12 m further.
 
     ## Endings
-    Those of `QuadEnv`: touching a wall, leaving the geofence, the ground at height 0, tipping over;
-    the time limit of 20 s.
+    The finish, 12 m behind the last wall. Beside it those of `QuadEnv`: touching a wall, leaving
+    the geofence, the ground at height 0, tipping over; the time limit of 35 s.
+    `info["gates_passed"]` counts the gaps that are 0.7 m behind.
 
     Args:
         progress_weight: Of v in the reward.
@@ -124,7 +128,7 @@ class OutageDash(Task):
         "next_width": Observed("m", "-", 0.0, 100.0),
         "course_share": Observed("-", "-", -1.0, 2.0),
     }
-    state: Mapping[str, ArrayLike] = {"earned": 0.0}
+    state: Mapping[str, ArrayLike] = {"earned": 0.0, "gates_passed": 0}
 
     def __init__(
         self, progress_weight: float = PROGRESS_WEIGHT, crash_cost: float = CRASH_COST
@@ -133,13 +137,20 @@ class OutageDash(Task):
         self._crash_cost = check.number("crash_cost", crash_cost, least=0.0)
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Add up what the course has earned: `view.state.earned` (n,)."""
+        """Add up what the course has earned, `view.state.earned` (n,), and count gaps."""
         view.state.earned = view.state.earned + self._weight * westward(view)
+        behind = gaps_behind(gaps_of(view), view.position)
+        view.state.gates_passed = np.maximum(view.state.gates_passed, behind)
 
     def reward(self, view: "View") -> Floats:
         """(n,) see the class."""
         forfeited = _CRASH(view) * (self._crash_cost + view.state.earned)
         return self._weight * westward(view) + _COSTS(view) - forfeited
+
+    def terminated(self, view: "View") -> NDArray[np.bool_]:
+        """(n,) whether the vehicle has crashed, or is beyond the finish."""
+        finish = gaps_of(view).centers[:, -1, 0]
+        return view.shipped.terminated | (view.position[:, 0] < finish)
 
     def observe(self, view: "View") -> dict[str, Floats]:
         """See the class."""

@@ -11,6 +11,7 @@ from quad_gym.commands import study as command
 from quad_gym.commands.main import main
 from quad_gym.commands.study_flights import Flown
 from quad_gym.commands.study_results import Study
+from quad_gym.commands.study_tasks import STUDIED, stays
 from quad_gym.commands.study_words import conclusions
 
 QUICK = ["study", "--quick", "--steps", "4096", "--env", "duration=0.6"]
@@ -50,6 +51,30 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("task", "arms"),
+    [
+        ("stale_race", ["pd", "truth", "covariance", "truth_on_truth", "covariance_stamped"]),
+        ("outage_dash", ["pd_waiting", "truth", "waiting", "truth_on_truth"]),
+    ],
+)
+def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, capsys):
+    folder, page = tmp_path / "out", tmp_path / "page.md"
+    page.write_text(f"before\n<!-- study: {task} -->\n<!-- /study: {task} -->\nafter\n")
+    short = ["--quick", "--steps", "4096", "--env", "duration=0.6", "--arms", *arms]
+    assert main(["study", task, *short, "--output", str(folder), "--page", str(page)]) == 0
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(summary["rows"]) == set(arms)
+    assert set(summary["rows"]["truth"]) >= {"success", "crashed", "gates", "speed"}
+    assert sorted(f.name for f in (folder / "runs").iterdir()) == sorted(arms)
+    assert not list((folder / "runs/truth_on_truth").rglob("best.npz"))
+    text = page.read_text()
+    assert "passed" in text.partition("Success: ")[2].partition(".")[0]
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert (tmp_path / f"images/{task}_pace.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--arms", "nobody"], "--arms must be one of"),
@@ -57,6 +82,8 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--episodes", "1"], "--episodes must be at least 2"),
         (["--success-within", "-1"], "--success-within must be"),
+        (["stale_race", "--success-within", "1"], "--success-within belongs to LookAround"),
+        (["stale_race", "--arms", "truth_stamped"], "--arms must name truth, whose policies"),
         (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
         (["--env", "observation=truth"], "--env must leave observation to --arms"),
         (["--set", "gammma=0.9"], "gammma"),
@@ -75,6 +102,10 @@ def test_wrong_arms_are_refused():
         Arm(name="a b", label="x")
     with pytest.raises(ValueError, match="must not be trained"):
         Arm(name="a", label="x", policy="pd", training={"observation": "truth"})
+    with pytest.raises(ValueError, match="must not be trained, as its policy is that of truth"):
+        Arm(name="a", label="x", flies="truth", parameters={"gamma": 0.9})
+    with pytest.raises(ValueError, match="have a policy, or fly that of another"):
+        Arm(name="a", label="x", flies="truth", policy="pd")
     with pytest.raises(ValueError, match=r"Arm.environment must be a"):
         Arm(name="a", label="x", environment=3)
 
@@ -98,7 +129,10 @@ def flown(returns, crashed, error):
         np.full(count, error),
         np.where(crashed, np.nan, error),
         np.full(count, 0.5),
-        *[np.zeros((1, 1))] * 6,
+        np.zeros(count, int),
+        np.ones(count),
+        np.zeros(1),
+        {},
     )
 
 
@@ -106,7 +140,7 @@ def results(tmp_path, numbers):
     arms = tuple(arm for arm in ARMS if arm.name in numbers)
     study = Study(
         *("QuadGym/LookAround-v0", arms, (0, 1, 2, 3, 4), recipe("QuadGym/LookAround-v0")),
-        *({}, 40, 0, 0.5, tmp_path, None),
+        *({}, 40, 0, STUDIED["look_around"], tmp_path, None),
     )
     rng = np.random.default_rng(0)
     found = {}
@@ -120,8 +154,8 @@ def results(tmp_path, numbers):
 
 def test_success_is_to_fly_to_the_end_near_the_reference():
     some = flown([1.0, 1.0, 1.0], [False, True, False], 0.3)
-    np.testing.assert_array_equal(some.succeeded(0.5), [True, False, True])
-    np.testing.assert_array_equal(some.succeeded(0.3), [False, False, False])
+    np.testing.assert_array_equal(stays(some, 0.5), [True, False, True])
+    np.testing.assert_array_equal(stays(some, 0.3), [False, False, False])
 
 
 def test_words_say_what_the_numbers_say(tmp_path):
