@@ -26,6 +26,7 @@ from quad_gym.records import (
     VELOCITY_BLOCK,
     WIDTH,
     Aid,
+    Gate,
 )
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
@@ -289,6 +290,7 @@ class InnovationRecorder:
         valid = np.column_stack([batch.read(f"{name}_valid") for name in names]) > 0.0
         if not valid.any():
             return
+        valid &= batch.read("gate") != Gate.UNSURE  # not made use of
         nis, innovation = batch.read("block_nis"), batch.read("innovation")
         white = innovation / batch.read("innovation_sigma")
         span = min(int(np.searchsorted(self._bins, time - 1e-9, "right")), self._bins.size - 1) - 1

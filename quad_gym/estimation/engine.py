@@ -30,8 +30,12 @@ from quad_gym.records import (
 
 Floats = NDArray[np.float64]
 
+_NOISE = (
+    *("accel_noise", "gyro_noise", "accel_error_noise"),
+    *("accel_thrust_noise", "gyro_thrust_noise"),
+)
 _OF_TICKS = (
-    *("dt", "accel_noise", "gyro_noise", "accel_error_noise"),
+    *("dt", *_NOISE),
     *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
     *("slow_decay", "slow_drive"),
 )
@@ -188,7 +192,7 @@ class Engine:
         if dt == imu.dt:
             return
         p["dt"] = dt
-        for name in ("accel_noise", "gyro_noise", "accel_error_noise"):
+        for name in _NOISE:
             p[name] *= math.sqrt(imu.dt / dt)
         for sensor in ("accel", "gyro"):
             sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")

@@ -82,6 +82,8 @@ def params_record(
     p["gyro_sigma"] = imu.gyro_noise_density / math.sqrt(imu.dt)
     p["accel_noise"], p["gyro_noise"] = imu.believed_accel_sigma, imu.believed_gyro_sigma
     p["accel_error_noise"] = imu.believed_accel_error
+    for sensor in ("accel", "gyro"):  # rotors that lift g shake it like this
+        p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / vehicle.gravity
     hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
     for sensor in ("accel", "gyro"):
         p[f"{sensor}_scale_sigma"] = getattr(imu, f"{sensor}_scale_sigma")

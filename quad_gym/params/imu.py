@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
 
-MANEUVER = 1.0
-"""How long a quadrotor accelerates one way [s]; our judgment."""
+MANEUVER = 0.5
+"""How long a quadrotor accelerates one way [s]; our judgment, between a turn through a gate (some
+tenths of a second) and steady wind."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +99,8 @@ class ImuParams(Checked):
     def believed_accel_sigma(self) -> float:
         """Standard deviation of a sample that the filter takes for white [m/s^2].
 
-        It counts the vibration at the rotor speeds of hovering, which those of gentle flight hardly
-        leave: a thrust 10 % larger vibrates 10 % more.
+        As of hovering; where the specific force differs from g the filter counts the vibration
+        of rotors that lift so much, as it grows with the thrust.
         """
         return math.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
 
@@ -111,8 +112,9 @@ class ImuParams(Checked):
         long as a maneuver: one of `MANEUVER` seconds moves the velocity as far as white noise does
         whose samples are larger by the square root of their number.
         """
-        error = max(self.accel_scale_sigma, self.accel_misalignment_sigma)
-        return error * math.sqrt(MANEUVER / self.dt)
+        scale, misalignment = self.accel_scale_sigma, self.accel_misalignment_sigma
+        mean_square = (scale**2 + 2.0 * misalignment**2) / 3.0  # over the axes
+        return math.sqrt(mean_square * MANEUVER / self.dt)
 
     @property
     def believed_gyro_sigma(self) -> float:

@@ -55,6 +55,8 @@ PARAMS_FIELDS = (
     Field("gyro_sigma", (), "rad/s", "white noise of a sample"),
     Field("accel_noise", (), "m/s^2", "noise of a sample that the filter takes for white"),
     Field("gyro_noise", (), "rad/s", "likewise"),
+    Field("accel_thrust_noise", (), "-", "noise per m/s^2 of specific force, of the rotors"),
+    Field("gyro_thrust_noise", (), "rad/s per m/s^2", "likewise"),
     Field("accel_error_noise", (), "-", "what it takes for white of scale and alignment, per m/s^2"),
     Field("accel_scale_sigma", (), "-", "scale factor error of each axis"),
     Field("gyro_scale_sigma", (), "-", "likewise"),

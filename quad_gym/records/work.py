@@ -46,6 +46,7 @@ WORK_FIELDS = (
     Field("judged_nis", (), "-", "sum of their NIS"),
     Field("judged_freedoms", (), "-", "sum of their degrees of freedom"),
     Field("left_out", (), "-", "numbers masked"),
+    Field("hidden", (MAX_FEATURES,), "0 or 1", "features whose directions are too uncertain"),
     # the segment of a trajectory at an instant
     Field("path_time", (), "s", "of the episode; then since the beginning of the segment"),
     Field("path_still", (), "0 or 1", "before the start or past the end"),

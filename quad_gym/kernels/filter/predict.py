@@ -29,7 +29,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.ekf import acceleration_column, angle_column
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_covariance
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
-from quad_gym.kernels.filter.preintegration import accel_variance
+from quad_gym.kernels.filter.preintegration import accel_variance, gyro_sigma
 from quad_gym.kernels.filter.slow import decay_slow, keep_slow_factor, predict_slow, turn_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
@@ -177,7 +177,7 @@ def _turned_angles(L, j, full, half, dt):
 @kernel
 def _add_gyro_noise(P, p, R_BI, f_B, half):
     """Add the gyro's white noise to P; half of the angle by which it errs turns the force."""
-    dt, sigma = p.dt, p.gyro_noise
+    dt, sigma = p.dt, gyro_sigma(p, f_B)
     zero = 0.0 * dt
     axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
     for axis in axes:
@@ -226,7 +226,8 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
     decay_a, decay_g = p.accel_bias_decay, p.gyro_bias_decay
     variance = accel_variance(p, f_B)
     extended, midpoint = (form & _EKF) != 0, (form & _MIDPOINT) != 0
-    gyro_variance = 0.0 * dt if midpoint else (dt * p.gyro_noise) * (dt * p.gyro_noise)
+    angle = 0.0 * dt if midpoint else dt * gyro_sigma(p, f_B)
+    gyro_variance = angle * angle
 
     for i in range(0, 9, 3):
         store_block(P, i, i, sum_of_squares(F, i, 15))

@@ -27,6 +27,7 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import (
     add,
     add33,
@@ -145,7 +146,24 @@ def take_mean(flight, p, work, back):
 def accel_variance(p, f_B):
     """What the filter takes for white in a sample of the accelerometer, per axis [m^2/s^4]."""
     d = (f_B[0], f_B[1], f_B[2] - p.gravity)
-    return p.accel_noise * p.accel_noise + p.accel_error_noise * p.accel_error_noise * dot(d, d)
+    variance = _with_thrust(p, p.accel_noise, p.accel_thrust_noise, f_B)
+    return variance + p.accel_error_noise * p.accel_error_noise * dot(d, d)
+
+
+@kernel
+def gyro_sigma(p, f_B):
+    """Likewise the standard deviation of a sample of the gyro [rad/s]."""
+    return math.sqrt(_with_thrust(p, p.gyro_noise, p.gyro_thrust_noise, f_B))
+
+
+@kernel
+def _with_thrust(p, hovering, thrust_noise, f_B):
+    """A variance as of hovering with what rotors add that lift f_B, not g.
+
+    Vibration grows with the square of the rotor speeds, as the thrust does.
+    """
+    more = dot(f_B, f_B) - p.gravity * p.gravity
+    return maximum(hovering * hovering + thrust_noise * thrust_noise * more, 0.0)
 
 
 @kernel
@@ -158,7 +176,7 @@ def put_noise(p, work, R_s, dR, dv):
     M, T = work.columns, work.since_time
     root = math.sqrt(p.dt * T)
     force = scale(select(T > 0.0, 1.0 / T, 0.0), dv)  # its mean
-    a, g = root * math.sqrt(accel_variance(p, force)), root * p.gyro_noise
+    a, g = root * math.sqrt(accel_variance(p, force)), root * gyro_sigma(p, force)
     zero = 0.0 * T
     for k in range(6):
         for i in range(15):

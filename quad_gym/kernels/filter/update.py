@@ -25,6 +25,7 @@ from quad_gym.kernels.maths.linalg import (
     add,
     add_outer,
     add_to_diagonal,
+    dot,
     keep3,
     keep33,
     load3,
@@ -36,6 +37,7 @@ from quad_gym.kernels.maths.linalg import (
     scale33,
     store3,
     store_block,
+    sub,
     sum_of_outers,
     sum_of_outers_of_rows,
     sum_of_squares,
@@ -46,12 +48,13 @@ from quad_gym.kernels.measurements.blocks import count, expect
 from quad_gym.kernels.measurements.rows import columns_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import FilterForm, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, FilterForm, FilterStatus, Gate
 
 _EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
 _GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _GRADUAL = int(FilterForm.GRADUAL)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
+_UNSURE = float(Gate.UNSURE)
 
 
 @kernel
@@ -127,29 +130,70 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
         stages: The table of stages, which has those of aiding sensors; None without slow errors.
     """
     loose, first, form = mask & (p.sigma_spread < 0.0), 2, settings.form  # nobody
+    hidden = loose
     if (form & _GRADUAL) != 0 and settings.feature_count > 0:
-        loose = mask & _is_loose(flight, p, settings.feature_count)
+        loose = mask & _is_loose(flight, p, work, settings.feature_count)
         if any_of(loose):
             first = 0
+            if (form & _GATE) == 0:  # a gate leaves them out by itself
+                hidden = _hide_unsure(flight, work, settings.feature_count, loose)
     failures = flight.update_failures
     for part in range(first, 3):
         doubt = select(loose, _DOUBTS[part], 1.0)
         well = flight.update_failures == failures  # a step that fails is the last
         taking, again = mask & well & (loose | (part == 2)), loose & (part > 0)
         _update_by(flight, p, work, settings, taking, doubt, again, slow, stages)
+    if any_of(hidden):
+        _show_hidden(flight, work, settings, hidden)
     if (form & _GRADUAL) != 0:
         flight.nis = select(loose, np.nan, flight.nis)
 
 
 @kernel
-def _is_loose(flight, p, feature_count):
-    """Where the camera sees a feature and the attitude deviates by more than `gradual_above`."""
-    seen = flight.feature_valid[0]
-    for i in range(1, feature_count):
-        seen = seen + flight.feature_valid[i]
-    P_ee = sum_of_squares(flight.L, E, 9)
-    variance = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
-    return (seen > 0.0) & (variance > p.gradual_above * p.gradual_above)
+def _is_loose(flight, p, work, feature_count):
+    """Where the camera sees a feature whose direction may be off by more than `gradual_above`.
+
+    It is off by the errors of attitude and position, whose share is the larger the nearer the
+    feature is. Keeps where that is more than a linear model bears even in steps.
+    """
+    P_rr, P_ee = sum_of_squares(flight.L, R, 3), sum_of_squares(flight.L, E, 9)
+    position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
+    attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
+    too_much, r = p.gradual_above * p.gradual_above, load3(flight.r_hat)
+    loose = attitude < 0.0  # nowhere
+    for i in range(feature_count):
+        offset = sub(load3(p.features[i]), r)
+        square, seen = dot(offset, offset), flight.feature_valid[i] > 0.0
+        loose = loose | (seen & (position > (too_much - attitude) * square))
+        unsure = seen & (position > (p.gate_uncertainty - attitude) * square)
+        work.hidden[i] = select(unsure, 1.0, 0.0)
+    return loose
+
+
+@kernel
+def _hide_unsure(flight, work, feature_count, mask):
+    """Hide features whose directions are too uncertain to make use of; return where there are any.
+
+    Each step takes from a wrong direction a wrong distance, of which the filter is then sure.
+    """
+    some = work.hidden[0] < 0.0  # nowhere
+    for i in range(feature_count):
+        hidden = mask & (work.hidden[i] > 0.0)
+        some = some | hidden
+        work.hidden[i] = select(hidden, 1.0, 0.0)
+        flight.feature_valid[i] = select(hidden, 0.0, flight.feature_valid[i])
+    return some
+
+
+@kernel
+def _show_hidden(flight, work, settings, mask):
+    """Undo that, and say of these features that they were left out."""
+    for i in range(settings.feature_count):
+        hidden = mask & (work.hidden[i] > 0.0)
+        flight.feature_valid[i] = select(hidden, 1.0, flight.feature_valid[i])
+        if (settings.form & _WATCH) != 0:
+            block = FEATURE_BLOCKS + i
+            flight.gate[block] = select(hidden, _UNSURE, flight.gate[block])
 
 
 @kernel
