@@ -32,7 +32,7 @@ $(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
 	touch $(VENV)/.user $(VENV)/.trainer $@  # which it holds
 
 $(VENV)/.writer: $(VENV)/.user
-	$(INSTALL) ".[train,plot,docs]"
+	$(INSTALL) ".[train,plot,render,docs]"
 	$(BYTECODE)
 	touch $@
 

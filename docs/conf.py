@@ -22,6 +22,7 @@ extensions = [
     "extensions.docstrings",
     "extensions.environment_pages",
     "extensions.equations",
+    "extensions.films",
 ]
 exclude_patterns = ["_build", "gallery", "tutorials/*.ipynb", "tutorials/*.py"]
 suppress_warnings = [

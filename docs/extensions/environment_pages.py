@@ -19,6 +19,7 @@ from sphinx.errors import ExtensionError
 from sphinx.pycode import ModuleAnalyzer
 
 import quad_gym
+from extensions.films import film_of
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import (
     KEYWORDS_WITHOUT_EFFECT,
@@ -200,6 +201,7 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         f"- **Reference**: {reference}\n- **Start**: {start}\n- **Time limit**: {limit}\n",
         "```python\nimport gymnasium\n\nimport quad_gym\n\n"
         f'env = gymnasium.make("{env_id}")\n```\n',
+        film_of(env_id),
         "Reward, start, endings and `info` below are those of the specification that all "
         "environments share, `help(quad_gym.QuadEnv)`.\n",
         f"## Observation\n\n{_table(head, observation)}",

@@ -72,7 +72,7 @@ class Args:
     sensors: SuiteName | None = None
     """if not given, the task's own, which for most is standard"""
     camera: bool = True
-    """measure with the camera"""
+    """measure with the camera, if the suite has one"""
     gnss_rate: float | None = None
     """GNSS fixes per second [Hz]; if not given, the suite's"""
     camera_rate: float | None = None
@@ -183,6 +183,8 @@ def make_env(args: Args) -> Any:
     named = {name: f"--{name.replace('_', '-')}" for name in options}
     given = leave(args.env, {**named, "faults": "--faults"})
     keywords = {**keywords_of_policy(args.policy, args.env_id), **given}
+    if not args.camera:
+        keywords["camera"] = False
     return gymnasium.make_vec(
         args.env_id,
         num_envs=1,
@@ -190,7 +192,6 @@ def make_env(args: Args) -> Any:
         observation=args.observation,
         action=args.action,
         sensors=sensors_of(args.env_id, args.sensors),
-        camera=args.camera,
         gnss_rate=args.gnss_rate,
         camera_rate=args.camera_rate,
         duration=args.duration,

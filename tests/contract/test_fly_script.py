@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quad_gym import Flight
+from quad_gym import IDS, Flight
 from quad_gym.commands import fly as script
 from tests import console_commands
 from tests.console import plain
@@ -44,6 +44,20 @@ def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
     done = fly("--replay", "new/hover.npz", *size, "--output", "again.gif", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "again.gif").read_bytes() == (tmp_path / "new/hover.gif").read_bytes()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_task_is_made_with_the_default_options(env_id):
+    env = script.make_env(script.Args(env_id=env_id))
+    assert env.unwrapped.flights.batch.sensors.camera is not None or "outage" in IDS[env_id]
+
+
+@pytest.mark.parametrize("suite", ["standard", "consumer"])
+@pytest.mark.parametrize("camera", [True, False])
+def test_any_suite_is_made_with_and_without_a_camera(suite, camera):
+    env = script.make_env(script.Args(sensors=suite, camera=camera))
+    wanted = camera and suite == "standard"
+    assert (env.unwrapped.flights.batch.sensors.camera is not None) == wanted
 
 
 def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
