@@ -134,7 +134,8 @@ class Flight:
     Args:
         rows: (n,) records with the fields of `COLUMNS`.
         stage: Where it takes place.
-        about: What else is worth knowing, such as seed and policy; of the types of JSON.
+        about: What else is worth knowing, such as seed and policy; of the types of JSON. Pictures
+            are titled with its "task", if it has one.
     """
 
     rows: NDArray[Any]

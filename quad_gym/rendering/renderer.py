@@ -118,7 +118,7 @@ class Renderer:
         """What, when, what the colors mean, and what is wrong, in the upper left corner."""
         canvas, stage, now = self._canvas, flight.stage, flight.rows[-1]
         large, small = self._text + 2, self._text - 1
-        name = stage.task.replace("_", " ")
+        name = str(flight.about.get("task", stage.task)).replace("_", " ")
         title = f"{name} on {_SEEN[stage.observation]}"
         aim = "reference, next second" if stage.reference_period else "reference"
         aim = "next gate" if len(stage.gates_I) else aim
