@@ -31,6 +31,10 @@ $(VENV)/.developer: pyproject.toml constraints.txt | $(BIN)/python
 	$(BYTECODE)
 	touch $(VENV)/.user $(VENV)/.trainer $@  # which it holds
 
+$(VENV)/.sweeper: $(VENV)/.developer
+	$(INSTALL) ".[sweep]"  # Ray is large: no part of the setup
+	touch $@
+
 $(VENV)/.writer: $(VENV)/.user
 	$(INSTALL) ".[train,plot,render,docs]"
 	$(BYTECODE)
@@ -76,7 +80,7 @@ $(CLIENTS)/.tester: pyproject.toml constraints-clients.txt
 		--editable ".[clients]" pytest hypothesis
 	touch $@
 
-test-slow: setup  ## the slow tests: statistics, soak, many processes
+test-slow: $(VENV)/.sweeper  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
 
 soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates over all suites and faults

@@ -6,6 +6,7 @@ CleanRL is no package but scripts to copy, written for Gymnasium 0.29. This is t
 written anew for Gymnasium 1: options, defaults and order of the wrappers are those of CleanRL.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,7 +133,7 @@ def train(args):
     size = args.num_steps * args.num_envs
     observation = torch.as_tensor(envs.reset(seed=args.seed)[0], dtype=torch.float32)
     done = torch.zeros(args.num_envs)
-    count = args.total_timesteps // size
+    count, returns = args.total_timesteps // size, deque(maxlen=100)
     for iteration in range(count):
         optimizer.param_groups[0]["lr"] = args.learning_rate * (1.0 - iteration / count)
         for t in range(args.num_steps):
@@ -142,7 +143,9 @@ def train(args):
                 actions[t] = policy.sample()
                 log_probs[t] = policy.log_prob(actions[t]).sum(1)
                 values[t] = agent.critic(observation).squeeze(1)
-            result, reward, terminated, truncated, _ = envs.step(actions[t].numpy())
+            result, reward, terminated, truncated, info = envs.step(actions[t].numpy())
+            if "final_info" in info:
+                returns.extend(info["final_info"]["episode"]["r"][info["_final_info"]])
             observation = torch.as_tensor(result, dtype=torch.float32)
             rewards[t] = torch.as_tensor(reward)
             done = torch.as_tensor(terminated | truncated, dtype=torch.float32)
@@ -158,6 +161,8 @@ def train(args):
                 loss.backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
                 optimizer.step()
+        if returns:
+            print(f"{(iteration + 1) * size:,} steps: return {np.mean(returns):.1f}", flush=True)
     statistics = [env.get_wrapper_attr("obs_rms") for env in envs.envs]
     agent.mean[:] = torch.as_tensor(np.mean([s.mean for s in statistics], axis=0))
     agent.variance[:] = torch.as_tensor(np.mean([s.var for s in statistics], axis=0))

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
@@ -82,6 +82,32 @@ def test_a_crash_is_not_reported_as_truncation():
     assert dones.all()
     assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
     assert infos[0]["ending"] == "on_the_ground"
+
+
+def test_the_replay_of_sac_tells_time_limits_from_crashes_and_keeps_final_observations():
+    """What each flight did alone: no bootstrap over a crash, and one from the last observation."""
+    limits = {"max_episode_steps": 25, "max_tilt": 0.3}
+    env = make(3, **limits)
+    settings = {"learning_starts": 10**6, "buffer_size": 360, "device": "cpu", "seed": 0}
+    model = SAC("MlpPolicy", env, **settings)
+    env.seed(50)
+    model.learn(360)
+    kept, ended = model.replay_buffer, {"crash": 0, "limit": 0}
+    for i in range(3):
+        alone = QuadEnv("hover", **limits)
+        observation, _ = alone.reset(seed=50 + i)
+        for k in range(120):
+            assert_same(kept.observations[k, i], observation)
+            observation, reward, terminated, truncated, _ = alone.step(kept.actions[k, i])
+            assert_same(kept.next_observations[k, i], observation)
+            assert kept.rewards[k, i] == np.float32(reward)
+            assert kept.dones[k, i] == (terminated or truncated)
+            assert kept.timeouts[k, i] == truncated
+            ended["crash"] += terminated
+            ended["limit"] += truncated
+            if terminated or truncated:
+                observation, _ = alone.reset()
+    assert min(ended.values()) > 0, ended
 
 
 def test_a_seed_holds_for_the_next_reset_only():

@@ -120,6 +120,7 @@ def test_jobs_of_submitit_may_be_killed(tmp_path, undisturbed):
     assert tables(tmp_path) == undisturbed
 
 
+@pytest.mark.slow  # needs submitit, which `make test-slow` installs
 @pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="needs submitit")
 def test_parameters_that_submitit_does_not_know_are_refused(tmp_path):
     with pytest.raises(ValueError, match="--options do not fit submitit"):
@@ -155,4 +156,25 @@ def test_workers_of_ray_may_be_killed_and_so_may_a_node(tmp_path, undisturbed, n
     worker_at(process, runs / GROUP.format(0.8) / "seed_0")
     cluster.remove_node(second, allow_graceful=False)
     end(process)
+    assert tables(tmp_path) == undisturbed
+
+
+@pytest.mark.slow
+def test_a_request_to_terminate_ends_trainings_on_ray_with_a_checkpoint(
+    tmp_path, undisturbed, monkeypatch
+):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    options = ["--executor", "ray", "--options", "num_cpus=1"]  # Ray on this machine alone
+    process = start(tmp_path, *options)
+    first = tmp_path / "out/runs" / GROUP.format(0.9) / "seed_0"
+    worker_at(process, first)
+    process.send_signal(signal.SIGTERM)
+    _, err = end(process, 130)
+    assert "start the same command again to go on" in err.lower()
+    assert not is_locked(first)
+    stopped = [path.parent for path in tmp_path.glob("out/runs/*/*/training.json")]
+    records = [json.loads((folder / "training.json").read_text()) for folder in stopped]
+    assert any(not record["finished"] and "steps" in record for record in records)
+    end(start(tmp_path, *options))
     assert tables(tmp_path) == undisturbed
