@@ -41,8 +41,8 @@ class LookAround(Task):
     At most 0.35 a step, so 262.5 in an episode of 750 steps.
 
     ## Observation
-    The built-in one, and then `features_direction` (3): the unit vector from the vehicle to the middle of
-    the markers in the body frame, both as the controller sees them.
+    The built-in one, and then `features_direction` (3): the unit vector from the vehicle to the
+    middle of the markers in the body frame, both as the controller sees them.
 
     ## Endings
     Those of `QuadEnv`, with 8 m to the reference as the bound: a controller that is mistaken about
