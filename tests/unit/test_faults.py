@@ -134,7 +134,7 @@ def test_a_new_episode_begins_without_the_faults_of_the_last():
 # ---- GNSS --------------------------------------------------------------------------------------
 
 
-def test_in_an_outage_there_are_no_fixes_and_else_the_same():
+def test_an_outage_takes_the_fixes_away_and_changes_nothing_else():
     faults = (GnssOutage(start=0.1, duration=0.1), BaselineLoss(start=0.15, duration=0.1))
     calm, faulty = both(BLIND, faults, count=3)
     for tick in range(1, 61):
