@@ -223,7 +223,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             self.rendering.close()
 
     def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
-        """What the judge says of the step."""
+        """Errors, endings and counters of the step."""
         infos: dict[str, Any] = {
             "position_error": results[:, COLUMN["position_error"]].copy(),
             "estimation_error": results[:, COLUMN["estimation_error"]].copy(),

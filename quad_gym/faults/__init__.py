@@ -20,28 +20,15 @@ Which faults are active is told by `info["faults"]` (name: True or False), by
 "outlier" and "feature_mistaken", for `FlightBatch.read`. Filter and controller are not told.
 """
 
-from quad_gym.faults.aids import SensorLoss
-from quad_gym.faults.base import Fault, Span, ends
-from quad_gym.faults.camera import CameraOcclusion, WrongAssociations
-from quad_gym.faults.gnss import BaselineLoss, GnssJump, GnssOutage, GnssOutliers, GnssRamp
-from quad_gym.faults.imu import AccelBiasStep, GyroBiasStep, ImuSaturation
-from quad_gym.faults.vehicle import PositionJump, RotorLoss
+from quad_gym.faults import aids, base, camera, gnss, imu, vehicle
+from quad_gym.faults.aids import *
+from quad_gym.faults.base import *
+from quad_gym.faults.camera import *
+from quad_gym.faults.gnss import *
+from quad_gym.faults.imu import *
+from quad_gym.faults.vehicle import *
 
-__all__ = [
-    "AccelBiasStep",
-    "BaselineLoss",
-    "CameraOcclusion",
-    "Fault",
-    "GnssJump",
-    "GnssOutage",
-    "GnssOutliers",
-    "GnssRamp",
-    "GyroBiasStep",
-    "ImuSaturation",
-    "PositionJump",
-    "RotorLoss",
-    "SensorLoss",
-    "Span",
-    "WrongAssociations",
-    "ends",
-]
+# each file says what of it is public
+__all__ = (
+    aids.__all__ + base.__all__ + camera.__all__ + gnss.__all__ + imu.__all__ + vehicle.__all__
+)

@@ -6,6 +6,8 @@ from quad_gym.faults.base import Fault
 from quad_gym.params import checks as check
 from quad_gym.records import Aid, FaultKind
 
+__all__ = ["SensorLoss"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class SensorLoss(Fault):

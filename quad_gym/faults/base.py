@@ -12,6 +12,8 @@ from quad_gym.params.portable import norm
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FaultKind
 
+__all__ = ["Fault", "Span", "ends"]
+
 _SENSORS = {"gnss": "GNSS"}
 """Parts of a suite that take no article."""
 
@@ -111,10 +113,13 @@ class Fault(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class DirectedFault(Fault):
-    """A fault with a direction, drawn uniformly from all directions unless it is given."""
+    """A fault with a size and a direction, drawn uniformly from all directions unless given."""
 
     direction: Vector | None = None
     """(3,) along which it lies, of any length; None: drawn each time it comes"""
+
+    size_field: ClassVar[str] = "size"
+    """which field is its size"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -122,6 +127,12 @@ class DirectedFault(Fault):
             self._check(check.vector, "direction", length=3)
             if not any(self.direction):
                 raise ValueError(f"{type(self).__name__}.direction must not be zero")
+        self._check(span, self.size_field, open_end=True)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What kernels read of it."""
+        return {"size": getattr(self, self.size_field), "direction": self.unit}
 
     @property
     def unit(self) -> np.ndarray:

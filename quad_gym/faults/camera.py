@@ -8,6 +8,8 @@ from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import FaultKind
 
+__all__ = ["CameraOcclusion", "WrongAssociations"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOcclusion(Fault):

@@ -6,6 +6,8 @@ from typing import Any
 from quad_gym.faults.base import DirectedFault, Fault, Span, share_of_one, span
 from quad_gym.records import FaultKind
 
+__all__ = ["BaselineLoss", "GnssJump", "GnssOutage", "GnssOutliers", "GnssRamp"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class GnssOutage(Fault):
@@ -62,15 +64,7 @@ class GnssRamp(DirectedFault):
 
     kind = FaultKind.GNSS_RAMP
     needs = "gnss"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(span, "speed", open_end=True)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
-        return {"size": self.speed, "direction": self.unit}
+    size_field = "speed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,15 +79,6 @@ class GnssJump(DirectedFault):
 
     kind = FaultKind.GNSS_JUMP
     needs = "gnss"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(span, "size", open_end=True)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
-        return {"size": self.size, "direction": self.unit}
 
 
 @dataclass(frozen=True, kw_only=True)

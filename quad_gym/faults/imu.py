@@ -4,9 +4,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from quad_gym.faults.base import DirectedFault, Fault, Span, span
+from quad_gym.faults.base import DirectedFault, Fault, Span
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind
+
+__all__ = ["AccelBiasStep", "GyroBiasStep", "ImuSaturation"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,15 +24,6 @@ class AccelBiasStep(DirectedFault):
 
     kind = FaultKind.ACCEL_BIAS_STEP
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(span, "size", open_end=True)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
-        return {"size": self.size, "direction": self.unit}
-
 
 @dataclass(frozen=True, kw_only=True)
 class GyroBiasStep(DirectedFault):
@@ -44,15 +37,6 @@ class GyroBiasStep(DirectedFault):
     """[rad/s]"""
 
     kind = FaultKind.GYRO_BIAS_STEP
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(span, "size", open_end=True)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
-        return {"size": self.size, "direction": self.unit}
 
 
 @dataclass(frozen=True, kw_only=True)

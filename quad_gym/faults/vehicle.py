@@ -7,6 +7,8 @@ from quad_gym.faults.base import DirectedFault, Fault, Span, ends, span
 from quad_gym.params import checks as check
 from quad_gym.records import FaultKind
 
+__all__ = ["PositionJump", "RotorLoss"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class PositionJump(DirectedFault):
@@ -21,15 +23,6 @@ class PositionJump(DirectedFault):
     """[m]"""
 
     kind = FaultKind.POSITION_JUMP
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._check(span, "size", open_end=True)
-
-    @property
-    def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
-        return {"size": self.size, "direction": self.unit}
 
 
 @dataclass(frozen=True, kw_only=True)

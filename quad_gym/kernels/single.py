@@ -37,12 +37,8 @@ from quad_gym.kernels.sensors.imperfect import (
     turn_baseline,
     vibrate_imu,
 )
-from quad_gym.kernels.sensors.measure import (
-    drift_biases,
-    measure_gnss,
-    measure_imu,
-    measure_imu_average,
-)
+from quad_gym.kernels.sensors.imu import drift_biases, measure_imu, measure_imu_average
+from quad_gym.kernels.sensors.sample import measure_gnss
 from quad_gym.kernels.simd.addresses import lanes_at
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.air import accelerations_in_air

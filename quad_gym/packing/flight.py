@@ -184,12 +184,13 @@ def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
 
 
 _HARMONICS = {
+    Task.HOVER: 0,
     Task.CIRCLE: 1,
     Task.LEMNISCATE: 2,
-    Task.RANDOM_TRAJECTORY: MAX_HARMONICS,
+    Task.WAYPOINTS: 0,
     Task.TRAJECTORY: FOLLOWED,
 }
-"""Terms of the series of a task's reference; none elsewhere."""
+"""Terms of the series of a task's reference, where these are not all."""
 
 
 def pack_latency(
@@ -277,7 +278,7 @@ def settings_record(
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
     s["pad"], s["randomize"] = task.pad, task.randomize
     s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
-    s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], 0)
+    s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], MAX_HARMONICS)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
     s["end_when_lost"] = task.end_when_lost

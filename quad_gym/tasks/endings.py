@@ -52,7 +52,7 @@ def _asked(flights: "TaskBatch", method: str) -> Truths:
 
 
 def _cut(flights: "TaskBatch") -> NDArray[np.float64]:
-    """Why an episode would be truncated, which the judge does not say of one that it terminates."""
+    """Why an episode would be truncated, also of one that is terminated."""
     why = np.full(flights.count, float(Ending.TIME_LIMIT))
     if flights.task.end_when_lost:
         why[flights.result("filter_lost") > 0.0] = float(Ending.FILTER_LOST)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels.task import reward as shipped
+from quad_gym.kernels.task import reward_and_endings as shipped
 from quad_gym.params import checks as check
 from quad_gym.records import Ending
 

@@ -160,7 +160,7 @@ def test_the_compile_section_has_an_empty_and_a_full_cache_and_an_edit(tmp_path)
     assert list(found["sections"]) == ["compile"]
     rows = {row["cache"]: row for row in found["sections"]["compile"]}
     assert list(rows) == ["empty", "full", "edit"]
-    assert rows["edit"]["name"].endswith("kernels/task/reward.py")
+    assert rows["edit"]["name"].endswith("kernels/task/reward_and_endings.py")
     assert rows["full"]["seconds"] < rows["empty"]["seconds"]
 
 

@@ -101,7 +101,7 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow  # three processes with torch; a training that is killed: test_training.py
-def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_nobody_behind(tmp_path):
+def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_no_process(tmp_path):
     options = ["--steps", "300000", "--env", "duration=0.2", "--output", tmp_path / "out"]
     options += ["--seeds", "1", "--jobs", "2", "--train-on", "truth", "noisy"]
     line = console_commands.line("compare.py", *options)

@@ -32,7 +32,7 @@ def test_flights_are_what_they_were(name):
 
 @pytest.mark.parametrize(("flights", "threads"), [(FLIGHTS + 1, 1), (5 * FLIGHTS, 2)])
 @pytest.mark.parametrize("name", SOME)
-def test_they_do_not_depend_on_who_flies_beside_them(name, flights, threads):
+def test_they_do_not_depend_on_the_other_flights(name, flights, threads):
     assert fly(CASES[name], flights=flights, threads=threads) == GOLDEN[name]
 
 

@@ -61,7 +61,7 @@ def test_all_three_interfaces_fly_the_same_flights():
     np.testing.assert_array_equal(third.reset(), first)
 
 
-def test_who_hits_a_wall_has_crashed_and_info_says_so():
+def test_hitting_a_wall_is_a_crash_and_info_says_so():
     env = QuadEnv("hover", world=WORLD, observation="truth", custom=Near)
     env.reset(seed=0)
     for _ in range(400):
@@ -76,7 +76,7 @@ def test_who_hits_a_wall_has_crashed_and_info_says_so():
     assert Crash()(view)[0] == 1.0
 
 
-def test_who_leaves_the_geofence_has_crashed_too():
+def test_leaving_the_geofence_is_a_crash_too():
     fenced = WORLD.replace(obstacles=())
     env = QuadEnv("hover", world=fenced, observation="truth", custom=Near, out_of_bounds=50.0)
     with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):

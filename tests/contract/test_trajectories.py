@@ -154,7 +154,7 @@ def test_snapshots_copies_and_pickles_go_on_bit_for_bit():
         assert one.snapshot().tobytes() == end.tobytes()
 
 
-def test_a_task_of_ones_own_sees_the_reference():
+def test_a_users_task_sees_the_reference():
     seen = {}
 
     class Watch(quad_gym.Task):

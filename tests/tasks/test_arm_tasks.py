@@ -36,7 +36,7 @@ def test_doubt_is_the_logarithm_of_the_largest_standard_deviation_of_the_positio
 
 
 @pytest.mark.parametrize("observation", ["truth", "noisy"])
-def test_who_sees_the_truth_has_no_doubt(observation):
+def test_a_controller_on_the_truth_has_no_doubt(observation):
     env, observations = make("Doubting", observation=observation)
     np.testing.assert_array_equal(part(env, observations, "log_sigma"), -1.0)
 

@@ -196,7 +196,7 @@ def test_a_privileged_task_may_observe_the_truth():
                 np.testing.assert_array_equal(final[:, 31], reward.astype(np.float32))
 
 
-def test_flights_that_are_no_more_end_whatever_the_task_says():
+def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
     task = quad_gym.Task.of(
         terminated=lambda view: np.zeros(view.count, bool),
         reward=lambda view: view.position[:, 0],

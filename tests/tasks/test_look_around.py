@@ -155,7 +155,12 @@ def test_it_takes_other_weights_sensors_and_tasks():
             LookAround(crash_cost=bad)
 
 
-def test_a_task_of_ones_own_can_be_laid_over_it():
+def test_without_a_camera_it_is_refused():
+    with pytest.raises(quad_gym.TaskError, match="LookAround needs a camera"):
+        gymnasium.make(ID, camera=False).reset()
+
+
+def test_a_users_task_can_be_based_on_it():
     quad_gym.register_task("Test/LookMore-v0", LookAround(heading_weight=0.2), ID)
     env = gymnasium.make_vec("Test/LookMore-v0", num_envs=2)
     assert env.unwrapped.flights.name == "look_around"
@@ -168,7 +173,7 @@ def test_keywords_of_another_task_are_refused():
     assert QuadVectorEnv(1, "look_around", max_speed=2.0).flights.task.max_speed == 2.0
 
 
-def test_who_does_not_use_it_does_not_import_it():
+def test_it_is_imported_only_where_it_is_used():
     code = (
         "import sys, gymnasium, quad_gym; gymnasium.make('QuadGym/Circle-v0'); "
         "print([m for m in sys.modules if m.startswith('quad_gym.tasks') or 'baselines' in m])"

@@ -151,7 +151,7 @@ def test_the_standard_deviations_tell_that_gnss_is_gone():
     assert sigma[lasted > 4.5].min() > 0.4
 
 
-def test_who_flies_on_the_truth_has_no_outage_and_who_asks_for_one_is_told_so():
+def test_flights_on_the_truth_have_no_outage_and_asking_for_one_is_refused():
     assert make(1, observation="truth").unwrapped.flights.batch.faults == ()
     watched = make(1, observation="truth", include_covariance=True)
     assert len(watched.unwrapped.flights.batch.faults) == 1

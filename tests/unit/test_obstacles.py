@@ -193,7 +193,7 @@ def test_contact_is_contact_to_the_last_bit(gap, touches):
     assert bool(batch.read("collided")[0]) is touches
 
 
-def test_who_leaves_the_geofence_ends_there():
+def test_leaving_the_geofence_ends_an_episode():
     low, high = (-9.0, -2.0, -1.0), (9.0, 2.0, 4.0)
     batch = circling(WorldParams(geofence=(low, high)))
     outside = np.zeros(8, bool)

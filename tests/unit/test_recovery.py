@@ -57,7 +57,7 @@ def test_a_magnetometer_tells_of_a_gyro_that_has_changed():
     assert beyond(batch, 6.0).mean() <= 0.1  # 0.35 if a drift doubted the bias no more than others
 
 
-def test_whether_a_flight_is_lost_does_not_depend_on_who_flies_beside_it():
+def test_whether_a_flight_is_lost_does_not_depend_on_the_other_flights():
     """Phases differ, so that flights of a block measure at different ticks."""
     suite = quad_gym.sensor_suite("rtk").simplified()  # prompt ones, whose update is of all lanes
     fault = GyroBiasStep(start=0.5, size=math.radians(3.0))
@@ -130,7 +130,7 @@ def test_a_filter_without_a_gate_watches_its_innovations_where_it_keeps_them():
 
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
-def test_a_filter_by_itself_doubts_itself_however_it_was_started(kind):
+def test_a_filter_alone_doubts_itself_after_any_start(kind):
     """Sound fixes 5 m away from where it was told to be, at 10 Hz: it moves there."""
     suite = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
     kalman = kind(sensors=suite)

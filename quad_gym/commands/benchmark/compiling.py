@@ -44,7 +44,7 @@ CONFIGURATIONS = {
 }
 """Suite, what comes before the environment, and its keywords; edits are made with the last one."""
 
-EDITED = ("kernels/task/reward.py", "kernels/filter/predict.py")
+EDITED = ("kernels/task/reward_and_endings.py", "kernels/filter/predict.py")
 """Sources that get one more constant, each after the other."""
 
 

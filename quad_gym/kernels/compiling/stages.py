@@ -219,15 +219,15 @@ SOURCES = {
     ),
     Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_slow(s) and s["warm"] > 0),
     Stage.AVERAGE_IMU: Source(
-        "sensors.measure", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
+        "sensors.imu", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
     ),
     Stage.CORRUPT_FEATURES: Source("sensors.faults", "corrupt_features_stage", _corrupts),
     Stage.CORRUPT_GNSS: Source("sensors.faults", "corrupt_gnss_stage", _corrupts),
     Stage.EXCHANGE: Source("filter.waiting", "exchange_stage", _late),
     Stage.INCREMENT: Source("filter.waiting", "increment_stage", _late),
     Stage.LOOK: Source("task.look", "look_stage", _always),
-    Stage.JUDGE: Source("task.reward", "judge_stage", _always),
-    Stage.DRIFT_BIASES: Source("sensors.measure", "drift_biases_stage", _filter),
+    Stage.JUDGE: Source("task.reward_and_endings", "judge_stage", _always),
+    Stage.DRIFT_BIASES: Source("sensors.imu", "drift_biases_stage", _filter),
     Stage.FOLLOW: Source("task.follow", "follow_stage", _follows),
     Stage.REST_ON_PAD: Source("vehicle.pad", "rest_on_pad_stage", _pad),
     Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),

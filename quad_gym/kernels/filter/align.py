@@ -13,7 +13,7 @@ from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
 from quad_gym.kernels.filter.slow import begin_slow
 from quad_gym.kernels.filter.wahba import wahba
-from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.maths.elementary import maximum, minimum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky33, lower33, solve_right33
 from quad_gym.kernels.maths.linalg import (
     add33,
@@ -24,6 +24,7 @@ from quad_gym.kernels.maths.linalg import (
     keep33,
     keep_block,
     load3,
+    load4,
     load33,
     load_block,
     multiply,
@@ -36,11 +37,11 @@ from quad_gym.kernels.maths.linalg import (
     transpose,
     unit_or,
 )
-from quad_gym.kernels.maths.rotation import level_attitude
-from quad_gym.kernels.sensors.measure import look_along_mark
+from quad_gym.kernels.maths.random import normal_pair, stream_of
+from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import FilterForm
+from quad_gym.records import DRAW_MARK, FilterForm
 
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 NOTHING = (0.0, 0.0, 0.0)
@@ -158,6 +159,17 @@ def known_velocity(flight, settings):
         select(known[2], zero, drawn[2]),
     )
     return v_I, variance
+
+
+@kernel
+def look_along_mark(flight, p):
+    """Level direction in I of the body x axis, as well as the place of the start tells it."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    zero = 0.0 * p.dt
+    x_I = unit_or((R_BI[0][0], R_BI[0][1], zero), (zero + 1.0, zero, zero))
+    n, _ = normal_pair(stream_of(flight), DRAW_MARK)
+    s, c = sin_cos(p.heading_sigma * n)
+    return (c * x_I[0] - s * x_I[1], s * x_I[0] + c * x_I[1], zero)
 
 
 @stage

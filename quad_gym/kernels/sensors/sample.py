@@ -2,13 +2,16 @@
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import add, keep3, load3, store3
-from quad_gym.kernels.measurements import features, velocity
+from quad_gym.kernels.maths.linalg import add, keep3, load3, load4, store3
+from quad_gym.kernels.maths.random import six_normals, stream_of
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.measurements import baseline, features, position, velocity
 from quad_gym.kernels.measurements.position import drift_gnss
 from quad_gym.kernels.sensors.faults import gnss_heard
-from quad_gym.kernels.sensors.measure import measure_gnss, measure_imu
+from quad_gym.kernels.sensors.imu import measure_imu
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import DRAW_GNSS
 
 _DISTURB_IMU, _TURN_BASELINE = int(Stage.DISTURB_IMU), int(Stage.TURN_BASELINE)
 _LIMIT_CAMERA, _HIDE_FEATURES = int(Stage.LIMIT_CAMERA), int(Stage.HIDE_FEATURES)
@@ -30,6 +33,16 @@ def _sample_imu(flight, world, settings, work, stages, mask, starting):
         keep3(flight.w_before, mask, load3(flight.w_meas))
     if settings.faults:
         call_stage(stages, _SATURATE_IMU, flight, world, world, settings, work, 0)
+
+
+@kernel
+def measure_gnss(flight, p, paired, mask):
+    """Measure antenna position, and the baseline if there is one (`paired`), in G, where `mask`."""
+    R_BI = quaternion_to_dcm(load4(flight.q))
+    n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
+    position.measure(flight, p, R_BI, n_p, mask)
+    if paired:
+        baseline.measure(flight, p, R_BI, n_b, mask)
 
 
 @kernel

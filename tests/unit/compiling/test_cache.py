@@ -143,7 +143,7 @@ def test_a_damaged_file_is_compiled_again_and_replaced(module, parts, damage, ca
     assert parts.compiled() == ["a", "a"]
 
 
-def test_files_of_a_function_that_nobody_wants_any_more_are_deleted(module, parts):
+def test_stale_files_of_a_function_are_deleted(module, parts):
     call(module.a)
     (file,) = parts.files("code")
     old = [file.with_name(f"{file.name[: -len('.code') - 32]}{k:032x}.code") for k in range(12)]

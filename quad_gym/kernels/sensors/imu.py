@@ -1,11 +1,10 @@
-"""What the IMU measures at the present instant, and what a GNSS fix is made of.
+"""The IMU: what it measures at the present instant, and how its biases drift.
 
 Every draw has a fixed number within its instant, so that a measurement does not depend on which
 others are taken. What GNSS and camera measure is in `kernels/measurements/`.
 """
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
@@ -16,11 +15,9 @@ from quad_gym.kernels.maths.linalg import (
     scale,
     select3,
     sub,
-    unit_or,
 )
-from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of
+from quad_gym.kernels.maths.random import six_normals, stream_of
 from quad_gym.kernels.maths.rotation import mean_quaternion, quaternion_to_dcm, rotation_between
-from quad_gym.kernels.measurements import baseline, position
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.dynamics import (
     accelerations,
@@ -30,9 +27,7 @@ from quad_gym.kernels.vehicle.dynamics import (
 )
 from quad_gym.records import (
     DRAW_BIAS,
-    DRAW_GNSS,
     DRAW_IMU,
-    DRAW_MARK,
 )
 
 
@@ -105,27 +100,6 @@ def measure_imu_average(flight, p, start, mask):
     R_mid = quaternion_to_dcm(mean_quaternion(q_start, q_end))
     f_B = apply(R_mid, (a_I[0], a_I[1], a_I[2] + p.gravity))
     _sample_imu(flight, p, scale(rate, rotation_between(q_start, q_end)), f_B, mask)
-
-
-@kernel
-def measure_gnss(flight, p, paired, mask):
-    """Measure antenna position, and the baseline if there is one (`paired`), in G, where `mask`."""
-    R_BI = quaternion_to_dcm(load4(flight.q))
-    n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
-    position.measure(flight, p, R_BI, n_p, mask)
-    if paired:
-        baseline.measure(flight, p, R_BI, n_b, mask)
-
-
-@kernel
-def look_along_mark(flight, p):
-    """Level direction in I of the body x axis, as well as the place of the start tells it."""
-    R_BI = quaternion_to_dcm(load4(flight.q))
-    zero = 0.0 * p.dt
-    x_I = unit_or((R_BI[0][0], R_BI[0][1], zero), (zero + 1.0, zero, zero))
-    n, _ = normal_pair(stream_of(flight), DRAW_MARK)
-    s, c = sin_cos(p.heading_sigma * n)
-    return (c * x_I[0] - s * x_I[1], s * x_I[0] + c * x_I[1], zero)
 
 
 @stage
