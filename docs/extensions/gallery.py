@@ -13,6 +13,8 @@ LESSONS = (
     "wind.py",
     "own_trajectory.py",
     "moving_target.py",
+    "landing.py",
+    "slalom.py",
     "look_at_markers.py",
     "filter_alone.py",
     "replay.py",

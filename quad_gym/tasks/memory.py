@@ -25,9 +25,14 @@ class ReadableBatch(FlightBatch):
         self._stages |= {Stage.SHOW}
         self._shown = self._new_shown()
 
+    shown: Floats
+    """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only"""
+
     def _new_shown(self) -> Floats:
         # rows that lie a power of two apart would share a few lines of the cache
-        return np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
+        room = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
+        self.shown = room[:, : self.count]  # once a step, as a view reads it many times
+        return room
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         self._shown = self._new_shown()
@@ -35,18 +40,13 @@ class ReadableBatch(FlightBatch):
             self._crew.gather()  # nobody may still write to the memory that goes
             self._calls.show_into(self._shown)
         observations = super()._run(command)
-        self._shown.flags.writeable = False
+        self.shown.flags.writeable = False
         return observations
 
     def _calls_of_threads(self) -> Calls:
         calls = super()._calls_of_threads()
         calls.show_into(self._shown)
         return calls
-
-    @property
-    def shown(self) -> Floats:
-        """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only."""
-        return self._shown[:, : self.count]
 
     def columns(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (..., n)."""

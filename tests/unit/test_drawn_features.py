@@ -174,7 +174,7 @@ def test_a_record_has_the_features_of_its_episode():
     flights = batch(3)
     recorder = FlightRecorder(flights, 2)
     recorder.keep()
-    np.testing.assert_array_equal(recorder.flight().stage.features_I, flights.feature_places()[2])
+    np.testing.assert_array_equal(recorder.flight.stage.features_I, flights.feature_places()[2])
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,88 @@
+"""
+Land on a pad
+=============
+
+A task of your own with ground that carries: the vehicle hovers, the pad lies up to a meter away,
+and PPO learns to set the vehicle down on it.
+"""
+
+from pathlib import Path
+
+import gymnasium
+import matplotlib.pyplot as plt
+import numpy as np
+
+import quad_gym
+from baselines.compiled_ppo.ppo import CompiledPPO
+from baselines.mlp import MlpPolicy
+from baselines.recipes import Recipe
+
+# %%
+# A step on the ground is paid where it is on the pad, and the way there a little. Touching the
+# ground faster than 0.5 m/s ends the episode, and with it all further pay.
+
+
+class Landing(quad_gym.Task):
+    state = {"pad": np.zeros(2)}
+    observes = {"to_pad": quad_gym.Observed("m", "B", -5.0, 5.0)}
+
+    def reset(self, view, rng):
+        view.state.pad = view.reference_position[:, :2] + rng.uniform(-1.0, 1.0, (view.count, 2))
+
+    def miss(self, view):
+        return np.linalg.norm(view.position[:, :2] - view.state.pad, axis=1)
+
+    def reward(self, view):
+        near = 0.5 * np.exp(-2.0 * self.miss(view)) + 0.5 * np.exp(-10.0 * self.miss(view))
+        low = np.exp(-2.0 * np.maximum(view.position[:, 2], 0.0))
+        stands = view.truth.on_ground & (self.miss(view) < 0.2)
+        return 0.2 * near + 0.3 * near * low + 0.5 * stands - 0.02 * quad_gym.rewards.Effort()(view)
+
+    def observe(self, view):
+        pad = np.column_stack([view.state.pad, np.zeros(view.count)])
+        return {"to_pad": np.einsum("nij,nj->ni", view.seen.R_BI, pad - view.seen.position)}
+
+
+# %%
+# The actions are velocities. A million steps take about a minute on two cores; the policy that they
+# lead to is kept beside this file.
+
+KEYWORDS = {
+    "custom": Landing(),
+    "world": quad_gym.WorldParams(ground=quad_gym.GroundParams(max_touchdown_speed=0.5)),
+    "action": "velocity",
+    "height": 1.0,
+    "max_episode_steps": 300,
+}
+RECIPE = Recipe(
+    steps=1_000_000,
+    n_envs=128,
+    parameters={"n_steps": 32, "batch_size": 1024, "n_epochs": 5, "gamma": 0.98},
+    policy={"log_std_init": -1.0},
+)
+FILE = Path("policies/landing.npz")
+if not FILE.exists():
+    made = {"num_envs": RECIPE.n_envs, "autoreset_mode": "SameStep"}
+    model = CompiledPPO(gymnasium.make_vec("QuadGym/Hover-v0", **made, **KEYWORDS), RECIPE, seed=0)
+    model.learn(RECIPE.steps)
+    model.policy().save(FILE)
+
+# %%
+# What it has learned, in 200 episodes with other seeds:
+
+policy = MlpPolicy.load(FILE)
+envs = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=200, **KEYWORDS)
+observations, _ = envs.reset(seed=1_000)
+batch, heights, crashed = envs.unwrapped.flights.batch, [], np.zeros(200, bool)
+for _ in range(299):
+    observations, _, terminated, *_ = envs.step(policy.predict(observations)[0])
+    crashed |= terminated
+    heights.append(batch.read("r")[:, 2])
+miss = np.linalg.norm(batch.read("r")[:, :2] - batch.view.state.pad, axis=1)
+stands = (batch.read("footing") > 0.0) & ~crashed
+landed = (stands & (miss < 0.2)).mean()
+print(f"on the pad {100 * landed:.0f} %, median miss {100 * np.median(miss):.1f} cm")
+assert landed > 0.95
+
+plt.plot(np.arange(299) / 50.0, np.array(heights)[:, :20])
+plt.gca().set(xlabel="time [s]", ylabel="height of the center of mass [m]")

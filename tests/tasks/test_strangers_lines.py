@@ -1,0 +1,53 @@
+"""The first three examples of the page on tasks do what they say, in as few lines as they take."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[:3]
+
+
+def lines(block):
+    """Lines of code, less blank ones and imports."""
+    found = [line for line in block.splitlines() if line.strip()]
+    return [line for line in found if not line.startswith(("import ", "from "))]
+
+
+def run():
+    names, envs = {}, []
+    for block in BLOCKS:
+        exec(block, names)
+        envs.append(names["env"])
+    return names, envs
+
+
+def test_they_are_short():
+    assert [len(lines(block)) for block in BLOCKS] <= [3, 5, 10]
+    assert all(len(lines(block)) <= most for block, most in zip(BLOCKS, (3, 5, 10), strict=True))
+
+
+def test_they_do_what_they_say():
+    names, (reward, path, wall) = run()
+    plain = reward.unwrapped.spec
+    reward.reset(seed=0)
+    first = reward.step(np.full(4, 0.5, np.float32))[1]
+    again = reward.step(np.full(4, 0.5, np.float32))[1]
+    assert again > first + 0.05, "a change of the action costs 0.1 of its square more"
+    assert plain is None or plain.id == "QuadGym/Circle-v0"
+
+    flown = names["path"]
+    times = np.linspace(0.0, flown.duration, 20_001)
+    for point in names["points"]:
+        assert np.linalg.norm(flown(times) - point, axis=1).min() < 1e-3
+    path.reset(seed=0)
+
+    observation, _ = wall.reset(seed=0)
+    flights = wall.unwrapped.flights
+    place = next(field.slice for field in flights.table if field.name == "wall")
+    seen = flights.batch.read("r_seen")[0]
+    level = np.maximum(np.abs(seen[:2] - [6.0, 0.0]) - [2.0, 0.1], 0.0)
+    above = max(abs(seen[2] - 1.5) - 1.5, 0.0)
+    expected = np.linalg.norm([*level, above])
+    np.testing.assert_allclose(observation[place], expected, rtol=1e-5)
