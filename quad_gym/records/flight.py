@@ -161,6 +161,7 @@ _FILTER_FIELDS = (
     Field("reopened", (SENSOR_GROUPS,), "-", "times that the gate of each of these was reopened in this episode"),
     Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
     Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
+    Field("innovation_bias", (SENSOR_GROUPS, 3), "-", "the same of more of them"),
     Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
     Field("doubt_tick", (), "ticks", "when the filter last doubted itself"),
     Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),

@@ -35,6 +35,7 @@ from quad_gym.kernels.maths.linalg import (
     load_block,
     norm,
     scale,
+    scale33,
     store_block,
     sub,
     sum_of_outers,
@@ -59,6 +60,11 @@ DRIFT_ALARM = 0.55
 """Mean of the last innovations, in deviations, from which on they drift."""
 _MEMORY = 0.02
 """Weight of the latest innovation in the mean: it deviates by sqrt(0.02 / 1.98) = 0.1."""
+BIAS_ALARM = 0.195
+"""The same of the last 400 or so, which shows smaller ones."""
+_LONG_MEMORY = 0.0025
+"""The weight that goes with it: that mean deviates by 0.035."""
+DRIFT_FACTOR, BIAS_FACTOR = 16.0, 240.0
 LARGEST = 3.0
 """Innovations count as no more deviations than that in the mean, for the sake of outliers."""
 LOST_RATIO, FOUND_RATIO = 2.0, 1.5
@@ -80,9 +86,11 @@ def follow_drift(flight, group, has, first, second, third):
     values = (first, second, third)
     for i in range(3):
         value = clip(values[i], -LARGEST, LARGEST)
-        mean = flight.innovation_drift[group, i]
-        mean = mean + _MEMORY * (value - mean)
-        flight.innovation_drift[group, i] = select(has, mean, flight.innovation_drift[group, i])
+        mean, long = flight.innovation_drift[group, i], flight.innovation_bias[group, i]
+        latest = mean + _MEMORY * (value - mean)
+        flight.innovation_drift[group, i] = select(has, latest, mean)
+        latest = long + _LONG_MEMORY * (value - long)
+        flight.innovation_bias[group, i] = select(has, latest, long)
 
 
 @kernel
@@ -110,8 +118,9 @@ def begin_recovery(flight, mask):
     for group in range(SENSOR_GROUPS):
         flight.accepted_tick[group] = select(mask, 0.0, flight.accepted_tick[group])
         for i in range(3):
-            drift = flight.innovation_drift[group, i]
+            drift, bias = flight.innovation_drift[group, i], flight.innovation_bias[group, i]
             flight.innovation_drift[group, i] = select(mask, 0.0, drift)
+            flight.innovation_bias[group, i] = select(mask, 0.0, bias)
     flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
     flight.lost = select(mask, 0.0, flight.lost)
     flight.doubt_tick = select(mask, -1e9, flight.doubt_tick)
@@ -129,10 +138,11 @@ def _squares(nu, mask):
 @kernel
 def drifts(flight, group):
     """Where the innovations of a group of measurements drift."""
-    largest = abs(flight.innovation_drift[group, 0])
-    largest = maximum(largest, abs(flight.innovation_drift[group, 1]))
-    largest = maximum(largest, abs(flight.innovation_drift[group, 2]))
-    return largest > DRIFT_ALARM
+    drift, bias = 0.0 * flight.tick, 0.0 * flight.tick
+    for i in range(3):
+        drift = maximum(drift, abs(flight.innovation_drift[group, i]))
+        bias = maximum(bias, abs(flight.innovation_bias[group, i]))
+    return (drift > DRIFT_ALARM) | (bias > BIAS_ALARM)
 
 
 @kernel
@@ -179,7 +189,7 @@ def _doubt_features(flight, p, feature_count, camera):
 
 
 @kernel
-def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, slow, D_d, p, stages):
+def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, slow, D_d, p, stages, factor):
     """P + D, with D of all parts of the state, where `mask`; return where it failed.
 
     There the covariance stays as it was.
@@ -187,7 +197,7 @@ def _add_to_covariance(flight, work, D_r, D_v, D_e, D_a, D_g, mask, slow, D_d, p
     L, P = flight.L, work.P
     for i in range(0, 15, 3):
         for j in range(0, i + 3, 3):
-            store_block(P, i, j, sum_of_outers(L, i, L, j, j + 3))
+            store_block(P, i, j, scale33(factor, sum_of_outers(L, i, L, j, j + 3)))
     store_block(P, R, R, add33(load_block(P, R, R), D_r))
     store_block(P, V, V, add33(load_block(P, V, V), D_v))
     store_block(P, E, E, add33(load_block(P, E, E), D_e))
@@ -221,6 +231,15 @@ def _variance_of(flight, row):
             if j <= row + i:
                 total = total + flight.L[row + i, j] * flight.L[row + i, j]
     return total / 3.0
+
+
+@kernel
+def tell_drifts(flight, mask):
+    """Count a filter that only watches its innovations as lost while they drift, where `mask`."""
+    drifting = drifts(flight, 0)
+    for group in range(1, SENSOR_GROUPS):
+        drifting = drifting | drifts(flight, group)
+    flight.doubt_tick = select(mask & drifting, flight.tick, flight.doubt_tick)
 
 
 @kernel
@@ -274,12 +293,13 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
     D_g = D_g + _square_of(math.sqrt(angle) / T_c, _MOST_GYRO_BIAS, camera)
 
     # a drift alone: four times the deviations of the biases
-    more_a, more_g = 15.0 * _variance_of(flight, BA), 15.0 * _variance_of(flight, BG)
+    factor = select(drifting, DRIFT_FACTOR, 1.0)
+    more_a, more_g = BIAS_FACTOR * _variance_of(flight, BA), BIAS_FACTOR * _variance_of(flight, BG)
     D_a = D_a + select(drifting, minimum(more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
     D_g = D_g + select(drifting, minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS), 0.0)
 
     failed = _add_to_covariance(
-        flight, work, D_r, D_v, D_e, D_a, D_g, doubtful, slow, D_d, p, stages
+        flight, work, D_r, D_v, D_e, D_a, D_g, doubtful, slow, D_d, p, stages, factor
     )
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
@@ -291,5 +311,6 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
         flight.reopened[group] = select(done, flight.reopened[group] + 1.0, flight.reopened[group])
         flight.rejected_in_row[group] = select(done, 0.0, row[group])
         for i in range(3):
-            mean = flight.innovation_drift[group, i]
+            mean, bias = flight.innovation_drift[group, i], flight.innovation_bias[group, i]
             flight.innovation_drift[group, i] = select(doubtful, 0.0, mean)
+            flight.innovation_bias[group, i] = select(doubtful, 0.0, bias)
