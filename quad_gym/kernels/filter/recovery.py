@@ -60,10 +60,12 @@ DRIFT_ALARM = 0.55
 """Mean of the last innovations, in deviations, from which on they drift."""
 _MEMORY = 0.02
 """Weight of the latest innovation in the mean: it deviates by sqrt(0.02 / 1.98) = 0.1."""
-BIAS_ALARM = 0.195
-"""The same of the last 400 or so, which shows smaller ones."""
-_LONG_MEMORY = 0.0025
-"""The weight that goes with it: that mean deviates by 0.035."""
+_CORRECTION_TIME = 2.0
+"""How long corrections of the biases are added up [s]."""
+_ONE_WAY = 6.0
+"""Deviations of their sum from which on they go one way."""
+_REMAINING = 9.0
+"""Square of how many times that sum may still be missing."""
 DRIFT_FACTOR, BIAS_FACTOR = 16.0, 240.0
 LARGEST = 3.0
 """Innovations count as no more deviations than that in the mean, for the sake of outliers."""
@@ -86,11 +88,48 @@ def follow_drift(flight, group, has, first, second, third):
     values = (first, second, third)
     for i in range(3):
         value = clip(values[i], -LARGEST, LARGEST)
-        mean, long = flight.innovation_drift[group, i], flight.innovation_bias[group, i]
-        latest = mean + _MEMORY * (value - mean)
-        flight.innovation_drift[group, i] = select(has, latest, mean)
-        latest = long + _LONG_MEMORY * (value - long)
-        flight.innovation_bias[group, i] = select(has, latest, long)
+        mean = flight.innovation_drift[group, i]
+        mean = mean + _MEMORY * (value - mean)
+        flight.innovation_drift[group, i] = select(has, mean, flight.innovation_drift[group, i])
+
+
+@kernel
+def follow_corrections(flight, p, L, L9, dx, columns, ok):
+    """Add up an update's corrections of the biases, and their variances, where `ok`.
+
+    Args:
+        flight: Record.
+        p: Parameters as the filter believes them.
+        L: The factor before the update.
+        L9: The columns of the factor that the update has changed.
+        dx: The correction of the state.
+        columns: How many columns these are.
+        ok: Which lanes.
+    """
+    kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _CORRECTION_TIME, 0.0)
+    for i in range(6):
+        variance = 0.0 * kept
+        for j in range(columns):
+            if j < 15:
+                variance = variance + L[BA + i, j] * L[BA + i, j]
+            variance = variance - L9[BA + i, j] * L9[BA + i, j]
+        total = kept * flight.corrected[i] + dx[BA + i]
+        flight.corrected[i] = select(ok, total, flight.corrected[i])
+        variance = kept * kept * flight.corrected_variance[i] + maximum(variance, 0.0)
+        before = flight.corrected_variance[i]
+        flight.corrected_variance[i] = select(ok, variance, before)
+    flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
+
+
+@kernel
+def _one_way(flight, first):
+    """Where the corrections of three biases from `first` on go one way, and how far [squared]."""
+    largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
+    for i in range(3):
+        total, variance = flight.corrected[first + i], flight.corrected_variance[first + i]
+        largest = maximum(largest, total * total - _ONE_WAY * _ONE_WAY * variance)
+        square = maximum(square, total * total)
+    return largest > 0.0, square
 
 
 @kernel
@@ -113,14 +152,22 @@ def camera_fits(flight, p):
 
 
 @kernel
+def _forget_corrections(flight, mask):
+    for i in range(6):
+        flight.corrected[i] = select(mask, 0.0, flight.corrected[i])
+        flight.corrected_variance[i] = select(mask, 0.0, flight.corrected_variance[i])
+    flight.corrected_tick = select(mask, flight.tick, flight.corrected_tick)
+
+
+@kernel
 def begin_recovery(flight, mask):
     """Forget all doubts at the start of an episode, where `mask`."""
     for group in range(SENSOR_GROUPS):
         flight.accepted_tick[group] = select(mask, 0.0, flight.accepted_tick[group])
         for i in range(3):
-            drift, bias = flight.innovation_drift[group, i], flight.innovation_bias[group, i]
+            drift = flight.innovation_drift[group, i]
             flight.innovation_drift[group, i] = select(mask, 0.0, drift)
-            flight.innovation_bias[group, i] = select(mask, 0.0, bias)
+    _forget_corrections(flight, mask)
     flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
     flight.lost = select(mask, 0.0, flight.lost)
     flight.doubt_tick = select(mask, -1e9, flight.doubt_tick)
@@ -138,11 +185,10 @@ def _squares(nu, mask):
 @kernel
 def drifts(flight, group):
     """Where the innovations of a group of measurements drift."""
-    drift, bias = 0.0 * flight.tick, 0.0 * flight.tick
-    for i in range(3):
-        drift = maximum(drift, abs(flight.innovation_drift[group, i]))
-        bias = maximum(bias, abs(flight.innovation_bias[group, i]))
-    return (drift > DRIFT_ALARM) | (bias > BIAS_ALARM)
+    largest = abs(flight.innovation_drift[group, 0])
+    largest = maximum(largest, abs(flight.innovation_drift[group, 1]))
+    largest = maximum(largest, abs(flight.innovation_drift[group, 2]))
+    return largest > DRIFT_ALARM
 
 
 @kernel
@@ -239,6 +285,9 @@ def tell_drifts(flight, mask):
     drifting = drifts(flight, 0)
     for group in range(1, SENSOR_GROUPS):
         drifting = drifting | drifts(flight, group)
+    accel, _ = _one_way(flight, 0)
+    gyro, _ = _one_way(flight, 3)
+    drifting = drifting | accel | gyro
     flight.doubt_tick = select(mask & drifting, flight.tick, flight.doubt_tick)
 
 
@@ -269,8 +318,11 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
             for s in range(AIDS):
                 drifting = drifting | drifts(flight, AID_GROUPS + s)
                 rejecting = rejecting | (mask & (row[AID_GROUPS + s] >= patience))
+    accel, more_a = _one_way(flight, 0)
+    gyro, more_g = _one_way(flight, 3)
     drifting = drifting & mask
-    doubtful = rejecting | drifting
+    accel, gyro = mask & accel, mask & gyro
+    doubtful = rejecting | drifting | accel | gyro
     if not any_of(doubtful):
         return
     nu = flight.innovation
@@ -293,7 +345,9 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
     D_g = D_g + _square_of(math.sqrt(angle) / T_c, _MOST_GYRO_BIAS, camera)
 
     # a drift alone: four times the deviations of the biases
-    factor = select(drifting, DRIFT_FACTOR, 1.0)
+    D_a = D_a + select(accel, minimum(_REMAINING * more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
+    D_g = D_g + select(gyro, minimum(_REMAINING * more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS), 0.0)
+    factor = select(drifting | accel | gyro, DRIFT_FACTOR, 1.0)
     more_a, more_g = BIAS_FACTOR * _variance_of(flight, BA), BIAS_FACTOR * _variance_of(flight, BG)
     D_a = D_a + select(drifting, minimum(more_a, _MOST_ACCEL_BIAS * _MOST_ACCEL_BIAS), 0.0)
     D_g = D_g + select(drifting, minimum(more_g, _MOST_GYRO_BIAS * _MOST_GYRO_BIAS), 0.0)
@@ -311,6 +365,6 @@ def raise_doubts(flight, p, work, feature_count, mask, slow, stages):
         flight.reopened[group] = select(done, flight.reopened[group] + 1.0, flight.reopened[group])
         flight.rejected_in_row[group] = select(done, 0.0, row[group])
         for i in range(3):
-            mean, bias = flight.innovation_drift[group, i], flight.innovation_bias[group, i]
+            mean = flight.innovation_drift[group, i]
             flight.innovation_drift[group, i] = select(doubtful, 0.0, mean)
-            flight.innovation_bias[group, i] = select(doubtful, 0.0, bias)
+    _forget_corrections(flight, doubtful)
