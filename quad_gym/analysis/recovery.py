@@ -136,5 +136,5 @@ def follow_recovery(
         right[k] = nees(errors, covariances) < bound
         told[k] = batch.read("lost") > 0.0
         far_off[k] = (np.abs(errors) > FAR_OFF * sigma).any(axis=1)
-    time = batch.sensors.imu.dt * stride * np.arange(1, looks + 1)
+    time = np.array([batch.sensors.imu.dt * stride * k for k in range(1, looks + 1)])
     return Recovery(time, right, told, far_off)

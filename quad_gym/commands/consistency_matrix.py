@@ -256,8 +256,8 @@ def run_matrix(
     }
 
     def fly(cell: Cell) -> dict[str, Any]:
-        options = {"flights": flights, "duration": duration, "first_seed": first_seed}
-        return measure(cell, **options, threads=threads)
+        many = {"flights": flights, "first_seed": first_seed, "threads": threads}
+        return measure(cell, duration=duration, **many)  # type: ignore[arg-type]
 
     def table(done: dict[str, Any]) -> str:
         return table_of(done, flights)

@@ -50,7 +50,9 @@ def test_the_time_to_recover_is_until_nearly_all_stay_right():
 
 
 def test_flights_are_right_and_far_off_as_a_plain_computation_says():
-    batch = fly(quad_gym.sensor_suite("rtk"), 64, filter_start="warm", faults=GyroBiasStep(start=0.3))
+    batch = fly(
+        quad_gym.sensor_suite("rtk"), 64, filter_start="warm", faults=GyroBiasStep(start=0.3)
+    )
     found = follow_recovery(batch, seeds=range(64), duration=1.5, every=0.5)
     square = nees(batch, slice(0, 9))
     np.testing.assert_array_equal(found.right[-1], square < stats.chi2.ppf(RIGHT, 9))

@@ -15,9 +15,10 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.doubts import raise_doubts
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
-from quad_gym.kernels.filter.recovery import follow_corrections, raise_doubts, tell_drifts
+from quad_gym.kernels.filter.recovery import follow_corrections, tell_drifts
 from quad_gym.kernels.filter.slow import load_slow, shift_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
@@ -297,8 +298,7 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     if (form & _WATCH) != 0 and any_of(failed):
         mark_failed(flight, p, work, settings, slow, failed)
     if (form & _GATE) != 0:
-        doubting, features = mask & logical_not(failed), settings.feature_count
-        raise_doubts(flight, p, work, features, doubting, slow, stages)
+        raise_doubts(flight, p, work, settings, mask & logical_not(failed), slow, stages)
     elif (form & _WATCH) != 0:
         tell_drifts(flight, mask)
 

@@ -6,6 +6,7 @@ arm's share turns with the error angles is neglected, so that the model is linea
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import V
+from quad_gym.kernels.filter.recovery import doubt_acceleration, suspect_group, time_of
 from quad_gym.kernels.maths.linalg import (
     add,
     add_to_diagonal,
@@ -17,6 +18,7 @@ from quad_gym.kernels.maths.linalg import (
     load4,
     load33,
     load_column3,
+    norm,
     scale,
     store3,
     sub,
@@ -108,6 +110,29 @@ def judge(flight, p, work, settings, slow, k):
 def mark_failed(flight, p, work, settings, slow, k):
     """Say that the update failed that it was part of, where `work.taking`."""
     mark_block(flight, VELOCITY_BLOCK, (work.taking > 0.0) & (flight.velocity_valid > 0.0))
+    return k
+
+
+# ---- doubts ----------------------------------------------------------------------------------
+
+
+@kernel
+def suspect(flight, p, work, settings, slow, k):
+    """Note whether velocities make the filter doubt itself."""
+    suspect_group(flight, p, work, VELOCITY_BLOCK, work.taking > 0.0)
+    return k
+
+
+@kernel
+def doubt(flight, p, work, settings, slow, k):
+    """Add to the covariance of what may be wrong, where velocities are doubted.
+
+    That is the velocity; accelerometer and tilt may have led there.
+    """
+    nu, doubted, P = load3(flight.innovation[VELOCITY_BLOCK]), work.doubted[VELOCITY_BLOCK], work.P
+    for i in range(3):
+        P[V + i, V + i] = P[V + i, V + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+    doubt_acceleration(p, P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), doubted)
     return k
 
 
