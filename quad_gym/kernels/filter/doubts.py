@@ -5,10 +5,12 @@ since the last acceptance may come from biases, so their variances grow likewise
 for the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g of
 that for the tilt. What each measurement doubts is in its file in `kernels/measurements/`.
 
-Where innovations drift, or corrections of the biases go one way, all of the covariance is
-multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and position, too,
-and correlations say how. The biases get more than that: sixteen times their deviation for a drift,
-three times the corrections that go one way.
+Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
+states is multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and
+position, too, and correlations say how. Slow errors of sensors keep theirs: a constant one
+that has become uncertain may stay so, such as hard iron, and the heading with it. The biases get
+more than that: sixteen times their deviation for a drift, three times the corrections that go one
+way.
 
 Source: ours.
 """
@@ -99,7 +101,7 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
     states = 15
     if slow is not None:
         states = 15 + slow.slow_states
-        fill_slow(flight, slow, P, factor)
+        fill_slow(flight, slow, P)
     _doubt_biases(flight, P, BA, drifting, accel, corrected_a, _MOST_ACCEL_BIAS)
     _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, _MOST_GYRO_BIAS)
     doubt(flight, p, work, settings, slow, 0)

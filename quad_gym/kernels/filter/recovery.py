@@ -33,6 +33,8 @@ _CORRECTION_TIME = 3.0
 """How long corrections of the biases are added up [s]."""
 _ONE_WAY = 5.0
 """Deviations of their sum from which on they go one way."""
+_HARMLESS = 1.0 / _ONE_WAY**2
+"""So that this sum is more than the bias's own deviation."""
 LARGEST = 3.0
 """Innovations count as no more deviations than that in the mean, for the sake of outliers."""
 LOST_RATIO, FOUND_RATIO = 2.0, 1.5
@@ -89,10 +91,19 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
 
 @kernel
 def one_way(flight, first):
-    """Where the corrections of three biases from `first` on go one way, and how far [squared]."""
+    """Where the corrections of three biases from `first` on go one way, and how far [squared].
+
+    They must add up to more than the deviation that the bias has: less does no harm, and may be
+    what rounding leaves of corrections by measurements that do not tell of biases yet.
+    """
     largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
     for i in range(3):
-        total, variance = flight.corrected[first + i], flight.corrected_variance[first + i]
+        variance, row = 0.0 * flight.tick, BA + first + i
+        for j in range(15):
+            if j <= row:
+                variance = variance + flight.L[row, j] * flight.L[row, j]
+        total = flight.corrected[first + i]
+        variance = _HARMLESS * variance + flight.corrected_variance[first + i]
         largest = maximum(largest, total * total - _ONE_WAY * _ONE_WAY * variance)
         square = maximum(square, total * total)
     return largest > 0.0, square

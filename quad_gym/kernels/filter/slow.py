@@ -30,7 +30,6 @@ from quad_gym.kernels.maths.linalg import (
     load_block,
     multiply,
     scale,
-    scale33,
     store_block,
     sum_of_outers,
     sum_of_squares,
@@ -158,16 +157,15 @@ def shift_slow(flight, slow, columns, ok, shift):
 
 
 @kernel
-def fill_slow(flight, slow, P, factor):
-    """Fill the rows of d in P with the present ones times a factor."""
+def fill_slow(flight, slow, P):
+    """Fill the rows of d in P with the present ones."""
     L, M = flight.L, flight.L_slow
     for i in range(0, slow.slow_states, 3):
         for j in range(0, D, 3):
-            store_block(P, D + i, j, scale33(factor, sum_of_outers(M, i, L, j, j + 3)))
+            store_block(P, D + i, j, sum_of_outers(M, i, L, j, j + 3))
         for j in range(0, i, 3):
-            block = sum_of_outers(M, i, M, j, D + j + 3)
-            store_block(P, D + i, D + j, scale33(factor, block))
-        store_block(P, D + i, D + i, scale33(factor, sum_of_squares(M, i, D + i + 3)))
+            store_block(P, D + i, D + j, sum_of_outers(M, i, M, j, D + j + 3))
+        store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
 
 
 # ---- late measurements -----------------------------------------------------------------------
