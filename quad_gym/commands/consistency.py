@@ -18,10 +18,13 @@ configuration and the seeds (consistency.json). For example:
 
 With --matrix it flies every suite on every task from both starts, and with faults, latencies,
 mountings, randomization, drawn starts and wind on one task, and writes one table of all means.
-A run that was interrupted goes on where it was when it is started again.
+With --recovery it flies every fault on every suite that can have it, and tables which filters are
+right again after 10 s, which say that they are lost, and how often they say so without cause.
+Either run, when it was interrupted, goes on where it was.
 
-  quad-gym consistency --matrix                    everything; some 250 cells
+  quad-gym consistency --matrix                    everything; some 200 cells
   quad-gym consistency --matrix --cells suites     the suites on all tasks
+  quad-gym consistency --recovery                  after faults
 """
 
 import math
@@ -30,7 +33,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import arg
 
@@ -93,6 +96,12 @@ class Args:
     matrix: bool = False
     """fly the matrix of configurations; of the other options only episodes, seed, duration,
     output and threads concern it"""
+    recovery: bool = False
+    """fly faults and see how filters recover; of the other options only episodes, seed, output,
+    page and threads concern it"""
+    page: Path | None = None
+    """with --matrix or --recovery: a page of Markdown whose table is replaced, between
+    <!-- table matrix --> and <!-- end of table matrix -->, or the same with recovery"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
     threads: int | None = None
@@ -135,9 +144,10 @@ class Args:
     def __post_init__(self) -> None:
         """Check the numbers."""
         if self.flights is None:
-            object.__setattr__(self, "flights", 400 if self.matrix else 4000)
+            object.__setattr__(self, "flights", 400 if self.tables else 4000)
         if self.output is None:
             folder = "consistency_matrix" if self.matrix else "consistency"
+            folder = "consistency_recovery" if self.recovery else folder
             object.__setattr__(self, "output", Path("results") / folder)
         if self.count < 2:
             raise ValueError(f"--episodes must be at least 2, got {self.flights}")
@@ -145,6 +155,10 @@ class Args:
             raise ValueError(f"ENV_ID must be a task of tracking, got {self.env_id!r}")
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
+        if self.matrix and self.recovery:
+            raise ValueError("--matrix and --recovery must not be given together")
+        if self.page is not None and not self.tables:
+            raise ValueError("--page needs --matrix or --recovery")
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -156,6 +170,11 @@ class Args:
     def task(self) -> str:
         """The short name of what is flown."""
         return IDS[self.env_id]
+
+    @property
+    def tables(self) -> bool:
+        """Whether a table of many configurations is wanted."""
+        return self.matrix or self.recovery
 
     @property
     def count(self) -> int:
@@ -284,32 +303,35 @@ def report_of(findings: Findings) -> str:
     return "\n\n".join([*tables, "\n".join(lines)])
 
 
-def fly_matrix(args: Args) -> None:
-    """Fly the matrix, and say where it is written."""
-    from quad_gym.commands.consistency_matrix import cells_of, run_matrix
+def fly_tables(args: Args) -> None:
+    """Fly a table of configurations, and say where it is written."""
+    from quad_gym.commands import consistency_matrix as matrix
+    from quad_gym.commands import consistency_recovery as recovery
+    from quad_gym.commands.resumable import put_table, require_table
 
+    name = "matrix" if args.matrix else "recovery"
     with usage_errors():
         require_writable("--output", args.folder)
-    cells = run_matrix(
-        cells_of(args.cells),
-        args.folder,
-        flights=args.count,
-        duration=args.duration,
-        first_seed=args.first_seed,
-        threads=args.threads,
-    )
-    unexpected = sum(
-        not ("" in cell["expected"] or name in cell["expected"])
-        for cell in cells.values()
-        for name in cell["misses"]
-    )
-    print(f"{len(cells)} cells, {unexpected} unexpected misses; see {args.folder / 'matrix.md'}.")
+        if args.page is not None:
+            require_table(args.page, name)
+    flown: dict[str, Any] = {"flights": args.count, "first_seed": args.first_seed}
+    flown["threads"] = args.threads
+    if args.matrix:
+        chosen = matrix.cells_of(args.cells)
+        found = matrix.run_matrix(chosen, args.folder, duration=args.duration, **flown)
+        wrong, table = matrix.unexpected(found), matrix.table_of(found, args.count)
+    else:
+        found = recovery.run_recovery(list(recovery.trials()), args.folder, **flown)
+        wrong, table = recovery.unexpected(found), recovery.table_of(found, args.count)
+    if args.page is not None:
+        put_table(args.page, name, table)
+    print(f"{len(found)} cells, {wrong} unexpected misses; see {args.folder / name}.md.")
 
 
 def main(args: Args) -> None:
     """Fly, measure, judge, draw and write."""
-    if args.matrix:
-        fly_matrix(args)
+    if args.tables:
+        fly_tables(args)
         return
     with usage_errors():
         require_matplotlib()

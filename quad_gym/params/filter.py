@@ -50,10 +50,11 @@ class FilterParams(Checked):
     """whether the fix that starts the filter is also its first measurement, as in the laboratory;
     that counts it twice, so suites other than "lab" do not"""
     gradual_above: float | None = None
-    """deviation of the attitude above which images are processed in steps, each about the estimate
-    that the one before has left [rad]; None: always whole (report). The derivatives of pixels are
-    off by the square of the attitude's error, more than a precise camera's noise at a rough start
-    """
+    """deviation of a feature's predicted direction above which images are processed in steps, each
+    about the estimate that the one before has left [rad]; None: always whole (report). The
+    derivatives of pixels are off by the square of that error, more than a precise camera's noise at
+    a rough start or after an outage. Without a gate, features beyond `gate_direction_sigma` are
+    then left out where there is GNSS, as by a gate"""
     gate_false_alarm: float = 0.0
     """probability that a valid measurement is rejected: a position, baseline, velocity or feature
     whose normalized innovation squared exceeds the chi-square quantile of this alarm level is left

@@ -251,8 +251,8 @@ STALE = RTK.replace(
 
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
-    # the laboratory's pixels are coarse, so that images need not be processed in steps, and no
-    # measurement of it is corrupted, so that none has to be rejected
+    # the laboratory's pixels are coarse, so that images need be processed in steps after outages
+    # alone, and no measurement of it is corrupted, so that none has to be rejected
     estimator=FIELD_FILTER.replace(gradual_above=0.1, gate_false_alarm=0.0),
     noisy=NoisyObservationParams(
         position=0.0020, velocity=0.0150, attitude=0.0011, body_rates=0.0124

@@ -117,7 +117,7 @@ PARAMS_FIELDS = (
     Field("initial_velocity_variance", (), "m^2/s^2", "of the filter's start"),
     Field("initial_scale", (), "-", "factor on the first fix's covariance"),
     Field("initial_tilt_sigma", (), "rad", "of roll and pitch at a level start; 0: attitude by Wahba's problem"),
-    Field("gradual_above", (), "rad", "deviation of the attitude above which images are processed in steps"),
+    Field("gradual_above", (), "rad", "deviation of a direction above which images are processed in steps"),
     Field("gate_position", (), "-", "largest accepted NIS of a position"),
     Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
     Field("gate_uncertainty", (), "rad^2", "largest sum of the variances of a feature's predicted direction"),

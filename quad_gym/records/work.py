@@ -8,6 +8,7 @@ from quad_gym.records.sizes import (
     MAX_OBSERVATION,
     MAX_SLOW,
     MAX_STATES,
+    SENSOR_GROUPS,
     SENSORS,
     TERMS,
     Field,
@@ -46,6 +47,8 @@ WORK_FIELDS = (
     Field("judged_nis", (), "-", "sum of their NIS"),
     Field("judged_freedoms", (), "-", "sum of their degrees of freedom"),
     Field("left_out", (), "-", "numbers masked"),
+    Field("doubted", (SENSOR_GROUPS,), "0 or 1", "groups rejected so often that the filter doubts itself"),
+    Field("drifting", (), "0 or 1", "whether the innovations of any drift"),
     Field("hidden", (MAX_FEATURES,), "0 or 1", "features whose directions are too uncertain"),
     # the segment of a trajectory at an instant
     Field("path_time", (), "s", "of the episode; then since the beginning of the segment"),

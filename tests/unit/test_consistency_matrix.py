@@ -90,7 +90,7 @@ def test_wrong_options_are_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", matrix.STARTS)
-@pytest.mark.parametrize("task", ["hover", "circle", "random_trajectory"])
+@pytest.mark.parametrize("task", ["hover", "circle", "random_trajectory", "waypoints"])
 @pytest.mark.parametrize("suite", [name for name in SUITES if name != "lab"])
 def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
     """Means over 400 flights of 10 s: 0.8 is 2.9 deviations even if a flight's errors stayed."""
@@ -99,3 +99,13 @@ def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
     assert found["filters_failed"] == 0
     assert 14.2 < found["values"]["state"] < 15.8
     assert cell.flown == quad_gym.sensor_suite(suite)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", matrix.STARTS)
+@pytest.mark.parametrize("fault", ["gnss_outage", "gnss_outage+camera_occlusion", "baseline_loss"])
+def test_the_default_filter_stays_consistent_while_sensors_are_silent(fault, start):
+    """Of 400 flights none may take a feature near a position that is uncertain for a fix."""
+    cell = matrix.Cell("standard", "random_trajectory", start, keywords={"faults": fault})
+    found = matrix.measure(cell, flights=400, duration=10.0, first_seed=0)
+    assert 14.2 < found["values"]["state"] < 15.8

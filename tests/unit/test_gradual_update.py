@@ -89,3 +89,28 @@ def test_a_rough_start_is_consistent_after_the_first_image_in_steps_only(kind):
 def test_a_deviation_that_is_invalid_is_refused():
     with pytest.raises(ValueError, match=r"^FilterParams.gradual_above must be"):
         quad_gym.FilterParams(gradual_above=0.0)
+
+
+@pytest.mark.parametrize("distance", [3.0, 30.0])
+def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
+    """A meter off at 3 m, a direction tells a distance that is wrong; at 30 m it is made use of."""
+    suite = quad_gym.sensor_suite("standard")
+    points = ((0.0, -distance, 0.0), (0.2, -distance, 0.0))
+    camera = suite.camera.replace(features_I=points, attitude=INDOOR.camera.attitude)
+    suite = suite.replace(camera=camera)
+    ukf = quad_gym.UnscentedKalmanFilter(suite)
+    covariance = np.diag(np.repeat([1.0, 0.1, 0.01, 0.2, 0.01], 3) ** 2)
+    ukf.set_state(
+        position=np.zeros(3),
+        velocity=np.zeros(3),
+        R_BI=np.eye(3),
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=covariance,
+    )
+    pixels = Camera(camera, rng=np.random.default_rng(3)).measure((0.8, 0.1, 0.3), np.eye(3))
+    assert np.isfinite(pixels).all()
+    ukf.update(pixels=pixels)
+    left_out = distance < 10.0
+    assert (np.abs(ukf.covariance - covariance).max() < 1e-12) == left_out
+    assert (np.abs(ukf.position).max() < 1e-9) == left_out

@@ -191,6 +191,27 @@ def test_the_filter_takes_vibration_for_white_noise_and_the_sensor_does_not():
     assert record["gyro_noise"] == pytest.approx(math.hypot(record["gyro_sigma"], 0.02), rel=1e-14)
 
 
+@pytest.mark.parametrize("lift", [0.0, 1.0, 2.5])
+def test_the_filter_counts_the_vibration_of_rotors_that_lift_what_it_measures(lift):
+    """In a tick: white noise, and vibration by the square of the specific force over g."""
+    imu = STANDARD.imu.replace(accel_vibration=0.3, gyro_vibration=0.02)
+    kalman = quad_gym.UnscentedKalmanFilter(STANDARD.replace(imu=imu))
+    kalman.set_state(
+        position=np.zeros(3),
+        velocity=np.zeros(3),
+        R_BI=np.eye(3),
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=1e-16 * np.eye(15),
+    )
+    kalman.predict(np.zeros(3), (0.0, 0.0, lift * VehicleParams().gravity))
+    added = np.diag(kalman.covariance) / imu.dt**2
+    accel = imu.accel_noise_density**2 * imu.rate + (0.3 * lift) ** 2
+    gyro = imu.gyro_noise_density**2 * imu.rate + (0.02 * lift) ** 2
+    np.testing.assert_allclose(added[5], accel, rtol=1e-6)  # up: gyro noise does not turn into it
+    np.testing.assert_allclose(added[6:9], gyro, rtol=1e-6)
+
+
 # ---- headings ---------------------------------------------------------------------------------
 
 

@@ -7,6 +7,8 @@ import pytest
 
 import quad_gym
 import quad_gym.frames
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import AccelBiasStep, GnssRamp, GyroBiasStep
@@ -47,14 +49,59 @@ def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
 
 def test_a_magnetometer_tells_of_a_gyro_that_has_changed():
     """It is all that watches the heading; what it says drifts before any of it is rejected."""
-    step = GyroBiasStep(start=3.0, size=math.radians(1.0))
     batch = fly(
-        quad_gym.sensor_suite("consumer"), 128, task="circle", filter_start="warm", faults=step
+        quad_gym.sensor_suite("consumer"), 128, task="circle", filter_start="warm", faults=STEP
     )
-    steps(batch, 5.0)
+    steps(batch, 4.0)
     assert beyond(batch, 6.0).mean() > 0.9
-    steps(batch, 8.0)
-    assert beyond(batch, 6.0).mean() <= 0.1  # 0.35 if a drift doubted the bias no more than others
+    steps(batch, 9.0)
+    assert beyond(batch, 6.0).mean() <= 0.01
+
+
+def test_a_camera_alone_finds_a_small_gyro_step_by_corrections_that_go_one_way():
+    """Attitude and position make up for each other, so that innovations hardly show it."""
+    batch = fly(
+        quad_gym.sensor_suite("indoor"),
+        128,
+        filter_start="warm",
+        faults=GyroBiasStep(start=3.0, size=math.radians(0.4)),
+    )
+    told = np.zeros(128, bool)
+    for _ in range(20):
+        steps(batch, 0.2)
+        told |= batch.read("lost") > 0.0
+    assert told.mean() > 0.95
+    steps(batch, 6.0)
+    assert beyond(batch, 6.0).mean() <= 0.01
+
+
+def test_a_filter_without_a_gate_says_that_a_gyro_has_changed_and_leaves_its_estimate_alone():
+    """Its gyro bias errs for long, as nothing is inflated; flights are those of before."""
+    suite, found = quad_gym.sensor_suite("standard"), []
+    for innovations in (True, False):
+        batch = FlightBatch(
+            32,
+            sensors=suite,
+            task=TASK_DEFAULTS["hover"],
+            gains="tuned",
+            filter_start="warm",
+            innovations=innovations,
+            faults=GyroBiasStep(start=0.5, size=math.radians(3.0)),
+        )
+        batch.reset(seeds=range(32))
+        steps(batch, 3.0)
+        found.append(batch.read("L"))
+        assert (batch.read("lost") > 0.0).mean() == (1.0 if innovations else 0.0)
+    np.testing.assert_array_equal(*found)
+
+
+def test_corrections_of_a_right_filter_have_the_variance_that_they_are_given():
+    """Their sums over 3 s in deviations, 6 x 256 of them, are standard normal."""
+    batch = fly(quad_gym.sensor_suite("rtk"), FLIGHTS, start="hover", filter_start="warm")
+    steps(batch, 6.0)
+    scaled = batch.read("corrected") / np.sqrt(batch.read("corrected_variance"))
+    assert 0.9 < (scaled**2).mean() < 1.1  # 2.8 deviations of the mean of so many
+    assert np.abs(scaled).max() < 5.0
 
 
 def test_whether_a_flight_is_lost_does_not_depend_on_the_other_flights():

@@ -135,6 +135,9 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
     estimates = {*FILTER, "nis", "nis_dimension", "innovation", "innovation_sigma", "block_nis"}
     estimates |= {
         "innovation_drift",
+        "corrected",
+        "corrected_variance",
+        "corrected_tick",
         "nis_ratio",
         "lost",
         "accepted_tick",

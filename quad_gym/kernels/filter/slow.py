@@ -26,7 +26,6 @@ is None` is decided as they are compiled, so that a filter without d has none of
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.maths.linalg import (
-    add33,
     load3,
     load_block,
     multiply,
@@ -158,8 +157,8 @@ def shift_slow(flight, slow, columns, ok, shift):
 
 
 @kernel
-def add_to_slow(flight, slow, P, D_d):
-    """Fill the rows of d in P with the present ones and D_d more of the drift of GNSS positions."""
+def fill_slow(flight, slow, P):
+    """Fill the rows of d in P with the present ones."""
     L, M = flight.L, flight.L_slow
     for i in range(0, slow.slow_states, 3):
         for j in range(0, D, 3):
@@ -167,8 +166,6 @@ def add_to_slow(flight, slow, P, D_d):
         for j in range(0, i, 3):
             store_block(P, D + i, D + j, sum_of_outers(M, i, M, j, D + j + 3))
         store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
-    if slow.estimates_drift:
-        store_block(P, D, D, add33(load_block(P, D, D), D_d))
 
 
 # ---- late measurements -----------------------------------------------------------------------

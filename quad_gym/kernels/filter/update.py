@@ -15,9 +15,10 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.doubts import raise_doubts
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
-from quad_gym.kernels.filter.recovery import raise_doubts
+from quad_gym.kernels.filter.recovery import follow_corrections, tell_drifts
 from quad_gym.kernels.filter.slow import load_slow, shift_slow
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
@@ -276,6 +277,8 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     ok = wanted & (pivot > 0.0) & is_finite(total)
     keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))
     keep3(flight.v_hat, ok, add(load3(flight.v_hat), (dx[V], dx[V + 1], dx[V + 2])))
+    if (form & _WATCH) != 0:
+        follow_corrections(flight, p, L, L9, dx, columns, ok)
     R_BI = multiply(euler_to_dcm((dx[E], dx[E + 1], dx[E + 2])), load33(flight.R_hat))
     keep33(flight.R_hat, ok, R_BI)
     keep3(flight.b_a_hat, ok, add(load3(flight.b_a_hat), (dx[BA], dx[BA + 1], dx[BA + 2])))
@@ -295,8 +298,9 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     if (form & _WATCH) != 0 and any_of(failed):
         mark_failed(flight, p, work, settings, slow, failed)
     if (form & _GATE) != 0:
-        doubting, features = mask & logical_not(failed), settings.feature_count
-        raise_doubts(flight, p, work, features, doubting, slow, stages)
+        raise_doubts(flight, p, work, settings, mask & logical_not(failed), slow, stages)
+    elif (form & _WATCH) != 0:
+        tell_drifts(flight, mask)
 
 
 @stage

@@ -12,9 +12,18 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.directions import direction_noise
 from quad_gym.kernels.filter.error_state import E
-from quad_gym.kernels.filter.recovery import camera_fits, follow_drift
+from quad_gym.kernels.filter.recovery import (
+    camera_fits,
+    doubt_rate,
+    follow_drift,
+    suspect_group,
+    time_of,
+)
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import (
     add,
+    add_outer,
+    add_to_diagonal,
     apply,
     apply_transposed,
     cross,
@@ -22,9 +31,11 @@ from quad_gym.kernels.maths.linalg import (
     keep3,
     load3,
     load33,
+    load_block,
     load_column3,
     norm,
     scale,
+    store_block,
 )
 from quad_gym.kernels.measurements.gate import judge_direction, leave_out
 from quad_gym.kernels.measurements.rows import (
@@ -128,3 +139,32 @@ def judge(flight, p, work, settings, slow, k):
     work.judged_freedoms = work.judged_freedoms + 2.0 * counts
     leave_out(flight, work, settings, k, BASELINE_BLOCK, has, rejected, columns, 3.0)
     return k + 3
+
+
+# ---- doubts ----------------------------------------------------------------------------------
+
+
+@kernel
+def suspect(flight, p, work, settings, slow, k):
+    """Note whether baselines make the filter doubt itself; not against a camera that fits."""
+    suspect_group(flight, p, work, BASELINE_BLOCK, logical_not(camera_fits(flight, p)))
+    return k
+
+
+@kernel
+def doubt(flight, p, work, settings, slow, k):
+    """Add to the covariance of what may be wrong, where baselines are doubted.
+
+    That is the heading by the innovation to the side, and roll and pitch by that up; the gyro may
+    have led there.
+    """
+    R_BI, P, doubted = load33(flight.R_hat), work.P, work.doubted[BASELINE_BLOCK]
+    vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+    side = select(doubted > 0.0, flight.innovation[BASELINE_BLOCK, 0], 0.0)
+    up = select(doubted > 0.0, flight.innovation[BASELINE_BLOCK, 1], 0.0)
+    P_ee = add_to_diagonal(load_block(P, E, E), up * up)
+    P_ee = add_outer(P_ee, scale(side * side - up * up, vertical), vertical)
+    store_block(P, E, E, P_ee)
+    turned = maximum(abs(side), abs(up))
+    doubt_rate(P, turned / time_of(flight, p, BASELINE_BLOCK), doubted)
+    return k

@@ -2,7 +2,8 @@
 
 Each is a file that says what it measures and what the filter makes of it, by functions of the same
 names: `count`, `expect`, `judge` and `mark_failed` for an update, `set_aside` and `exchange` for
-what is late, `keep_valid` and `choose` for its turn in an update of late measurements.
+what is late, `keep_valid` and `choose` for its turn in an update of late measurements, `suspect`
+and `doubt` for a filter that doubts itself (`filter/doubts.py`).
 """
 
 import functools
@@ -37,4 +38,5 @@ def in_turn(name, sensor=None):
 count, expect, judge = in_turn("count"), in_turn("expect"), in_turn("judge")
 mark_failed = in_turn("mark_failed")
 set_aside = in_turn("set_aside")
+suspect, doubt = in_turn("suspect"), in_turn("doubt")
 keep_valid, choose = in_turn("keep_valid"), in_turn("choose")

@@ -17,10 +17,18 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.directions import direction_noise, direction_pair
 from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.recovery import FITTING_FEATURES, LARGEST, follow_drift
+from quad_gym.kernels.filter.recovery import (
+    FITTING_FEATURES,
+    LARGEST,
+    doubt_rate,
+    follow_drift,
+    suspect_group,
+    time_of,
+)
 from quad_gym.kernels.maths.elementary import clip, maximum
 from quad_gym.kernels.maths.linalg import (
     add_outer,
+    add_to_diagonal,
     apply,
     apply_transposed,
     cross,
@@ -28,11 +36,13 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load4,
     load33,
+    load_block,
     load_column3,
     norm,
     scale,
     select3,
     store3,
+    store_block,
     sub,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
@@ -222,6 +232,38 @@ def mark_failed(flight, p, work, settings, slow, k):
     failed = work.taking > 0.0
     for i in range(settings.feature_count):
         mark_block(flight, FEATURE_BLOCKS + i, failed & (flight.feature_valid[i] > 0.0))
+    return k
+
+
+# ---- doubts ----------------------------------------------------------------------------------
+
+
+@kernel
+def suspect(flight, p, work, settings, slow, k):
+    """Note whether images make the filter doubt itself."""
+    suspect_group(flight, p, work, FEATURE_BLOCKS, work.taking > 0.0)
+    return k
+
+
+@kernel
+def doubt(flight, p, work, settings, slow, k):
+    """Add to the covariance of what may be wrong, where whole images are doubted.
+
+    That is the attitude by the largest innovation, or the position by what that is at the feature's
+    distance; the gyro may have led there.
+    """
+    angle, offset, P = 0.0 * flight.tick, 0.0 * flight.tick, work.P
+    doubted, nu = work.doubted[FEATURE_BLOCKS], flight.innovation
+    for i in range(settings.feature_count):
+        s = FEATURE_BLOCKS + i
+        seen = (doubted > 0.0) & (flight.feature_valid[i] > 0.0)
+        square = select(seen, nu[s, 0] * nu[s, 0] + nu[s, 1] * nu[s, 1], 0.0)
+        distance = norm(sub(load3(p.features[i]), load3(flight.r_hat)))
+        angle = maximum(angle, square)
+        offset = maximum(offset, square * distance * distance)
+    store_block(P, E, E, add_to_diagonal(load_block(P, E, E), angle))
+    store_block(P, R, R, add_to_diagonal(load_block(P, R, R), offset))
+    doubt_rate(P, math.sqrt(angle) / time_of(flight, p, FEATURE_BLOCKS), doubted)
     return k
 
 

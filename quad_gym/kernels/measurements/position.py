@@ -12,8 +12,13 @@ and the derivative along an offset is dr + R_hat^T (de x l_p) + dd.
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import E, R
-from quad_gym.kernels.filter.recovery import camera_fits
+from quad_gym.kernels.filter.error_state import D, E, R
+from quad_gym.kernels.filter.recovery import (
+    camera_fits,
+    doubt_acceleration,
+    suspect_group,
+    time_of,
+)
 from quad_gym.kernels.maths.elementary import exp, log
 from quad_gym.kernels.maths.linalg import (
     add,
@@ -24,6 +29,7 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load33,
     load_column3,
+    norm,
     scale,
 )
 from quad_gym.kernels.maths.random import six_normals, stream_of
@@ -133,3 +139,30 @@ def judge(flight, p, work, settings, slow, k):
     work.judged_freedoms = work.judged_freedoms + 3.0 * counts
     leave_out(flight, work, settings, k, POSITION_BLOCK, has, rejected, columns, 3.0)
     return k + 3
+
+
+# ---- doubts ----------------------------------------------------------------------------------
+
+
+@kernel
+def suspect(flight, p, work, settings, slow, k):
+    """Note whether positions make the filter doubt itself; not against a camera that fits."""
+    suspect_group(flight, p, work, POSITION_BLOCK, logical_not(camera_fits(flight, p)))
+    return k
+
+
+@kernel
+def doubt(flight, p, work, settings, slow, k):
+    """Add to the covariance of what may be wrong, where positions are doubted.
+
+    That is the position itself, or its slow error; accelerometer and tilt may have led there.
+    """
+    nu, doubted, P = load3(flight.innovation[POSITION_BLOCK]), work.doubted[POSITION_BLOCK], work.P
+    T = time_of(flight, p, POSITION_BLOCK)
+    for i in range(3):
+        P[R + i, R + i] = P[R + i, R + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+        if slow is not None:
+            if slow.estimates_drift:
+                P[D + i, D + i] = P[D + i, D + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+    doubt_acceleration(p, P, 2.0 * norm(nu) / (T * T), doubted)
+    return k

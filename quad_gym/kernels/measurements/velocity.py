@@ -6,6 +6,7 @@ arm's share turns with the error angles is neglected, so that the model is linea
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import V
+from quad_gym.kernels.filter.recovery import doubt_acceleration, suspect_group, time_of
 from quad_gym.kernels.maths.linalg import (
     add,
     add_to_diagonal,
@@ -17,6 +18,7 @@ from quad_gym.kernels.maths.linalg import (
     load4,
     load33,
     load_column3,
+    norm,
     scale,
     sub,
 )
@@ -95,3 +97,26 @@ def judge(flight, p, work, settings, slow, k):
     work.judged_freedoms = work.judged_freedoms + select(has, 3.0, 0.0)
     leave_out(flight, work, settings, k, VELOCITY_BLOCK, has, rejected, columns, 3.0)
     return k + 3
+
+
+# ---- doubts ----------------------------------------------------------------------------------
+
+
+@kernel
+def suspect(flight, p, work, settings, slow, k):
+    """Note whether velocities make the filter doubt itself."""
+    suspect_group(flight, p, work, VELOCITY_BLOCK, work.taking > 0.0)
+    return k
+
+
+@kernel
+def doubt(flight, p, work, settings, slow, k):
+    """Add to the covariance of what may be wrong, where velocities are doubted.
+
+    That is the velocity; accelerometer and tilt may have led there.
+    """
+    nu, doubted, P = load3(flight.innovation[VELOCITY_BLOCK]), work.doubted[VELOCITY_BLOCK], work.P
+    for i in range(3):
+        P[V + i, V + i] = P[V + i, V + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+    doubt_acceleration(p, P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), doubted)
+    return k

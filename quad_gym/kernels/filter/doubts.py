@@ -1,0 +1,132 @@
+"""What a filter doubts that notices that it is wrong: what it adds to its covariance.
+
+What may be wrong is not only what the sensor measures. An innovation that has grown for a time T
+since the last acceptance may come from biases, so their variances grow likewise: nu / T of an angle
+for the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g of
+that for the tilt. What each measurement doubts is in its file in `kernels/measurements/`.
+
+Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
+states is multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and
+position, too, and correlations say how. Slow errors of sensors keep theirs: a constant one
+that has become uncertain may stay so, such as hard iron, and the heading with it. The biases get
+more than that: sixteen times their deviation for a drift, three times the corrections that go one
+way.
+
+Source: ours.
+"""
+
+import numpy as np
+
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.error_state import BA, BG
+from quad_gym.kernels.filter.recovery import forget_corrections, one_way, suspect_group
+from quad_gym.kernels.filter.slow import fill_slow, keep_slow_factor
+from quad_gym.kernels.maths.elementary import minimum
+from quad_gym.kernels.maths.factors import cholesky
+from quad_gym.kernels.maths.linalg import (
+    add_to_diagonal,
+    load_block,
+    scale33,
+    store_block,
+    sum_of_outers,
+)
+from quad_gym.kernels.measurements.blocks import doubt, suspect
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import AID_GROUPS, AIDS, SENSOR_GROUPS, Act, Aid, FilterStatus
+
+_FIRST_AID, _DOUBT = int(Stage[Aid(0).name]), int(Act.DOUBT)
+_UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
+_FACTOR, _BIAS_FACTOR = 16.0, 240.0
+"""Of the covariance, and what is added of the biases' variances, where innovations drift."""
+_REMAINING = 9.0
+"""Square of how many times the sum of corrections may still be missing."""
+_MOST_ACCEL_BIAS, _MOST_GYRO_BIAS = 2.0, 0.1
+"""Largest deviations that these two add [m/s^2], [rad/s]."""
+
+
+@kernel
+def _variance_of(flight, row):
+    """Mean variance of the three states from a row of the covariance on."""
+    total = 0.0 * flight.tick
+    for i in range(3):
+        for j in range(15):
+            if j <= row + i:
+                total = total + flight.L[row + i, j] * flight.L[row + i, j]
+    return total / 3.0
+
+
+@kernel
+def _doubt_biases(flight, P, row, drifting, going, square, most):
+    """Add to the variances of three biases from a row on."""
+    more = select(drifting, minimum(_BIAS_FACTOR * _variance_of(flight, row), most * most), 0.0)
+    more = more + select(going, minimum(_REMAINING * square, most * most), 0.0)
+    store_block(P, row, row, add_to_diagonal(load_block(P, row, row), more))
+
+
+@kernel
+def raise_doubts(flight, p, work, settings, mask, slow, stages):
+    """Inflate the covariance of what may be wrong, where the filter is, and `mask`.
+
+    Args:
+        flight: Record; reads innovations, rejections and drifts, changes the covariance.
+        p: Parameters as the filter believes them.
+        work: Workspace.
+        settings: What the batch does.
+        mask: Which lanes.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
+        stages: The table of stages, which has those of aiding sensors; None without slow errors.
+    """
+    work.taking, work.drifting = select(mask, 1.0, 0.0), 0.0 * flight.tick
+    for group in range(SENSOR_GROUPS):
+        work.doubted[group] = 0.0 * flight.tick
+    suspect(flight, p, work, settings, slow, 0)
+    if slow is not None:
+        if slow.aids > 0:
+            for s in range(AIDS):
+                suspect_group(flight, p, work, AID_GROUPS + s, mask)
+    accel, corrected_a = one_way(flight, 0)
+    gyro, corrected_g = one_way(flight, 3)
+    drifting, accel, gyro = work.drifting > 0.0, mask & accel, mask & gyro
+    inflated = drifting | accel | gyro
+    doubtful = inflated
+    for group in range(SENSOR_GROUPS):
+        doubtful = doubtful | (work.doubted[group] > 0.0)
+    if not any_of(doubtful):
+        return
+
+    L, P, factor = flight.L, work.P, select(inflated, _FACTOR, 1.0)
+    for i in range(0, 15, 3):
+        for j in range(0, i + 3, 3):
+            store_block(P, i, j, scale33(factor, sum_of_outers(L, i, L, j, j + 3)))
+    states = 15
+    if slow is not None:
+        states = 15 + slow.slow_states
+        fill_slow(flight, slow, P)
+    _doubt_biases(flight, P, BA, drifting, accel, corrected_a, _MOST_ACCEL_BIAS)
+    _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, _MOST_GYRO_BIAS)
+    doubt(flight, p, work, settings, slow, 0)
+    if slow is not None:
+        if slow.aids > 0:
+            work.taking = select(doubtful, 1.0, 0.0)
+            for s in range(AIDS):
+                if slow.aid_on[s] > 0:
+                    call_stage(stages, _FIRST_AID + s, flight, p, p, slow, work, _DOUBT)
+
+    ok = doubtful & (cholesky(P, states, work.inverse_diagonal) > 0.0)
+    for i in range(15):
+        for j in range(i + 1):
+            L[i, j] = select(ok, P[i, j], L[i, j])
+    if slow is not None:
+        keep_slow_factor(flight, slow, work, ok)
+    failed, status = doubtful & logical_not(ok), flight.filter_status
+    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
+    flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
+    flight.doubt_tick = select(doubtful, flight.tick, flight.doubt_tick)
+    for group in range(SENSOR_GROUPS):
+        flight.reopened[group] = flight.reopened[group] + work.doubted[group]
+        row = flight.rejected_in_row[group]
+        flight.rejected_in_row[group] = select(work.doubted[group] > 0.0, 0.0, row)
+        for i in range(3):
+            mean = flight.innovation_drift[group, i]
+            flight.innovation_drift[group, i] = select(doubtful, 0.0, mean)
+    forget_corrections(flight, doubtful)

@@ -1,0 +1,126 @@
+"""Recovery after faults, counted by hand; the tables of it; and pages whose tables are replaced."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym.analysis.recovery import RIGHT, Recovery, follow_recovery, longest
+from quad_gym.commands import consistency
+from quad_gym.commands import consistency_recovery as recovery
+from quad_gym.commands.options import parse
+from quad_gym.commands.resumable import put_table, require_table
+from quad_gym.faults import GyroBiasStep
+from quad_gym.params.suites import SUITES
+from tests.field_flights import fly, nees
+
+
+def seen(right, told, far_off, every=0.5):
+    time = every * np.arange(1, len(right) + 1)
+    return Recovery(time, *(np.array(flags, bool) for flags in (right, told, far_off)))
+
+
+def test_runs_are_the_longest_ones():
+    flags = np.array([[1, 0], [1, 1], [0, 1], [1, 1], [1, 0], [1, 0]], bool)
+    assert longest(flags).tolist() == [3, 3]
+    assert longest(flags[:, :0]).shape == (0,)
+
+
+def test_alarms_are_missed_where_a_flight_is_far_off_for_two_seconds_and_never_told():
+    far_off = [[1, 1, 1]] * 4 + [[0, 0, 1]]  # 2 s, 2 s, and 2.5 s of which one instant is told
+    told = [[0, 0, 0]] * 3 + [[0, 1, 0]] + [[0, 0, 0]]
+    found = seen(np.zeros((5, 3)), told, far_off)
+    assert found.long_far_off().tolist() == [True, True, True]
+    assert found.missed_alarms().tolist() == [True, False, True]
+    assert found.alarms() == 1
+    assert found.hours == pytest.approx(5 * 3 * 0.5 / 3600.0)
+
+
+def test_the_time_to_recover_is_until_nearly_all_stay_right():
+    right = np.ones((8, 100), bool)
+    right[:3], right[4, 0], right[5, :2] = False, False, False  # one in a hundred is allowed
+    found = seen(right, np.zeros_like(right), ~right)
+    assert found.time_to(found.right, 1.0) == pytest.approx(2.5)
+    assert found.time_to(found.right, 3.5) == 0.0
+    assert found.time_to(found.told, 1.0) == math.inf
+    assert found.share(found.silent, 3.0) == pytest.approx(0.02)
+
+
+def test_flights_are_right_and_far_off_as_a_plain_computation_says():
+    batch = fly(
+        quad_gym.sensor_suite("rtk"), 64, filter_start="warm", faults=GyroBiasStep(start=0.3)
+    )
+    found = follow_recovery(batch, seeds=range(64), duration=1.5, every=0.5)
+    square = nees(batch, slice(0, 9))
+    np.testing.assert_array_equal(found.right[-1], square < stats.chi2.ppf(RIGHT, 9))
+    assert 0.0 < found.share(found.right, 1.5) < 1.0
+    np.testing.assert_array_equal(found.told[-1], batch.read("lost") > 0.0)
+    assert found.time.tolist() == pytest.approx([0.5, 1.0, 1.5])
+    with pytest.raises(ValueError, match="at least twice every"):
+        follow_recovery(batch, seeds=range(64), duration=0.1, every=0.1)
+
+
+def test_every_fault_of_the_catalogue_ends_and_meets_every_suite_that_can_have_it():
+    found = list(recovery.trials())
+    names = [trial.name for trial in found]
+    assert len(set(names)) == len(names)
+    for suite in SUITES:
+        assert {f"{suite}, {task}" for task in recovery.CALM_TASKS} <= set(names)
+    assert {"rtk, gnss_ramp", "indoor, camera_occlusion", "consumer, barometer_loss"} <= set(names)
+    assert "indoor, gnss_outage" not in names
+    over = {trial.name: trial.over for trial in found if trial.faults}
+    assert set(over.values()) == {3.0, 8.0}
+    assert over["rtk, imu_bias_step"] == 3.0
+    assert over["rtk, gnss_outage with imu_bias_step"] == 8.0
+
+
+def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
+    chosen = [t for t in recovery.trials() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
+    chosen = [t for t in chosen if t.faults]  # hovering takes a minute
+    cells = recovery.run_recovery(chosen, tmp_path, flights=32, first_seed=0)
+    values = cells["rtk, camera_occlusion"]["values"]
+    assert values["right"] >= 90.0
+    assert set(values) == set(recovery.COLUMNS)
+    assert "| rtk, camera_occlusion | " in (tmp_path / "recovery.md").read_text()
+    calm = {"values": {"alarms": 0.25, "share": 0.01, "hours": 6.0}, "miss": False}
+    calm |= {"expected": "", "filters_failed": 0}
+    lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "miss": True, "expected": ""}
+    lost |= {"filters_failed": 1}
+    text = recovery.table_of({"a": lost, "b": lost | {"expected": "why"}, "c": calm}, 32)
+    assert "| **5.0** |" in text.splitlines()[4]
+    assert "**1 filters failed**" in text
+    assert "| *5.0* |" in text
+    assert "| why" in text
+    assert "| c | 0.2 | 0.0 | 6.0 |" in text
+
+
+def test_a_table_is_put_between_its_marks(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# One\n<!-- table matrix -->\nold\n<!-- end of table matrix -->\ntwo\n")
+    put_table(page, "matrix", "| new |\n")
+    put_table(page, "matrix", "| newer |\n")
+    assert page.read_text() == (
+        "# One\n<!-- table matrix -->\n\n| newer |\n\n<!-- end of table matrix -->\ntwo\n"
+    )
+    with pytest.raises(ValueError, match="--page must have the lines <!-- table recovery -->"):
+        put_table(page, "recovery", "")
+    with pytest.raises(ValueError, match="--page must be a file"):
+        require_table(tmp_path / "none.md", "matrix")
+
+
+@pytest.mark.parametrize("name", ["matrix", "recovery"])
+def test_the_pages_of_the_documentation_have_the_marks(name):
+    page = {"matrix": "consistency-matrix.md", "recovery": "recovery.md"}[name]
+    assert require_table(Path(__file__).parents[2] / "docs" / page, name)
+
+
+def test_options_that_do_not_go_together_are_refused():
+    for line in (["--page", "x.md"], ["--matrix", "--recovery"], ["--recovery", "--cells", "all"]):
+        if line[-1] == "all":
+            assert parse(consistency.Args, line).count == 400
+            continue
+        with pytest.raises(SystemExit):
+            parse(consistency.Args, line)
