@@ -223,10 +223,22 @@ class Wary(OutageDash):
 
 
 class Steady(OutageDash):
-    """`OutageDash` whose crash forfeits nothing of the course, for training.
+    """`OutageDash` for training: crashes forfeit nothing, and episodes begin all along the course.
 
-    Sums of up to 660 that are lost all at once make learning unsteady.
+    Sums of up to 660 that are lost all at once make learning unsteady. So do flights that come to
+    the same gap, and lose GNSS, at the same time: a batch shows one part of the course alone, and
+    what was learned of the others is lost. Episodes begin before the first wall, or halfway between
+    two walls, with equal chances.
     """
+
+    def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike]:
+        """Draw where episodes begin."""
+        x = gaps_of(view).centers[:, :-1, 0]
+        before = np.floor(x.shape[1] * rng.random()).astype(np.int64)
+        halfway = x[np.arange(view.count), before] + 0.5 * (x[:, 0] - x[:, 1])
+        start = view.reference_position.copy()
+        start[:, 0] = np.where(before == 0, start[:, 0], halfway)
+        return {"position": start}
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) see the class."""

@@ -108,6 +108,7 @@ STUDIED: Mapping[str, StudiedTask] = {
     "outage_dash": StudiedTask(
         arms=ARMS_OF["outage_dash"],
         carrying=("pd", "pd_slow", "pd_waiting", "truth", "waiting", "truth_on_truth"),
+        evaluations=6,
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
         columns={
