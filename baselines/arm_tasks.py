@@ -163,7 +163,7 @@ class SeenRace(StaleRace):
     def observe(self, view: "View") -> Parts:
         """The gates relative to a state that is off by the residual."""
         residual, seen = self.residual(view), view.seen
-        R_BI = Rotation.from_rotvec(residual[:, 6:9]).as_matrix() @ seen.R_BI
+        R_BI = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ seen.R_BI
 
         def in_body(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.ascontiguousarray((R_BI @ vectors[:, :, np.newaxis])[:, :, 0])
