@@ -54,9 +54,13 @@ animation: setup  ## the animation of README
 compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
 	$(BIN)/quad-gym compare --sensors standard rtk --output results/compare/circle
 
-study: $(VENV)/.trainer  ## the study of docs/where-it-matters.md: LookAround, 5 training seeds
-	$(BIN)/quad-gym study --arms pd_reference pd_features pd_unsure truth sure \
-		--output results/study/look_around --page docs/where-it-matters.md
+study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
+	$(BIN)/quad-gym study look_around --page docs/where-it-matters.md
+	$(BIN)/quad-gym study --arms-file baselines/arms_misled.py --section misled --episodes 200 \
+		--page docs/where-it-matters.md
+	$(BIN)/quad-gym study stale_race --seeds 3 --episodes 200 --page docs/where-it-matters.md
+	$(BIN)/quad-gym study outage_dash --arms pd pd_slow pd_waiting --episodes 400 \
+		--page docs/where-it-matters.md
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"

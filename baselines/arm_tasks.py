@@ -1,14 +1,18 @@
 """Variants of tasks for the arms of a study: for training, and some for evaluation."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
+from baselines import residuals
 from baselines.pd import MARGIN, SIGMAS
+from quad_gym.params import checks as check
 from quad_gym.tasks.look_around import LookAround
-from quad_gym.tasks.outage_dash import OutageDash, gaps_behind, gaps_of, westward
+from quad_gym.tasks.outage_dash import PAID_SPEED, OutageDash, gaps_behind, gaps_of, westward
+from quad_gym.tasks.rewards import Crash
 from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import Observed
 
@@ -35,6 +39,8 @@ RECALLED_EVERY = 5
 _RECALLED = 12
 """What is recalled of each: errors of position and velocity, vertical, body rates."""
 
+_CRASH = Crash()
+
 Parts = dict[str, NDArray[np.float64]]
 
 
@@ -43,7 +49,14 @@ class Doubting(LookAround):
 
     As log10(sigma / TYPICAL) of the largest standard deviation, so that a network sees a doubling
     alike whether it is of millimeters or of meters.
+
+    Args:
+        told: What the standard deviation is multiplied by before it is shown.
     """
+
+    def __init__(self, told: float = 1.0) -> None:
+        super().__init__()
+        self._told = check.positive("told", told)
 
     observes: Mapping[str, Observed] = {
         **LookAround.observes,
@@ -53,10 +66,14 @@ class Doubting(LookAround):
     def observe(self, view: "View") -> Parts:
         """`features_direction` (n, 3), and `log_sigma` (n,)."""
         try:
-            sigma = view.estimate.position_sigma.max(axis=1)
+            sigma = self._told * view.estimate.position_sigma.max(axis=1)
         except ValueError:  # no filter runs: who sees the truth has no doubt
             sigma = np.zeros(view.count)
         return {**super().observe(view), "log_sigma": np.log10(np.maximum(sigma, 1e-9) / TYPICAL)}
+
+
+TOLD_A_QUARTER, TOLD_HALF, TOLD_TWICE, TOLD_FOURFOLD = map(Doubting, (0.25, 0.5, 2.0, 4.0))
+"""A filter that is as it is, and a controller that is told another standard deviation."""
 
 
 class Remembering(Doubting):
@@ -124,6 +141,67 @@ class RecallingRace(StaleRace):
         return {"past": view.state.past.reshape(view.count, -1)}
 
 
+class SeenRace(StaleRace):
+    """`StaleRace` observed as `ResidualRace` is: what is seen, without a model of residuals."""
+
+    replaces_observation = True
+    keeps: Collection[str] = ("last_action",)
+    observes: Mapping[str, Observed] = {
+        "position_error": Observed("m", "B"),
+        "velocity_error": Observed("m/s", "B"),
+        "up": Observed("-", "B"),
+        "heading": Observed("-", "B"),
+        "body_rates": Observed("rad/s", "B"),
+        "preview_1": Observed("m", "B"),
+        "preview_2": Observed("m", "B"),
+    }
+
+    def residual(self, view: "View") -> NDArray[np.float64]:
+        """(n, 12) what is added to the seen state; see `baselines.residuals`."""
+        return np.zeros((view.count, residuals.SIZE))
+
+    def observe(self, view: "View") -> Parts:
+        """The gates relative to a state that is off by the residual."""
+        residual, seen = self.residual(view), view.seen
+        R_BI = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ seen.R_BI
+
+        def in_body(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.ascontiguousarray((R_BI @ vectors[:, :, np.newaxis])[:, :, 0])
+
+        gate, later = view.reference_position, view.preview
+        return {
+            "position_error": in_body(gate - seen.position - residual[:, :3]),
+            "velocity_error": in_body(view.reference_velocity - seen.velocity - residual[:, 3:6]),
+            "up": np.ascontiguousarray(R_BI[:, :, 2]),
+            "heading": in_body(view.reference_heading),
+            "body_rates": seen.body_rates + residual[:, 9:],
+            "preview_1": in_body(later[:, 0] - gate),
+            "preview_2": in_body(later[:, 1] - gate),
+        }
+
+
+class ResidualRace(SeenRace):
+    """`SeenRace` with residuals that a model of recorded estimation errors draws.
+
+    To be trained in on the truth (`observation="truth"`); the episode begins without an error.
+    """
+
+    state: Mapping[str, ArrayLike] = {"residual": np.zeros(residuals.SIZE)}
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._model = residuals.ResidualModel.load(residuals.FITTED / "stale_race.json")
+
+    def update(self, view: "View", rng: "FlightRandom") -> None:
+        """Draw the next residual."""
+        noise = rng.normal(size=residuals.SIZE)
+        view.state.residual = self._model.advance(view.state.residual, view.velocity, noise)
+
+    def residual(self, view: "View") -> NDArray[np.float64]:
+        """(n, 12) the drawn one."""
+        return view.state.residual
+
+
 class Wary(OutageDash):
     """`OutageDash` whose observation also says how unsure the filter is for the next two gaps.
 
@@ -144,10 +222,34 @@ class Wary(OutageDash):
         return {**parts, "doubt": doubts(view, widths)}
 
 
-class Waiting(Wary):
-    """`Wary` that in training pays for no progress where the next gap is too narrow.
+class Steady(OutageDash):
+    """`OutageDash` for training: crashes forfeit nothing, and episodes begin all along the course.
 
-    That is while `doubt` is above 0. Who hurries on then has nothing but the risk of it.
+    Sums of up to 660 that are lost all at once make learning unsteady. So do flights that come to
+    the same gap, and lose GNSS, at the same time: a batch shows one part of the course alone, and
+    what was learned of the others is lost. Episodes begin before the first wall, or halfway between
+    two walls, with equal chances.
+    """
+
+    def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike]:
+        """Draw where episodes begin."""
+        x = gaps_of(view).centers[:, :-1, 0]
+        before = np.floor(x.shape[1] * rng.random()).astype(np.int64)
+        halfway = x[np.arange(view.count), before] + 0.5 * (x[:, 0] - x[:, 1])
+        start = view.reference_position.copy()
+        start[:, 0] = np.where(before == 0, start[:, 0], halfway)
+        return {"position": start}
+
+    def reward(self, view: "View") -> NDArray[np.float64]:
+        """(n,) see the class."""
+        return super().reward(view) + _CRASH(view) * view.state.earned
+
+
+class Waiting(Steady, Wary):
+    """`Wary` that in training pays for standing still where the next gap is too narrow.
+
+    That is while `doubt` is above 0: there, 0.1 min(|v|, 5) is a cost, and progress is not paid
+    for. Crashes cost what they do in `Steady`.
     """
 
     def reward(self, view: "View") -> NDArray[np.float64]:
@@ -156,7 +258,10 @@ class Waiting(Wary):
         through = gaps_behind(gaps, view.seen.position)
         width = gaps.widths[np.arange(view.count), through]
         unsure = doubts(view, width[:, np.newaxis])[:, 0] > 0.0
-        return super().reward(view) - self._weight * np.where(unsure, westward(view), 0.0)
+        progress = westward(view)
+        moving = np.minimum(np.linalg.norm(view.velocity, axis=1), PAID_SPEED)
+        change = np.where(unsure, -moving - progress, 0.0)
+        return super().reward(view) + self._weight * change
 
 
 def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:

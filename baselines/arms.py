@@ -119,6 +119,12 @@ STALE_RACE = (
         label="estimate + 15 standard deviations + memory",
         environment=_RECALLING,
     ),
+    Arm(
+        name="residual",
+        label="truth + residual model",
+        environment={"custom": "baselines.arm_tasks:SeenRace"},
+        training={"custom": "baselines.arm_tasks:ResidualRace", **_TRUTH},
+    ),
     Arm(name="truth_on_truth", label="truth, flown on it", flies="truth", environment=_TRUTH),
     Arm(
         name="truth_stamped",
@@ -136,6 +142,7 @@ STALE_RACE = (
 """Those of `QuadGym/StaleRace-v0`."""
 
 _WARY = {"custom": "baselines.arm_tasks:Wary"}
+_STEADY = {"custom": "baselines.arm_tasks:Steady"}
 
 OUTAGE_DASH = (
     Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
@@ -146,12 +153,16 @@ OUTAGE_DASH = (
         policy="pd:waiting",
         environment=_SIGMAS,
     ),
-    Arm(name="truth", label="truth", training=_TRUTH),
-    Arm(name="covariance", label="estimate + 15 standard deviations", environment=_SIGMAS),
-    Arm(name="wary", label="estimate + doubt", environment=_WARY),
+    Arm(name="truth", label="truth", training=_TRUTH, learning=_STEADY),
+    Arm(
+        name="covariance",
+        label="estimate + 15 standard deviations",
+        environment=_SIGMAS,
+        learning=_STEADY,
+    ),
     Arm(
         name="waiting",
-        label="estimate + doubt, unpaid while unsure",
+        label="estimate + doubt, paid for standing still while unsure",
         environment=_WARY,
         learning={"custom": "baselines.arm_tasks:Waiting"},
     ),

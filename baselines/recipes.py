@@ -140,7 +140,7 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         steps=3_000_000, parameters={**_PPO.parameters, "gamma": 0.99}
     ),
     ("QuadGym/StaleRace-v0", "ppo"): _PPO.replace(
-        steps=2_000_000, reward_scale=1.0, parameters={**_PPO.parameters, "gamma": 0.99}
+        steps=4_000_000, reward_scale=1.0, parameters={**_PPO.parameters, "gamma": 0.99}
     ),
     # closer bounds than the task's: who has lost himself need not be watched for long
     ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
@@ -150,8 +150,8 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
     ),
     # gaps lie seconds apart; a start on the ground is no part of it
     ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
-        steps=2_500_000,
-        reward_scale=0.1,
+        steps=1_500_000,
+        reward_scale=0.05,
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={},
     ),

@@ -2,7 +2,7 @@
 
     quad-gym study                                   # LookAround, 5 seeds
     quad-gym study stale_race
-    quad-gym study outage_dash --arms pd_waiting truth wary --seeds 10
+    quad-gym study outage_dash --arms pd_waiting truth covariance --seeds 10
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
@@ -40,8 +40,6 @@ from quad_gym.commands.study_tasks import STUDIED, WITHIN, StudiedTask, stays
 from quad_gym.commands.study_words import conclusions
 from quad_gym.params import checks as check
 
-EVALUATED = 9
-"""How often a policy is evaluated over its training, to keep the best one."""
 QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 
 
@@ -75,10 +73,12 @@ class Args:
     threads: int | None = None
     """of flights and learning; if not given, one per core; no result depends on them"""
     page: Path | None = None
-    """write table and conclusions into this page, too, between its marks for the task, and the
+    """write table and conclusions into this page, too, between its marks for the section, and the
     figures to the folder images beside it"""
+    section: str | None = None
+    """of the page: the name in its marks, and in the figures' names; if not given, the task's"""
     output: Path | None = None
-    """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
+    """folder; if not given, results/study/SECTION (with --quick, .../SECTION_quick)"""
 
 
 def studied(args: Args) -> StudiedTask:
@@ -149,6 +149,7 @@ def configure(args: Args) -> Study:
     steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
     chosen = chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
     task = IDS[args.env_id]
+    name = args.section or task
     study = Study(
         env_id=args.env_id,
         arms=arms_of(args),
@@ -158,7 +159,7 @@ def configure(args: Args) -> Study:
         episodes=QUICK_EPISODES if args.quick else args.episodes,
         first_episode=first_seed("test", args.seed, args.episodes),
         about=about,
-        folder=args.output or Path("results/study") / (f"{task}_quick" if args.quick else task),
+        folder=args.output or Path("results/study") / (f"{name}_quick" if args.quick else name),
         threads=args.threads,
     )
     for arm in study.arms:
@@ -168,7 +169,7 @@ def configure(args: Args) -> Study:
             plan.make_judge().close()
         test_flights(study, arm, 1).close()
     if args.page is not None:
-        marks_of(args.page, task)
+        marks_of(args.page, name)
     require_writable("--output", study.folder)
     return study
 
@@ -183,7 +184,7 @@ def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
         seed=seed,
         engine="compiled",
         threads=study.threads,
-        evaluations=EVALUATED,
+        evaluations=study.about.evaluations,
     )
 
 
@@ -255,10 +256,10 @@ def main(args: Args) -> None:
     with usage_errors():
         study = configure(args)
     trained = sum(arm.trained for arm in study.arms)
+    trainings = f"{trained * len(study.seeds)} trainings of {study.recipe.steps:,} steps, "
     print(
-        f"{study.env_id}: {len(study.arms)} arms, {trained * len(study.seeds)} trainings of "
-        f"{study.recipe.steps:,} steps, {study.episodes:,} episodes with each policy; into "
-        f"{study.folder}."
+        f"{study.env_id}: {len(study.arms)} arms, {trainings if trained else ''}"
+        f"{study.episodes:,} episodes with each policy; into {study.folder}."
     )
     try:
         with usage_errors((RunError,)):
@@ -272,7 +273,7 @@ def main(args: Args) -> None:
         print(sentence)
     written = write_report(results)
     if args.page is not None:
-        written = [*update_page(results, args.page), *written]
+        written = [*update_page(results, args.page, args.section), *written]
     print(
         f"\nWrote {len(written)} files to {study.folder} after "
         f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."

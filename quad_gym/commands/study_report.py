@@ -153,8 +153,8 @@ def page_text(results: Results) -> str:
     ]
     return "\n".join(
         [
-            f"Training seeds: {len(study.seeds)}, of {study.recipe.steps:,} steps each; "
-            f"{study.episodes:,} test episodes with each policy. Success: {study.about.meaning}.",
+            f"{_trainings(results)}{study.episodes:,} test episodes with each policy. Success: "
+            f"{study.about.meaning}.",
             "",
             table_markdown(results),
             "",
@@ -173,18 +173,26 @@ def page_text(results: Results) -> str:
     )
 
 
-def update_page(results: Results, page: Path) -> list[Path]:
+def _trainings(results: Results) -> str:
+    """How many there were, if there were any."""
+    study = results.study
+    if not results.trained():
+        return ""
+    return f"Training seeds: {len(study.seeds)}, of {study.recipe.steps:,} steps each; "
+
+
+def update_page(results: Results, page: Path, section: str | None = None) -> list[Path]:
     """Write a study into a page, and its figures beside it; return what was written."""
     from quad_gym import IDS
 
-    task = IDS[results.study.env_id]
-    before, _, after = marks_of(page, task)
+    name_of_section = section or IDS[results.study.env_id]
+    before, _, after = marks_of(page, name_of_section)
     page.write_text(before + page_text(results) + after, encoding="utf-8")
     images = page.parent / "images"
     images.mkdir(exist_ok=True)
     written = [page]
     for name, figure in _figures(results).items():
-        written.append(images / f"{task}_{name}.png")
+        written.append(images / f"{name_of_section}_{name}.png")
         figure.savefig(written[-1], dpi=130)
     return written
 
@@ -262,8 +270,8 @@ def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
     ]
     parts = [
         f"<h1>{html.escape(study.env_id)}</h1>",
-        f"<p>{len(study.seeds)} training seeds of {study.recipe.steps:,} steps, {study.episodes:,} "
-        "episodes with each policy, flown on the estimate. Interquartile means over seeds; in "
+        f"<p>{_trainings(results)}{study.episodes:,} episodes with each policy, flown on the "
+        "estimate. Interquartile means over seeds; in "
         "brackets bootstrap 95 % intervals over seeds and episodes. Success: "
         f"{study.about.meaning}.</p>",
         f"<table>{''.join(rows)}</table><ul>",

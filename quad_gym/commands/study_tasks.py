@@ -44,6 +44,8 @@ class StudiedTask:
     """the column that says how the task was done, beside successes and crashes"""
     traced: tuple[str, ...]
     """what is kept of the first episodes, for the figure; see `study_flights.TRACES`"""
+    evaluations: int = 9
+    """how often a policy is evaluated over its training, to keep the best one"""
     figure: str
     """"glance": where policies look; "pace": how fast they fly, and how sure the filter is"""
 
@@ -92,6 +94,7 @@ STUDIED: Mapping[str, StudiedTask] = {
             *("pd", "truth", "covariance", "truth_on_truth", "truth_stamped"),
             "covariance_stamped",
         ),
+        evaluations=8,
         success=lambda run: passes(run, 8),
         meaning="all eight gates passed",
         columns={
@@ -105,6 +108,7 @@ STUDIED: Mapping[str, StudiedTask] = {
     "outage_dash": StudiedTask(
         arms=ARMS_OF["outage_dash"],
         carrying=("pd", "pd_slow", "pd_waiting", "truth", "waiting", "truth_on_truth"),
+        evaluations=6,
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
         columns={

@@ -51,7 +51,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; unless given, a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; unless given, 10 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a cost of looking at them | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
-    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 20 s |
+    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 35 s |
 
     Reward and observation of the last three are specified in classes of their own:
     `quad_gym.tasks.look_around.LookAround`, `stale_race.StaleRace` and `outage_dash.OutageDash`.

@@ -1,16 +1,19 @@
-"""Variants of `LookAround` that arms of a study learn in, recomputed from the flights."""
+"""Variants of tasks that arms of a study learn in, recomputed from the flights."""
 
 import gymnasium
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
+from quad_gym.faults import GnssOutage
 
 ID = "QuadGym/LookAround-v0"
 
 
-def make(name, count=6, **keywords):
+def make(name, count=6, task=ID, **keywords):
     custom = f"baselines.arm_tasks:{name}"
     env = gymnasium.make_vec(
-        ID, num_envs=count, autoreset_mode="Disabled", custom=custom, **keywords
+        task, num_envs=count, autoreset_mode="Disabled", custom=custom, **keywords
     )
     observations, _ = env.reset(seed=3)
     return env, observations
@@ -55,6 +58,106 @@ def test_memory_holds_every_tenth_observation_newest_first():
         for k in range(4):
             expected = seen[k] if k < len(seen) else np.zeros((6, 18))
             np.testing.assert_allclose(past[:, k], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "told"), [("TOLD_HALF", 0.5), ("TOLD_FOURFOLD", 4.0)])
+def test_a_controller_may_be_told_another_standard_deviation(name, told):
+    (plain, a), (misled, b) = make("Doubting"), make(name)
+    change = part(misled, b, "log_sigma") - part(plain, a, "log_sigma")
+    np.testing.assert_allclose(change, np.log10(told), atol=1e-5)
+
+
+def test_what_is_recalled_in_a_race_is_every_fifth_observation_newest_first():
+    env, observations = make("RecallingRace", task="QuadGym/StaleRace-v0")
+    names, seen = ("position_error", "velocity_error", "up", "body_rates"), []
+    for step in range(1, 27):
+        observations, *_ = env.step(np.full((6, 4), 0.01, np.float32))
+        if step % 5 == 0:
+            now = [part(env, observations, name) for name in names]
+            seen.insert(0, np.concatenate(now, axis=1))
+        past = part(env, observations, "past").reshape(6, 4, 12)
+        for k in range(4):
+            expected = seen[k] if k < len(seen) else np.zeros((6, 12))
+            np.testing.assert_allclose(past[:, k], expected, atol=1e-5)
+
+
+def test_a_race_seen_without_residuals_is_the_shipped_observation():
+    (plain, a), (own, b) = (
+        make(name, task="QuadGym/StaleRace-v0") for name in ("RecallingRace", "SeenRace")
+    )
+    for _ in range(20):
+        for name in ("position_error", "velocity_error", "up", "heading", "body_rates"):
+            np.testing.assert_allclose(part(own, b, name), part(plain, a, name), atol=1e-5)
+        for name in ("preview_1", "preview_2", "last_action"):
+            np.testing.assert_allclose(part(own, b, name), part(plain, a, name), atol=1e-5)
+        action = np.full((6, 4), 0.05, np.float32)
+        a, b = plain.step(action)[0], own.step(action)[0]
+
+
+def test_residuals_of_a_race_are_what_the_model_draws():
+    env, b = make("ResidualRace", task="QuadGym/StaleRace-v0", observation="truth")
+    batch = env.unwrapped.flights.batch
+    for _ in range(30):
+        b, *_ = env.step(np.zeros((6, 4), np.float32))
+        residual = batch.view.state.residual
+        R = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ batch.read("R_BI")
+        gap = batch.read("r_ref") - batch.read("r") - residual[:, :3]
+        expected = (R @ gap[:, :, np.newaxis])[:, :, 0]
+        np.testing.assert_allclose(part(env, b, "position_error"), expected, atol=1e-4)
+    assert np.abs(residual).max() > 1e-3
+
+
+def next_width(env):
+    walls = env.unwrapped.flights.batch.read("obstacle_center")[:, :4, 1]
+    return np.stack([walls[:, k] - walls[:, k + 1] - 30.0 for k in (0, 2)], axis=1)
+
+
+def test_doubt_says_whether_two_standard_deviations_fit_through_the_gap():
+    env, observations = make("Wary", task="QuadGym/OutageDash-v0")
+    for _ in range(10):
+        room = 0.5 * next_width(env) - 0.5
+        expected = np.log2(2.0 * largest_sigma(env)[:, np.newaxis] / room)
+        np.testing.assert_allclose(part(env, observations, "doubt"), expected, atol=1e-4)
+        observations, *_ = env.step(np.zeros((6, 4), np.float32))
+    env, observations = make("Wary", task="QuadGym/OutageDash-v0", observation="truth")
+    np.testing.assert_array_equal(part(env, observations, "doubt"), -8.0)
+
+
+def test_waiting_is_paid_for_standing_still_while_unsure():
+    faults = [GnssOutage(start=0.0)]
+    plain, waiting = (
+        make(name, task="QuadGym/OutageDash-v0", faults=faults)[0] for name in ("Wary", "Waiting")
+    )
+    batch, cases = waiting.unwrapped.flights.batch, set()
+    action = np.zeros((6, 4), np.float32)
+    action[:, 0] = 0.05
+    for _ in range(400):
+        reward, paid = plain.step(action)[1], waiting.step(action)[1]
+        if not plain.unwrapped.flights.batch.view.shipped.terminated.any():
+            unsure = 2.0 * largest_sigma(waiting) > 0.5 * next_width(waiting)[:, 0] - 0.5
+            v = batch.read("v")
+            lost = 0.1 * (np.minimum(np.linalg.norm(v, axis=1), 5.0) + np.minimum(-v[:, 0], 5.0))
+            np.testing.assert_allclose(paid, reward - np.where(unsure, lost, 0.0), atol=1e-9)
+            cases |= set(unsure.tolist())
+        else:
+            break
+    assert cases == {True, False}
+
+
+def test_a_steady_crash_forfeits_nothing():
+    plain, steady = (
+        make(name, task="QuadGym/OutageDash-v0", observation="truth")[0]
+        for name in ("Wary", "Steady")
+    )
+    action = np.full((6, 4), -0.5, np.float32)
+    for _ in range(200):
+        _, a, over, *_ = plain.step(action)
+        b = steady.step(action)[1]
+        earned = plain.unwrapped.flights.batch.view.state.earned
+        np.testing.assert_allclose(b, a + np.where(over, earned, 0.0), atol=1e-9)
+        if over.any():
+            return
+    raise AssertionError("nobody crashed")
 
 
 def test_being_sure_is_paid_for():
