@@ -81,13 +81,13 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
     found, *_ = np.linalg.lstsq(x / scale, y, rcond=None)
     found = (found / scale[:, np.newaxis]).T
     rest = y - x @ found.T
-    A, covariance = found[:, :SIZE], np.cov(rest.T).astype(np.float64)
+    A, covariance = found[:, :SIZE], np.cov(rest.T)
     largest = float(np.abs(np.linalg.eigvals(A)).max())
     if largest >= 1.0:
         raise ValueError(
             f"errors must be those of a stationary model, got eigenvalue {largest:.4f}"
         )
-    factor: Floats = np.linalg.cholesky(covariance + 1e-18 * np.eye(SIZE))
+    factor = np.linalg.cholesky(covariance + 1e-18 * np.eye(SIZE)).astype(np.float64)
     return ResidualModel(A, found[:, SIZE:], factor)
 
 
