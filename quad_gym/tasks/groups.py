@@ -60,9 +60,7 @@ class Truth(Group):
         """(n, 3) velocity of the air in I [m/s]."""
         return self._flights.rows("wind")
 
-    position_error = Shown(
-        "position_error", "(n,) distance of the position from the reference [m]."
-    )
+    position_error = Shown("position_error", "(n,) distance from the reference [m].")
 
     @Lazy
     def estimation_error(self) -> Floats:
@@ -94,18 +92,14 @@ class Truth(Group):
 
     @Lazy
     def features_in_view(self) -> Truths:
-        """(n, m) whether the camera faces a marker, as vehicle and sensors are nominally.
-
-        A marker behind an obstacle does not count.
-        """
+        """(n, m) whether the camera faces a marker and no obstacle hides it, nominally."""
         p = self._flights.nominal()
         R_BI, r = self.R_BI[:, np.newaxis], self.position[:, np.newaxis]
         X_B = (R_BI @ (self._view.features - r)[..., np.newaxis])[..., 0] - p["camera"]
         X_C = (p["R_CB"] @ X_B[..., np.newaxis])[..., 0]
         in_front = X_C[..., 2] > 1e-9
-        pixels = (
-            X_C[..., :2] * (p["focal_length"] / np.where(in_front, X_C[..., 2], 1.0))[..., None]
-        )
+        per_depth = p["focal_length"] / np.where(in_front, X_C[..., 2], 1.0)
+        pixels = X_C[..., :2] * per_depth[..., None]
         seen = in_front & (np.abs(pixels) <= p["half_image"]).all(axis=-1)
         obstacles = self._flights.world.obstacles
         if obstacles:
@@ -330,8 +324,7 @@ class Measured(Group):
     def features_seen(self) -> Truths:
         """(n, m) whether an image of this step has the feature."""
         self._need_sensors()
-        camera = self._flights.sensors.camera
-        count = 0 if camera is None else len(camera.features_I)
+        count = self._flights.feature_places().shape[1]
         return self._flights.rows("feature_fresh")[:, :count] > 0.0
 
     def _in_I(self, name: str, valid: Truths) -> Floats:

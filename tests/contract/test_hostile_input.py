@@ -216,6 +216,10 @@ PARAMETERS = {
         quad_gym.BatteryParams(),
         lambda p: {"world": quad_gym.WorldParams(battery=p)},
     ),
+    "GroundParams": (
+        quad_gym.GroundParams(),
+        lambda p: {"world": quad_gym.WorldParams(ground=p)},
+    ),
     "ImuParams": (RTK.imu, imu_suite),
     "GnssParams": (RTK.gnss, lambda p: suite_of(gnss=p)),
     "CameraParams": (RTK.camera, lambda p: suite_of(camera=p)),

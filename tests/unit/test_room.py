@@ -29,6 +29,7 @@ CHOICES = {
     "late and gated": {"sensors": late("rtk")},
 }
 MORE = {
+    "features": {"randomization": {"features_yaw": Uniform(-1.0, 1.0)}},
     "ground": {"world": quad_gym.WorldParams(ground=quad_gym.GroundParams())},
     "plain": {},
     "trajectory": {"task": quad_gym.TaskParams(kind="trajectory", start="hover")},
