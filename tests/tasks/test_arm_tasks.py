@@ -100,8 +100,8 @@ def test_residuals_of_a_race_are_what_the_model_draws():
     for _ in range(30):
         b, *_ = env.step(np.zeros((6, 4), np.float32))
         residual = batch.view.state.residual
-        R = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ batch.read("R_BI")
-        gap = batch.read("r_ref") - batch.read("r") - residual[:, :3]
+        R = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ batch.view.R_BI
+        gap = batch.view.reference_position - batch.read("r") - residual[:, :3]
         expected = (R @ gap[:, :, np.newaxis])[:, :, 0]
         np.testing.assert_allclose(part(env, b, "position_error"), expected, atol=1e-4)
     assert np.abs(residual).max() > 1e-3
