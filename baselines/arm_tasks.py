@@ -194,7 +194,7 @@ class ResidualRace(SeenRace):
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Draw the next residual."""
-        noise = rng.normal(size=residuals.SIZE)
+        noise = rng.normal(size=(view.count, residuals.SIZE))
         view.state.residual = self._model.advance(view.state.residual, view.velocity, noise)
 
     def residual(self, view: "View") -> NDArray[np.float64]:

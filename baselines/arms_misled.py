@@ -43,12 +43,12 @@ ARMS = (
     *(
         _flown(
             f"told_{name.lower()}",
-            f"told {number} of its standard deviation",
+            f"told {number} its standard deviation",
             f"baselines.arm_tasks:TOLD_{name}",
         )
         for name, number in (
-            ("A_QUARTER", "1/4"),
-            ("HALF", "1/2"),
+            ("A_QUARTER", "1/4 of"),
+            ("HALF", "1/2 of"),
             ("TWICE", "twice"),
             ("FOURFOLD", "4 times"),
         )

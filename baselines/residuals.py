@@ -87,8 +87,8 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
         raise ValueError(
             f"errors must be those of a stationary model, got eigenvalue {largest:.4f}"
         )
-    factor = np.linalg.cholesky(covariance + 1e-18 * np.eye(SIZE)).astype(np.float64)
-    return ResidualModel(A, found[:, SIZE:], factor)
+    L: Floats = np.linalg.cholesky(covariance + 1e-18 * np.eye(SIZE)).astype(np.float64)
+    return ResidualModel(A, found[:, SIZE:], L)
 
 
 def record(

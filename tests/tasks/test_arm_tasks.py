@@ -100,8 +100,8 @@ def test_residuals_of_a_race_are_what_the_model_draws():
     for _ in range(30):
         b, *_ = env.step(np.zeros((6, 4), np.float32))
         residual = batch.view.state.residual
-        R = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ batch.read("R_BI")
-        gap = batch.read("r_ref") - batch.read("r") - residual[:, :3]
+        R = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ batch.view.R_BI
+        gap = batch.view.reference_position - batch.read("r") - residual[:, :3]
         expected = (R @ gap[:, :, np.newaxis])[:, :, 0]
         np.testing.assert_allclose(part(env, b, "position_error"), expected, atol=1e-4)
     assert np.abs(residual).max() > 1e-3
@@ -126,15 +126,16 @@ def test_doubt_says_whether_two_standard_deviations_fit_through_the_gap():
 def test_waiting_is_paid_for_standing_still_while_unsure():
     faults = [GnssOutage(start=0.0)]
     plain, waiting = (
-        make(name, task="QuadGym/OutageDash-v0", faults=faults)[0] for name in ("Wary", "Waiting")
+        make(name, task="QuadGym/OutageDash-v0", faults=faults)[0] for name in ("Steady", "Waiting")
     )
     batch, cases = waiting.unwrapped.flights.batch, set()
     action = np.zeros((6, 4), np.float32)
     action[:, 0] = 0.05
     for _ in range(400):
-        reward, paid = plain.step(action)[1], waiting.step(action)[1]
+        reward = plain.step(action)[1]
+        observed, paid, *_ = waiting.step(action)
         if not plain.unwrapped.flights.batch.view.shipped.terminated.any():
-            unsure = 2.0 * largest_sigma(waiting) > 0.5 * next_width(waiting)[:, 0] - 0.5
+            unsure = part(waiting, observed, "doubt")[:, 0] > 0.0
             v = batch.read("v")
             lost = 0.1 * (np.minimum(np.linalg.norm(v, axis=1), 5.0) + np.minimum(-v[:, 0], 5.0))
             np.testing.assert_allclose(paid, reward - np.where(unsure, lost, 0.0), atol=1e-9)
