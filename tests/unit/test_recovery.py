@@ -41,9 +41,11 @@ def test_ten_seconds_after_a_bias_step_the_filter_is_back_or_says_that_it_is_los
 
 
 def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
-    batch = flown("rtk", STEP, 5.0)
+    batch = flown("rtk", STEP, 3.25)
+    assert beyond(batch, 6.0).mean() > 0.9
+    steps(batch, 0.75)
     wrong, lost = beyond(batch, 6.0), batch.read("lost") > 0.0
-    assert wrong.mean() > 0.5
+    assert lost.mean() > 0.95
     assert (wrong & ~lost).mean() <= 0.01
 
 
