@@ -17,6 +17,7 @@ from quad_gym.records.params import PARAMS_FIELDS
 _FIELDS = {
     "any": (
         *("gravity", "dt", "accel_noise", "accel_error_noise", "gyro_noise"),
+        *("accel_thrust_noise", "gyro_thrust_noise"),
         *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
         *("accel_bias_sigma", "gyro_bias_sigma"),
         *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
@@ -39,6 +40,9 @@ _AIDS = ("aid_sigma", "aid_gate", "aid_numbers")
 
 _MEANINGS = {
     "accel_error_noise": "noise of a sample per m/s^2 of f_B - (0, 0, g), for scale and alignment",
+    "accel_noise": "noise of a sample in hover that the filter takes for white",
+    "accel_thrust_noise": "noise per m/s^2 by which |f_B| differs from g: sigma^2 (f_B^2 - g^2)",
+    "gyro_thrust_noise": "likewise",
     "gyro_noise": "noise of a sample that the filter takes for white",
     "accel_bias_decay": "of the bias over a tick: exp(-dt/tau)",
     "gyro_bias_decay": "of the bias over a tick: exp(-dt/tau)",

@@ -95,7 +95,7 @@ def test_a_deviation_that_is_invalid_is_refused():
 def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
     """A meter off at 3 m, a direction tells a distance that is wrong; at 30 m it is made use of."""
     suite = quad_gym.sensor_suite("standard")
-    points = ((0.0, -distance, 0.0), (0.2, -distance, 0.0))
+    points = ((distance, 0.0, 0.0), (distance, 0.2, 0.0))
     camera = suite.camera.replace(features_I=points, attitude=INDOOR.camera.attitude)
     suite = suite.replace(camera=camera)
     ukf = quad_gym.UnscentedKalmanFilter(suite)
@@ -108,7 +108,7 @@ def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
         gyro_bias=np.zeros(3),
         covariance=covariance,
     )
-    pixels = Camera(camera, rng=np.random.default_rng(3)).measure((0.8, 0.1, 0.3), np.eye(3))
+    pixels = Camera(camera, rng=np.random.default_rng(3)).measure((0.1, 0.4, 0.2), np.eye(3))
     assert np.isfinite(pixels).all()
     ukf.update(pixels=pixels)
     left_out = distance < 10.0
