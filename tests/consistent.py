@@ -4,8 +4,6 @@ import numpy as np
 
 STATE = ("state", "attitude", "accel_bias", "gyro_bias")
 """Parts whose errors hardly change in 10 s."""
-BAND = 1000
-"""Flights, at most, that the bands of `MeanSquare` are for."""
 
 
 def assert_consistent(nees, nis, whiteness, apart=()):
@@ -24,7 +22,8 @@ def assert_consistent(nees, nis, whiteness, apart=()):
     """
     found = nees | {f"NIS of {name}": part for name, part in nis.items() if name not in apart}
     for name, part in found.items():
-        off = abs(part.overall - part.dimension) / np.sqrt(2.0 * part.dimension / BAND)
+        deviation = np.mean(part.high - part.low) / (2.0 * 1.96)
+        off = abs(part.overall - part.dimension) / deviation
         by_mean = off < 1.0 and part.share_inside >= 0.8
         lasting = name in STATE and off < 3.5
         message = f"{name}: {part.share_inside:.3f} inside, {off:.2f} deviations off"

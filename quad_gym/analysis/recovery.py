@@ -61,16 +61,19 @@ class Recovery:
         return ~(self.right | self.told)
 
     def time_to(self, flags: Flags, since: float) -> float:
-        """How long after `since` it takes until `flags` hold for WANTED of the flights.
+        """How long after `since` it takes until `flags` hold for WANTED of the flights, for good.
 
-        Of some hundred flights of a filter that is right, chance alone has more outside now and
-        then, so that it is the first instant that counts.
+        Of some hundred flights of a filter that is right, chance alone has some outside now and
+        then: only an instant at which twice as many lack is one before the recovery.
 
         Returns:
             Time [s]; infinite if they never do.
         """
         after = self.time > since + 1e-9
-        enough = np.flatnonzero(flags[after].mean(axis=1) >= WANTED)
+        share = flags[after].mean(axis=1)
+        lacking = np.flatnonzero(share < 1.0 - 2.0 * (1.0 - WANTED))
+        share[: lacking[-1] + 1 if lacking.size else 0] = 0.0
+        enough = np.flatnonzero(share >= WANTED)
         return float(self.time[after][enough[0]] - since) if enough.size else np.inf
 
     def missed_alarms(self) -> Flags:

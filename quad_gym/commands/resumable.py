@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from tqdm import tqdm
 
 from quad_gym.analysis.reports import as_json, write_json
+from quad_gym.kernels.compiling.digest import flights_digest
 from quad_gym.params.sensors import SensorSuite
 
 
@@ -36,7 +37,7 @@ def run_cells(
         cells: Each a `Flown`.
         files: Where they are written, less the suffix: .json has the numbers and .md the table.
             Both are written anew after each cell.
-        head: What a former run must have in common with this one.
+        head: What a former run must have in common with this one, beside the code that flies.
         measure: What is found of a cell; with "sensors".
         table: The table of all that are found, by name.
 
@@ -45,6 +46,7 @@ def run_cells(
     """
     file, chosen = files.with_suffix(".json"), list(cells)
     before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    head = {**head, "sources": flights_digest()}
     same = {key: before.get(key) for key in head} == as_json(head)
     done: dict[str, Any] = before["cells"] if same else {}
     for cell in tqdm(chosen, desc=files.name, unit=" cells"):

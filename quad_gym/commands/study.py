@@ -226,11 +226,10 @@ def fly_all(study: Study) -> dict[Any, Flown]:
     for arm in study.arms:
         env: Any = None
         for seed in study.seeds_of(arm):
-            file = study.run_folder(arm, seed) / f"flown_{study.test_digest(arm)}.npz"
+            file = study.run_folder(arm, seed) / f"flown_{study.test_digest(arm, seed)}.npz"
             if not file.exists():
                 env = env or test_flights(study, arm, study.episodes)
-                name = arm.policy or str(study.policy_folder(arm, seed) / "best.npz")
-                policy = load_policy(name, env)
+                policy = load_policy(study.policy_of(arm, seed), env)
                 fly(policy, env, study.first_episode, study.about.traced).save(file)
             flown[arm.name, seed] = Flown.load(file)
     return flown

@@ -21,6 +21,7 @@ from quad_gym.analysis.robust import (
 )
 from quad_gym.commands.study_flights import Flown
 from quad_gym.commands.study_tasks import ALWAYS, StudiedTask
+from quad_gym.kernels.compiling.digest import flights_digest
 
 Floats = NDArray[np.float64]
 
@@ -55,11 +56,17 @@ class Study:
         name = arm.flies or arm.name
         return self.folder / "runs" / name / f"seed_{seed}"
 
-    def test_digest(self, arm: Arm) -> str:
-        """Of what the test of an arm depends on, beside its policy."""
+    def policy_of(self, arm: Arm, seed: int | None) -> str:
+        """The policy that an arm flies: a rule by name, or the file of a training."""
+        return arm.policy or str(self.policy_folder(arm, seed) / "best.npz")
+
+    def test_digest(self, arm: Arm, seed: int | None) -> str:
+        """Of what the test of an arm depends on: the policy, the episodes, the code that flies."""
         about = {**self.environment, **arm.environment}
-        flight = [self.env_id, about, self.episodes, self.first_episode, arm.policy]
-        given = as_json([*flight, self.about.traced])
+        policy = Path(self.policy_of(arm, seed))
+        trained = hashlib.sha256(policy.read_bytes()).hexdigest() if policy.is_file() else ""
+        flight = [self.env_id, about, self.episodes, self.first_episode, arm.policy, trained]
+        given = as_json([*flight, self.about.traced, flights_digest()])
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
 
     def description(self) -> dict[str, Any]:

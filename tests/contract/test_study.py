@@ -8,6 +8,7 @@ import pytest
 from baselines.arms import ARMS, Arm
 from baselines.recipes import recipe
 from quad_gym.commands import study as command
+from quad_gym.commands import study_results
 from quad_gym.commands.main import main
 from quad_gym.commands.study_flights import Flown
 from quad_gym.commands.study_results import Study
@@ -119,6 +120,24 @@ def test_a_reward_of_an_arm_holds_in_training_alone():
     assert type(learned.custom).__name__ == "Sure"
     assert type(judged.custom).__name__ == "Doubting"
     assert judged.task.out_of_bounds == 8.0
+
+
+def test_flights_are_flown_again_after_another_training_or_another_flight(tmp_path, monkeypatch):
+    arms = tuple(arm for arm in ARMS if arm.name in ("truth", "truth_on_truth"))
+    study = Study(
+        *("QuadGym/StaleRace-v0", arms, (0,), recipe("QuadGym/StaleRace-v0")),
+        *({}, 40, 0, STUDIED["stale_race"], tmp_path, None),
+    )
+    policy = tmp_path / "runs" / "truth" / "seed_0" / "best.npz"
+    policy.parent.mkdir(parents=True)
+    found = []
+    for content in (b"one training", b"another", b"another"):
+        policy.write_bytes(content)
+        found.append([study.test_digest(arm, 0) for arm in arms])
+    monkeypatch.setattr(study_results, "flights_digest", lambda: "of other sources")
+    found.append([study.test_digest(arm, 0) for arm in arms])
+    for first, second, same, last in zip(*found, strict=True):
+        assert first != second == same != last
 
 
 def flown(returns, crashed, error):

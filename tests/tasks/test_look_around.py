@@ -121,9 +121,9 @@ def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not
 
 def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_covariance=True)
-    rule = fly(PDPolicy(env, faces="features_when_unsure"), env, 0)
+    rule = fly(PDPolicy(env, faces="features_when_unsure"), env, 0, traced=("sigma",))
     assert rule.returns.mean() > facing.returns.mean()
-    assert UNSURE < np.nanmax(rule.sigma) < 3.0
+    assert UNSURE < np.nanmax(rule.traces["sigma"]) < 3.0
     assert rule.crashed.mean() < 0.1
 
 

@@ -16,7 +16,7 @@ from quad_gym.analysis.consistency import (
     verdict,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, Gate
 from tests.unit.alarms import assert_normal
 
 
@@ -125,6 +125,7 @@ class Measured:
             "innovation": np.repeat(innovations[:, np.newaxis], MAX_BLOCKS, axis=1),
             "innovation_sigma": np.full((*blocks, 3), 2.0),
             "block_nis": np.repeat(nis[:, np.newaxis], MAX_BLOCKS, axis=1),
+            "gate": np.full(blocks, float(Gate.NONE)),
         }
 
     def read(self, name):

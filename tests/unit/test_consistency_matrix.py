@@ -5,7 +5,7 @@ import json
 import pytest
 
 import quad_gym
-from quad_gym.commands import consistency
+from quad_gym.commands import consistency, resumable
 from quad_gym.commands import consistency_matrix as matrix
 from quad_gym.commands.options import parse
 from quad_gym.params.suites import SUITES
@@ -71,6 +71,9 @@ def test_a_run_goes_on_where_it_was_and_begins_anew_with_other_flights(tmp_path,
     assert flown == [cell.name for cell in cells[:4]]
     matrix.run_matrix(cells[:1], tmp_path, **SMALL | {"flights": 65})
     assert flown[4:] == [cells[0].name]
+    monkeypatch.setattr(resumable, "flights_digest", lambda: "of other sources")
+    matrix.run_matrix(cells[:1], tmp_path, **SMALL | {"flights": 65})
+    assert flown[5:] == [cells[0].name]
 
 
 def test_the_table_marks_misses_and_those_that_are_expected():

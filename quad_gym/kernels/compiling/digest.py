@@ -54,6 +54,21 @@ def digest_of(path: Path) -> str:
     return digest.hexdigest()
 
 
+@functools.cache
+def flights_digest() -> str:
+    """A digest of all sources that flights and what is found of them depend on.
+
+    Results on disk are kept beside it: with other code they are measured anew. What commands and
+    pictures look like does not count.
+    """
+    apart = ("commands", "rendering", "compiling")
+    files = sorted(
+        file for file in (_BASE / PACKAGE).rglob("*.py") if not set(apart) & set(file.parts)
+    )
+    lines = (f"{os.path.relpath(f, _BASE)} {_read(f, f.stat().st_mtime_ns)[0]}\n" for f in files)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
 @functools.lru_cache(maxsize=1024)
 def _read(file: Path, changed: int) -> tuple[str, tuple[Path, ...]]:
     """The digest of one file, and the files of the package that it imports."""
