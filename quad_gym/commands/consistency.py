@@ -91,8 +91,8 @@ class Args:
     settle: float = 0.0
     """time at the start that does not count [s]"""
     output: Path | None = None
-    """folder for figures and numbers, made if it is missing; if not given, results/consistency, with
-    --matrix results/consistency_matrix, with --recovery results/consistency_recovery"""
+    """folder for figures and numbers, made if it is missing; if not given, results/consistency,
+    with --matrix results/consistency_matrix, with --recovery results/consistency_recovery"""
     matrix: bool = False
     """fly the matrix of configurations; of the other options only episodes, seed, duration,
     output, page, cells and threads concern it"""
