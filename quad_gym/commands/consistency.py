@@ -91,11 +91,11 @@ class Args:
     settle: float = 0.0
     """time at the start that does not count [s]"""
     output: Path | None = None
-    """folder for figures and numbers, made if it is missing; if not given, results/consistency, or
-    results/consistency_matrix"""
+    """folder for figures and numbers, made if it is missing; if not given, results/consistency,
+    with --matrix results/consistency_matrix, with --recovery results/consistency_recovery"""
     matrix: bool = False
     """fly the matrix of configurations; of the other options only episodes, seed, duration,
-    output and threads concern it"""
+    output, page, cells and threads concern it"""
     recovery: bool = False
     """fly faults and see how filters recover; of the other options only episodes, seed, output,
     page and threads concern it"""

@@ -76,7 +76,8 @@ def cells(results: Results) -> list[list[str]]:
 def table_text(results: Results) -> str:
     """The table for the screen."""
     heads = headings(results)
-    return text_table({"": heads[:1], "flown on the estimate": heads[1:]}, cells(results))
+    flown = "flown on the estimate unless the arm says otherwise"
+    return text_table({"": heads[:1], flown: heads[1:]}, cells(results))
 
 
 def table_markdown(results: Results) -> str:
@@ -271,7 +272,7 @@ def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
     parts = [
         f"<h1>{html.escape(study.env_id)}</h1>",
         f"<p>{_trainings(results)}{study.episodes:,} episodes with each policy, flown on the "
-        "estimate. Interquartile means over seeds; in "
+        "estimate unless the arm says otherwise. Interquartile means over seeds; in "
         "brackets bootstrap 95 % intervals over seeds and episodes. Success: "
         f"{study.about.meaning}.</p>",
         f"<table>{''.join(rows)}</table><ul>",

@@ -56,12 +56,11 @@ class OutageDash(Task):
     The sensors are those of a hobby vehicle (`consumer`). With GNSS the filter knows the position
     to 0.2 m; without it the error is 0.25 m after two seconds, 0.8 m after five, 2 m after eight,
     and 4 m after twelve (root mean square). Gaps are 3 to 6 m wide, walls 12 m apart. A controller
-    that hurries on through an outage hits a wall; one that waits for its end loses the course that
-    it could have flown, and drifts. How far to go on depends on the filter's uncertainty and on the
-    width of the next gap.
+    that hurries on through an outage hits a wall; one that waits for its end needs the time, and
+    drifts. How far to go on depends on the filter's uncertainty and on the width of the next gap.
 
-    There is time to wait: at 5 m/s the course takes 27 s of the 35 s, and nothing is paid for time
-    that is left. With 20 s, as in the first version, waiting paid hardly more than hurrying on.
+    At 5 m/s the course takes 27 s of the 35 s, and nothing is paid for time that is left: at that
+    speed, 8 s of waiting cost nothing, and longer waiting costs the end of the course.
 
     ## Course
     It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,

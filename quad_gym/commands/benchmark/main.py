@@ -4,9 +4,10 @@ Every figure is the best of some repeats, as other load on the machine can only 
 "spread" is how much longer the median of the repeats took. All ratios are taken within one run.
 
 Compiling and learning are measured by `--only compile` and `--only learning` alone, as they take
-minutes: `learning` trains the compiled PPO with ten seeds, until it flies better than tuned PD
-control and to the end. `--against DIR` compares the environments with those of another
-checkout, by turns in one run: on a machine that others use, too, two runs cannot be compared.
+minutes: `learning` trains the compiled PPO with ten seeds, the whole recipe each, and says when
+each first flew better than tuned PD control. `--against DIR` compares the environments with those
+of another checkout, by turns in one run: on a machine that others use, too, two runs cannot be
+compared.
 
 Progress goes to stderr, tables go to stdout, and everything goes to benchmark.json with the
 configuration, the versions and the processor. Run it on an idle machine.
