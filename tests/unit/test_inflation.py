@@ -7,6 +7,10 @@ import pytest
 
 import quad_gym
 import quad_gym.frames
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.records import FEATURE_BLOCKS, POSITION_BLOCK
+from tests.field_flights import steps
 
 MOST = np.repeat([100.0, 20.0, math.nan, 2.0, 0.1], 3)  # of attitude: tilt 0.2, heading pi/sqrt 3
 
@@ -111,3 +115,28 @@ def test_alarms_that_repeat_leave_what_nothing_measures_bounded():
     assert sigma[:3].max() > 50.0
     k = R_BI[:, 2]
     assert math.sqrt(k @ ukf.covariance[6:9, 6:9] @ k) < 2.0
+
+
+def test_a_sensor_that_no_longer_measures_does_not_keep_a_filter_lost():
+    """Without a gate nothing begins its mean anew; the camera goes on."""
+    batch = FlightBatch(
+        8,
+        sensors="standard",
+        task=TASK_DEFAULTS["hover"],
+        gains="tuned",
+        filter_start="warm",
+        innovations=True,
+    )
+    batch.reset(seeds=range(8))
+    steps(batch, 1.0)
+    assert not batch.read("lost").any()
+    flights = batch.snapshot()
+    flights["innovation_drift"][:, POSITION_BLOCK] = 0.8
+    batch.restore(flights)
+    batch.switch_sensors(gnss=False)
+    steps(batch, 0.5)
+    assert batch.read("lost").all()
+    steps(batch, 1.8)
+    assert (batch.read("innovation_drift")[:, POSITION_BLOCK] == 0.8).all()
+    assert (batch.read("accepted_tick")[:, FEATURE_BLOCKS] > 0.0).all()
+    assert not batch.read("lost").any()

@@ -196,11 +196,15 @@ def doubt_rate(P, rate, doubted):
 
 
 @kernel
-def tell_drifts(flight, mask):
-    """Count a filter that only watches its innovations as lost while they drift, where `mask`."""
-    drifting = drifts(flight, 0)
-    for group in range(1, SENSOR_GROUPS):
-        drifting = drifting | drifts(flight, group)
+def tell_drifts(flight, p, mask):
+    """Count a filter that only watches its innovations as lost while they drift, where `mask`.
+
+    The mean of a sensor that no longer measures stays what it was, and tells nothing of now.
+    """
+    drifting = mask & (flight.tick < 0.0)  # nobody
+    for group in range(SENSOR_GROUPS):
+        recent = (flight.tick - flight.accepted_tick[group]) * p.dt <= DOUBT_TIME
+        drifting = drifting | (recent & drifts(flight, group))
     accel, _ = one_way(flight, 0)
     gyro, _ = one_way(flight, 3)
     drifting = drifting | accel | gyro

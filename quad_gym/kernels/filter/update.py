@@ -300,7 +300,7 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     if (form & _GATE) != 0:
         raise_doubts(flight, p, work, settings, mask & logical_not(failed), slow, stages)
     elif (form & _WATCH) != 0:
-        tell_drifts(flight, mask)
+        tell_drifts(flight, p, mask)
 
 
 @stage
