@@ -188,13 +188,18 @@ def _hide_unsure(flight, work, feature_count, mask):
 
 @kernel
 def _show_hidden(flight, work, settings, mask):
-    """Undo that, and say of these features that they were left out."""
+    """Undo that, and say of these features that they were left out: they have no innovation."""
     for i in range(settings.feature_count):
         hidden = mask & (work.hidden[i] > 0.0)
         flight.feature_valid[i] = select(hidden, 1.0, flight.feature_valid[i])
         if (settings.form & _WATCH) != 0:
             block = FEATURE_BLOCKS + i
             flight.gate[block] = select(hidden, _UNSURE, flight.gate[block])
+            flight.block_nis[block] = select(hidden, np.nan, flight.block_nis[block])
+            for axis in range(3):
+                nu, sigma = flight.innovation[block, axis], flight.innovation_sigma[block, axis]
+                flight.innovation[block, axis] = select(hidden, np.nan, nu)
+                flight.innovation_sigma[block, axis] = select(hidden, np.nan, sigma)
 
 
 @kernel
