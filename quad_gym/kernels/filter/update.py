@@ -175,7 +175,7 @@ def _is_loose(flight, p, work, feature_count):
 def _hide_unsure(flight, work, feature_count, mask):
     """Hide features whose directions are too uncertain to make use of; return where there are any.
 
-    Each step takes from a wrong direction a wrong distance, of which the filter is then sure.
+    Each step would infer a wrong distance from a wrong direction and make the filter overconfident.
     """
     some = work.hidden[0] < 0.0  # nowhere
     for i in range(feature_count):
