@@ -36,6 +36,8 @@ class FlightMemory:
     sensors: SensorSuite
     faults: tuple[Fault, ...]
     randomization: Randomization
+    _model: NDArray[Any]
+    _world: NDArray[Any]
 
     def _allocate(self, room: Room, undrawn: NDArray[np.float64]) -> None:
         """Make the records of flights that have never been reset.
@@ -107,12 +109,13 @@ class FlightMemory:
     def feature_places(self) -> NDArray[np.float64]:
         """(count, m, 3) where the camera's features are in the present episodes, in I [m].
 
-        As the filter believes.
+        As the filter believes, which are the true ones where it knows the sensors.
         """
-        camera = self.sensors.camera
-        nominal = np.array([] if camera is None else camera.features_I).reshape(-1, 3)
+        count = 0 if self.sensors.camera is None else len(self.sensors.camera.features_I)
         if self._room.holds("feature_place"):
-            return np.ascontiguousarray(self.read("feature_place")[:, : len(nominal)])
+            return np.ascontiguousarray(self.read("feature_place")[:, :count])
+        believed = self._world if self.randomization.known else self._model
+        nominal = believed["features"][0, :count, :, 0].copy()
         return np.broadcast_to(nominal, (self.count, *nominal.shape))
 
     def active_faults(self) -> dict[str, NDArray[np.bool_]]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.sensors import AID_PARAMS
-from quad_gym.records import AID_FREEDOMS, COLUMNS, Aid, Control, Layout, Source
+from quad_gym.records import AID_FREEDOMS, COLUMNS, MAX_OBSERVATION, Aid, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
 """Values of the keyword `observation`."""
@@ -189,7 +189,16 @@ def observation_layout(
 def layout_bounds(
     table: tuple[ObservationField, ...],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(low, high) of every number of an observation, (n,) each."""
+    """(low, high) of every number of an observation, (n,) each.
+
+    Raises:
+        ValueError: If they are more than the kernels have room for.
+    """
+    if table[-1].slice.stop > MAX_OBSERVATION:
+        raise ValueError(
+            f"an observation must have at most {MAX_OBSERVATION} numbers, got "
+            f"{table[-1].slice.stop}"
+        )
     low, high = np.empty(table[-1].slice.stop), np.empty(table[-1].slice.stop)
     for field in table:
         low[field.slice], high[field.slice] = field.low, field.high

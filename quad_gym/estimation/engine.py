@@ -128,7 +128,7 @@ class Engine:
         """Carry the estimate over the time of a sample."""
         self._set_dt(sample.dt)
         blocks = self.blocks
-        blocks["tick"] += 1.0
+        blocks["tick"] += sample.dt / self.sensors.imu.dt  # a clock, whatever pieces it goes in
         self.fill("gyro", sample.gyro)
         self.fill("accel", sample.accel)
         # they turn the lever arms of a velocity and of the accelerometer
@@ -159,6 +159,7 @@ class Engine:
             blocks["feature_valid"][:, : self.features] = seen
             image = np.where(seen, m.pixels, 0.0)[..., np.newaxis]
             blocks["pixels"][:, : self.features] = image
+        self._set_dt(self.sensors.imu.dt)  # `tick` counts these
         kept = self.impose(m.noise)
         self._run(Stage.UPDATE, Stage.UPDATE_WITH_SLOW)
         self.restore_noise(kept)

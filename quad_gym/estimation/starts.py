@@ -5,8 +5,8 @@ All that is uncertain at the start is a linear function of independent errors s,
     x = (r, v, e, b_a, b_g, d) = G s,
 
 so that `L L^T = G diag(s^2) G^T` follows from a QR factorization, also where it is singular. The
-position hangs on the attitude, as the antenna was measured and not the center of mass: with r =
-antenna - R^T l its error is that of the fix and J e, J = R_hat^T [l x]. The heading hangs on what
+position depends on the attitude, as the antenna was measured and not the center of mass: with r =
+antenna - R^T l its error is that of the fix and J e, J = R_hat^T [l x]. The heading depends on what
 tells it (`magnetic_heading`, `baseline_heading`).
 
 R_hat is T level(heading): T turns the level frame, whose x axis is the body's without its vertical

@@ -77,14 +77,15 @@ def pack_places(
     """Write into a settings record whether features are drawn, and where they are without draws.
 
     Args:
-        s: The settings.
+        s: The settings, which say already whether the filter knows the world as it is.
         draws: What is drawn.
         true_sensors: As they are.
-        sensors: As the filter believes.
+        sensors: As the filter believes, unless it knows.
     """
     s["features_drawn"] = bool(set(FEATURE_DRAWS) & set(draws.names))
     if s["features_drawn"]:
-        for k, suite in enumerate((true_sensors, sensors)):
+        believed = true_sensors if s["known"] else sensors
+        for k, suite in enumerate((true_sensors, believed)):
             assert suite.camera is not None
             s["feature_places"][k, : len(suite.camera.features_I)] = suite.camera.features_I
 

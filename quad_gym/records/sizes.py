@@ -46,7 +46,7 @@ SENSOR_GROUPS = AID_GROUPS + AIDS
 """Kinds of measurements: positions, baselines, velocities, images, and aiding sensors."""
 FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1), *AID_FREEDOMS)
 """Degrees of freedom of the blocks: a direction has two."""
-MAX_OBSERVATION = 256
+MAX_OBSERVATION = 512
 """Numbers that an observation can hold."""
 WARM_DRAWS = 21
 """Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym.envs.spaces import layout_bounds
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import COLUMNS, MAX_FEATURES, MAX_OBSERVATION, Aid
 from tests.contract.comparing import actions_of
 from tests.contract.test_tasks import SECONDS, UNBOUNDED, body_axes, level, unit
 from tests.reference_ukf import east_north_up, rotation_312
@@ -297,3 +299,58 @@ def test_observations_are_held_within_their_bounds():
     )
     assert observation in env.observation_space
     assert abs(observation).max() == 100.0
+
+
+def nearly_all_draws():
+    """A distribution for all that can be drawn together in a world without a battery."""
+    left_out = ("wind_speed", "wind_direction", "battery_charge", "battery_resistance")
+    absolute = ("wind_", "start_", "feature", "camera_", "lever_arm", "center_of", "gust_")
+    draws = {}
+    for name in COLUMNS:
+        if name in left_out:
+            continue
+        if name.startswith(absolute) or name.endswith(("drag_B", "action_delay")):
+            draws[name] = quad_gym.Uniform(0.0, 0.01)
+        else:
+            draws[name] = quad_gym.Uniform(0.99, 1.01, relative=True)
+    return draws
+
+
+def test_the_longest_observation_fits_and_ends_with_the_draws():
+    """Raw measurements of all sensors, sixteen features, deviations, the truth and draws."""
+    suite = quad_gym.sensor_suite("rtk")
+    features = tuple((2.0 + 0.1 * i, 0.2 * i, 1.0) for i in range(16))
+    suite = suite.replace(
+        camera=suite.camera.replace(features_I=features),
+        barometer=quad_gym.BarometerParams(),
+        magnetometer=quad_gym.MagnetometerParams(),
+    )
+    keywords = {"observation": "sensors", "include_covariance": True, "privileged": True}
+    env, observation, actions = flown(
+        steps=2, sensors=suite, randomization=nearly_all_draws(), **keywords
+    )
+    batch = env.flights.batch
+    keywords |= {"feature_count": 16, "gnss_velocity": True, "aids": suite.aids}
+    parts = parts_of(observation, drawn=batch.randomization.names, **keywords)
+    assert sum(part.shape[1] for part in parts.values()) == 262
+    values = batch.drawn()
+    close(parts["last_action"], actions)
+    offsets = values["feature_offsets_I"].reshape(6, -1)
+    close(parts["drawn_feature_offsets_I"], (offsets - 0.005) / 0.005, 10.0)
+    close(parts["drawn_wind_up"][:, 0], (values["wind_up"] - 0.005) / 0.005, 10.0)
+
+
+def test_every_observation_fits():
+    table = quad_gym.observation_layout(
+        "sensors",
+        include_covariance=True,
+        privileged=True,
+        feature_count=MAX_FEATURES,
+        gnss_velocity=True,
+        aids=tuple(Aid),
+        drawn=tuple(COLUMNS),
+    )
+    assert 256 < table[-1].slice.stop <= MAX_OBSERVATION
+    longer = [*table, table[0]._replace(slice=slice(0, MAX_OBSERVATION + 1))]
+    with pytest.raises(ValueError, match="an observation must have at most 512 numbers, got 513"):
+        layout_bounds(tuple(longer))

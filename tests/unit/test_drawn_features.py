@@ -106,6 +106,17 @@ def test_an_error_of_the_map_turns_with_it():
     np.testing.assert_allclose(flights.feature_places(), places(flights.drawn()), atol=1e-12)
 
 
+@pytest.mark.parametrize("drawn", [False, True])
+def test_a_filter_that_knows_the_sensors_knows_the_true_map(drawn):
+    wrong = NOMINAL + np.array([0.2, 0.0, 0.0])
+    true = INDOOR.replace(camera=INDOOR.camera.replace(features_I=tuple(map(tuple, wrong))))
+    for known, map_I in ((True, wrong), (False, NOMINAL)):
+        randomization = Randomization(DRAWS if drawn else {}, known=known)
+        flights = batch(3, true_sensors=true, randomization=randomization)
+        expected = places(flights.drawn(), map_I) if drawn else [map_I] * 3
+        np.testing.assert_allclose(flights.feature_places(), expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     "options",
     [{}, {"sensors": "indoor"}, {"filter_start": "warm"}, {"sensors": INDOOR.replace(

@@ -110,7 +110,12 @@ def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
     )
     pixels = Camera(camera, rng=np.random.default_rng(3)).measure((0.1, 0.4, 0.2), np.eye(3))
     assert np.isfinite(pixels).all()
+    for name in ("innovation", "innovation_sigma", "block_nis"):
+        ukf._engine.blocks[name] = 1.0  # of an image before
     ukf.update(pixels=pixels)
     left_out = distance < 10.0
+    kept = ukf.last_update
+    for values in (kept.innovation[-2:, 0], kept.sigma[-2:, 0], kept.nis[-2:]):
+        assert (np.isnan(values) == left_out).all()
     assert (np.abs(ukf.covariance - covariance).max() < 1e-12) == left_out
     assert (np.abs(ukf.position).max() < 1e-9) == left_out

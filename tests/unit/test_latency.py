@@ -274,6 +274,20 @@ def test_a_late_measurement_that_fails_leaves_the_estimate_bit_for_bit():
         np.testing.assert_array_equal(after[0][name], after[1][name], err_msg=name)
 
 
+def test_an_undone_update_leaves_no_corrections_behind():
+    suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
+    batch = fly(suite, 10, task="hover")
+    steps(batch, 6 * DT)
+    flights = batch.snapshot()
+    flights["late_position"][0, 0, 1, ::2] = np.nan
+    flights["corrected"], flights["corrected_variance"] = 1.0, 1e9
+    batch.restore(flights)
+    steps(batch, 9 * DT)
+    failed = np.isin(np.arange(10), [0, 2, 4, 6])
+    for name in ("corrected", "corrected_variance"):
+        np.testing.assert_array_equal((batch.read(name) == 0.0).all(axis=1), failed)
+
+
 def test_a_failure_before_does_not_stop_late_measurements():
     suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.25), camera=None), gnss=0.05)
     batch = fly(suite, WIDTH, task="hover")

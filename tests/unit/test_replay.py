@@ -10,6 +10,7 @@ import pytest
 import quad_gym
 from quad_gym.analysis.replay_plots import replay_figure
 from quad_gym.estimation import LOG_COLUMNS, Log, Stream, read_log, replay
+from quad_gym.estimation.player import Player
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
 from tests.console_commands import run
 from tests.logged_flights import PX4, RTK, Recorded, errors_in_flight, errors_in_replay, flown
@@ -149,6 +150,22 @@ def test_a_regular_log_replays_as_it_was_flown(flight):
     late = k > 400
     gap = np.abs(result.position - flight["estimated_position"][k])[late]
     assert gap.max() < 0.1 * sizes(errors_in_flight(recorded, k)[late])[0]
+
+
+def test_the_memory_of_corrections_is_of_seconds_whatever_the_stamps_are(flight):
+    """Fixes 0.1 ms after a sample split the next one: the filter ends with as many corrections."""
+    recorded = Recorded(flight, RTK, lost=0.0, jitter=0.0, most_ticks=1)
+    found = []
+    for shift in (0.0, 1e-4):
+        recorded.gnss = [
+            (stamp + shift, received + shift, v) for stamp, received, v in recorded.gnss
+        ]
+        player = Player(read_log(recorded.table()), RTK, "ukf", {}, True, 0.5)
+        player.play()
+        engine = player.filter._engine
+        found.append(engine.read("corrected_variance")[0])
+        assert engine.read("tick")[0] * RTK.imu.dt == pytest.approx(SECONDS, abs=0.02)
+    np.testing.assert_allclose(found[1], found[0], rtol=0.05)
 
 
 def test_what_has_come_too_late_is_left_out_and_counted(table):

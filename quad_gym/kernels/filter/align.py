@@ -51,7 +51,7 @@ _STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that te
 
 @kernel
 def _tie_position_to_attitude(L, R_BI, lever_B, mask):
-    """Put into L that the start's position hangs on its attitude, where `mask`.
+    """Put into L that the start's position depends on its attitude, where `mask`.
 
     The antenna was measured, and r = antenna - R^T l: with R = R(e) R_hat the error of the position
     is that of the fix and J e, J = R_hat^T [l x].
@@ -78,10 +78,10 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
     with equal weights, or level with the baseline's heading (one antenna has a vertical baseline,
-    so to speak); position from the antenna; velocity
-    and biases zero. A level start knows that its position hangs on its attitude. The heading is the
-    less certain the steeper the baseline. Where that tells none to speak of, the body x axis joins
-    in Wahba's problem, or gives the heading; where nobody knows it either, the heading may be any.
+    so to speak); position from the antenna; velocity and biases zero. A level start knows that its
+    position depends on its attitude. The heading is the less certain the steeper the baseline.
+    Where that tells none to speak of, the body x axis joins in Wahba's problem, or gives the
+    heading; where nobody knows it either, the heading may be any.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.

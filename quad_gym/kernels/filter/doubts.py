@@ -10,22 +10,42 @@ states is multiplied by `_FACTOR`: what went wrong with the biases is in attitud
 position, too, and correlations say how. Slow errors of sensors keep theirs: a constant one
 that has become uncertain may stay so, such as hard iron, and the heading with it. The biases get
 more than that: sixteen times their deviation for a drift, three times the corrections that go one
-way.
+way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
+
+No alarm inflates a deviation beyond `_MOST_POSITION` and its like. What nothing measures for a
+time, such as the heading in hover without a baseline, or the position in an outage of GNSS, would
+otherwise grow fourfold with each alarm, until sigma points mean nothing. The bounds act as a
+congruence P -> M P M with M diagonal in the position, velocity and biases, and in tilt and heading,
+so that P stays positive definite.
 
 Source: ours.
 """
 
+import math
+
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import BA, BG
-from quad_gym.kernels.filter.recovery import forget_corrections, one_way, suspect_group
+from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
+from quad_gym.kernels.filter.recovery import (
+    MOST_ACCEL_BIAS,
+    MOST_GYRO_BIAS,
+    MOST_TILT,
+    forget_corrections,
+    one_way,
+    suspect_group,
+)
 from quad_gym.kernels.filter.slow import fill_slow, keep_slow_factor
-from quad_gym.kernels.maths.elementary import minimum
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
-    add_to_diagonal,
+    add_outer,
+    apply,
+    dot,
+    load33,
     load_block,
+    multiply,
+    scale,
     scale33,
     store_block,
     sum_of_outers,
@@ -40,8 +60,8 @@ _FACTOR, _BIAS_FACTOR = 16.0, 240.0
 """Of the covariance, and what is added of the biases' variances, where innovations drift."""
 _REMAINING = 9.0
 """Square of how many times the sum of corrections may still be missing."""
-_MOST_ACCEL_BIAS, _MOST_GYRO_BIAS = 2.0, 0.1
-"""Largest deviations that these two add [m/s^2], [rad/s]."""
+_MOST_POSITION, _MOST_VELOCITY, _MOST_HEADING = 100.0, 20.0, math.pi / math.sqrt(3.0)
+"""Largest deviations that inflation leads to [m], [m/s], [rad]; the last of any angle."""
 
 
 @kernel
@@ -57,10 +77,62 @@ def _variance_of(flight, row):
 
 @kernel
 def _doubt_biases(flight, P, row, drifting, going, square, most):
-    """Add to the variances of three biases from a row on."""
+    """Add to the variances of three biases from a row on, up to `most`."""
     more = select(drifting, minimum(_BIAS_FACTOR * _variance_of(flight, row), most * most), 0.0)
     more = more + select(going, minimum(_REMAINING * square, most * most), 0.0)
-    store_block(P, row, row, add_to_diagonal(load_block(P, row, row), more))
+    for i in range(row, row + 3):
+        P[i, i] = P[i, i] + minimum(more, maximum(most * most - P[i, i], 0.0))
+
+
+@kernel
+def _share(variance, most, inflated):
+    """What an inflated deviation keeps so as not to exceed `most`; at least that of before."""
+    return select(inflated, math.sqrt(clip(most * most / variance, 1.0 / _FACTOR, 1.0)), 1.0)
+
+
+@kernel
+def _shrink_block(P, row, M, states):
+    """Multiply the three rows and the three columns from `row` on by a symmetric M."""
+    for j in range(0, row, 3):
+        store_block(P, row, j, multiply(M, load_block(P, row, j)))
+    store_block(P, row, row, multiply(multiply(M, load_block(P, row, row)), M))
+    for i in range(row + 3, states, 3):
+        store_block(P, i, row, multiply(load_block(P, i, row), M))
+
+
+@kernel
+def _shrink_axes(P, row, most, inflated, states):
+    """Bound the inflation of three states, each by itself."""
+    a = _share(P[row, row], most, inflated)
+    b = _share(P[row + 1, row + 1], most, inflated)
+    c = _share(P[row + 2, row + 2], most, inflated)
+    zero = 0.0 * a
+    _shrink_block(P, row, ((a, zero, zero), (zero, b, zero), (zero, zero, c)), states)
+
+
+@kernel
+def bound_inflation(flight, P, inflated, states):
+    """Take back from P what inflation by `_FACTOR` has put beyond the largest deviations.
+
+    Args:
+        flight: Record; reads R_hat, for the vertical.
+        P: The inflated covariance, its lower triangle by blocks.
+        inflated: Which lanes are.
+        states: How many states there are, slow errors included.
+    """
+    R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
+    k = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
+    heading = dot(k, apply(P_ee, k))
+    both = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
+    tilted = _share(both, MOST_TILT, inflated)
+    turned = _share(heading, _MOST_HEADING, inflated) - tilted
+    zero = 0.0 * tilted
+    M = ((tilted, zero, zero), (zero, tilted, zero), (zero, zero, tilted))
+    _shrink_block(P, E, add_outer(M, scale(turned, k), k), states)
+    _shrink_axes(P, R, _MOST_POSITION, inflated, states)
+    _shrink_axes(P, V, _MOST_VELOCITY, inflated, states)
+    _shrink_axes(P, BA, MOST_ACCEL_BIAS, inflated, states)
+    _shrink_axes(P, BG, MOST_GYRO_BIAS, inflated, states)
 
 
 @kernel
@@ -102,8 +174,9 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
     if slow is not None:
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)
-    _doubt_biases(flight, P, BA, drifting, accel, corrected_a, _MOST_ACCEL_BIAS)
-    _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, _MOST_GYRO_BIAS)
+    bound_inflation(flight, P, inflated, states)
+    _doubt_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
+    _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)
     doubt(flight, p, work, settings, slow, 0)
     if slow is not None:
         if slow.aids > 0:

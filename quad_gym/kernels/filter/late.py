@@ -21,6 +21,7 @@ from quad_gym.kernels.filter.preintegration import (
     take_columns,
     take_mean,
 )
+from quad_gym.kernels.filter.recovery import forget_corrections
 from quad_gym.kernels.filter.slow import (
     begin_to_carry_slow,
     carry_slow,
@@ -56,11 +57,12 @@ from quad_gym.kernels.measurements.blocks import choose, count, keep_valid
 from quad_gym.kernels.measurements.stamps import go_to_stamp
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import AIDS, DELAY_SLOTS, SENSORS, FilterStatus
+from quad_gym.records import AIDS, DELAY_SLOTS, SENSORS, FilterForm, FilterStatus
 
 _PRESENT = SENSORS + AIDS
 """The turn of what is not late, after those of GNSS, camera and aiding sensors."""
 _UPDATE, _UPDATE_WITH_SLOW = int(Stage.UPDATE), int(Stage.UPDATE_WITH_SLOW)
+_WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
 
@@ -177,8 +179,11 @@ def _carry(flight, p, work, back, ticks, slow):
 
 
 @kernel
-def _restore_estimate(flight, work, arrived, good, slow):
-    """Undo what has happened but where something arrived and all went well."""
+def _restore_estimate(flight, work, settings, arrived, good, slow):
+    """Undo what has happened but where something arrived and all went well.
+
+    What has been corrected is added up anew: the last correction is no more.
+    """
     old = logical_not(arrived & good)
     keep3(flight.r_hat, old, load3(work.kept_r))
     keep3(flight.v_hat, old, load3(work.kept_v))
@@ -192,6 +197,8 @@ def _restore_estimate(flight, work, arrived, good, slow):
         restore_slow(flight, slow, work, old)
     store3(flight.w_meas, load3(work.kept_rates))
     failed = arrived & old
+    if (settings.form & _WATCH) != 0 and any_of(failed):
+        forget_corrections(flight, failed)
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     failures = select(failed, work.kept_failures + 1.0, flight.update_failures)
@@ -254,7 +261,7 @@ def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
                 call_stage(stages, update, flight, p, p, settings, work, 0)
         if late:
             good = good & (flight.update_failures == work.kept_failures)
-            _restore_estimate(flight, work, arrived, good, slow)
+            _restore_estimate(flight, work, settings, arrived, good, slow)
     for sensor in range(SENSORS):
         work.turn[sensor] = 1.0
     choose(flight, p, work, settings, slow, 0)

@@ -3,8 +3,8 @@
 Three things tell a filter that its covariance does not explain what is measured.
 
 * **Rejections.** A kind of measurement was rejected `gate_patience` times in a row. Then the filter
-  is likelier wrong than the sensor - unless GNSS is rejected while the camera's features fit, which
-  then speak for the estimate: GNSS stays out as long as they do.
+  is more likely wrong than the sensor - unless GNSS is rejected while the camera's features fit,
+  which then speak for the estimate: GNSS stays out as long as they do.
 * **Drifts.** Innovations of a right filter are white. Their mean over the last 50 or so, in
   deviations, exceeds `DRIFT_ALARM` in a right filter about once in a million times.
 * **Corrections that go one way.** Corrections of the IMU biases are white in a right filter, too,
@@ -46,7 +46,7 @@ FITTING_FEATURES = 3
 """Features of an image that speak for the estimate against GNSS."""
 _FIT_TIME = 1.0
 """How long they do [s]."""
-_MOST_ACCEL_BIAS, _MOST_GYRO_BIAS, _MOST_TILT = 2.0, 0.1, 0.2
+MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
 """Largest deviations that a doubt adds [m/s^2], [rad/s], [rad]."""
 
 
@@ -179,10 +179,10 @@ def time_of(flight, p, group):
 @kernel
 def doubt_acceleration(p, P, acceleration, doubted):
     """Add to the variances of accelerometer biases, and of the tilt by what g makes of it."""
-    bounded = minimum(acceleration, _MOST_ACCEL_BIAS)
+    bounded = minimum(acceleration, MOST_ACCEL_BIAS)
     more = select(doubted > 0.0, bounded * bounded, 0.0)
     store_block(P, BA, BA, add_to_diagonal(load_block(P, BA, BA), more))
-    tilt = minimum(acceleration / p.gravity, _MOST_TILT)
+    tilt = minimum(acceleration / p.gravity, MOST_TILT)
     more = select(doubted > 0.0, tilt * tilt, 0.0)
     store_block(P, E, E, add_to_diagonal(load_block(P, E, E), more))
 
@@ -190,17 +190,21 @@ def doubt_acceleration(p, P, acceleration, doubted):
 @kernel
 def doubt_rate(P, rate, doubted):
     """Add to the variances of gyro biases."""
-    bounded = minimum(rate, _MOST_GYRO_BIAS)
+    bounded = minimum(rate, MOST_GYRO_BIAS)
     more = select(doubted > 0.0, bounded * bounded, 0.0)
     store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), more))
 
 
 @kernel
-def tell_drifts(flight, mask):
-    """Count a filter that only watches its innovations as lost while they drift, where `mask`."""
-    drifting = drifts(flight, 0)
-    for group in range(1, SENSOR_GROUPS):
-        drifting = drifting | drifts(flight, group)
+def tell_drifts(flight, p, mask):
+    """Count a filter that only watches its innovations as lost while they drift, where `mask`.
+
+    The mean of a sensor that no longer measures stays what it was, and tells nothing of now.
+    """
+    drifting = mask & (flight.tick < 0.0)  # nobody
+    for group in range(SENSOR_GROUPS):
+        recent = (flight.tick - flight.accepted_tick[group]) * p.dt <= DOUBT_TIME
+        drifting = drifting | (recent & drifts(flight, group))
     accel, _ = one_way(flight, 0)
     gyro, _ = one_way(flight, 3)
     drifting = drifting | accel | gyro

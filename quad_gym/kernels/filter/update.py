@@ -175,7 +175,7 @@ def _is_loose(flight, p, work, feature_count):
 def _hide_unsure(flight, work, feature_count, mask):
     """Hide features whose directions are too uncertain to make use of; return where there are any.
 
-    Each step takes from a wrong direction a wrong distance, of which the filter is then sure.
+    Each step would infer a wrong distance from a wrong direction and make the filter overconfident.
     """
     some = work.hidden[0] < 0.0  # nowhere
     for i in range(feature_count):
@@ -188,13 +188,18 @@ def _hide_unsure(flight, work, feature_count, mask):
 
 @kernel
 def _show_hidden(flight, work, settings, mask):
-    """Undo that, and say of these features that they were left out."""
+    """Undo that, and say of these features that they were left out: they have no innovation."""
     for i in range(settings.feature_count):
         hidden = mask & (work.hidden[i] > 0.0)
         flight.feature_valid[i] = select(hidden, 1.0, flight.feature_valid[i])
         if (settings.form & _WATCH) != 0:
             block = FEATURE_BLOCKS + i
             flight.gate[block] = select(hidden, _UNSURE, flight.gate[block])
+            flight.block_nis[block] = select(hidden, np.nan, flight.block_nis[block])
+            for axis in range(3):
+                nu, sigma = flight.innovation[block, axis], flight.innovation_sigma[block, axis]
+                flight.innovation[block, axis] = select(hidden, np.nan, nu)
+                flight.innovation_sigma[block, axis] = select(hidden, np.nan, sigma)
 
 
 @kernel
@@ -300,7 +305,7 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     if (form & _GATE) != 0:
         raise_doubts(flight, p, work, settings, mask & logical_not(failed), slow, stages)
     elif (form & _WATCH) != 0:
-        tell_drifts(flight, mask)
+        tell_drifts(flight, p, mask)
 
 
 @stage

@@ -17,7 +17,7 @@ _EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 
 @kernel
 def _cannot_align(flight, p, work, settings, mask):
-    """What a sensor that tells no heading does for the filter's start, which nobody asks of it."""
+    """What a sensor that tells no heading does for the filter's start, never called."""
 
 
 def aid_stage(

@@ -48,6 +48,7 @@ from quad_gym.kernels.maths.linalg import (
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.measurements.gate import (
+    accept_group,
     count_in_row,
     judge_direction,
     mark_block,
@@ -223,6 +224,8 @@ def judge(flight, p, work, settings, slow, k):
         count_in_row(flight, FEATURE_BLOCKS, seen > 0.0, refused >= seen, again)
         fits = (seen - refused >= FITTING_FEATURES) & (2.0 * refused < seen) & logical_not(again)
         flight.fit_tick = select(fits, flight.tick, flight.fit_tick)
+    else:
+        accept_group(flight, FEATURE_BLOCKS, fresh > 0.0)
     return k
 
 

@@ -118,6 +118,13 @@ def count_in_row(flight, group, measured, rejected, again):
 
 
 @kernel
+def accept_group(flight, group, measured):
+    """Note when a group was last accepted, without a gate."""
+    before = flight.accepted_tick[group]
+    flight.accepted_tick[group] = select(measured, flight.tick, before)
+
+
+@kernel
 def decide(flight, s, has, wanting, again, decision):
     """Where a block gets `decision`: as `wanting` says or, in a later step, as in the first."""
     return has & ((wanting & logical_not(again)) | (again & (flight.gate[s] == decision)))
@@ -164,11 +171,13 @@ def judge_direction(flight, p, work, settings, k, s, has, columns, most):
 
 @kernel
 def leave_out(flight, work, settings, k, group, has, rejected, columns, numbers):
-    """Mask the block at row k where it is `rejected`, and count that, if there is a gate."""
+    """Mask the block at row k where it is `rejected`, and count that; without a gate it is none."""
     if (settings.form & _GATE) != 0:
         mask_block(work, k, rejected, columns)
         count_in_row(flight, group, has, rejected, work.again > 0.0)
         work.left_out = work.left_out + select(rejected, numbers, 0.0)
+    else:
+        accept_group(flight, group, has)
 
 
 @kernel

@@ -66,7 +66,7 @@ def triple_functions(name: str, block: int) -> TripleFunctions:
 
     @kernel
     def mark_nothing(flight, arrived):
-        """Say nothing, as nobody asks."""
+        """Say nothing: there is no such field."""
 
     tell_arrival = mark_fresh if fresh in _FIELDS else mark_nothing
 

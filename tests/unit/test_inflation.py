@@ -1,0 +1,142 @@
+"""A filter that doubts itself again and again inflates nothing beyond the largest deviations."""
+
+import math
+
+import numpy as np
+import pytest
+
+import quad_gym
+import quad_gym.frames
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.records import FEATURE_BLOCKS, POSITION_BLOCK
+from tests.field_flights import steps
+
+MOST = np.repeat([100.0, 20.0, math.nan, 2.0, 0.1], 3)  # of attitude: tilt 0.2, heading pi/sqrt 3
+
+
+def axis_turn(angle, axis):
+    """exp(-[angle axis x]), Rodrigues' formula."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) - math.sin(angle) * K + (1.0 - math.cos(angle)) * K @ K
+
+
+R_BI = axis_turn(0.5, (1.0, -2.0, 0.5))
+SUITE = quad_gym.sensor_suite("rtk").simplified().replace(camera=None)
+R_IG = quad_gym.frames.ecef_to_enu(SUITE.gnss.reference_antenna_G)
+
+
+def started(deviations, seed=0):
+    """A filter whose states are correlated, and the position that its antenna measures."""
+    ukf = quad_gym.UnscentedKalmanFilter(SUITE)
+    rng = np.random.default_rng(seed)
+    mixed = np.eye(15) + 0.3 * rng.standard_normal((15, 15))
+    P = mixed @ mixed.T
+    scaled = np.array(deviations) / np.sqrt(np.diag(P))
+    ukf.set_state(
+        position=np.zeros(3),
+        velocity=np.zeros(3),
+        R_BI=R_BI,
+        accel_bias=np.zeros(3),
+        gyro_bias=np.zeros(3),
+        covariance=P * np.outer(scaled, scaled),
+    )
+    return ukf
+
+
+def fix(ukf):
+    """The velocity that the filter expects, so that it corrects nothing; no gate rejects it."""
+    lever = np.cross(ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B)
+    return {"gnss_velocity_G": R_IG.T @ (ukf.velocity + ukf.R_BI.T @ lever)}
+
+
+def alarm(ukf):
+    """Let innovations of velocities drift, as if the last 50 had been 0.9 deviations off."""
+    ukf._engine.blocks["innovation_drift"][:, 2] = 0.9
+    ukf.update(**fix(ukf))
+
+
+def inflated(P):
+    """P after an alarm, by NumPy: a congruence, and what is added of the biases."""
+    M, var = np.zeros((15, 15)), np.diag(P)
+    k = R_BI[:, 2]
+    P_ee = P[6:9, 6:9]
+    heading = k @ P_ee @ k
+    tilt = (np.trace(P_ee) - heading) / 2.0
+
+    def root(most, variance):
+        return math.sqrt(min(16.0, max(1.0, most**2 / variance)))
+
+    for i in range(15):
+        if not 6 <= i < 9:
+            M[i, i] = root(MOST[i], var[i])
+    to_heading = np.outer(k, k)
+    M[6:9, 6:9] = root(0.2, tilt) * (np.eye(3) - to_heading)
+    M[6:9, 6:9] += root(math.pi / math.sqrt(3.0), heading) * to_heading
+    found = M @ P @ M
+    for first in (9, 12):
+        more = min(240.0 * var[first : first + 3].mean(), MOST[first] ** 2)
+        for i in range(first, first + 3):
+            found[i, i] += min(more, max(MOST[i] ** 2 - found[i, i], 0.0))
+    return found
+
+
+@pytest.mark.parametrize(
+    "deviations",
+    [(0.1, 0.05, 0.01, 0.02, 1e-3), (50.0, 3.0, 0.1, 0.3, 0.02), (300.0, 30.0, 0.5, 3.0, 0.2)],
+    ids=["small", "some beyond", "all beyond"],
+)
+def test_an_alarm_inflates_each_deviation_up_to_its_bound(deviations):
+    quiet, alarmed = started(np.repeat(deviations, 3)), started(np.repeat(deviations, 3))
+    quiet.update(**fix(quiet))
+    alarm(alarmed)
+    scale = np.sqrt(np.diag(alarmed.covariance))
+    np.testing.assert_allclose(
+        alarmed.covariance / np.outer(scale, scale),
+        inflated(quiet.covariance) / np.outer(scale, scale),
+        atol=1e-6,
+    )
+
+
+def test_alarms_that_repeat_leave_what_nothing_measures_bounded():
+    """Only velocities are measured: nothing tells the position or the heading for 25 alarms."""
+    ukf = started(np.repeat([0.1, 0.05, 0.05, 0.05, 0.005], 3))
+    for _ in range(25):
+        alarm(ukf)
+        sigma = np.sqrt(np.diag(ukf.covariance))
+        assert (np.linalg.eigvalsh(ukf.covariance / np.outer(sigma, sigma)) > 0.0).all()
+        for _ in range(20):
+            ukf.predict(np.zeros(3), R_BI @ (0.0, 0.0, 9.8))
+    assert ukf._engine.read("update_failures").max() == 0
+    assert ukf._engine.read("prediction_failures").max() == 0
+    others = np.r_[0:6, 9:15]
+    assert (sigma[others] <= 1.01 * MOST[others]).all()  # and what the samples between add
+    assert sigma[:3].max() > 50.0
+    k = R_BI[:, 2]
+    assert math.sqrt(k @ ukf.covariance[6:9, 6:9] @ k) < 2.0
+
+
+def test_a_sensor_that_no_longer_measures_does_not_keep_a_filter_lost():
+    """Without a gate nothing begins its mean anew; the camera goes on."""
+    batch = FlightBatch(
+        8,
+        sensors="standard",
+        task=TASK_DEFAULTS["hover"],
+        gains="tuned",
+        filter_start="warm",
+        innovations=True,
+    )
+    batch.reset(seeds=range(8))
+    steps(batch, 1.0)
+    assert not batch.read("lost").any()
+    flights = batch.snapshot()
+    flights["innovation_drift"][:, POSITION_BLOCK] = 0.8
+    batch.restore(flights)
+    batch.switch_sensors(gnss=False)
+    steps(batch, 0.5)
+    assert batch.read("lost").all()
+    steps(batch, 1.8)
+    assert (batch.read("innovation_drift")[:, POSITION_BLOCK] == 0.8).all()
+    assert (batch.read("accepted_tick")[:, FEATURE_BLOCKS] > 0.0).all()
+    assert not batch.read("lost").any()
