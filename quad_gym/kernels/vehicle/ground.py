@@ -118,23 +118,34 @@ def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
 
 
 @kernel
-def _share_without_gain(before, after, raised, p):
+def _share_without_gain(start, before, after, ahead, p):
     """Share of the impulses with which a vehicle has no more energy than it would without any.
 
-    Kinetic and potential energy at the end of the tick are quadratic in the share s: less those of
-    free flight, `a s^2 / 2 + b s + c`. The largest share in [0, 1] for which they are not positive.
+    The forces of free flight, mean over the tick, do work along the way: their acceleration is
+    a = (v_free - v_start) / h. Kinetic energy less that work, at the end of the tick, less the
+    same of free flight, is `A s^2 / 2 + B s + C` in the share s, with
+
+        A = m |dv|^2 + dw . J dw,   B = m (v_free - h a) . dv + w_free . J dw,   C = -m a . ahead.
+
+    With the impulses that the sweeps converge to it is never positive at s = 1. Gravity alone in
+    place of all forces would take a stand under thrust for a gain.
 
     Args:
-        before: Velocity (I) and body rates (B) without impulses.
+        start: Velocity (I) at the tick's start.
+        before: Velocity (I) and body rates (B) at its end without impulses.
         after: Likewise with them.
-        raised: By how much the way at the velocity of the end is above that of free flight [m].
+        ahead: By how much the way at the velocity of the end is beyond that of free flight, in I
+            [m].
         p: Parameters as they are.
+
+    Returns:
+        The largest share in [0, 1] for which the energy is not positive.
     """
     J = load33(p.inertia)
     dv, dw = sub(after[0], before[0]), sub(after[1], before[1])
     a = p.mass * dot(dv, dv) + dot(dw, apply(J, dw))
-    b = p.mass * (dot(before[0], dv) + p.gravity * p.dt * dv[2]) + dot(before[1], apply(J, dw))
-    c = p.mass * p.gravity * raised
+    b = p.mass * dot(start, dv) + dot(before[1], apply(J, dw))  # v_free - h a is the start's
+    c = -p.mass * dot(sub(before[0], start), ahead) / p.dt
     changes = a > 1e-300
     root = math.sqrt(maximum(b * b - 2.0 * a * c, 0.0))
     return clip((root - b) / select(changes, a, 1.0), 0.0, 1.0)
@@ -176,7 +187,7 @@ def _can_hold(work, F, T, friction):
 
 
 @kernel
-def carry(p, settings, work, pose, rates, free, raised):
+def carry(p, settings, work, pose, rates, free, ahead):
     """Let the ground push for one tick.
 
     Args:
@@ -186,7 +197,7 @@ def carry(p, settings, work, pose, rates, free, raised):
         pose: Position in I and attitude quaternion at the tick's start.
         rates: Velocity in I and body rates in B at its start.
         free: Likewise at its end, as without the ground.
-        raised: See `_share_without_gain`.
+        ahead: See `_share_without_gain`.
 
     Returns:
         Velocity in I and body rates in B at its end; which lanes the ground pushes, which of them
@@ -218,7 +229,7 @@ def carry(p, settings, work, pose, rates, free, raised):
         for _ in range(SWEEPS):
             v_I, w_I = _sweep(work, v_I, w_I, spread_I, inverse_mass, settings.friction, rate)
         w_B = apply(R_BI, w_I)
-        share = _share_without_gain(free, (v_I, w_B), raised, p)
+        share = _share_without_gain(v_start, free, (v_I, w_B), ahead, p)
         v = add(v_free, scale(share, sub(v_I, v_free)))
         w = add(w_free, scale(share, sub(w_B, w_free)))
         for i in range(_FEET):
@@ -260,9 +271,9 @@ def stand(flight, p, settings, work, start):
     """
     r_I, v_I, q, w_B, _ = start
     free = load3(flight.v), load3(flight.w)
-    raised = r_I[2] + p.dt * free[0][2] - flight.r[2]
+    ahead = sub(add(r_I, scale(p.dt, free[0])), load3(flight.r))
     pose = (r_I, q)
-    v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
+    v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, ahead)
     flight.footing = feet
     flight.crashed = select(crashes, 1.0, flight.crashed)
     if any_of(meets):
@@ -311,8 +322,8 @@ def begin_on_ground(flight, p, settings, work, mask):
     a_I, dw_B = _free_accelerations(flight, p, R_BI)
     free = add(v_I, scale(h, a_I)), add(w_B, scale(h, dw_B))
     pose = load3(flight.r), load4(flight.q)
-    raised = 0.5 * h * (free[0][2] - v_I[2])
-    v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
+    ahead = scale(0.5 * h, sub(free[0], v_I))
+    v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, ahead)
     before = load3(flight.ground_push)
     gained = scale(1.0 / h, sub(v, v_I)), scale(1.0 / h, sub(w, w_B))
     _feel(flight, p, R_BI, gained, meets)
