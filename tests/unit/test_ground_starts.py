@@ -1,0 +1,79 @@
+"""Where vehicles begin in a world whose ground carries them, and what ground is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from quad_gym import FlightBatch, GroundParams, TaskParams, Trajectory, WorldParams
+from quad_gym.records import Control, Source
+
+LEGS = 0.1
+
+
+def batch(count=4, height=-0.1, task=None, ground=None, **options):
+    world = WorldParams(ground=GroundParams(**(ground or {})), ground_height=height)
+    task = TaskParams(**({"start": "ground", "duration": 0.0} | (task or {})))
+    options = {"sensors": "lab", "source": Source.TRUTH, "control": Control.MOTOR} | options
+    return FlightBatch(count, task=task, world=world, **options)
+
+
+def stand(flights, steps=20):
+    """Let flights stand with stopped rotors; the endings that there were."""
+    endings = np.zeros(flights.count)
+    for _ in range(steps):
+        flights.step(np.full((flights.count, 4), -1.0))
+        endings = np.maximum(endings, flights.result("ending"))
+    return endings
+
+
+@pytest.mark.parametrize(
+    ("height", "reference"), [(-300.0, 1.0), (-0.7, 1.0), (-0.4, 1.0), (5.0, 6.0), (900.0, 901.0)]
+)
+@pytest.mark.parametrize("kind", ["hover", "circle", "waypoints"])
+def test_no_episode_ends_because_of_where_the_ground_is(kind, height, reference):
+    task = {"kind": kind, "height": reference, "out_of_bounds": 400.0}
+    flights = batch(height=height, task=task)
+    flights.reset(seeds=range(4))
+    assert (stand(flights) == 0.0).all()
+    np.testing.assert_allclose(flights.read("r")[:, 2], height + LEGS, rtol=0.0, atol=1e-9)
+    assert (flights.read("footing") == 4.0).all()
+
+
+@pytest.mark.parametrize("start", ["ground", "mixed", "hover"])
+def test_ground_out_of_bounds_of_the_reference_is_refused(start):
+    task = {"start": start, "height": 1.0, "out_of_bounds": 3.0}
+    for height in (-2.0, 3.8):
+        flights = batch(64, height=height, task=task)
+        flights.reset(seeds=range(64))
+        assert (stand(flights, steps=1) == 0.0).all()
+    with pytest.raises(ValueError, match=r"WorldParams\.ground_height .* out_of_bounds=3 .* got 4"):
+        batch(height=4.0, task=task)
+    if start == "hover":
+        batch(height=-2.2, task=task)
+    else:
+        with pytest.raises(ValueError, match=r"WorldParams\.ground_height .* got -2.2"):
+            batch(height=-2.2, task=task)
+
+
+def test_where_a_reference_begins_decides():
+    path = Trajectory.through([(0, 0, 10), (2, 0, 11), (4, 0, 14)])
+    given = {"kind": "trajectory", "trajectory": path}
+    for height, refused in ((7.0, False), (12.0, False), (0.0, True), (14.0, True)):
+        if refused:
+            with pytest.raises(ValueError, match=r"WorldParams\.ground_height"):
+                batch(height=height, task=given)
+        else:
+            batch(height=height, task=given)
+    for kind in ("waypoints", "random_trajectory"):
+        with pytest.raises(ValueError, match=r"WorldParams\.ground_height"):
+            batch(height=50.0, task={"kind": kind})
+
+
+def test_the_ground_of_a_task_without_ground_that_carries_stays():
+    flights = FlightBatch(1, task=TaskParams(ground=0.3), world=WorldParams(ground_height=-5.0))
+    assert flights._settings["ground"][0] == 0.3
+    assert batch(task={"ground": -7.0})._settings["ground"][0] == -7.0
+    assert math.isclose(
+        batch(height=-3.0, task={"out_of_bounds": 9.0})._settings["ground"][0], -3.5
+    )
