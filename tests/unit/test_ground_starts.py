@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from quad_gym import FlightBatch, GroundParams, TaskParams, Trajectory, WorldParams
-from quad_gym.records import Control, Source
+from quad_gym import FlightBatch, GroundParams, TaskParams, Trajectory, Uniform, WorldParams
+from quad_gym.records import COLUMNS, Control, Source
 
 LEGS = 0.1
 
@@ -76,4 +76,53 @@ def test_the_ground_of_a_task_without_ground_that_carries_stays():
     assert batch(task={"ground": -7.0})._settings["ground"][0] == -7.0
     assert math.isclose(
         batch(height=-3.0, task={"out_of_bounds": 9.0})._settings["ground"][0], -3.5
+    )
+
+
+@pytest.mark.parametrize("pad", [True, False])
+@pytest.mark.parametrize("moving", [{}, {"start_velocity_I"}, {"start_body_rates"}, {"start_yaw"}])
+def test_starts_on_the_ground_are_on_it_with_any_draws(pad, moving):
+    draws = {name: Uniform(-1e-3, 1e-3) for name in moving}
+    task = {"pad": pad, "out_of_bounds": 10.0}
+    flights = batch(16, height=-2.0, task=task, randomization=draws)
+    flights.reset(seeds=range(16))
+    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+    flights.reset(seeds=range(16), velocity=[0.1, 0.0, 0.0])
+    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pad", [True, False])
+@pytest.mark.parametrize("start", ["ground", "mixed"])
+def test_a_drawn_height_is_on_top_of_the_ground(pad, start):
+    draws = {"start_position_I": (None, None, Uniform(0.5, 1.5))}
+    task = {"pad": pad, "start": start, "out_of_bounds": 10.0}
+    flights, level = (
+        batch(64, height=-2.0, task=task, randomization=given) for given in (draws, {})
+    )
+    flights.reset(seeds=range(64))
+    level.reset(seeds=range(64))
+    drawn = flights.read("drawn")[:, COLUMNS["start_position_I"]][:, 2]
+    np.testing.assert_allclose(
+        flights.read("r")[:, 2], level.read("r")[:, 2] + drawn, rtol=0.0, atol=1e-12
+    )
+    assert (level.read("r")[:, 2] == -2.0 + LEGS).sum() > 20
+    assert (flights.read("footing") == 0.0).all()
+    flights.reset(seeds=range(64), position=[0.0, 0.0, -1.0])
+    assert (flights.read("r")[:, 2] == -1.0).all()
+
+
+def test_a_drawn_height_below_the_ground_is_lifted_onto_it():
+    draws = {"start_position_I": (None, None, Uniform(-0.5, -0.1))}
+    flights = batch(height=-2.0, task={"out_of_bounds": 10.0}, randomization=draws)
+    flights.reset(seeds=range(4))
+    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+
+
+def test_only_flights_that_begin_are_put_onto_the_ground():
+    flights = batch(16, height=-2.0, task={"out_of_bounds": 10.0})
+    flights.reset(seeds=range(16), position=[0.0, 0.0, 1.0])
+    chosen = np.arange(16) % 2 == 0
+    flights.reset(mask=chosen)
+    np.testing.assert_allclose(
+        flights.read("r")[:, 2], np.where(chosen, -2.0 + LEGS, 1.0), rtol=0.0, atol=1e-12
     )

@@ -313,9 +313,12 @@ def begin_on_ground(flight, p, settings, work, mask):
         l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
         lowest = minimum(lowest, height + apply_transposed(R_BI, l_B)[2])
     given = flight.start_given[2]
-    placed = (flight.on_pad > 0.0) & logical_not(given == given)
+    placed = (work.on_ground > 0.0) & logical_not(given == given)
+    z = flight.r[2]
+    # z is 0 on the ground, and the drawn height is on top of it
+    above = select(placed, maximum(z, 0.0), 0.0)
     moved = mask & (placed | (lowest < 0.0))
-    flight.r[2] = select(moved, flight.r[2] - lowest, flight.r[2])
+    flight.r[2] = select(moved, z - lowest + above, z)
     flight.on_pad = select(mask, 0.0, flight.on_pad)
     flight.crashed = select(mask, 0.0, flight.crashed)
     v_I, w_B, h = load3(flight.v), load3(flight.w), p.dt
