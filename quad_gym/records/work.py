@@ -61,7 +61,7 @@ WORK_FIELDS = (
     # contact with the ground: four feet, then four rotor hubs
     Field("on_ground", (), "0 or 1", "lanes whose episode begins on the ground"),
     Field("ground_arm", (8, 3), "m", "from the center of mass, in I"),
-    Field("ground_resistance", (8, 3), "kg", "impulse that changes a point's velocity by one, along each axis of I"),
+    Field("ground_mass", (8, 3), "kg", "effective mass of a point along each axis of I: impulse over change of velocity"),
     Field("ground_impulse", (8, 3), "N s", "of the ground on a point, in I"),
     Field("ground_gap", (8,), "m", "height of a point above the ground"),
     # the batch

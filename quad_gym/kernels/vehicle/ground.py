@@ -57,15 +57,15 @@ def _free_accelerations(flight, p, R_BI):
 
 
 @kernel
-def _resistance(arm, along, spread_I, inverse_mass):
-    """1 / (velocity along a direction that a unit impulse along it gives to a point)."""
+def _effective_mass(arm, along, spread_I, inverse_mass):
+    """Impulse on a point along a direction, over the change of its velocity along it [kg]."""
     turn = cross(arm, along)
     return 1.0 / (inverse_mass + dot(turn, apply(spread_I, turn)))
 
 
 @kernel
 def _prepare(work, p, R_BI, spread_I, height):
-    """Set arms in I, resistances and gaps of all points; no impulses as yet.
+    """Set arms in I, effective masses and gaps of all points; no impulses as yet.
 
     Args:
         work: Workspace.
@@ -80,11 +80,11 @@ def _prepare(work, p, R_BI, spread_I, height):
         l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
         arm = apply_transposed(R_BI, l_B)
         store3(work.ground_arm[i], arm)
-        x = _resistance(arm, (one, zero, zero), spread_I, inverse_mass)
-        y = _resistance(arm, (zero, one, zero), spread_I, inverse_mass)
-        z = _resistance(arm, (zero, zero, one), spread_I, inverse_mass)
+        x = _effective_mass(arm, (one, zero, zero), spread_I, inverse_mass)
+        y = _effective_mass(arm, (zero, one, zero), spread_I, inverse_mass)
+        z = _effective_mass(arm, (zero, zero, one), spread_I, inverse_mass)
         # one for all level directions, so that friction opposes the sliding
-        store3(work.ground_resistance[i], (minimum(x, y), minimum(x, y), z))
+        store3(work.ground_mass[i], (minimum(x, y), minimum(x, y), z))
         store3(work.ground_impulse[i], (zero, zero, zero))
         work.ground_gap[i] = height + arm[2]
 
@@ -100,14 +100,14 @@ def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
     """One sweep over all points; returns velocity and body rates in I after it."""
     zero = 0.0 * v_I[0]
     for i in range(_POINTS):
-        arm, resistance = load3(work.ground_arm[i]), load3(work.ground_resistance[i])
+        arm, mass = load3(work.ground_arm[i]), load3(work.ground_mass[i])
         old = load3(work.ground_impulse[i])
         floor = -maximum(work.ground_gap[i], zero) * rate
         u = add(v_I, cross(w_I, arm))
-        up = maximum(old[2] + resistance[2] * (floor - u[2]), zero)
+        up = maximum(old[2] + mass[2] * (floor - u[2]), zero)
         v_I, w_I = _pushed(v_I, w_I, arm, (zero, zero, up - old[2]), spread_I, inverse_mass)
         u = add(v_I, cross(w_I, arm))
-        x, y = old[0] - resistance[0] * u[0], old[1] - resistance[1] * u[1]
+        x, y = old[0] - mass[0] * u[0], old[1] - mass[1] * u[1]
         size, most = math.sqrt(x * x + y * y), friction * up
         share = select(size > most, most / select(size > most, size, 1.0), 1.0)
         x, y = share * x, share * y
