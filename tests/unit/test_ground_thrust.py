@@ -84,3 +84,24 @@ def test_who_tumbles_under_thrust_does_not_sink_in():
         deepest = np.minimum(deepest, (points(flights)[..., 2] - FLOOR).min(axis=1))
     assert math.isfinite(flights.read("v").sum())
     assert deepest.min() > -0.02
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.01])
+def test_feet_below_the_plane_come_to_rest(tilt):
+    """Nothing pushes them out, which would gain energy; they stand where they are."""
+    rng = np.random.default_rng(0)
+    flights = batch(64)
+    flights.reset(seeds=range(64))
+    actions = level(flights, np.full(64, 0.3), -rng.uniform(0.0, 0.02, 64), np.zeros((64, 3)))
+    angle, half = rng.uniform(-math.pi, math.pi, 64), 0.5 * tilt
+    aside = math.sin(half) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    put(flights, q=np.column_stack([np.full(64, math.cos(half)), aside, np.zeros(64)]))
+    for _ in range(4 * 200):  # who leans on a foot below the plane settles slowly
+        flights.step(actions)
+    assert (flights.read("v") == 0.0).all()
+    assert (flights.read("w") == 0.0).all()
+    assert feet(flights).max() < STILL_GAP
+    before = flights.read("r")
+    for _ in range(100):
+        flights.step(actions)
+    assert (flights.read("r") == before).all()

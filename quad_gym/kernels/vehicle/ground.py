@@ -41,7 +41,10 @@ from quad_gym.records import Ending
 SWEEPS = 24
 """Of all points; in each a point meets what the others have changed."""
 STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
-"""Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest."""
+"""Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest.
+
+Feet that an impact has left below the plane, at an angle or not, stand as well as those on it.
+"""
 _FEET, _POINTS = 4, 8
 _ON_THE_GROUND = float(Ending.ON_THE_GROUND)
 
@@ -215,7 +218,7 @@ def carry(p, settings, work, pose, rates, free, ahead):
         low = work.ground_gap[i] + p.dt * down < 0.0
         meets = meets | low
         if i < _FEET:
-            still = still & (abs(work.ground_gap[i]) <= STILL_GAP)
+            still = still & (work.ground_gap[i] <= STILL_GAP)
         else:
             hard = hard | low
     hard = hard | (R_BI[2][2] < settings.hard_up) | (v_start[2] < -settings.hard_speed)
