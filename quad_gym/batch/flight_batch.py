@@ -189,7 +189,7 @@ class FlightBatch(FlightMemory):
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
         check_trajectories(self.task, self.vehicle, self.actions, self.control)
-        check_standing(self.task, self.world, draws)
+        check_standing(self.task, true_vehicle, self.world, draws)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
         true["action_delay"] = self.action_delay

@@ -1,7 +1,10 @@
 """Whether vehicles can stand on the ground of a world, and begin there."""
 
+import numpy as np
+
 from quad_gym.params.randomization import DrawingTable
 from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS
 
@@ -11,20 +14,30 @@ RANDOM_RISE = 0.3
 """How far a random trajectory leads up or down, over `TaskParams.radius`: typically less."""
 
 
-def check_standing(task: TaskParams, world: WorldParams, draws: DrawingTable) -> None:
-    """Refuse ground on which no episode of a task can begin.
+def check_standing(
+    task: TaskParams, vehicle: VehicleParams, world: WorldParams, draws: DrawingTable
+) -> None:
+    """Refuse ground on which the vehicle cannot stand, or where no episode of a task can begin.
 
     Args:
         task: Says where the reference begins, and how far away an episode is over.
+        vehicle: As it is.
         world: With its ground, if there is one.
         draws: What is drawn around the task's own start.
 
     Raises:
-        ValueError: If a start on the ground is farther from the reference than
+        ValueError: If a foot is not below all rotor hubs, on which the vehicle would stand, which
+            is a crash; or if a start on the ground is farther from the reference than
             `TaskParams.out_of_bounds`, so that the episode ends with its first step.
     """
     if world.ground is None:
         return
+    feet, hubs = (np.array(p)[:, 2] for p in (world.ground.feet_B, vehicle.rotor_positions_B))
+    if feet.max() >= hubs.min():
+        raise ValueError(
+            "GroundParams.feet_B must be below the vehicle's lowest rotor hub, at "
+            f"{hubs.min():g} m, got {feet.max():g} m"
+        )
     standing = world.ground_height - world.ground.feet_B[0][2]
     column = COLUMNS["start_position_I"].stop - 1
     lower, upper = (max(float(ends[column]), 0.0) for ends in (draws.low, draws.high))

@@ -5,10 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from quad_gym import FlightBatch, GroundParams, TaskParams, Trajectory, Uniform, WorldParams
+from quad_gym import (
+    FlightBatch,
+    GroundParams,
+    TaskParams,
+    Trajectory,
+    Uniform,
+    WorldParams,
+    vehicle_params,
+)
 from quad_gym.records import COLUMNS, Control, Source
 
-LEGS = 0.1
+LEGS, HUBS = 0.1, vehicle_params("lab").rotor_positions_B
 
 
 def batch(count=4, height=-0.1, task=None, ground=None, **options):
@@ -126,3 +134,19 @@ def test_only_flights_that_begin_are_put_onto_the_ground():
     np.testing.assert_allclose(
         flights.read("r")[:, 2], np.where(chosen, -2.0 + LEGS, 1.0), rtol=0.0, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("whose", ["vehicle", "true_vehicle"])
+def test_feet_that_are_not_below_the_rotor_hubs_are_refused(whose):
+    """Nominally or as it is: only the latter stands on them."""
+    lab = vehicle_params("lab")
+    for z, refused in ((0.1, False), (-0.099, False), (-0.1, True), (-0.2, True)):
+        hubs = tuple((x, y, z if k == 2 else 0.2) for k, (x, y, _) in enumerate(HUBS))
+        given = {whose: lab.replace(rotor_positions_B=hubs)}
+        if refused:
+            with pytest.raises(ValueError, match=rf"GroundParams\.feet_B .* at {z:g} m, got -0.1"):
+                batch(**given)
+        else:
+            batch(**given)
+    hubs = tuple((x, y, -0.3) for x, y, _ in HUBS)
+    batch(vehicle=lab.replace(rotor_positions_B=hubs), true_vehicle=lab)
