@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.following import check_trajectories, followed
 from quad_gym.batch.memory import FlightMemory
+from quad_gym.batch.standing import check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
@@ -188,6 +189,7 @@ class FlightBatch(FlightMemory):
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
         check_trajectories(self.task, self.vehicle, self.actions, self.control)
+        check_standing(self.task, true_vehicle, self.world, draws)
         model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
         true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
         true["action_delay"] = self.action_delay

@@ -13,6 +13,9 @@ from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import COLUMNS, SETTINGS, Supply
 
+FALLEN_THROUGH = 0.5
+"""Below ground that carries vehicles, nothing flies at this depth [m]."""
+
 
 def pack_world(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
     """Write the numbers of a world around a vehicle into a parameter record."""
@@ -103,6 +106,8 @@ def pack_obstacles(s: Any, world: WorldParams) -> None:
         s["fenced"], s["fence"] = True, world.geofence
     if world.ground is not None:
         s["grounded"], s["friction"] = True, world.ground.friction
+        # the ground ends no episode but in a crash; only who has fallen through is far below it
+        s["ground"] = min(s["ground"], world.ground_height - FALLEN_THROUGH)
         s["hard_speed"] = world.ground.max_touchdown_speed
         s["hard_up"] = math.cos(world.ground.max_touchdown_tilt)
     s["contacts"] = bool(world.obstacles) or world.geofence is not None

@@ -17,8 +17,9 @@ class GroundParams(Checked):
     """A level plane at `WorldParams.ground_height` that carries a vehicle anywhere.
 
     Four feet and the four rotor hubs can touch it. Contact is a constraint on velocities, solved
-    once in a tick: a point does not go below the plane, the plane pushes and never pulls, impacts
-    are inelastic, and friction is Coulomb's. There is no stiffness, so that every step is stable
+    once in a tick: the plane stops points that would go below it, pushes and never pulls, impacts
+    are inelastic, and friction is Coulomb's. Points of a vehicle that turns fast may be millimeters
+    below the plane after the tick of an impact. There is no stiffness, so that every step is stable
     (J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", 1988; D. E.
     Stewart, J. C. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic
     collisions and Coulomb friction", Int. J. Numerical Methods in Engineering 39, 1996).
@@ -31,7 +32,8 @@ class GroundParams(Checked):
         (-0.15, -0.15, -0.1),
     )
     """(4, 3) soles of the feet relative to the center of mass, in B [m]; legs 0.1 m long under the
-    arms of the laboratory's vehicle, whose hubs are 0.21 m out along both axes"""
+    arms of the laboratory's vehicle, whose hubs are 0.21 m out along both axes; a level plane, below
+    all rotor hubs of the vehicle"""
     friction: float = 0.6
     """Coulomb's coefficient, sticking and sliding; rubber on concrete has 0.6 to 0.85; 0: ice"""
     max_touchdown_speed: float = 1.5

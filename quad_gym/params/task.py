@@ -43,7 +43,8 @@ class TaskParams(Checked):
     probability 0.5"""
     pad: bool = True
     """whether a launch pad carries a vehicle that starts on the ground until its thrust lifts it;
-    without one it sinks while its rotors spin up, as in the report"""
+    without one it sinks while its rotors spin up, as in the report. Ground that carries vehicles
+    (`WorldParams.ground`) needs none"""
     reward_per: str = "step"
     """"step": a reward of the order of one in each step, as learning algorithms expect; "second":
     the same times the control period"""
@@ -57,7 +58,7 @@ class TaskParams(Checked):
     """distance from the reference at which an episode ends [m]"""
     ground: float = -0.5
     """height at which an episode ends [m]; below 0, as a vehicle without a launch pad sinks while
-    its rotors spin up"""
+    its rotors spin up. Where `WorldParams.ground` carries vehicles, at least 0.5 m below it"""
     end_when_lost: bool = False
     """whether an episode is truncated where the filter finds that it is lost"""
     max_tilt: float = math.radians(100.0)

@@ -59,8 +59,9 @@ WORK_FIELDS = (
     Field("path_point", (2,), "m", "to look toward, in I"),
     Field("path_end", (2,), "-", "heading at the start or end"),
     # contact with the ground: four feet, then four rotor hubs
+    Field("on_ground", (), "0 or 1", "lanes whose episode begins on the ground"),
     Field("ground_arm", (8, 3), "m", "from the center of mass, in I"),
-    Field("ground_resistance", (8, 3), "kg", "impulse that changes a point's velocity by one, along each axis of I"),
+    Field("ground_mass", (8, 3), "kg", "effective mass of a point along each axis of I: impulse over change of velocity"),
     Field("ground_impulse", (8, 3), "N s", "of the ground on a point, in I"),
     Field("ground_gap", (8,), "m", "height of a point above the ground"),
     # the batch

@@ -160,8 +160,8 @@ def _given_or(given, drawn):
 
 
 @kernel
-def draw_start(flight, p, model, settings, stream, mask):
-    """Set the true state at the start of an episode, where `mask`."""
+def draw_start(flight, p, model, settings, work, stream, mask):
+    """Set the true state at the start of an episode, where `mask`; keep who is on the ground."""
     (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     yaw = atan2(x_ref[1], x_ref[0])
     zero = 0.0 * yaw
@@ -204,6 +204,7 @@ def draw_start(flight, p, model, settings, stream, mask):
     v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
     yaw = _given_or(given[6], yaw)
     still = dot(v_I, v_I) + dot(w_B, w_B) <= 0.0
+    work.on_ground = select(on_ground, 1.0, 0.0)
     on_pad = select(on_ground & still, 1.0 * settings.pad, 0.0)
     flight.on_pad = select(mask, on_pad, flight.on_pad)
     keep3(flight.r, mask, (x, y, z))
@@ -265,6 +266,6 @@ def begin_stage(flight, world, model, settings, work, stages, flag):
     draw_reference(flying, settings, stream, mask)
     if settings.harmonics == FOLLOWED:
         call_stage(stages, _FOLLOW, flight, world, model, settings, work, 0)
-    draw_start(flying, true, believed, settings, stream, mask)
+    draw_start(flying, true, believed, settings, lanes_of(work), stream, mask)
     flying.charge = select(mask, true.battery_charge, flying.charge)
     begin_counters(flying, mask)

@@ -5,10 +5,14 @@ points take its place: with the gap g_i and the velocity u_i of point i, and the
 
     u_iz >= -g_i / h,   j_iz >= 0,   |(j_ix, j_iy)| <= friction j_iz,
 
-found by Gauss-Seidel sweeps; then r+ = r + h v+ and q+ = q exp(h w+). The set of velocities that
-the plane allows contains rest, so that the projection onto it never gains energy; a last scaling of
-the impulses makes sure of that where the sweeps have not converged. A vehicle that is at rest, and
-that normal forces and static friction can hold so, stays exactly where it is.
+found by Gauss-Seidel sweeps; then r+ = r + h v+ and q+ = q exp(h w+). Impulses that fulfil this do
+no positive work at the velocities that they lead to, u_i . j_i <= 0, and contact gains no energy. The
+number of sweeps is fixed, however: where they have not converged, as in an impact of several points
+at once, their impulses may add some, and a last scaling of all of them takes that away, see
+`_share_without_gain`. As r+ and q+ follow from velocities, points of a vehicle that turns fast may
+end a tick below the plane; they go no deeper, and nothing pushes them out, which would gain energy.
+A vehicle that is at rest, and that normal forces and static friction can hold so, stays exactly
+where it is.
 """
 
 import math
@@ -41,7 +45,10 @@ from quad_gym.records import Ending
 SWEEPS = 24
 """Of all points; in each a point meets what the others have changed."""
 STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
-"""Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest."""
+"""Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest.
+
+Feet that an impact has left below the plane, at an angle or not, stand as well as those on it.
+"""
 _FEET, _POINTS = 4, 8
 _ON_THE_GROUND = float(Ending.ON_THE_GROUND)
 
@@ -57,15 +64,15 @@ def _free_accelerations(flight, p, R_BI):
 
 
 @kernel
-def _resistance(arm, along, spread_I, inverse_mass):
-    """1 / (velocity along a direction that a unit impulse along it gives to a point)."""
+def _effective_mass(arm, along, spread_I, inverse_mass):
+    """Impulse on a point along a direction, over the change of its velocity along it [kg]."""
     turn = cross(arm, along)
     return 1.0 / (inverse_mass + dot(turn, apply(spread_I, turn)))
 
 
 @kernel
 def _prepare(work, p, R_BI, spread_I, height):
-    """Set arms in I, resistances and gaps of all points; no impulses as yet.
+    """Set arms in I, effective masses and gaps of all points; no impulses as yet.
 
     Args:
         work: Workspace.
@@ -80,11 +87,11 @@ def _prepare(work, p, R_BI, spread_I, height):
         l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
         arm = apply_transposed(R_BI, l_B)
         store3(work.ground_arm[i], arm)
-        x = _resistance(arm, (one, zero, zero), spread_I, inverse_mass)
-        y = _resistance(arm, (zero, one, zero), spread_I, inverse_mass)
-        z = _resistance(arm, (zero, zero, one), spread_I, inverse_mass)
+        x = _effective_mass(arm, (one, zero, zero), spread_I, inverse_mass)
+        y = _effective_mass(arm, (zero, one, zero), spread_I, inverse_mass)
+        z = _effective_mass(arm, (zero, zero, one), spread_I, inverse_mass)
         # one for all level directions, so that friction opposes the sliding
-        store3(work.ground_resistance[i], (minimum(x, y), minimum(x, y), z))
+        store3(work.ground_mass[i], (minimum(x, y), minimum(x, y), z))
         store3(work.ground_impulse[i], (zero, zero, zero))
         work.ground_gap[i] = height + arm[2]
 
@@ -100,14 +107,14 @@ def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
     """One sweep over all points; returns velocity and body rates in I after it."""
     zero = 0.0 * v_I[0]
     for i in range(_POINTS):
-        arm, resistance = load3(work.ground_arm[i]), load3(work.ground_resistance[i])
+        arm, mass = load3(work.ground_arm[i]), load3(work.ground_mass[i])
         old = load3(work.ground_impulse[i])
         floor = -maximum(work.ground_gap[i], zero) * rate
         u = add(v_I, cross(w_I, arm))
-        up = maximum(old[2] + resistance[2] * (floor - u[2]), zero)
+        up = maximum(old[2] + mass[2] * (floor - u[2]), zero)
         v_I, w_I = _pushed(v_I, w_I, arm, (zero, zero, up - old[2]), spread_I, inverse_mass)
         u = add(v_I, cross(w_I, arm))
-        x, y = old[0] - resistance[0] * u[0], old[1] - resistance[1] * u[1]
+        x, y = old[0] - mass[0] * u[0], old[1] - mass[1] * u[1]
         size, most = math.sqrt(x * x + y * y), friction * up
         share = select(size > most, most / select(size > most, size, 1.0), 1.0)
         x, y = share * x, share * y
@@ -118,23 +125,34 @@ def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
 
 
 @kernel
-def _share_without_gain(before, after, raised, p):
+def _share_without_gain(start, before, after, ahead, p):
     """Share of the impulses with which a vehicle has no more energy than it would without any.
 
-    Kinetic and potential energy at the end of the tick are quadratic in the share s: less those of
-    free flight, `a s^2 / 2 + b s + c`. The largest share in [0, 1] for which they are not positive.
+    The forces of free flight, mean over the tick, do work along the way: their acceleration is
+    a = (v_free - v_start) / h. Kinetic energy less that work, at the end of the tick, less the
+    same of free flight, is `A s^2 / 2 + B s + C` in the share s, with
+
+        A = m |dv|^2 + dw . J dw,   B = m (v_free - h a) . dv + w_free . J dw,   C = -m a . ahead.
+
+    With the impulses that the sweeps converge to it is never positive at s = 1. Gravity alone in
+    place of all forces would take a stand under thrust for a gain.
 
     Args:
-        before: Velocity (I) and body rates (B) without impulses.
+        start: Velocity (I) at the tick's start.
+        before: Velocity (I) and body rates (B) at its end without impulses.
         after: Likewise with them.
-        raised: By how much the way at the velocity of the end is above that of free flight [m].
+        ahead: By how much the way at the velocity of the end is beyond that of free flight, in I
+            [m].
         p: Parameters as they are.
+
+    Returns:
+        The largest share in [0, 1] for which the energy is not positive.
     """
     J = load33(p.inertia)
     dv, dw = sub(after[0], before[0]), sub(after[1], before[1])
     a = p.mass * dot(dv, dv) + dot(dw, apply(J, dw))
-    b = p.mass * (dot(before[0], dv) + p.gravity * p.dt * dv[2]) + dot(before[1], apply(J, dw))
-    c = p.mass * p.gravity * raised
+    b = p.mass * dot(start, dv) + dot(before[1], apply(J, dw))  # v_free - h a is the start's
+    c = -p.mass * dot(sub(before[0], start), ahead) / p.dt
     changes = a > 1e-300
     root = math.sqrt(maximum(b * b - 2.0 * a * c, 0.0))
     return clip((root - b) / select(changes, a, 1.0), 0.0, 1.0)
@@ -176,7 +194,7 @@ def _can_hold(work, F, T, friction):
 
 
 @kernel
-def carry(p, settings, work, pose, rates, free, raised):
+def carry(p, settings, work, pose, rates, free, ahead):
     """Let the ground push for one tick.
 
     Args:
@@ -186,7 +204,7 @@ def carry(p, settings, work, pose, rates, free, raised):
         pose: Position in I and attitude quaternion at the tick's start.
         rates: Velocity in I and body rates in B at its start.
         free: Likewise at its end, as without the ground.
-        raised: See `_share_without_gain`.
+        ahead: See `_share_without_gain`.
 
     Returns:
         Velocity in I and body rates in B at its end; which lanes the ground pushes, which of them
@@ -204,7 +222,7 @@ def carry(p, settings, work, pose, rates, free, raised):
         low = work.ground_gap[i] + p.dt * down < 0.0
         meets = meets | low
         if i < _FEET:
-            still = still & (abs(work.ground_gap[i]) <= STILL_GAP)
+            still = still & (work.ground_gap[i] <= STILL_GAP)
         else:
             hard = hard | low
     hard = hard | (R_BI[2][2] < settings.hard_up) | (v_start[2] < -settings.hard_speed)
@@ -218,7 +236,7 @@ def carry(p, settings, work, pose, rates, free, raised):
         for _ in range(SWEEPS):
             v_I, w_I = _sweep(work, v_I, w_I, spread_I, inverse_mass, settings.friction, rate)
         w_B = apply(R_BI, w_I)
-        share = _share_without_gain(free, (v_I, w_B), raised, p)
+        share = _share_without_gain(v_start, free, (v_I, w_B), ahead, p)
         v = add(v_free, scale(share, sub(v_I, v_free)))
         w = add(w_free, scale(share, sub(w_B, w_free)))
         for i in range(_FEET):
@@ -260,9 +278,9 @@ def stand(flight, p, settings, work, start):
     """
     r_I, v_I, q, w_B, _ = start
     free = load3(flight.v), load3(flight.w)
-    raised = r_I[2] + p.dt * free[0][2] - flight.r[2]
+    ahead = sub(add(r_I, scale(p.dt, free[0])), load3(flight.r))
     pose = (r_I, q)
-    v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
+    v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, ahead)
     flight.footing = feet
     flight.crashed = select(crashes, 1.0, flight.crashed)
     if any_of(meets):
@@ -302,17 +320,20 @@ def begin_on_ground(flight, p, settings, work, mask):
         l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
         lowest = minimum(lowest, height + apply_transposed(R_BI, l_B)[2])
     given = flight.start_given[2]
-    placed = (flight.on_pad > 0.0) & logical_not(given == given)
+    placed = (work.on_ground > 0.0) & logical_not(given == given)
+    z = flight.r[2]
+    # z is 0 on the ground, and the drawn height is on top of it
+    above = select(placed, maximum(z, 0.0), 0.0)
     moved = mask & (placed | (lowest < 0.0))
-    flight.r[2] = select(moved, flight.r[2] - lowest, flight.r[2])
+    flight.r[2] = select(moved, z - lowest + above, z)
     flight.on_pad = select(mask, 0.0, flight.on_pad)
     flight.crashed = select(mask, 0.0, flight.crashed)
     v_I, w_B, h = load3(flight.v), load3(flight.w), p.dt
     a_I, dw_B = _free_accelerations(flight, p, R_BI)
     free = add(v_I, scale(h, a_I)), add(w_B, scale(h, dw_B))
     pose = load3(flight.r), load4(flight.q)
-    raised = 0.5 * h * (free[0][2] - v_I[2])
-    v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, raised)
+    ahead = scale(0.5 * h, sub(free[0], v_I))
+    v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, ahead)
     before = load3(flight.ground_push)
     gained = scale(1.0 / h, sub(v, v_I)), scale(1.0 / h, sub(w, w_B))
     _feel(flight, p, R_BI, gained, meets)

@@ -1,0 +1,72 @@
+"""Whether vehicles can stand on the ground of a world, and begin there."""
+
+import numpy as np
+
+from quad_gym.params.randomization import DrawingTable
+from quad_gym.params.task import TaskParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
+from quad_gym.records import COLUMNS
+
+GATE_HEIGHTS = (0.7, 1.3)
+"""Lowest and highest gate of a course, over `TaskParams.height`."""
+RANDOM_RISE = 0.3
+"""How far a random trajectory leads up or down, over `TaskParams.radius`: typically less."""
+
+
+def check_standing(
+    task: TaskParams, vehicle: VehicleParams, world: WorldParams, draws: DrawingTable
+) -> None:
+    """Refuse ground on which the vehicle cannot stand, or where no episode of a task can begin.
+
+    Args:
+        task: Says where the reference begins, and how far away an episode is over.
+        vehicle: As it is.
+        world: With its ground, if there is one.
+        draws: What is drawn around the task's own start.
+
+    Raises:
+        ValueError: If a foot is not below all rotor hubs, on which the vehicle would stand, which
+            is a crash; or if a start on the ground is farther from the reference than
+            `TaskParams.out_of_bounds`, so that the episode ends with its first step.
+    """
+    if world.ground is None:
+        return
+    feet, hubs = (np.array(p)[:, 2] for p in (world.ground.feet_B, vehicle.rotor_positions_B))
+    if feet.max() >= hubs.min():
+        raise ValueError(
+            "GroundParams.feet_B must be below the vehicle's lowest rotor hub, at "
+            f"{hubs.min():g} m, got {feet.max():g} m"
+        )
+    standing = world.ground_height - world.ground.feet_B[0][2]
+    column = COLUMNS["start_position_I"].stop - 1
+    lower, upper = (max(float(ends[column]), 0.0) for ends in (draws.low, draws.high))
+    for low, high in _reference_heights(task):
+        above, below = standing + lower - high, low - (standing + upper)
+        # a hovering start is near the reference, unless the ground lifts it
+        distance = above if task.start == "hover" else max(above, below)
+        if distance > task.out_of_bounds:
+            begins = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+            raise ValueError(
+                "WorldParams.ground_height must let a vehicle stand within "
+                f"out_of_bounds={task.out_of_bounds:g} m of the reference, which begins at a "
+                f"height of {begins} m, got {world.ground_height:g}, where it stands at "
+                f"{standing:g} m"
+            )
+
+
+def _reference_heights(task: TaskParams) -> list[tuple[float, float]]:
+    """Between which heights each reference of a task begins [m]."""
+    if task.kind == "waypoints":
+        return [(GATE_HEIGHTS[0] * task.height, GATE_HEIGHTS[1] * task.height)]
+    if task.kind == "random_trajectory":
+        rise = RANDOM_RISE * task.radius
+        return [(task.height - rise, task.height + rise)]
+    if task.kind != "trajectory":
+        return [(task.height, task.height)]
+    heights = []
+    for path in task.trajectories:
+        anywhere = task.randomize and path.closed
+        z = path(path.instants(200))[:, 2] if anywhere else path(0.0)[2:3]
+        heights.append((float(z.min()), float(z.max())))
+    return heights

@@ -1,0 +1,152 @@
+"""Where vehicles begin in a world whose ground carries them, and what ground is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from quad_gym import (
+    FlightBatch,
+    GroundParams,
+    TaskParams,
+    Trajectory,
+    Uniform,
+    WorldParams,
+    vehicle_params,
+)
+from quad_gym.records import COLUMNS, Control, Source
+
+LEGS, HUBS = 0.1, vehicle_params("lab").rotor_positions_B
+
+
+def batch(count=4, height=-0.1, task=None, ground=None, **options):
+    world = WorldParams(ground=GroundParams(**(ground or {})), ground_height=height)
+    task = TaskParams(**({"start": "ground", "duration": 0.0} | (task or {})))
+    options = {"sensors": "lab", "source": Source.TRUTH, "control": Control.MOTOR} | options
+    return FlightBatch(count, task=task, world=world, **options)
+
+
+def stand(flights, steps=20):
+    """Let flights stand with stopped rotors; the endings that there were."""
+    endings = np.zeros(flights.count)
+    for _ in range(steps):
+        flights.step(np.full((flights.count, 4), -1.0))
+        endings = np.maximum(endings, flights.result("ending"))
+    return endings
+
+
+@pytest.mark.parametrize(
+    ("height", "reference"), [(-300.0, 1.0), (-0.7, 1.0), (-0.4, 1.0), (5.0, 6.0), (900.0, 901.0)]
+)
+@pytest.mark.parametrize("kind", ["hover", "circle", "waypoints"])
+def test_no_episode_ends_because_of_where_the_ground_is(kind, height, reference):
+    task = {"kind": kind, "height": reference, "out_of_bounds": 400.0}
+    flights = batch(height=height, task=task)
+    flights.reset(seeds=range(4))
+    assert (stand(flights) == 0.0).all()
+    np.testing.assert_allclose(flights.read("r")[:, 2], height + LEGS, rtol=0.0, atol=1e-9)
+    assert (flights.read("footing") == 4.0).all()
+
+
+@pytest.mark.parametrize("start", ["ground", "mixed", "hover"])
+def test_ground_out_of_bounds_of_the_reference_is_refused(start):
+    task = {"start": start, "height": 1.0, "out_of_bounds": 3.0}
+    for height in (-2.0, 3.8):
+        flights = batch(64, height=height, task=task)
+        flights.reset(seeds=range(64))
+        assert (stand(flights, steps=1) == 0.0).all()
+    with pytest.raises(ValueError, match=r"WorldParams\.ground_height .* out_of_bounds=3 .* got 4"):
+        batch(height=4.0, task=task)
+    if start == "hover":
+        batch(height=-2.2, task=task)
+    else:
+        with pytest.raises(ValueError, match=r"WorldParams\.ground_height .* got -2.2"):
+            batch(height=-2.2, task=task)
+
+
+def test_where_a_reference_begins_decides():
+    path = Trajectory.through([(0, 0, 10), (2, 0, 11), (4, 0, 14)])
+    given = {"kind": "trajectory", "trajectory": path}
+    for height, refused in ((7.0, False), (12.0, False), (0.0, True), (14.0, True)):
+        if refused:
+            with pytest.raises(ValueError, match=r"WorldParams\.ground_height"):
+                batch(height=height, task=given)
+        else:
+            batch(height=height, task=given)
+    for kind in ("waypoints", "random_trajectory"):
+        with pytest.raises(ValueError, match=r"WorldParams\.ground_height"):
+            batch(height=50.0, task={"kind": kind})
+
+
+def test_the_ground_of_a_task_without_ground_that_carries_stays():
+    flights = FlightBatch(1, task=TaskParams(ground=0.3), world=WorldParams(ground_height=-5.0))
+    assert flights._settings["ground"][0] == 0.3
+    assert batch(task={"ground": -7.0})._settings["ground"][0] == -7.0
+    assert math.isclose(
+        batch(height=-3.0, task={"out_of_bounds": 9.0})._settings["ground"][0], -3.5
+    )
+
+
+@pytest.mark.parametrize("pad", [True, False])
+@pytest.mark.parametrize("moving", [{}, {"start_velocity_I"}, {"start_body_rates"}, {"start_yaw"}])
+def test_starts_on_the_ground_are_on_it_with_any_draws(pad, moving):
+    draws = {name: Uniform(-1e-3, 1e-3) for name in moving}
+    task = {"pad": pad, "out_of_bounds": 10.0}
+    flights = batch(16, height=-2.0, task=task, randomization=draws)
+    flights.reset(seeds=range(16))
+    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+    flights.reset(seeds=range(16), velocity=[0.1, 0.0, 0.0])
+    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pad", [True, False])
+@pytest.mark.parametrize("start", ["ground", "mixed"])
+def test_a_drawn_height_is_on_top_of_the_ground(pad, start):
+    draws = {"start_position_I": (None, None, Uniform(0.5, 1.5))}
+    task = {"pad": pad, "start": start, "out_of_bounds": 10.0}
+    flights, level = (
+        batch(64, height=-2.0, task=task, randomization=given) for given in (draws, {})
+    )
+    flights.reset(seeds=range(64))
+    level.reset(seeds=range(64))
+    drawn = flights.read("drawn")[:, COLUMNS["start_position_I"]][:, 2]
+    np.testing.assert_allclose(
+        flights.read("r")[:, 2], level.read("r")[:, 2] + drawn, rtol=0.0, atol=1e-12
+    )
+    assert (level.read("r")[:, 2] == -2.0 + LEGS).sum() > 20
+    assert (flights.read("footing") == 0.0).all()
+    flights.reset(seeds=range(64), position=[0.0, 0.0, -1.0])
+    assert (flights.read("r")[:, 2] == -1.0).all()
+
+
+def test_a_drawn_height_below_the_ground_is_lifted_onto_it():
+    draws = {"start_position_I": (None, None, Uniform(-0.5, -0.1))}
+    flights = batch(height=-2.0, task={"out_of_bounds": 10.0}, randomization=draws)
+    flights.reset(seeds=range(4))
+    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+
+
+def test_only_flights_that_begin_are_put_onto_the_ground():
+    flights = batch(16, height=-2.0, task={"out_of_bounds": 10.0})
+    flights.reset(seeds=range(16), position=[0.0, 0.0, 1.0])
+    chosen = np.arange(16) % 2 == 0
+    flights.reset(mask=chosen)
+    np.testing.assert_allclose(
+        flights.read("r")[:, 2], np.where(chosen, -2.0 + LEGS, 1.0), rtol=0.0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("whose", ["vehicle", "true_vehicle"])
+def test_feet_that_are_not_below_the_rotor_hubs_are_refused(whose):
+    """Nominally or as it is: only the latter stands on them."""
+    lab = vehicle_params("lab")
+    for z, refused in ((0.1, False), (-0.099, False), (-0.1, True), (-0.2, True)):
+        hubs = tuple((x, y, z if k == 2 else 0.2) for k, (x, y, _) in enumerate(HUBS))
+        given = {whose: lab.replace(rotor_positions_B=hubs)}
+        if refused:
+            with pytest.raises(ValueError, match=rf"GroundParams\.feet_B .* at {z:g} m, got -0.1"):
+                batch(**given)
+        else:
+            batch(**given)
+    hubs = tuple((x, y, -0.3) for x, y, _ in HUBS)
+    batch(vehicle=lab.replace(rotor_positions_B=hubs), true_vehicle=lab)
