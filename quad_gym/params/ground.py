@@ -32,8 +32,8 @@ class GroundParams(Checked):
         (-0.15, -0.15, -0.1),
     )
     """(4, 3) soles of the feet relative to the center of mass, in B [m]; legs 0.1 m long under the
-    arms of the laboratory's vehicle, whose hubs are 0.21 m out along both axes; a level plane, below
-    all rotor hubs of the vehicle"""
+    arms of the laboratory's vehicle, whose hubs are 0.21 m out along both axes; in a level plane,
+    below all rotor hubs of the vehicle"""
     friction: float = 0.6
     """Coulomb's coefficient, sticking and sliding; rubber on concrete has 0.6 to 0.85; 0: ice"""
     max_touchdown_speed: float = 1.5

@@ -41,7 +41,7 @@ def test_a_suite_of_the_field_is_consistent_by_its_settings(name):
 
 @pytest.mark.parametrize("suite", FIELD)
 def test_errors_at_a_level_start_are_as_claimed(suite):
-    """All 15 together: the position depends on the attitude, for the antenna is what was measured."""
+    """All 15 together: the position depends on the attitude: the antenna's is measured."""
     batch = fly(suite, 4000)
     errors, L = state_errors(batch), batch.read("L")
     assert_normal(np.linalg.solve(L, errors[..., np.newaxis])[..., 0], np.zeros(15), np.eye(15))
