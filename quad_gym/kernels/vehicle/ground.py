@@ -7,8 +7,8 @@ points take its place: with the gap g_i and the velocity u_i of point i, and the
 
 found by Gauss-Seidel sweeps; then r+ = r + h v+ and q+ = q exp(h w+). Impulses that fulfil this do
 no positive work at the velocities that they lead to, u_i . j_i <= 0, and contact gains no energy.
-The number of sweeps is fixed, however: where they have not converged, as in an impact of several points
-at once, their impulses may add some, and a last scaling of all of them takes that away, see
+The number of sweeps is fixed, however: where they have not converged, as in an impact of several
+points at once, their impulses may add some, and a last scaling of all of them takes that away, see
 `_share_without_gain`. As r+ and q+ follow from velocities, points of a vehicle that turns fast may
 end a tick below the plane; they go no deeper, and nothing pushes them out, which would gain energy.
 A vehicle that is at rest, and that normal forces and static friction can hold so, stays exactly
