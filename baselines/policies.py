@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,6 +55,9 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     Raises:
         ValueError: If there is no such policy, or it does not fit the environment.
         ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
+
+    Warns:
+        UserWarning: If a `.npz` was trained on another task.
     """
     if name in ("pd", "pd:tuned", "pd:lab"):
         return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
@@ -70,6 +74,11 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
         policy: Any = MlpPolicy.load(file)
         _require_agreement(file, policy.record, env)
         _require_size(file, policy.inputs, env)
+        trained_on = policy.record.get("plan", {}).get("env_id", task_of(env))
+        if trained_on != task_of(env):
+            warnings.warn(
+                f"{file} was trained on {trained_on}, and flies {task_of(env)}", stacklevel=2
+            )
         return policy  # type: ignore[no-any-return]
     if file.suffix != ".zip":
         raise ValueError(

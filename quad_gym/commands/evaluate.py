@@ -145,7 +145,8 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
         row = [f"{_short(name)} on {observation}"]
         if course:
             done = episodes.ending == "last_gate"
-            seconds = episodes.lengths[done].mean() / env.unwrapped.flights.control_rate
+            steps = episodes.lengths[done].sum() / max(int(done.sum()), 1)
+            seconds = steps / env.unwrapped.flights.control_rate
             row += [
                 f"{found['gates_passed'] / gates:.1%}",
                 f"{seconds:.2f} s" if any(done) else "-",

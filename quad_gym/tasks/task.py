@@ -1,8 +1,10 @@
 """`Task`: a user's reward, endings, observation and reset, in place of the built-in ones."""
 
+import difflib
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -77,6 +79,16 @@ class Task:
     replaces_observation: bool = False
     keeps: Collection[str] = ()
     privileged: bool = False
+
+    def __init_subclass__(cls) -> None:
+        """Warn of methods whose names are nearly those of a task: nobody would call them."""
+        super().__init_subclass__()
+        for name, value in vars(cls).items():
+            near = difflib.get_close_matches(name, METHODS, 1, cutoff=0.8)
+            if callable(value) and near and name not in METHODS and not hasattr(Task, name):
+                warnings.warn(
+                    f"{cls.__name__}.{name} is not called; did you mean {near[0]}?", stacklevel=2
+                )
 
     @staticmethod
     def of(

@@ -1,5 +1,7 @@
 """Wrong tasks raise errors that name the method and the flights, and leave flights usable."""
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
@@ -238,3 +240,21 @@ def test_a_wrong_observe_is_refused_when_the_environment_is_made():
     task = quad_gym.Task.of(observe=lambda view: view.position)
     with pytest.raises(TaskError, match=r"observe failed.*cannot read the truth"):
         gymnasium.make("QuadGym/Hover-v0", custom=task)
+
+
+def test_a_method_whose_name_is_nearly_right_is_warned_of():
+    with pytest.warns(UserWarning, match=r"Mine\.rewards is not called; did you mean reward\?"):
+
+        class Mine(quad_gym.Task):
+            def rewards(self, view):
+                return view.time
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+
+        class Right(quad_gym.Task):
+            def reward(self, view):
+                return self.pieces(view)
+
+            def pieces(self, view):
+                return view.time

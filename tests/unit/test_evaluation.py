@@ -1,10 +1,13 @@
 """`roll_out` against a plain loop over single environments."""
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
 
 from baselines import PDPolicy
+from baselines.policies import load_policy, pretrained_file
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import evaluate, roll_out
@@ -110,3 +113,12 @@ def test_what_cannot_be_rolled_out_is_refused():
         evaluate(policy, "QuadGym/Square-v0")
     with pytest.raises(ValueError, match="episodes"):
         evaluate(policy, "QuadGym/Hover-v0", episodes=0)
+
+
+def test_a_policy_of_another_task_flies_with_a_warning():
+    env = gymnasium.make_vec("QuadGym/Waypoints-v0", num_envs=1)
+    with pytest.warns(UserWarning, match=r"trained on QuadGym/Circle-v0, and flies QuadGym/Waypo"):
+        load_policy(str(pretrained_file("QuadGym/Circle-v0")), env)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_policy("pretrained", env)

