@@ -248,7 +248,7 @@ class Steady(OutageDash):
 class Waiting(Steady, Wary):
     """`Wary` that in training pays for standing still where the next gap is too narrow.
 
-    That is while `doubt` is above 0: there, 0.1 min(|v|, 5) is a cost, and progress is not paid
+    That is while `doubt` is above 0: there, 0.1 min(speed, 5) is a cost, and progress is not paid
     for. Crashes cost what they do in `Steady`.
     """
 
