@@ -59,6 +59,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "show_signature": False,
+    "capture_repr": (),  # what is worth saying is printed
     "min_reported_time": 1e9,
     "remove_config_comments": True,
     "reset_modules": ("matplotlib", "extensions.gallery.reset"),
