@@ -61,11 +61,11 @@ def flights_digest() -> str:
     Results on disk are kept beside it: with other code they are measured anew. What commands and
     pictures look like does not count.
     """
-    apart = ("commands", "rendering", "compiling")
-    files = sorted(
-        file for file in (_BASE / PACKAGE).rglob("*.py") if not set(apart) & set(file.parts)
-    )
-    lines = (f"{os.path.relpath(f, _BASE)} {_read(f, f.stat().st_mtime_ns)[0]}\n" for f in files)
+    apart = {"commands", "rendering", "compiling"}
+    names = sorted(name for name in _sources_of(_BASE / PACKAGE) if not apart & {*name.split("/")})
+    files = [_BASE / name for name in names]
+    digests = [_read(file, file.stat().st_mtime_ns)[0] for file in files]
+    lines = (f"{name} {digest}\n" for name, digest in zip(names, digests, strict=True))
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
