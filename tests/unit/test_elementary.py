@@ -16,13 +16,25 @@ from tests.unit.compiled import Compiled
 def functions(f, option):
     x = f.x
     f.sin, f.cos = sin_cos(x)
-    f.sin_small, f.cos_less_one = sin_cos_minus_one(x)
+    (f.sin_small, f.cos_less_one), _, (f.sin_last, f.cos_less_one_last) = sin_cos_minus_one(
+        (x, 0.0 * x, x)
+    )
     f.exp = exp(x)
     f.log = log(x)
     f.angle = atan2(f.y, x)
 
 
-NAMES = ("sin", "cos", "sin_small", "cos_less_one", "exp", "log", "angle")
+NAMES = (
+    "sin",
+    "cos",
+    "sin_small",
+    "cos_less_one",
+    "sin_last",
+    "cos_less_one_last",
+    "exp",
+    "log",
+    "angle",
+)
 compiled = Compiled(functions, x=(), y=(), **dict.fromkeys(NAMES, ()))
 
 

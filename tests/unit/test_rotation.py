@@ -15,6 +15,8 @@ from quad_gym.kernels.maths.rotation import (
     quaternion_rate,
     quaternion_to_dcm,
     split_rotation,
+    turn_pair,
+    turn_pair_back,
 )
 from tests.unit.compiled import Compiled
 
@@ -39,9 +41,17 @@ def attitude(f, option):
     store_rows(f.even, even)
     store_rows(f.odd, odd)
     store4(f.parts, parts)
+    x, d = load3(f.x), load3(f.d)
+    there = turn_pair(even, odd, x, d)
+    store3(f.pair[0], there[0])
+    store3(f.pair[1], there[1])
+    back = turn_pair_back(even, odd, x, d)
+    store3(f.pair_back[0], back[0])
+    store3(f.pair_back[1], back[1])
 
 
-FIELDS = {"e": (3,), "w": (3,), "q": (4,), "q_rate": (4,), "parts": (4,)}
+FIELDS = {"e": (3,), "w": (3,), "q": (4,), "q_rate": (4,), "parts": (4,), "x": (3,), "d": (3,)}
+FIELDS |= {"pair": (2, 3), "pair_back": (2, 3)}
 FIELDS |= dict.fromkeys(("R", "R_again", "even", "odd"), (3, 3))
 kernels = Compiled(attitude, **FIELDS)
 INSTANCES = ("on_floats", "on_lanes")
@@ -169,6 +179,19 @@ def test_the_even_and_odd_parts_add_up_to_the_rotation(instance, size):
     roll, pitch = e[:, 0], e[:, 1]
     parts = [np.sin(roll), -2 * np.sin(roll / 2) ** 2, np.sin(pitch), -2 * np.sin(pitch / 2) ** 2]
     np.testing.assert_allclose(got["parts"], np.transpose(parts), rtol=2e-15)
+
+
+@pytest.mark.parametrize("instance", INSTANCES)
+@pytest.mark.parametrize("size", [0.02, np.pi])
+def test_a_pair_of_turned_vectors_is_that_of_the_rotations(instance, size):
+    e, rng = size / np.pi * random_eulers(8, 200), np.random.default_rng(9)
+    x, d = rng.normal(size=(2, 200, 3))
+    got = getattr(kernels, instance)(e=e, x=x, d=d)
+    for name, axes in (("pair", "kij,kj->ki"), ("pair_back", "kji,kj->ki")):
+        plus = np.einsum(axes, scipy_dcm(e), x - d)
+        minus = np.einsum(axes, scipy_dcm(-e), x + d)
+        np.testing.assert_allclose(got[name][:, 0], (plus - minus) / 2, rtol=0.0, atol=5e-15)
+        np.testing.assert_allclose(got[name][:, 1], (plus + minus) / 2 - x, rtol=0.0, atol=5e-15)
 
 
 @pytest.mark.parametrize("instance", INSTANCES)

@@ -21,8 +21,28 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 
+from quad_gym.records import WIDTH
 
-class KernelLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+_LANES_BYTES = 8 * WIDTH
+
+
+class _AlignedLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+    """A library whose functions keep vectors of lanes on the stack within cache lines.
+
+    LLVM aligns the stack for what it knows to lie there when it begins to allocate registers, not
+    for registers that it spills later on; these would straddle lines, and some straddle pages.
+    """
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Add IR as Numba has lowered it."""
+        for function in ir_module.functions:
+            if not function.is_declaration:
+                function.attributes.alignstack = _LANES_BYTES
+                function.attributes.add("nounwind")  # llvmlite leaves out an alignment alone
+        super().add_ir_module(ir_module)
+
+
+class KernelLibrary(_AlignedLibrary):
     """The IR of a kernel, and the libraries that it calls."""
 
     def add_llvm_module(self, ll_module: Any) -> None:
@@ -47,7 +67,7 @@ class KernelLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
                 seen[library] = None
 
 
-class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+class EntryLibrary(_AlignedLibrary):
     """The code of an entry with all kernels that it reaches."""
 
     _linking_libraries: list[Any]

@@ -3,7 +3,7 @@
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.linalg import add, add_outer, add_to_diagonal, dot, scale
+from quad_gym.kernels.maths.linalg import add, add_outer, add_scaled, add_to_diagonal, dot, scale
 from quad_gym.kernels.simd.lanes import any_of, select
 
 
@@ -56,6 +56,6 @@ def direction_pair(v, inverse_norm, v_even, v_odd):
     d_odd = inverse_square * (2.0 * dot(centre, v_odd))
     plus, minus = _shrinkage(d_even + d_odd), _shrinkage(d_even - d_odd)
     both, gap = 0.5 * (plus + minus), 0.5 * (plus - minus)
-    difference = add(add(v_odd, scale(both, v_odd)), scale(gap, centre))
-    half_sum = add(add(v_even, scale(both, centre)), scale(gap, v_odd))
+    difference = add_scaled(add_scaled(v_odd, both, v_odd), gap, centre)
+    half_sum = add_scaled(add_scaled(v_even, both, centre), gap, v_odd)
     return scale(inverse_norm, difference), scale(inverse_norm, half_sum)

@@ -13,7 +13,7 @@ The derivatives of measurements are in the files of these, in `kernels/measureme
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BG, E
-from quad_gym.kernels.maths.linalg import add, apply_transposed, cross, load_column3, scale, sub
+from quad_gym.kernels.maths.linalg import add_scaled, apply_transposed, cross, load_column3, sub
 
 
 @kernel
@@ -27,4 +27,4 @@ def angle_column(L, j, w_B, dt):
     """Derivative of the Euler step e + dt S(e) (w - b_g) along column j."""
     d, dg = load_column3(L, E, j), load_column3(L, BG, j)
     rate = (d[1] * w_B[2] - dg[0], -d[0] * w_B[2] - dg[1], -d[1] * w_B[0] - dg[2])
-    return add(d, scale(dt, rate))
+    return add_scaled(d, dt, rate)

@@ -37,6 +37,8 @@ from quad_gym.kernels.maths.linalg import (
     add,
     add33,
     add_outer,
+    add_scaled,
+    add_scaled33,
     add_to_diagonal,
     apply,
     apply_transposed,
@@ -55,7 +57,12 @@ from quad_gym.kernels.maths.linalg import (
     sum_of_outers,
     sum_of_squares,
 )
-from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation, vector_to_dcm
+from quad_gym.kernels.maths.rotation import (
+    euler_to_dcm,
+    split_rotation,
+    turn_pair_back,
+    vector_to_dcm,
+)
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm, FilterStatus
@@ -72,16 +79,17 @@ def _euler_rate_parts(parts, w_B, dg):
     """
     s_phi, m_phi, s_th, m_th = parts
     c_phi, c_th = 1.0 + m_phi, 1.0 + m_th
-    t_phi = s_phi / c_phi
+    per_c_phi = 1.0 / c_phi
+    t_phi = s_phi * per_c_phi
     odd = (
         s_th * w_B[2] - c_th * dg[0],
         -dg[1] - t_phi * (s_th * dg[0] + c_th * w_B[2]),
-        (-s_th * w_B[0] - c_th * dg[2]) / c_phi,
+        (-s_th * w_B[0] - c_th * dg[2]) * per_c_phi,
     )
     even = (
         m_th * w_B[0] - s_th * dg[2],
         t_phi * (s_th * w_B[0] + c_th * dg[2]),
-        (s_th * dg[0] + (m_th - m_phi) * w_B[2]) / c_phi,
+        (s_th * dg[0] + (m_th - m_phi) * w_B[2]) * per_c_phi,
     )
     return odd, even
 
@@ -95,7 +103,7 @@ def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
     df = scale(c, load_column3(L, BA, j))
     if midpoint:
         dg = scale(c, load_column3(L, BG, j))
-        df = apply_transposed(half, add(df, scale(half_dt, cross(dg, f_B))))
+        df = apply_transposed(half, add_scaled(df, half_dt, cross(dg, f_B)))
     return df
 
 
@@ -133,20 +141,19 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
             df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
             even, odd, parts = split_rotation(d)
             # a_I = R^T R(e)^T (f - b_a) - g: its odd part in the offset, its even less the center
-            odd_B = sub(sub(apply_transposed(odd, f_start), df), apply_transposed(even, df))
-            even_B = sub(apply_transposed(even, f_start), apply_transposed(odd, df))
+            odd_B, even_B = turn_pair_back(even, odd, f_start, df)
             a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
             a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
             e_odd, e_even = nothing, nothing
             if not midpoint:
                 rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
-                e_odd = scale(inverse_c, add(d, scale(dt, rate_odd)))
+                e_odd = scale(inverse_c, add_scaled(d, dt, rate_odd))
                 e_even = scale(dt * inverse_c, rate_even)
         if midpoint:
             e_odd = _turned_angles(L, j, full, half, dt)
 
         v_j = load_column3(L, V, j)
-        r_j = add(load_column3(L, R, j), scale(dt, v_j))
+        r_j = add_scaled(load_column3(L, R, j), dt, v_j)
         for i in range(3):
             F[R + i, j] = r_j[i] + half_dt2 * a_odd[i]
             F[V + i, j] = v_j[i] + dt * a_odd[i]
@@ -171,7 +178,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
 def _turned_angles(L, j, full, half, dt):
     """Column j of the error angles about the new R_hat, R_half (R_half e - dt b_g)."""
     turned = apply(full, load_column3(L, E, j))
-    return sub(turned, scale(dt, apply(half, load_column3(L, BG, j))))
+    return add_scaled(turned, -dt, apply(half, load_column3(L, BG, j)))
 
 
 @kernel
@@ -203,14 +210,14 @@ def _add_second_order(work, p, mean_a, mean_e, midpoint):
     half_dt2 = 0.5 * dt * dt
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     aa = add_outer(sum_of_squares(S, 0, 9), scale(excess, mean_a), mean_a)
-    store_block(P, R, R, add33(load_block(P, R, R), scale33(half_dt2 * half_dt2, aa)))
-    store_block(P, V, R, add33(load_block(P, V, R), scale33(dt * half_dt2, aa)))
-    store_block(P, V, V, add33(load_block(P, V, V), scale33(dt * dt, aa)))
+    store_block(P, R, R, add_scaled33(load_block(P, R, R), half_dt2 * half_dt2, aa))
+    store_block(P, V, R, add_scaled33(load_block(P, V, R), dt * half_dt2, aa))
+    store_block(P, V, V, add_scaled33(load_block(P, V, V), dt * dt, aa))
     if not midpoint:
         ea = add_outer(sum_of_outers(S, 3, S, 0, 9), scale(excess, mean_e), mean_a)
         ee = add_outer(sum_of_squares(S, 3, 9), scale(excess, mean_e), mean_e)
-        store_block(P, E, R, add33(load_block(P, E, R), scale33(half_dt2, ea)))
-        store_block(P, E, V, add33(load_block(P, E, V), scale33(dt, ea)))
+        store_block(P, E, R, add_scaled33(load_block(P, E, R), half_dt2, ea))
+        store_block(P, E, V, add_scaled33(load_block(P, E, V), dt, ea))
         store_block(P, E, E, add33(load_block(P, E, E), ee))
 
 
@@ -299,7 +306,7 @@ def predict(flight, p, work, form=0, slow=None):
     _sum_moments(flight, p, work, mean_a, mean_e, f_B, form)
     if slow is not None:
         predict_slow(flight, slow, p, work)
-    turn = add(scale(dt, w_B), mean_e)
+    turn = add_scaled(mean_e, dt, w_B)
     if midpoint:
         _add_gyro_noise(work.P, p, R_BI, f_B, half)
         R_pred, f_B = multiply(half, multiply(half, R_BI)), apply_transposed(half, f_B)
@@ -314,8 +321,8 @@ def predict(flight, p, work, form=0, slow=None):
     a_I = apply_transposed(R_BI, f_B)
     a_I = add((a_I[0], a_I[1], a_I[2] - p.gravity), mean_a)
     r, v = load3(flight.r_hat), load3(flight.v_hat)
-    r_pred = add(add(r, scale(dt, v)), scale(0.5 * dt * dt, a_I))
-    v_pred = add(v, scale(dt, a_I))
+    r_pred = add_scaled(add_scaled(r, dt, v), 0.5 * dt * dt, a_I)
+    v_pred = add_scaled(v, dt, a_I)
     ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
 
     keep3(flight.r_hat, ok, r_pred)

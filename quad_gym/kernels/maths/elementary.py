@@ -129,18 +129,36 @@ def sin_cos(x):
 
 
 @kernel
-def sin_cos_minus_one(x):
-    """(sin x, cos x - 1) without cancellation, fastest for |x| < 0.05 rad as of sigma points."""
+def _near_zero(x):
+    """(sin x, cos x - 1) for |x| < 0.05 rad."""
     z = x * x
-    sine = x + x * z * (-1.0 / 6.0 + z * (1.0 / 120.0 - z * (1.0 / 5040.0)))
-    rest = z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40320.0))))
-    if any_of(abs(x) >= _SMALL_ANGLE):
-        full_sine, _ = sin_cos(x)
-        half_sine, _ = sin_cos(0.5 * x)
-        small = abs(x) < _SMALL_ANGLE
-        sine = select(small, sine, full_sine)
-        rest = select(small, rest, -2.0 * half_sine * half_sine)
-    return sine, rest
+    return (
+        x + x * z * (-1.0 / 6.0 + z * (1.0 / 120.0 - z * (1.0 / 5040.0))),
+        z * (-0.5 + z * (1.0 / 24.0 + z * (-1.0 / 720.0 + z * (1.0 / 40320.0)))),
+    )
+
+
+@kernel
+def _where_large(x, near):
+    """(sin x, cos x - 1) for any x, `near` where that is small."""
+    sine, _ = sin_cos(x)
+    half_sine, _ = sin_cos(0.5 * x)
+    small = abs(x) < _SMALL_ANGLE
+    return select(small, near[0], sine), select(small, near[1], -2.0 * half_sine * half_sine)
+
+
+@kernel
+def sin_cos_minus_one(angles):
+    """(sin x, cos x - 1) of three angles x without cancellation, fastest below 0.05 rad.
+
+    Sigma points have such angles. One branch for all three lets the processor go ahead.
+    """
+    x, y, z = angles
+    of_x, of_y, of_z = _near_zero(x), _near_zero(y), _near_zero(z)
+    large = (abs(x) >= _SMALL_ANGLE) | (abs(y) >= _SMALL_ANGLE) | (abs(z) >= _SMALL_ANGLE)
+    if any_of(large):
+        of_x, of_y, of_z = _where_large(x, of_x), _where_large(y, of_y), _where_large(z, of_z)
+    return of_x, of_y, of_z
 
 
 @kernel

@@ -10,17 +10,20 @@ from quad_gym.kernels.simd.lanes import select
 
 @kernel
 def cholesky33(m):
-    """The lower Cholesky factor with its diagonal inverted, the diagonal, and the least pivot."""
+    """The lower Cholesky factor with its diagonal inverted, the diagonal, and the least pivot.
+
+    Each pivot needs the one before it. They are those of L D L^T, whose chain has divisions alone;
+    the roots, which take as long, are taken side by side.
+    """
     p0 = m[0][0]
-    i0 = 1.0 / math.sqrt(p0)
-    l10, l20 = m[1][0] * i0, m[2][0] * i0
-    p1 = m[1][1] - l10 * l10
-    i1 = 1.0 / math.sqrt(p1)
-    l21 = (m[2][1] - l20 * l10) * i1
-    p2 = m[2][2] - l20 * l20 - l21 * l21
-    i2 = 1.0 / math.sqrt(p2)
+    r0 = 1.0 / p0
+    p1 = m[1][1] - (m[1][0] * r0) * m[1][0]
+    r1 = 1.0 / p1
+    rest = m[2][1] - (m[2][0] * r0) * m[1][0]
+    p2 = m[2][2] - (m[2][0] * r0) * m[2][0] - (rest * r1) * rest
+    i0, i1, i2 = math.sqrt(r0), math.sqrt(r1), math.sqrt(1.0 / p2)
     return (
-        ((i0, 0.0, 0.0), (l10, i1, 0.0), (l20, l21, i2)),
+        ((i0, 0.0, 0.0), (m[1][0] * i0, i1, 0.0), (m[2][0] * i0, rest * i1, i2)),
         (p0 * i0, p1 * i1, p2 * i2),
         minimum(minimum(p0, p1), p2),
     )

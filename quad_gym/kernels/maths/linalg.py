@@ -54,6 +54,12 @@ def scale(s, a):
 
 
 @kernel
+def add_scaled(a, s, b):
+    """A + s b, in one multiply-add for each number."""
+    return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
+
+
+@kernel
 def dot(a, b):
     """A . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -269,6 +275,12 @@ def sum_of_outers_of_rows(a, b, i, k, rows):
 def add33(a, b):
     """A + b."""
     return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
+
+
+@kernel
+def add_scaled33(a, s, b):
+    """A + s b."""
+    return (add_scaled(a[0], s, b[0]), add_scaled(a[1], s, b[1]), add_scaled(a[2], s, b[2]))
 
 
 @kernel

@@ -35,9 +35,7 @@ def split_rotation(e):
         (even, odd), and the sines and cosines less one of roll and pitch
         (s_phi, c_phi - 1, s_th, c_th - 1), which the Euler-rate matrix needs again.
     """
-    s_phi, m_phi = sin_cos_minus_one(e[0])
-    s_th, m_th = sin_cos_minus_one(e[1])
-    s_psi, m_psi = sin_cos_minus_one(e[2])
+    (s_phi, m_phi), (s_th, m_th), (s_psi, m_psi) = sin_cos_minus_one(e)
     c_phi, c_th, c_psi = 1.0 + m_phi, 1.0 + m_th, 1.0 + m_psi
     even = (
         (m_psi * c_th + m_th, c_psi * s_phi * s_th, 0.0),
@@ -50,6 +48,51 @@ def split_rotation(e):
         (c_psi * s_th, -c_psi * c_th * s_phi, 0.0),
     )
     return even, odd, (s_phi, m_phi, s_th, m_th)
+
+
+@kernel
+def turn_pair(even, odd, x, d):
+    """The parts odd and even of (I + even +- odd) (x -+ d), less x; of what `split_rotation` gives.
+
+    They are `odd x - d - even d` and `even x - odd d`, written out to leave out the zeros.
+    """
+    (e00, e01, _), (_, e11, _), (e20, e21, e22) = even
+    (o00, o01, o02), (o10, _, o12), (o20, o21, _) = odd
+    x0, x1, x2 = x
+    d0, d1, d2 = d
+    return (
+        (
+            o00 * x0 + o01 * x1 + o02 * x2 - d0 - e00 * d0 - e01 * d1,
+            o10 * x0 + o12 * x2 - d1 - e11 * d1,
+            o20 * x0 + o21 * x1 - d2 - e20 * d0 - e21 * d1 - e22 * d2,
+        ),
+        (
+            e00 * x0 + e01 * x1 - o00 * d0 - o01 * d1 - o02 * d2,
+            e11 * x1 - o10 * d0 - o12 * d2,
+            e20 * x0 + e21 * x1 + e22 * x2 - o20 * d0 - o21 * d1,
+        ),
+    )
+
+
+@kernel
+def turn_pair_back(even, odd, x, d):
+    """The same of (I + even +- odd)^T (x -+ d)."""
+    (e00, e01, _), (_, e11, _), (e20, e21, e22) = even
+    (o00, o01, o02), (o10, _, o12), (o20, o21, _) = odd
+    x0, x1, x2 = x
+    d0, d1, d2 = d
+    return (
+        (
+            o00 * x0 + o10 * x1 + o20 * x2 - d0 - e00 * d0 - e20 * d2,
+            o01 * x0 + o21 * x2 - d1 - e01 * d0 - e11 * d1 - e21 * d2,
+            o02 * x0 + o12 * x1 - d2 - e22 * d2,
+        ),
+        (
+            e00 * x0 + e20 * x2 - o00 * d0 - o10 * d1 - o20 * d2,
+            e01 * x0 + e11 * x1 + e21 * x2 - o01 * d0 - o21 * d2,
+            e22 * x2 - o02 * d0 - o12 * d1,
+        ),
+    )
 
 
 @kernel

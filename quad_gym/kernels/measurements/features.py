@@ -28,6 +28,7 @@ from quad_gym.kernels.filter.recovery import (
 from quad_gym.kernels.maths.elementary import clip, maximum
 from quad_gym.kernels.maths.linalg import (
     add_outer,
+    add_scaled,
     add_to_diagonal,
     apply,
     apply_transposed,
@@ -46,7 +47,7 @@ from quad_gym.kernels.maths.linalg import (
     sub,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm, turn_pair
 from quad_gym.kernels.measurements.gate import (
     accept_group,
     count_in_row,
@@ -135,7 +136,7 @@ def _center(flight, p, work, settings, k):
             u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
             noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
             # a pixel does not move along the optical axis c: less c c^T, across u
-            across = sub(R_CB[2], scale(dot(R_CB[2], u_B), u_B))
+            across = add_scaled(R_CB[2], -dot(R_CB[2], u_B), u_B)
             less = scale(-p.noise_projected * sigma * sigma, across)
             put_noise(work, k, has, add_outer(noise, less, across))
             k += 3
@@ -156,12 +157,11 @@ def _column(flight, p, work, settings, k, j, A, S, R_BI):
             if by_derivative:
                 u_B = load3(work.h[k : k + 3])
                 v = scale(work.inverse_distance[i], sub(cross(X_B, d), dr_B))
-                put_three(A, k, has, sub(v, scale(dot(u_B, v), u_B)))
+                put_three(A, k, has, add_scaled(v, -dot(u_B, v), u_B))
                 put_three(S, k, has, scale(0.0, dr))
             else:
                 # (I + even +- odd) (X_B -+ dr_B) - l_c
-                v_odd = sub(sub(apply(odd, X_B), dr_B), apply(even, dr_B))
-                v_even = sub(apply(even, X_B), apply(odd, dr_B))
+                v_odd, v_even = turn_pair(even, odd, X_B, dr_B)
                 v = sub(X_B, camera)
                 a, s = direction_pair(v, work.inverse_distance[i], v_even, v_odd)
                 put_three(A, k, has, scale(inverse_c, a))

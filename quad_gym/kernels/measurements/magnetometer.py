@@ -32,6 +32,7 @@ from quad_gym.kernels.maths.linalg import (
     add,
     add33,
     add_outer,
+    add_scaled,
     add_to_diagonal,
     apply,
     apply_transposed,
@@ -212,7 +213,7 @@ def _put_center(flight, p, work, settings, k, has, f_B):
 @kernel
 def _expect(flight, p, work, settings, k):
     """Fill rows k to k + 2."""
-    L, M, c = flight.L, flight.L_slow, work.spread
+    L, M, inverse_c = flight.L, flight.L_slow, work.inverse_spread
     has, last = flight.aid_valid[_S] > 0.0, D + settings.slow_states - 1
     first, delta = settings.aid_vector[_S], settings.aid_scalar[_S]
     f_B, g_B = _expected_field(flight, p, settings)
@@ -228,9 +229,9 @@ def _expect(flight, p, work, settings, k):
                 straight = add(straight, cross(f_B, load_column3(L, E, j)))
             else:
                 odd, even = load33(work.odd[j]), load33(work.even[j])
-                bent = add(scale(1.0 / c, apply(odd, f_B)), apply(even, turned))
+                bent = add_scaled(apply(even, turned), inverse_c, apply(odd, f_B))
                 straight = add(straight, bent)
-                half_sum = add(scale(1.0 / c, apply(even, f_B)), apply(odd, turned))
+                half_sum = add_scaled(apply(odd, turned), inverse_c, apply(even, f_B))
             store3(work.E[8 - j][k : k + 3], select3(has, half_sum, nothing))
         store3(work.A[last - j][k : k + 3], select3(has, straight, nothing))
 

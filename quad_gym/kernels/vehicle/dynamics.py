@@ -6,6 +6,7 @@ A state is (r_I, v_I, q, w_B, rotor_speeds), a tuple of tuples; its derivative h
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import (
     add,
+    add_scaled,
     apply,
     apply_transposed,
     cross,
@@ -58,7 +59,7 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     thrust, torque_x, torque_y, torque_z = combine(p.effectiveness, forces)
     z_I = R_BI[2]
     drag = p.half_drag * abs(dot(z_I, v_I))
-    force_I = add(sub(scale(thrust, z_I), scale(drag, v_I)), d_I)
+    force_I = add(add_scaled(scale(thrust, z_I), -drag, v_I), d_I)
     inverse_mass = 1.0 / p.mass
     a_I = scale(inverse_mass, force_I)
     a_I = (a_I[0], a_I[1], a_I[2] - p.gravity)
@@ -97,10 +98,10 @@ def _advance4(x, h, k):
 def advance(state, h, rate):
     """State + h rate."""
     return (
-        add(state[0], scale(h, rate[0])),
-        add(state[1], scale(h, rate[1])),
+        add_scaled(state[0], h, rate[0]),
+        add_scaled(state[1], h, rate[1]),
         _advance4(state[2], h, rate[2]),
-        add(state[3], scale(h, rate[3])),
+        add_scaled(state[3], h, rate[3]),
         _advance4(state[4], h, rate[4]),
     )
 

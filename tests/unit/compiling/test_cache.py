@@ -11,6 +11,7 @@ from quad_gym.kernels import single
 from quad_gym.kernels.compiling import cache as caches
 from quad_gym.kernels.compiling import entry, kernel, routine
 from quad_gym.kernels.maths.linalg import cross
+from quad_gym.records import WIDTH
 from tests.unit.compiled import Compiled
 from tests.unit.compiling.parts import PREPARE, RIGHT, Parts
 
@@ -60,6 +61,18 @@ def test_an_entry_is_called_and_found_in_the_cache():
     cache = single.wahba_of_vectors._cache
     signature = next(iter(single.wahba_of_vectors.overloads))
     assert cache.holds(signature, single.wahba_of_vectors.targetctx)
+
+
+def test_vectors_on_the_stack_lie_within_cache_lines(tmp_path, monkeypatch):
+    monkeypatch.setattr(caches.config, "CACHE_DIR", str(tmp_path))  # compiled here, not loaded
+
+    @entry
+    def doubles(x):
+        x[0] *= 2.0
+
+    doubles(np.ones(1))
+    (compiled,) = doubles.overloads.values()
+    assert f"alignstack={8 * WIDTH}" in compiled.library.get_llvm_str()
 
 
 # ---- what cached code needs of Numba -----------------------------------------------------------
