@@ -71,7 +71,7 @@ def truths(task: Task, method: str, value: Any, count: int) -> Truths:
         TaskError: If it is something else.
     """
     found = numbers(task, method, value)
-    if found.dtype != bool or found.shape != (count,):
+    if found.dtype.kind != "b" or found.shape != (count,):
         raise TaskError(
             f"{label(task)}.{method} must return booleans of shape ({count},), "
             f"got {found.dtype} of {found.shape}"
@@ -95,6 +95,27 @@ def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
                 f"{_of(name)}, got {array.shape}"
             )
         found[str(name)] = array[:, np.newaxis] if array.ndim == 1 else array
+    return found
+
+
+def parts_as_before(value: Any, shapes: Mapping[str, tuple[int, ...]]) -> list[NDArray[Any]] | None:
+    """The arrays that `observe` has returned, if they are as they were at first, as nearly always.
+
+    Args:
+        value: What it has returned.
+        shapes: Of its parts, by name; (n, k) each.
+
+    Returns:
+        The arrays, in the order of `shapes`; None: what has been returned needs a closer look.
+    """
+    if type(value) is not dict or len(value) != len(shapes):
+        return None
+    found = []
+    for name, shape in shapes.items():
+        part = value.get(name)
+        if type(part) is not np.ndarray or part.shape != shape or part.dtype.kind != "f":
+            return None
+        found.append(part)
     return found
 
 

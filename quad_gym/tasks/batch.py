@@ -14,9 +14,10 @@ from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
 from quad_gym.tasks.endings import endings
 from quad_gym.tasks.memory import ReadableBatch
+from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.state import State
-from quad_gym.tasks.task import METHODS, Task, TaskError, label
+from quad_gym.tasks.task import METHODS, Task, label
 from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
@@ -25,6 +26,8 @@ Truths = NDArray[np.bool_]
 
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
 _TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
+_FIELDS = {result: result.name.lower() for result in Result}
+"""Where records keep results."""
 
 
 class Before(NamedTuple):
@@ -32,14 +35,6 @@ class Before(NamedTuple):
 
     position_error: Floats
     gates_passed: Floats
-
-
-class Part(NamedTuple):
-    """One part of what `observe` returns."""
-
-    size: int
-    low: float
-    high: float
 
 
 class TaskBatch(ReadableBatch):
@@ -79,11 +74,9 @@ class TaskBatch(ReadableBatch):
         self.custom = custom
         self.methods = frozenset(method for method in METHODS if custom.has(method))
         self._same_step = autoreset == Autoreset.SAME_STEP
-        self._parts, self._split = dict(parts or {}), split
-        self._observes = parts is not None and "observe" in self.methods
-        self._kept: slice | NDArray[np.intp] = slice(0, split)
-        if kept is not None and len(kept) < split:
-            self._kept = np.array(kept, np.intp)
+        self._split, self._joiner = split, None
+        if parts is not None and "observe" in self.methods:
+            self._joiner = Joiner(self.count, parts, self._low.size, split, kept)
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self._state = State(self.count, custom.state)
@@ -92,12 +85,9 @@ class TaskBatch(ReadableBatch):
         self._failed = self._nobody.copy()
         self.began, self.began_some = self._nobody, False
         self.before = Before(np.zeros(self.count), np.zeros(self.count))
-        self._sizes = [part.size for part in self._parts.values()]
-        bounds = [(part.low, part.high) for part in self._parts.values() for _ in range(part.size)]
-        self._own_low, self._own_high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
-        self._least = self._own_low.max(initial=-np.inf)
-        self._most = self._own_high.min(initial=np.inf)
-        self._finals = np.zeros((self.count, self._size_of_observation()), np.float32)
+        size = self._joiner.size if self._joiner else self._low.size
+        self._finals = np.zeros((self.count, size), np.float32)
+        self._begun_again = False
         self._view: View | None = None
 
     # ---- flying -------------------------------------------------------------------------------
@@ -157,6 +147,7 @@ class TaskBatch(ReadableBatch):
         """Ask the task about a step that has been flown; return what is observed."""
         self.view.step_over()
         self.began, self.began_some = began, bool(np.count_nonzero(began))
+        self._begun_again = False
         if self.began_some:
             shipped = self._begin(began, {}, shipped)
         if "update" in self.methods:
@@ -164,8 +155,8 @@ class TaskBatch(ReadableBatch):
                 answers.ask(self.custom, "update", self.view, rng)
         judged = self._judge(returns)
         observations = self._observed(shipped)
-        if self._observes and self.custom.privileged:
-            self.view.own_shipped.read()
+        if self._joiner and self.custom.privileged:
+            self.view.shipped.read()
         self._write(judged)
         if self._same_step:
             ends = self.judged_over
@@ -201,6 +192,7 @@ class TaskBatch(ReadableBatch):
         self._blocks["instant"][again] -= np.uint64(1)
         self._blocks["episode"][again] -= 1.0
         shipped = super().reset(mask=chosen, **start)
+        self._begun_again = True
         self.view.forget()
         return shipped
 
@@ -241,14 +233,14 @@ class TaskBatch(ReadableBatch):
         """Let results and records say what the task has judged."""
         for result, values in judged.items():
             self._results[result, : self.count] = values
-            self.write(result.name.lower(), values)
+            self.write(_FIELDS[result], values)
         if self._counts_gates:
             passed = np.where(self.began, 0.0, self._state.gates_passed)
             self._results[Result.GATES_PASSED, : self.count] = passed
             self.write("gate_next", passed)
         if Result.ENDING in judged:
             self.write("needs_reset", judged[Result.TERMINATED] + judged[Result.TRUNCATED])
-        if self.began_some:
+        if self._begun_again:
             for name in ("position_error", "estimation_error", "filter_status"):
                 row = self._results[Result[name.upper()], : self.count]
                 row[self.began] = self.columns(name)[self.began]
@@ -270,58 +262,21 @@ class TaskBatch(ReadableBatch):
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
         """What `observe` returns at the present instant, (count, k) each."""
+        return answers.parts(self.custom, self._asked_to_observe(), self.count)
+
+    def _asked_to_observe(self) -> Any:
         view = self.view
         view.hide(not self.custom.privileged)
         try:
-            value = answers.ask(self.custom, "observe", view)
+            return answers.ask(self.custom, "observe", view)
         finally:
             view.hide(False)
-        return answers.parts(self.custom, value, self.count)
 
     def _observed(self, shipped: Singles) -> Singles:
-        """The observations that the environment shows: shipped, the task's, privileged ones."""
-        if not self._observes:
+        """The observations that the environment shows."""
+        if self._joiner is None:
             return shipped
-        found = self.ask_parts()
-        if found.keys() != self._parts.keys():
-            self._refuse_parts(found)
-        own = [found[name] for name in self._parts]
-        if [part.shape[1] for part in own] != self._sizes:
-            self._refuse_parts(found)
-        kept, rest = shipped[:, self._kept], shipped[:, self._split :]
-        parts = [*([kept] if kept.shape[1] else []), *own, *([rest] if rest.shape[1] else [])]
-        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
-        ours = joined[:, kept.shape[1] : joined.shape[1] - rest.shape[1]]
-        flat = joined.ravel()
-        if not np.isfinite(np.dot(flat, flat)):
-            self._require_finite(found, ours)
-        if ours.min() < self._least or ours.max() > self._most:  # seldom, and it takes long
-            np.clip(ours, self._own_low, self._own_high, out=ours)
-        return joined
-
-    def _require_finite(self, found: Mapping[str, NDArray[Any]], ours: Singles) -> None:
-        """Refuse what is not finite; of flights that are no more, make it finite."""
-        for name, values in found.items():
-            sound = np.isfinite(values).all(axis=1)
-            if not sound.all():
-                sound |= ~self.finite(~sound)
-                answers.require(sound, self.custom, "observe", values, f"finite {name!r}")
-        np.nan_to_num(ours, copy=False)
-
-    def _refuse_parts(self, found: Mapping[str, NDArray[Any]]) -> None:
-        sizes = {name: part.shape[1] for name, part in found.items()}
-        declared = {name: part.size for name, part in self._parts.items()}
-        raise TaskError(
-            f"{label(self.custom)}.observe must return as many numbers as at first, {declared}, "
-            f"got {sizes}"
-        )
-
-    def _size_of_observation(self) -> int:
-        """Numbers of an observation that the environment shows."""
-        shipped = self._split if isinstance(self._kept, slice) else len(self._kept)
-        kept = shipped + self._low.size - self._split
-        own = sum(part.size for part in self._parts.values())
-        return kept + own if self._observes else self._low.size
+        return self._joiner.join(self, self._asked_to_observe(), shipped)
 
     # ---- keeping ------------------------------------------------------------------------------
 
@@ -371,7 +326,7 @@ class TaskBatch(ReadableBatch):
     @contextmanager
     def _writing(self, chosen: Truths, draws: int) -> Iterator[FlightRandom]:
         """Let a method change the task's state, of some flights alone."""
-        kept = {} if chosen.all() else self._state.copies()
+        kept = {} if np.count_nonzero(chosen) == self.count else self._state.copies()
         self._state.lock(False)
         try:
             yield FlightRandom(self.rows("key"), self.columns("instant"), draws)

@@ -26,7 +26,7 @@ def endings(flights: "TaskBatch") -> dict[Result, NDArray[Any]]:
     nobody = not any(np.count_nonzero(value) for value in asked.values())
     if nobody and not np.count_nonzero(flights.judged_over):
         return {}  # almost always
-    shipped = flights.view.own_shipped
+    shipped = flights.view.shipped
     terminated = asked.get("terminated", shipped.terminated)
     if "terminated" in asked:
         spared = shipped.terminated & ~terminated

@@ -95,10 +95,6 @@ class Group:
     def __init__(self, flights: Any) -> None:
         self._flights = flights
 
-    def forget(self) -> None:
-        """Forget the arrays, as the flights have gone on."""
-        self.__dict__.clear()
-
     def __setattr__(self, name: str, value: Any) -> None:
         if name[0] != "_":
             raise AttributeError(f"view.{name} is what it is: keep your own in view.state")

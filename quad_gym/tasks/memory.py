@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.calls import Calls
-from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.flight_batch import WORTH_NO_COPY, FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.records import SHOWN_SIZE, WIDTH, Command
 
@@ -23,23 +23,23 @@ class ReadableBatch(FlightBatch):
         super().__init__(count, **keywords)
         self._settings["shown"] = True
         self._stages |= {Stage.SHOW}
-        self._shown = self._new_shown()
+        self._fields: dict[str, NDArray[Any]] = {}
+        # rows that lie a power of two apart would share a few lines of the cache
+        self._shown = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
+        self.shown = self._shown[:, : self.count]
 
     shown: Floats
     """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only"""
 
-    def _new_shown(self) -> Floats:
-        # rows that lie a power of two apart would share a few lines of the cache
-        room = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
-        self.shown = room[:, : self.count]  # once a step, as a view reads it many times
-        return room
-
     def _run(self, command: Command) -> NDArray[np.float32]:
-        self._shown = self._new_shown()
-        if self._crew is not None:
-            self._crew.gather()  # nobody may still write to the memory that goes
-            self._calls.show_into(self._shown)
+        copied = self._shown.nbytes < WORTH_NO_COPY
+        if not copied:
+            self._shown = np.empty_like(self._shown)
+            if self._crew is not None:
+                self._crew.gather()  # nobody may still write to the memory that goes
+                self._calls.show_into(self._shown)
         observations = super()._run(command)
+        self.shown = (self._shown.copy() if copied else self._shown)[:, : self.count]
         self.shown.flags.writeable = False
         return observations
 
@@ -48,11 +48,22 @@ class ReadableBatch(FlightBatch):
         calls.show_into(self._shown)
         return calls
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what looks into other memory than a copy's."""
+        return super().__getstate__() | {"_fields": {}}
+
+    def _field(self, name: str) -> NDArray[Any]:
+        """A field of the flights' records, (blocks, ..., lanes), found once."""
+        field = self._fields.get(name)
+        if field is None:
+            field = self._fields[name] = self._blocks[name]
+        return field
+
     def columns(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (..., n)."""
-        if name not in (self._blocks.dtype.fields or {}):
+        if name not in self._fields and not self._room.holds(name):
             return np.ascontiguousarray(np.moveaxis(self.read(name), 0, -1))
-        values = self._blocks[name]
+        values = self._field(name)
         if values.ndim == 2:
             return values.flatten()[: self.count]
         last = values.ndim - 1
@@ -66,7 +77,7 @@ class ReadableBatch(FlightBatch):
 
     def write(self, name: str, values: NDArray[Any]) -> None:
         """Write a field of the flights' records, (n,)."""
-        field = self._blocks[name]
+        field = self._field(name)
         if values.size == field.size:
             field[:] = values.reshape(field.shape)
             return
