@@ -11,9 +11,6 @@ from quad_gym.tasks.task import Task, TaskError, label
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-LARGEST_REWARD = 1e30
-"""A larger one is a mistake; learning algorithms hold rewards in single precision."""
-
 LONE = "observed"
 """What the table of observations calls an array that `observe` returns without a name."""
 
@@ -49,7 +46,7 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
     return found
 
 
-def reward(task: Task, value: Any, count: int) -> Floats:
+def reward(task: Task, value: Any, count: int) -> NDArray[Any]:
     """(n,) rewards; they may still be NaN or infinite.
 
     Raises:
@@ -61,7 +58,7 @@ def reward(task: Task, value: Any, count: int) -> Floats:
             f"{label(task)}.reward must return shape ({count},), a number per flight, "
             f"got {found.shape}"
         )
-    return found.astype(np.float64)
+    return found
 
 
 def truths(task: Task, method: str, value: Any, count: int) -> Truths:
@@ -95,27 +92,6 @@ def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
                 f"{_of(name)}, got {array.shape}"
             )
         found[str(name)] = array[:, np.newaxis] if array.ndim == 1 else array
-    return found
-
-
-def parts_as_before(value: Any, shapes: Mapping[str, tuple[int, ...]]) -> list[NDArray[Any]] | None:
-    """The arrays that `observe` has returned, if they are as they were at first, as nearly always.
-
-    Args:
-        value: What it has returned.
-        shapes: Of its parts, by name; (n, k) each.
-
-    Returns:
-        The arrays, in the order of `shapes`; None: what has been returned needs a closer look.
-    """
-    if type(value) is not dict or len(value) != len(shapes):
-        return None
-    found = []
-    for name, shape in shapes.items():
-        part = value.get(name)
-        if type(part) is not np.ndarray or part.shape != shape or part.dtype.kind != "f":
-            return None
-        found.append(part)
     return found
 
 

@@ -2,17 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.starts import checked_mask
+from quad_gym.kernels.task.settle import LARGEST_REWARD, Verdict, settle
 from quad_gym.params import checks as check
-from quad_gym.records import WIDTH, Autoreset, Result
+from quad_gym.records import SHOWN, WIDTH, Autoreset, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
-from quad_gym.tasks.endings import endings
 from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
@@ -25,16 +26,7 @@ Singles = NDArray[np.float32]
 Truths = NDArray[np.bool_]
 
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
-_TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
-_FIELDS = {result: result.name.lower() for result in Result}
-"""Where records keep results."""
-
-
-class Before(NamedTuple):
-    """What flights were like before a step."""
-
-    position_error: Floats
-    gates_passed: Floats
+_GATE_NEXT, _TIME = SHOWN["gate_next"].start, SHOWN["time"].start
 
 
 class TaskBatch(ReadableBatch):
@@ -81,10 +73,17 @@ class TaskBatch(ReadableBatch):
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self._state = State(self.count, custom.state)
         self._counts_gates = "gates_passed" in custom.state
-        self._nobody = np.zeros(self.count, bool)
-        self._failed = self._nobody.copy()
-        self.began, self.began_some = self._nobody, False
-        self.before = Before(np.zeros(self.count), np.zeros(self.count))
+        self._failed = np.zeros(self.count, bool)
+        self._began_in_step: Truths = np.zeros(self.count, bool)
+        self.began: Truths = self._began_in_step
+        self.began_some = False
+        self._answers = {
+            Verdict.REWARDS: np.zeros(self.count),
+            Verdict.TERMINATED: np.zeros(self.count, bool),
+            Verdict.TRUNCATED: np.zeros(self.count, bool),
+        }
+        self._returns = np.zeros(self.count)
+        self.before, self.gates_before = self.shown, self._returns
         size = self._joiner.size if self._joiner else self._low.size
         self._finals = np.zeros((self.count, size), np.float32)
         self._begun_again = False
@@ -133,38 +132,40 @@ class TaskBatch(ReadableBatch):
             )
         if not self._begun:
             self._require_begun()
-        self.before = Before(self.columns("position_error"), self.columns("gate_next"))
-        returns = self.columns("episode_return")
-        began = self.columns("needs_reset") > 0.0 if self._in_kernel else self._nobody
+        self.before = self.shown
+        self.gates_before = (
+            self.columns("gate_next") if self._counts_gates else self.shown[_GATE_NEXT]
+        )
         shipped = super().step(actions)
         try:
-            return self._after_step(shipped, began, returns)
+            return self._after_step(shipped)
         except BaseException:
-            self._failed = ~self._nobody
+            self._failed = np.ones(self.count, bool)
             raise
 
-    def _after_step(self, shipped: Singles, began: Truths, returns: Floats) -> Singles:
+    def _after_step(self, shipped: Singles) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
         self.view.step_over()
-        self.began, self.began_some = began, bool(np.count_nonzero(began))
+        self.began, self.began_some = self._began_in_step, False
         self._begun_again = False
+        if self._in_kernel:
+            np.equal(self.shown[_TIME], 0.0, out=self._began_in_step)
+            self.began_some = bool(np.count_nonzero(self.began))
         if self.began_some:
-            shipped = self._begin(began, {}, shipped)
+            shipped = self._begin(self._began_in_step, {}, shipped)
         if "update" in self.methods:
-            with self._writing(~began, _UPDATE_DRAWS) as rng:
+            with self._writing(~self.began, _UPDATE_DRAWS) as rng:
                 answers.ask(self.custom, "update", self.view, rng)
-        judged = self._judge(returns)
+        self._judge()
         observations = self._observed(shipped)
         if self._joiner and self.custom.privileged:
             self.view.shipped.read()
-        self._write(judged)
-        if self._same_step:
-            ends = self.judged_over
-            if np.count_nonzero(ends):
-                over = ends[0] | ends[1]
-                self._finals[over] = observations[over]
-                shipped = self._begin(over, {}, super().reset(mask=over))
-                observations[over] = self._observed(shipped)[over]
+        ended = self._settle()
+        if ended and self._same_step:
+            over = self.result("terminated") + self.result("truncated") > 0.0
+            self._finals[over] = observations[over]
+            shipped = self._begin(over, {}, super().reset(mask=over))
+            observations[over] = self._observed(shipped)[over]
         return observations
 
     # ---- episodes that begin ------------------------------------------------------------------
@@ -173,6 +174,7 @@ class TaskBatch(ReadableBatch):
         """Ask the task about episodes that the kernels have begun; return what these observe."""
         self.began, self.began_some = chosen, True
         self._state.begin(chosen)
+        self._returns[chosen] = 0.0
         self.view.begin(chosen)
         if "reset" not in self.methods:
             return shipped
@@ -198,52 +200,49 @@ class TaskBatch(ReadableBatch):
 
     # ---- judging ------------------------------------------------------------------------------
 
-    def _judge(self, returns: Floats) -> dict[Result, Floats]:
-        """Ask for reward and endings; return what takes the place of the kernels' judgment."""
-        judged: dict[Result, Floats] = {}
-        if "reward" in self.methods:
-            reward = self._rewards()
-            judged[Result.REWARD] = reward
-            judged[Result.EPISODE_RETURN] = returns + reward
-            if self.began_some:
-                judged[Result.REWARD] = np.where(self.began, 0.0, reward)
-                judged[Result.EPISODE_RETURN][self.began] = 0.0
-        if "terminated" in self.methods or "truncated" in self.methods:
-            judged |= endings(self)
-        return judged
+    def _judge(self) -> None:
+        """Ask for reward and endings, and keep the answers."""
+        custom, view, methods, said = self.custom, self.view, self.methods, self._answers
+        if "reward" in methods:
+            value = answers.ask(custom, "reward", view)
+            said[Verdict.REWARDS][:] = answers.reward(custom, value, self.count)
+        if "terminated" in methods:
+            value = answers.ask(custom, "terminated", view)
+            said[Verdict.TERMINATED][:] = answers.truths(custom, "terminated", value, self.count)
+        if "truncated" in methods:
+            value = answers.ask(custom, "truncated", view)
+            said[Verdict.TRUNCATED][:] = answers.truths(custom, "truncated", value, self.count)
 
-    def _rewards(self) -> Floats:
-        """(n,) what the task's reward returns, in the unit of the results."""
-        value = answers.ask(self.custom, "reward", self.view)
-        reward = answers.reward(self.custom, value, self.count)
-        if not float(np.dot(reward, reward)) <= answers.LARGEST_REWARD**2:
-            sound = np.abs(reward) <= answers.LARGEST_REWARD
-            # nobody is asked about a flight that begins, or that is no more
-            sound |= self.began | ~self.finite(~sound)
-            answers.require(sound, self.custom, "reward", reward, "finite rewards")
-            reward = np.where(np.isfinite(reward), reward, 0.0)
-        return reward if self.reward_scale == 1.0 else reward * self.reward_scale
-
-    @property
-    def judged_over(self) -> Truths:
-        """(2, n) whether flights are terminated, and whether they are truncated."""
-        return self._results[_TERMINATED : _TRUNCATED + 1, : self.count] > 0.0
-
-    def _write(self, judged: Mapping[Result, Floats]) -> None:
-        """Let results and records say what the task has judged."""
-        for result, values in judged.items():
-            self._results[result, : self.count] = values
-            self.write(_FIELDS[result], values)
+    def _settle(self) -> int:
+        """Let results and records say what the task has judged; return how many flights end."""
+        ended: int = settle(self._calls.words, self._verdict, self.reward_scale)
+        if ended < 0:
+            rewards = self._answers[Verdict.REWARDS]
+            sound = np.abs(rewards) <= LARGEST_REWARD
+            answers.require(sound, self.custom, "reward", rewards, "finite rewards")
         if self._counts_gates:
             passed = np.where(self.began, 0.0, self._state.gates_passed)
             self._results[Result.GATES_PASSED, : self.count] = passed
             self.write("gate_next", passed)
-        if Result.ENDING in judged:
-            self.write("needs_reset", judged[Result.TERMINATED] + judged[Result.TRUNCATED])
         if self._begun_again:
             for name in ("position_error", "estimation_error", "filter_status"):
                 row = self._results[Result[name.upper()], : self.count]
                 row[self.began] = self.columns(name)[self.began]
+        return ended
+
+    def _calls_of_threads(self) -> Calls:
+        """What the compiled code is called with, that which settles steps included."""
+        self._verdict = np.zeros(len(Verdict), np.int64)
+        for word, method in (
+            (Verdict.REWARDS, "reward"),
+            (Verdict.TERMINATED, "terminated"),
+            (Verdict.TRUNCATED, "truncated"),
+        ):
+            if method in self.methods:
+                self._verdict[word] = address_of(self._answers[word])
+        self._verdict[Verdict.RETURNS] = address_of(self._returns)
+        self._verdict[Verdict.BEGAN] = address_of(self._began_in_step)
+        return super()._calls_of_threads()
 
     # ---- observing ----------------------------------------------------------------------------
 
@@ -314,7 +313,9 @@ class TaskBatch(ReadableBatch):
         super().restore(flights)
         if len(self._state):
             self._state.read_from(snapshot["state"])
-        self._failed = self._nobody.copy()
+        self._returns[:] = self.columns("episode_return")
+        self.show_anew("position_error", "gate_next")
+        self._failed = np.zeros(self.count, bool)
         self._view = None
 
     def __getstate__(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
+from quad_gym.records import SHOWN
 from quad_gym.rotations import dcm_to_quaternion
 from quad_gym.tasks.lazy import Group, Lazy, Shown
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
+
+
+_POSITION_ERROR = SHOWN["position_error"].start
 
 
 class Truth(Group):
@@ -74,7 +78,7 @@ class Truth(Group):
             target = view.gates[every, np.maximum(view.gates_passed - 1, 0)]
             of_gate = np.linalg.norm(target - self.position, axis=1)
             distance = np.where(view.gate_passed, of_gate, distance)
-        speed = (self._flights.before.position_error - distance) / view.period
+        speed = (self._flights.before[_POSITION_ERROR] - distance) / view.period
         return np.where(view.began, 0.0, speed)
 
     @Lazy
@@ -224,7 +228,7 @@ class Estimate(Group):
     def status(self) -> NDArray[np.int64]:
         """(n,) what has failed so far, see `FilterStatus`; 0: nothing."""
         self._need_filter()
-        return self._flights.columns("filter_status").astype(np.int64)
+        return self._flights.counts("filter_status")  # type: ignore[no-any-return]
 
     @Lazy
     def lost(self) -> Truths:
@@ -242,7 +246,7 @@ class Estimate(Group):
     def nis_dimension(self) -> NDArray[np.int64]:
         """(n,) measurements in it."""
         self._need_filter()
-        return self._flights.columns("nis_dimension").astype(np.int64)
+        return self._flights.counts("nis_dimension")  # type: ignore[no-any-return]
 
 
 class Seen(Group):

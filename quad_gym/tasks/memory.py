@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import WORTH_NO_COPY, FlightBatch
 from quad_gym.kernels.compiling import Stage
-from quad_gym.records import SHOWN_SIZE, WIDTH, Command
+from quad_gym.kernels.compiling.linked import SETTLE
+from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
 
 Floats = NDArray[np.float64]
 
@@ -23,6 +24,7 @@ class ReadableBatch(FlightBatch):
         super().__init__(count, **keywords)
         self._settings["shown"] = True
         self._stages |= {Stage.SHOW}
+        self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
         # rows that lie a power of two apart would share a few lines of the cache
         self._shown = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
@@ -75,6 +77,10 @@ class ReadableBatch(FlightBatch):
         values = self.columns(name)
         return values.T if values.ndim == 2 else np.ascontiguousarray(np.moveaxis(values, -1, 0))
 
+    def counts(self, name: str) -> NDArray[np.int64]:
+        """A field of the flights' records as whole numbers, (n,)."""
+        return self._field(name).astype(np.int64).ravel()[: self.count]
+
     def write(self, name: str, values: NDArray[Any]) -> None:
         """Write a field of the flights' records, (n,)."""
         field = self._field(name)
@@ -84,6 +90,13 @@ class ReadableBatch(FlightBatch):
         lanes = field.flatten()
         lanes[: self.count] = values
         field[:] = lanes.reshape(field.shape)
+
+    def show_anew(self, *names: str) -> None:
+        """Let `shown` say what the records say of some fields, as these have changed since."""
+        self.shown = self.shown.copy()
+        for name in names:
+            self.shown[SHOWN[name]] = self.columns(name)
+        self.shown.flags.writeable = False
 
     def gates(self) -> Floats:
         """(n, gates, 3) of a course in I [m]; none elsewhere."""

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 Singles = NDArray[np.float32]
 
+_FLOAT = np.dtype(np.float64)
 _SQUARABLE = 1e15
 """Numbers whose squares have a sum in single precision."""
 
@@ -46,7 +47,8 @@ class Joiner:
         kept: Sequence[int] | None,
     ) -> None:
         self._sizes = {name: part.size for name, part in parts.items()}
-        self._shapes = {name: (count, part.size) for name, part in parts.items()}
+        self._names = tuple(parts)
+        self._shapes = [(count, part.size) for part in parts.values()]
         self._split, self._rest = split, shipped - split
         self._kept: slice | NDArray[np.intp] = slice(0, split)
         if kept is not None and len(kept) < split:
@@ -71,10 +73,9 @@ class Joiner:
         Raises:
             TaskError: If something is wrong with what it has returned.
         """
-        own = answers.parts_as_before(value, self._shapes)
-        if own is None:
-            own = self._checked(flights, value)
-        parts = own.copy()
+        if not self._is_as_at_first(value):
+            value = self._checked(flights, value)
+        parts = list(value.values())
         if self._begin:
             parts.insert(0, shipped[:, self._kept])
         if self._rest:
@@ -82,11 +83,20 @@ class Joiner:
         joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
         flat = joined.ravel()
         if not np.dot(flat, flat) <= self._surely_within:  # NaN is not, either
-            self._hold(flights, joined[:, self._begin : self.size - self._rest], own)
+            self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
         return joined
 
-    def _checked(self, flights: "TaskBatch", value: Any) -> list[NDArray[Any]]:
-        """What `observe` has returned, (n, k) each, in the order of the observation."""
+    def _is_as_at_first(self, value: Any) -> bool:
+        """Whether `observe` has returned floats of the names and shapes that it had at first."""
+        if type(value) is not dict or tuple(value) != self._names:
+            return False
+        for part, shape in zip(value.values(), self._shapes, strict=True):
+            if type(part) is not np.ndarray or part.shape != shape or part.dtype is not _FLOAT:
+                return False
+        return True
+
+    def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
+        """What `observe` has returned, (n, k) each by name, in the order of the observation."""
         found = answers.parts(flights.custom, value, flights.count)
         sizes = {name: part.shape[1] for name, part in found.items()}
         if sizes != self._sizes:
@@ -94,9 +104,9 @@ class Joiner:
                 f"{label(flights.custom)}.observe must return as many numbers as at first, "
                 f"{self._sizes}, got {sizes}"
             )
-        return [found[name] for name in self._sizes]
+        return {name: found[name] for name in self._sizes}
 
-    def _hold(self, flights: "TaskBatch", ours: Singles, own: Sequence[NDArray[Any]]) -> None:
+    def _hold(self, flights: "TaskBatch", ours: Singles, own: Mapping[str, Any]) -> None:
         """Hold the task's part of observations within its bounds.
 
         Raises:
@@ -105,7 +115,7 @@ class Joiner:
         if ours.min() >= self._least and ours.max() <= self._most:
             return  # clipping takes long
         if not np.isfinite(ours).all():
-            for name, values in zip(self._sizes, own, strict=True):
+            for name, values in own.items():
                 sound = np.isfinite(values).all(axis=1)
                 if not sound.all():
                     sound |= ~flights.finite(~sound)

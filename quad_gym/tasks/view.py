@@ -32,8 +32,10 @@ class View(Group):
     likewise the other states. `view.state` holds what the task keeps.
     """
 
-    __slots__ = ("_hidden", "_of_instant", "_shipped", "_truth")
-    __slots__ += ("estimate", "measured", "seen", "state")
+    __slots__ = (
+        *("_hidden", "_of_instant", "_shipped", "_truth"),
+        *("estimate", "measured", "seen", "state"),
+    )
 
     estimate: Estimate
     seen: Seen
@@ -189,7 +191,7 @@ class View(Group):
     @Lazy
     def step(self) -> NDArray[np.int64]:
         """(n,) steps since the start of the episode."""
-        return self._flights.columns("step").astype(np.int64)
+        return self._flights.counts("step")  # type: ignore[no-any-return]
 
     @Lazy
     def began(self) -> Truths:
@@ -230,7 +232,7 @@ class View(Group):
     @Lazy
     def gate_passed(self) -> Truths:
         """(n,) whether this step passed a gate."""
-        return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
+        return (self.gates_passed > self._flights.gates_before) & ~self._flights.began
 
     @Lazy
     def features(self) -> Floats:
