@@ -56,7 +56,7 @@ from quad_gym.records import (
 
 _NO_BOUNDS = np.zeros(0)
 """Fields that are NaN at first, all others are zero."""
-WORTH_NO_COPY = 1 << 16
+_WORTH_NO_COPY = 1 << 16
 """Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
 
 
@@ -327,7 +327,7 @@ class FlightBatch(FlightMemory):
             self._calls = self._calls_of_threads()
             self._crew = Crew(self._calls, len(self._blocks), self.threads)
         self._crew.gather()
-        if self._observations.nbytes < WORTH_NO_COPY:
+        if self._observations.nbytes < _WORTH_NO_COPY:
             self._crew.run(int(command))
             return self._observations.copy()
         self._observations = np.empty_like(self._observations)

@@ -27,6 +27,7 @@ Truths = NDArray[np.bool_]
 
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
 _GATE_NEXT, _TIME = SHOWN["gate_next"].start, SHOWN["time"].start
+_POSITION_ERROR = SHOWN["position_error"].start
 
 
 class TaskBatch(ReadableBatch):
@@ -83,7 +84,7 @@ class TaskBatch(ReadableBatch):
             Verdict.TRUNCATED: np.zeros(self.count, bool),
         }
         self._returns = np.zeros(self.count)
-        self.before, self.gates_before = self.shown, self._returns
+        self.error_before = self.gates_before = np.zeros(self.count)
         size = self._joiner.size if self._joiner else self._low.size
         self._finals = np.zeros((self.count, size), np.float32)
         self._begun_again = False
@@ -132,10 +133,11 @@ class TaskBatch(ReadableBatch):
             )
         if not self._begun:
             self._require_begun()
-        self.before = self.shown
-        self.gates_before = (
-            self.columns("gate_next") if self._counts_gates else self.shown[_GATE_NEXT]
-        )
+        self.error_before = self.shown[_POSITION_ERROR].copy()
+        self.gates_before = self.shown[_GATE_NEXT].copy()
+        if self._counts_gates:
+            self.gates_before = self.columns("gate_next")
+        self.view.step_over()
         shipped = super().step(actions)
         try:
             return self._after_step(shipped)
@@ -145,7 +147,6 @@ class TaskBatch(ReadableBatch):
 
     def _after_step(self, shipped: Singles) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
-        self.view.step_over()
         self.began, self.began_some = self._began_in_step, False
         self._begun_again = False
         if self._in_kernel:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
-from quad_gym.records import SHOWN
 from quad_gym.rotations import dcm_to_quaternion
 from quad_gym.tasks.lazy import Group, Lazy, Shown
 
@@ -16,9 +15,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
-
-
-_POSITION_ERROR = SHOWN["position_error"].start
 
 
 class Truth(Group):
@@ -78,7 +74,7 @@ class Truth(Group):
             target = view.gates[every, np.maximum(view.gates_passed - 1, 0)]
             of_gate = np.linalg.norm(target - self.position, axis=1)
             distance = np.where(view.gate_passed, of_gate, distance)
-        speed = (self._flights.before[_POSITION_ERROR] - distance) / view.period
+        speed = (self._flights.error_before - distance) / view.period
         return np.where(view.began, 0.0, speed)
 
     @Lazy

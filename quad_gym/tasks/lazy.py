@@ -70,7 +70,7 @@ class Shown:
         if self._is_matrix:
             # in memory as for a single flight, so that products with it have the same bits
             value = np.ascontiguousarray(shown[self._rows].T).reshape(-1, *self._shape)
-            value.flags.writeable = False
+            value.setflags(write=False)
         else:
             value = shown[self._rows].T if self._shape else shown[self._first]
         group.__dict__[self._name] = value
@@ -80,7 +80,7 @@ class Shown:
 def frozen(value: Any) -> Any:
     """An array that cannot be written to, or a mapping of them."""
     if isinstance(value, np.ndarray):
-        value.flags.writeable = False
+        value.setflags(write=False)
         return value
     if isinstance(value, dict):
         return MappingProxyType({name: frozen(part) for name, part in value.items()})

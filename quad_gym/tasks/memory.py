@@ -1,12 +1,13 @@
 """Flights whose memory a view reads, and to which a task writes its rewards and endings."""
 
+from sys import getrefcount
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.calls import Calls
-from quad_gym.batch.flight_batch import WORTH_NO_COPY, FlightBatch
+from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import SETTLE
 from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
@@ -15,6 +16,8 @@ Floats = NDArray[np.float64]
 
 _GAP = 8
 """Numbers between two rows of what is shown: a line of the cache."""
+_OUR_REFERENCES = 4
+"""To the memory of what is shown: the batch's, that of `shown`, the calls', and the argument."""
 
 
 class ReadableBatch(FlightBatch):
@@ -27,23 +30,23 @@ class ReadableBatch(FlightBatch):
         self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
         # rows that lie a power of two apart would share a few lines of the cache
-        self._shown = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
-        self.shown = self._shown[:, : self.count]
+        self._show_in(np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
 
     shown: Floats
     """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only"""
 
-    def _run(self, command: Command) -> NDArray[np.float32]:
-        copied = self._shown.nbytes < WORTH_NO_COPY
-        if not copied:
-            self._shown = np.empty_like(self._shown)
-            if self._crew is not None:
-                self._crew.gather()  # nobody may still write to the memory that goes
-                self._calls.show_into(self._shown)
-        observations = super()._run(command)
-        self.shown = (self._shown.copy() if copied else self._shown)[:, : self.count]
+    def _show_in(self, memory: Floats) -> None:
+        """Let the next step or reset write what is shown to other memory."""
+        if self._crew is not None:
+            self._crew.gather()  # nobody may still write to the memory that goes
+            self._calls.show_into(memory)
+        self._shown, self.shown = memory, memory[:, : self.count]
         self.shown.flags.writeable = False
-        return observations
+
+    def _run(self, command: Command) -> NDArray[np.float32]:
+        if getrefcount(self._shown) > _OUR_REFERENCES:  # somebody keeps what was shown
+            self._show_in(np.empty_like(self._shown))
+        return super()._run(command)
 
     def _calls_of_threads(self) -> Calls:
         calls = super()._calls_of_threads()
@@ -93,10 +96,10 @@ class ReadableBatch(FlightBatch):
 
     def show_anew(self, *names: str) -> None:
         """Let `shown` say what the records say of some fields, as these have changed since."""
-        self.shown = self.shown.copy()
+        memory = self._shown.copy()
         for name in names:
-            self.shown[SHOWN[name]] = self.columns(name)
-        self.shown.flags.writeable = False
+            memory[SHOWN[name], : self.count] = self.columns(name)
+        self._show_in(memory)
 
     def gates(self) -> Floats:
         """(n, gates, 3) of a course in I [m]; none elsewhere."""

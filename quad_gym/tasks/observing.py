@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 Singles = NDArray[np.float32]
 
-_FLOAT = np.dtype(np.float64)
 _SQUARABLE = 1e15
 """Numbers whose squares have a sum in single precision."""
 
@@ -91,7 +90,11 @@ class Joiner:
         if type(value) is not dict or tuple(value) != self._names:
             return False
         for part, shape in zip(value.values(), self._shapes, strict=True):
-            if type(part) is not np.ndarray or part.shape != shape or part.dtype is not _FLOAT:
+            if (
+                type(part) is not np.ndarray
+                or part.shape != shape
+                or part.dtype is not answers.FLOAT
+            ):
                 return False
         return True
 
