@@ -16,8 +16,8 @@ Floats = NDArray[np.float64]
 
 _GAP = 8
 """Numbers between two rows of what is shown: a line of the cache."""
-_OUR_REFERENCES = 4
-"""To the memory of what is shown: the batch's, that of `shown`, the calls', and the argument."""
+_OUR_REFERENCES = 5
+"""To the memory of what is shown: the batch's, those of two arrays, the calls', the argument."""
 
 
 class ReadableBatch(FlightBatch):
@@ -41,7 +41,8 @@ class ReadableBatch(FlightBatch):
             self._crew.gather()  # nobody may still write to the memory that goes
             self._calls.show_into(memory)
         self._shown, self.shown = memory, memory[:, : self.count]
-        self.shown.flags.writeable = False
+        self.shown.setflags(write=False)
+        self.shown_of_flights = self.shown.T
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         if getrefcount(self._shown) > _OUR_REFERENCES:  # somebody keeps what was shown
