@@ -49,6 +49,11 @@ class Calls:
         self._words[:, Call.WORK] = [address_of(array) for array in work]
         self._rows = list(self._words)
 
+    @property
+    def words(self) -> NDArray[np.int64]:
+        """(len(Call),) of the first thread."""
+        return self._rows[0]
+
     def observe_into(self, observations: NDArray[np.float32]) -> None:
         """Let the next step write its observations here."""
         self._memory[1][Call.OBSERVATIONS] = observations

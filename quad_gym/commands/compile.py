@@ -49,7 +49,7 @@ class Args:
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     """The compiled functions that some of KINDS stand for, the longest to compile first."""
     from quad_gym.envs.configuration import Flights
-    from quad_gym.kernels.compiling.linked import names_of
+    from quad_gym.kernels.compiling.linked import FLY, SETTLE, names_of
     from quad_gym.kernels.compiling.stages import Stage, needed_stages
     from quad_gym.kernels.single import (
         FILTER_ENTRIES,
@@ -66,7 +66,8 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
             needed |= needed_stages(flights.batch._settings[0])
     if "all" in kinds:
         needed = frozenset(Stage)
-    names = names_of(needed) if needed else []
+    entries = (FLY, SETTLE) if Stage.SHOW in needed else (FLY,)
+    names = names_of(needed, entries) if needed else []
     if {"single", "all"} & set(kinds):
         filters = names_of(FILTER_STAGES | SLOW_FILTER_STAGES, FILTER_ENTRIES)
         names = [*filters, *names, *SENSORS_AND_VEHICLE]

@@ -8,7 +8,8 @@ import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.spaces import ObservationField, policy_size
-from quad_gym.tasks.batch import Part, TaskBatch
+from quad_gym.tasks.batch import TaskBatch
+from quad_gym.tasks.observing import Part
 from quad_gym.tasks.task import Observed, resolve_task
 
 Table = tuple[ObservationField, ...]

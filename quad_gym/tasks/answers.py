@@ -11,8 +11,7 @@ from quad_gym.tasks.task import Task, TaskError, label
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-LARGEST_REWARD = 1e30
-"""A larger one is a mistake; learning algorithms hold rewards in single precision."""
+FLOAT, _TRUTH = np.dtype(np.float64), np.dtype(np.bool_)
 
 LONE = "observed"
 """What the table of observations calls an array that `observe` returns without a name."""
@@ -49,19 +48,21 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
     return found
 
 
-def reward(task: Task, value: Any, count: int) -> Floats:
+def reward(task: Task, value: Any, count: int) -> NDArray[Any]:
     """(n,) rewards; they may still be NaN or infinite.
 
     Raises:
         TaskError: If it has another shape, or is no array of numbers.
     """
+    if type(value) is np.ndarray and value.dtype is FLOAT and value.shape == (count,):
+        return value  # almost always
     found = numbers(task, "reward", value)
     if found.shape != (count,):
         raise TaskError(
             f"{label(task)}.reward must return shape ({count},), a number per flight, "
             f"got {found.shape}"
         )
-    return found.astype(np.float64)
+    return found
 
 
 def truths(task: Task, method: str, value: Any, count: int) -> Truths:
@@ -70,8 +71,10 @@ def truths(task: Task, method: str, value: Any, count: int) -> Truths:
     Raises:
         TaskError: If it is something else.
     """
+    if type(value) is np.ndarray and value.dtype is _TRUTH and value.shape == (count,):
+        return value  # almost always
     found = numbers(task, method, value)
-    if found.dtype != bool or found.shape != (count,):
+    if found.dtype.kind != "b" or found.shape != (count,):
         raise TaskError(
             f"{label(task)}.{method} must return booleans of shape ({count},), "
             f"got {found.dtype} of {found.shape}"

@@ -2,21 +2,23 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.starts import checked_mask
+from quad_gym.kernels.task.settle import LARGEST_REWARD, Verdict, settle
 from quad_gym.params import checks as check
-from quad_gym.records import WIDTH, Autoreset, Result
+from quad_gym.records import SHOWN, WIDTH, Autoreset, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
-from quad_gym.tasks.endings import endings
 from quad_gym.tasks.memory import ReadableBatch
+from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.state import State
-from quad_gym.tasks.task import METHODS, Task, TaskError, label
+from quad_gym.tasks.task import METHODS, Task, label
 from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
@@ -24,22 +26,8 @@ Singles = NDArray[np.float32]
 Truths = NDArray[np.bool_]
 
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
-_TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
-
-
-class Before(NamedTuple):
-    """What flights were like before a step."""
-
-    position_error: Floats
-    gates_passed: Floats
-
-
-class Part(NamedTuple):
-    """One part of what `observe` returns."""
-
-    size: int
-    low: float
-    high: float
+_GATE_NEXT, _TIME = SHOWN["gate_next"].start, SHOWN["time"].start
+_POSITION_ERROR = SHOWN["position_error"].start
 
 
 class TaskBatch(ReadableBatch):
@@ -79,25 +67,27 @@ class TaskBatch(ReadableBatch):
         self.custom = custom
         self.methods = frozenset(method for method in METHODS if custom.has(method))
         self._same_step = autoreset == Autoreset.SAME_STEP
-        self._parts, self._split = dict(parts or {}), split
-        self._observes = parts is not None and "observe" in self.methods
-        self._kept: slice | NDArray[np.intp] = slice(0, split)
-        if kept is not None and len(kept) < split:
-            self._kept = np.array(kept, np.intp)
+        self._split, self._joiner = split, None
+        if parts is not None and "observe" in self.methods:
+            self._joiner = Joiner(self.count, parts, self._low.size, split, kept)
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self._state = State(self.count, custom.state)
         self._counts_gates = "gates_passed" in custom.state
-        self._nobody = np.zeros(self.count, bool)
-        self._failed = self._nobody.copy()
-        self.began, self.began_some = self._nobody, False
-        self.before = Before(np.zeros(self.count), np.zeros(self.count))
-        self._sizes = [part.size for part in self._parts.values()]
-        bounds = [(part.low, part.high) for part in self._parts.values() for _ in range(part.size)]
-        self._own_low, self._own_high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
-        self._least = self._own_low.max(initial=-np.inf)
-        self._most = self._own_high.min(initial=np.inf)
-        self._finals = np.zeros((self.count, self._size_of_observation()), np.float32)
+        self._failed = np.zeros(self.count, bool)
+        self._began_in_step: Truths = np.zeros(self.count, bool)
+        self.began: Truths = self._began_in_step
+        self.began_some = False
+        self._answers = {
+            Verdict.REWARDS: np.zeros(self.count),
+            Verdict.TERMINATED: np.zeros(self.count, bool),
+            Verdict.TRUNCATED: np.zeros(self.count, bool),
+        }
+        self._returns = np.zeros(self.count)
+        self.error_before = self.gates_before = np.zeros(self.count)
+        size = self._joiner.size if self._joiner else self._low.size
+        self._finals = np.zeros((self.count, size), np.float32)
+        self._begun_again = False
         self._view: View | None = None
 
     # ---- flying -------------------------------------------------------------------------------
@@ -143,37 +133,40 @@ class TaskBatch(ReadableBatch):
             )
         if not self._begun:
             self._require_begun()
-        self.before = Before(self.columns("position_error"), self.columns("gate_next"))
-        returns = self.columns("episode_return")
-        began = self.columns("needs_reset") > 0.0 if self._in_kernel else self._nobody
+        self.error_before = self.shown[_POSITION_ERROR].copy()
+        self.gates_before = self.shown[_GATE_NEXT].copy()
+        if self._counts_gates:
+            self.gates_before = self.columns("gate_next")
+        self.view.step_over()
         shipped = super().step(actions)
         try:
-            return self._after_step(shipped, began, returns)
+            return self._after_step(shipped)
         except BaseException:
-            self._failed = ~self._nobody
+            self._failed = np.ones(self.count, bool)
             raise
 
-    def _after_step(self, shipped: Singles, began: Truths, returns: Floats) -> Singles:
+    def _after_step(self, shipped: Singles) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
-        self.view.step_over()
-        self.began, self.began_some = began, bool(np.count_nonzero(began))
+        self.began, self.began_some = self._began_in_step, False
+        self._begun_again = False
+        if self._in_kernel:
+            np.equal(self.shown[_TIME], 0.0, out=self._began_in_step)
+            self.began_some = bool(np.count_nonzero(self.began))
         if self.began_some:
-            shipped = self._begin(began, {}, shipped)
+            shipped = self._begin(self._began_in_step, {}, shipped)
         if "update" in self.methods:
-            with self._writing(~began, _UPDATE_DRAWS) as rng:
+            with self._writing(~self.began, _UPDATE_DRAWS) as rng:
                 answers.ask(self.custom, "update", self.view, rng)
-        judged = self._judge(returns)
+        self._judge()
         observations = self._observed(shipped)
-        if self._observes and self.custom.privileged:
-            self.view.own_shipped.read()
-        self._write(judged)
-        if self._same_step:
-            ends = self.judged_over
-            if np.count_nonzero(ends):
-                over = ends[0] | ends[1]
-                self._finals[over] = observations[over]
-                shipped = self._begin(over, {}, super().reset(mask=over))
-                observations[over] = self._observed(shipped)[over]
+        if self._joiner and self.custom.privileged:
+            self.view.shipped.read()
+        ended = self._settle()
+        if ended and self._same_step:
+            over = self.result("terminated") + self.result("truncated") > 0.0
+            self._finals[over] = observations[over]
+            shipped = self._begin(over, {}, super().reset(mask=over))
+            observations[over] = self._observed(shipped)[over]
         return observations
 
     # ---- episodes that begin ------------------------------------------------------------------
@@ -182,6 +175,7 @@ class TaskBatch(ReadableBatch):
         """Ask the task about episodes that the kernels have begun; return what these observe."""
         self.began, self.began_some = chosen, True
         self._state.begin(chosen)
+        self._returns[chosen] = 0.0
         self.view.begin(chosen)
         if "reset" not in self.methods:
             return shipped
@@ -201,57 +195,55 @@ class TaskBatch(ReadableBatch):
         self._blocks["instant"][again] -= np.uint64(1)
         self._blocks["episode"][again] -= 1.0
         shipped = super().reset(mask=chosen, **start)
+        self._begun_again = True
         self.view.forget()
         return shipped
 
     # ---- judging ------------------------------------------------------------------------------
 
-    def _judge(self, returns: Floats) -> dict[Result, Floats]:
-        """Ask for reward and endings; return what takes the place of the kernels' judgment."""
-        judged: dict[Result, Floats] = {}
-        if "reward" in self.methods:
-            reward = self._rewards()
-            judged[Result.REWARD] = reward
-            judged[Result.EPISODE_RETURN] = returns + reward
-            if self.began_some:
-                judged[Result.REWARD] = np.where(self.began, 0.0, reward)
-                judged[Result.EPISODE_RETURN][self.began] = 0.0
-        if "terminated" in self.methods or "truncated" in self.methods:
-            judged |= endings(self)
-        return judged
+    def _judge(self) -> None:
+        """Ask for reward and endings, and keep the answers."""
+        custom, view, methods, said = self.custom, self.view, self.methods, self._answers
+        if "reward" in methods:
+            value = answers.ask(custom, "reward", view)
+            said[Verdict.REWARDS][:] = answers.reward(custom, value, self.count)
+        if "terminated" in methods:
+            value = answers.ask(custom, "terminated", view)
+            said[Verdict.TERMINATED][:] = answers.truths(custom, "terminated", value, self.count)
+        if "truncated" in methods:
+            value = answers.ask(custom, "truncated", view)
+            said[Verdict.TRUNCATED][:] = answers.truths(custom, "truncated", value, self.count)
 
-    def _rewards(self) -> Floats:
-        """(n,) what the task's reward returns, in the unit of the results."""
-        value = answers.ask(self.custom, "reward", self.view)
-        reward = answers.reward(self.custom, value, self.count)
-        if not float(np.dot(reward, reward)) <= answers.LARGEST_REWARD**2:
-            sound = np.abs(reward) <= answers.LARGEST_REWARD
-            # nobody is asked about a flight that begins, or that is no more
-            sound |= self.began | ~self.finite(~sound)
-            answers.require(sound, self.custom, "reward", reward, "finite rewards")
-            reward = np.where(np.isfinite(reward), reward, 0.0)
-        return reward if self.reward_scale == 1.0 else reward * self.reward_scale
-
-    @property
-    def judged_over(self) -> Truths:
-        """(2, n) whether flights are terminated, and whether they are truncated."""
-        return self._results[_TERMINATED : _TRUNCATED + 1, : self.count] > 0.0
-
-    def _write(self, judged: Mapping[Result, Floats]) -> None:
-        """Let results and records say what the task has judged."""
-        for result, values in judged.items():
-            self._results[result, : self.count] = values
-            self.write(result.name.lower(), values)
+    def _settle(self) -> int:
+        """Let results and records say what the task has judged; return how many flights end."""
+        ended: int = settle(self._calls.words, self._verdict, self.reward_scale)
+        if ended < 0:
+            rewards = self._answers[Verdict.REWARDS]
+            sound = np.abs(rewards) <= LARGEST_REWARD
+            answers.require(sound, self.custom, "reward", rewards, "finite rewards")
         if self._counts_gates:
             passed = np.where(self.began, 0.0, self._state.gates_passed)
             self._results[Result.GATES_PASSED, : self.count] = passed
             self.write("gate_next", passed)
-        if Result.ENDING in judged:
-            self.write("needs_reset", judged[Result.TERMINATED] + judged[Result.TRUNCATED])
-        if self.began_some:
+        if self._begun_again:
             for name in ("position_error", "estimation_error", "filter_status"):
                 row = self._results[Result[name.upper()], : self.count]
                 row[self.began] = self.columns(name)[self.began]
+        return ended
+
+    def _calls_of_threads(self) -> Calls:
+        """What the compiled code is called with, that which settles steps included."""
+        self._verdict = np.zeros(len(Verdict), np.int64)
+        for word, method in (
+            (Verdict.REWARDS, "reward"),
+            (Verdict.TERMINATED, "terminated"),
+            (Verdict.TRUNCATED, "truncated"),
+        ):
+            if method in self.methods:
+                self._verdict[word] = address_of(self._answers[word])
+        self._verdict[Verdict.RETURNS] = address_of(self._returns)
+        self._verdict[Verdict.BEGAN] = address_of(self._began_in_step)
+        return super()._calls_of_threads()
 
     # ---- observing ----------------------------------------------------------------------------
 
@@ -270,58 +262,21 @@ class TaskBatch(ReadableBatch):
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
         """What `observe` returns at the present instant, (count, k) each."""
+        return answers.parts(self.custom, self._asked_to_observe(), self.count)
+
+    def _asked_to_observe(self) -> Any:
         view = self.view
         view.hide(not self.custom.privileged)
         try:
-            value = answers.ask(self.custom, "observe", view)
+            return answers.ask(self.custom, "observe", view)
         finally:
             view.hide(False)
-        return answers.parts(self.custom, value, self.count)
 
     def _observed(self, shipped: Singles) -> Singles:
-        """The observations that the environment shows: shipped, the task's, privileged ones."""
-        if not self._observes:
+        """The observations that the environment shows."""
+        if self._joiner is None:
             return shipped
-        found = self.ask_parts()
-        if found.keys() != self._parts.keys():
-            self._refuse_parts(found)
-        own = [found[name] for name in self._parts]
-        if [part.shape[1] for part in own] != self._sizes:
-            self._refuse_parts(found)
-        kept, rest = shipped[:, self._kept], shipped[:, self._split :]
-        parts = [*([kept] if kept.shape[1] else []), *own, *([rest] if rest.shape[1] else [])]
-        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
-        ours = joined[:, kept.shape[1] : joined.shape[1] - rest.shape[1]]
-        flat = joined.ravel()
-        if not np.isfinite(np.dot(flat, flat)):
-            self._require_finite(found, ours)
-        if ours.min() < self._least or ours.max() > self._most:  # seldom, and it takes long
-            np.clip(ours, self._own_low, self._own_high, out=ours)
-        return joined
-
-    def _require_finite(self, found: Mapping[str, NDArray[Any]], ours: Singles) -> None:
-        """Refuse what is not finite; of flights that are no more, make it finite."""
-        for name, values in found.items():
-            sound = np.isfinite(values).all(axis=1)
-            if not sound.all():
-                sound |= ~self.finite(~sound)
-                answers.require(sound, self.custom, "observe", values, f"finite {name!r}")
-        np.nan_to_num(ours, copy=False)
-
-    def _refuse_parts(self, found: Mapping[str, NDArray[Any]]) -> None:
-        sizes = {name: part.shape[1] for name, part in found.items()}
-        declared = {name: part.size for name, part in self._parts.items()}
-        raise TaskError(
-            f"{label(self.custom)}.observe must return as many numbers as at first, {declared}, "
-            f"got {sizes}"
-        )
-
-    def _size_of_observation(self) -> int:
-        """Numbers of an observation that the environment shows."""
-        shipped = self._split if isinstance(self._kept, slice) else len(self._kept)
-        kept = shipped + self._low.size - self._split
-        own = sum(part.size for part in self._parts.values())
-        return kept + own if self._observes else self._low.size
+        return self._joiner.join(self, self._asked_to_observe(), shipped)
 
     # ---- keeping ------------------------------------------------------------------------------
 
@@ -359,7 +314,9 @@ class TaskBatch(ReadableBatch):
         super().restore(flights)
         if len(self._state):
             self._state.read_from(snapshot["state"])
-        self._failed = self._nobody.copy()
+        self._returns[:] = self.columns("episode_return")
+        self.show_anew("position_error", "gate_next")
+        self._failed = np.zeros(self.count, bool)
         self._view = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -371,7 +328,7 @@ class TaskBatch(ReadableBatch):
     @contextmanager
     def _writing(self, chosen: Truths, draws: int) -> Iterator[FlightRandom]:
         """Let a method change the task's state, of some flights alone."""
-        kept = {} if chosen.all() else self._state.copies()
+        kept = {} if np.count_nonzero(chosen) == self.count else self._state.copies()
         self._state.lock(False)
         try:
             yield FlightRandom(self.rows("key"), self.columns("instant"), draws)

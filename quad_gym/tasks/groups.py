@@ -1,4 +1,4 @@
-"""The groups of a view: truth, estimate, what is seen, what was measured, built-in results."""
+"""The groups of a view: truth, estimate, what is seen, what was measured."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -8,15 +8,13 @@ from numpy.typing import NDArray
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
 from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.tasks.lazy import Group, Lazy, Shown, frozen
+from quad_gym.tasks.lazy import Group, Lazy, Shown
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
-
-_JUDGED = ("reward", "terminated", "truncated", "ending")
 
 
 class Truth(Group):
@@ -76,7 +74,7 @@ class Truth(Group):
             target = view.gates[every, np.maximum(view.gates_passed - 1, 0)]
             of_gate = np.linalg.norm(target - self.position, axis=1)
             distance = np.where(view.gate_passed, of_gate, distance)
-        speed = (self._flights.before.position_error - distance) / view.period
+        speed = (self._flights.error_before - distance) / view.period
         return np.where(view.began, 0.0, speed)
 
     @Lazy
@@ -226,7 +224,7 @@ class Estimate(Group):
     def status(self) -> NDArray[np.int64]:
         """(n,) what has failed so far, see `FilterStatus`; 0: nothing."""
         self._need_filter()
-        return self._flights.columns("filter_status").astype(np.int64)
+        return self._flights.counts("filter_status")  # type: ignore[no-any-return]
 
     @Lazy
     def lost(self) -> Truths:
@@ -244,7 +242,7 @@ class Estimate(Group):
     def nis_dimension(self) -> NDArray[np.int64]:
         """(n,) measurements in it."""
         self._need_filter()
-        return self._flights.columns("nis_dimension").astype(np.int64)
+        return self._flights.counts("nis_dimension")  # type: ignore[no-any-return]
 
 
 class Seen(Group):
@@ -356,44 +354,3 @@ class Measured(Group):
         seen = self.features_seen
         pixels = self._flights.rows("pixels")[:, : seen.shape[1]]
         return np.where(seen[:, :, np.newaxis], pixels, np.nan)
-
-
-class Shipped(Group):
-    """What the id's task says of the step."""
-
-    @Lazy
-    def reward(self) -> Floats:
-        """(n,) as with `reward_per="step"`."""
-        reward = self._flights.result("reward")
-        return reward if self._flights.reward_scale == 1.0 else reward / self._flights.reward_scale
-
-    @Lazy
-    def terminated(self) -> Truths:
-        """(n,) crashed, or through the last gate."""
-        return self._flights.result("terminated") > 0.0
-
-    @Lazy
-    def truncated(self) -> Truths:
-        """(n,) time limit, failed filter, or lost with `end_when_lost`; also where terminated."""
-        flights = self._flights
-        over = flights.result("filter_status") > 0.0
-        if flights.max_steps:
-            over |= flights.result("episode_steps") >= flights.max_steps
-        if flights.task.end_when_lost:
-            over |= flights.result("filter_lost") > 0.0
-        return over & ~flights.began
-
-    @Lazy
-    def ending(self) -> NDArray[np.int64]:
-        """(n,) see `quad_gym.records.Ending`."""
-        return self._flights.result("ending").astype(np.int64)
-
-    def read(self) -> None:
-        """Make all arrays, before the task's own answers take the place of what they come from."""
-        self.__dict__.update({name: getattr(self, name) for name in _JUDGED})
-
-    def begin(self, chosen: Truths) -> None:
-        """Forget what was said of flights that have begun an episode since."""
-        for name in _JUDGED:
-            value = np.where(chosen, 0, getattr(self, name)).astype(getattr(self, name).dtype)
-            self.__dict__[name] = frozen(value)

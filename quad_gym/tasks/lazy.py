@@ -47,9 +47,9 @@ class Shown:
     """
 
     def __init__(self, name: str, meaning: str, first: int | None = None) -> None:
-        rows, self._shape = SHOWN[name], SHOWN_SHAPES[name]
-        self._first, self.__doc__ = rows.start, meaning
-        self._rows = rows if first is None else slice(rows.start, rows.start + first)
+        rows, self._shape, self.__doc__ = SHOWN[name], SHOWN_SHAPES[name], meaning
+        chosen = rows if first is None else slice(rows.start, rows.start + first)
+        self._key = (slice(None), chosen if self._shape else rows.start)
         self._is_matrix = len(self._shape) > 1 and first is None
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -66,13 +66,13 @@ class Shown:
         """Take it; from then on it is an ordinary attribute of the group."""
         if group is None:
             return self
-        shown = group._flights.shown
         if self._is_matrix:
             # in memory as for a single flight, so that products with it have the same bits
-            value = np.ascontiguousarray(shown[self._rows].T).reshape(-1, *self._shape)
-            value.flags.writeable = False
+            rows = group._flights.shown[self._key[1]]
+            value = np.ascontiguousarray(rows.T).reshape(-1, *self._shape)
+            value.setflags(write=False)
         else:
-            value = shown[self._rows].T if self._shape else shown[self._first]
+            value = group._flights.shown_of_flights[self._key]
         group.__dict__[self._name] = value
         return value
 
@@ -80,7 +80,7 @@ class Shown:
 def frozen(value: Any) -> Any:
     """An array that cannot be written to, or a mapping of them."""
     if isinstance(value, np.ndarray):
-        value.flags.writeable = False
+        value.setflags(write=False)
         return value
     if isinstance(value, dict):
         return MappingProxyType({name: frozen(part) for name, part in value.items()})
@@ -94,10 +94,6 @@ class Group:
 
     def __init__(self, flights: Any) -> None:
         self._flights = flights
-
-    def forget(self) -> None:
-        """Forget the arrays, as the flights have gone on."""
-        self.__dict__.clear()
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name[0] != "_":

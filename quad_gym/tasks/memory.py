@@ -1,5 +1,6 @@
 """Flights whose memory a view reads, and to which a task writes its rewards and endings."""
 
+from sys import getrefcount
 from typing import Any
 
 import numpy as np
@@ -8,12 +9,15 @@ from numpy.typing import NDArray
 from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
-from quad_gym.records import SHOWN_SIZE, WIDTH, Command
+from quad_gym.kernels.compiling.linked import SETTLE
+from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
 
 Floats = NDArray[np.float64]
 
 _GAP = 8
 """Numbers between two rows of what is shown: a line of the cache."""
+_OUR_REFERENCES = 5
+"""To the memory of what is shown: the batch's, those of two arrays, the calls', the argument."""
 
 
 class ReadableBatch(FlightBatch):
@@ -23,36 +27,49 @@ class ReadableBatch(FlightBatch):
         super().__init__(count, **keywords)
         self._settings["shown"] = True
         self._stages |= {Stage.SHOW}
-        self._shown = self._new_shown()
+        self._entries.append(SETTLE)
+        self._fields: dict[str, NDArray[Any]] = {}
+        # rows that lie a power of two apart would share a few lines of the cache
+        self._show_in(np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
 
     shown: Floats
     """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only"""
 
-    def _new_shown(self) -> Floats:
-        # rows that lie a power of two apart would share a few lines of the cache
-        room = np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP))
-        self.shown = room[:, : self.count]  # once a step, as a view reads it many times
-        return room
-
-    def _run(self, command: Command) -> NDArray[np.float32]:
-        self._shown = self._new_shown()
+    def _show_in(self, memory: Floats) -> None:
+        """Let the next step or reset write what is shown to other memory."""
         if self._crew is not None:
             self._crew.gather()  # nobody may still write to the memory that goes
-            self._calls.show_into(self._shown)
-        observations = super()._run(command)
-        self.shown.flags.writeable = False
-        return observations
+            self._calls.show_into(memory)
+        self._shown, self.shown = memory, memory[:, : self.count]
+        self.shown.setflags(write=False)
+        self.shown_of_flights = self.shown.T
+
+    def _run(self, command: Command) -> NDArray[np.float32]:
+        if getrefcount(self._shown) > _OUR_REFERENCES:  # somebody keeps what was shown
+            self._show_in(np.empty_like(self._shown))
+        return super()._run(command)
 
     def _calls_of_threads(self) -> Calls:
         calls = super()._calls_of_threads()
         calls.show_into(self._shown)
         return calls
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what looks into other memory than a copy's."""
+        return super().__getstate__() | {"_fields": {}}
+
+    def _field(self, name: str) -> NDArray[Any]:
+        """A field of the flights' records, (blocks, ..., lanes), found once."""
+        field = self._fields.get(name)
+        if field is None:
+            field = self._fields[name] = self._blocks[name]
+        return field
+
     def columns(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (..., n)."""
-        if name not in (self._blocks.dtype.fields or {}):
+        if name not in self._fields and not self._room.holds(name):
             return np.ascontiguousarray(np.moveaxis(self.read(name), 0, -1))
-        values = self._blocks[name]
+        values = self._field(name)
         if values.ndim == 2:
             return values.flatten()[: self.count]
         last = values.ndim - 1
@@ -64,15 +81,26 @@ class ReadableBatch(FlightBatch):
         values = self.columns(name)
         return values.T if values.ndim == 2 else np.ascontiguousarray(np.moveaxis(values, -1, 0))
 
+    def counts(self, name: str) -> NDArray[np.int64]:
+        """A field of the flights' records as whole numbers, (n,)."""
+        return self._field(name).astype(np.int64).ravel()[: self.count]
+
     def write(self, name: str, values: NDArray[Any]) -> None:
         """Write a field of the flights' records, (n,)."""
-        field = self._blocks[name]
+        field = self._field(name)
         if values.size == field.size:
             field[:] = values.reshape(field.shape)
             return
         lanes = field.flatten()
         lanes[: self.count] = values
         field[:] = lanes.reshape(field.shape)
+
+    def show_anew(self, *names: str) -> None:
+        """Let `shown` say what the records say of some fields, as these have changed since."""
+        memory = self._shown.copy()
+        for name in names:
+            memory[SHOWN[name], : self.count] = self.columns(name)
+        self._show_in(memory)
 
     def gates(self) -> Floats:
         """(n, gates, 3) of a course in I [m]; none elsewhere."""

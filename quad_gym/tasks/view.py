@@ -1,13 +1,14 @@
 """`View`: what the methods of a task read of all flights; `fields.py` has it as a table."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.records import SHOWN
-from quad_gym.tasks.groups import Estimate, Measured, Seen, Shipped, Truth
+from quad_gym.tasks.groups import Estimate, Measured, Seen, Truth
 from quad_gym.tasks.lazy import Group, Lazy, Shown
+from quad_gym.tasks.shipped import Shipped
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
 
@@ -19,7 +20,6 @@ Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
 _GATE_NEXT = SHOWN["gate_next"].start
-_GROUPS = ("estimate", "seen", "measured", "state", "own_shipped")
 
 
 class View(Group):
@@ -32,50 +32,44 @@ class View(Group):
     likewise the other states. `view.state` holds what the task keeps.
     """
 
-    __slots__ = ("_hidden", "_truth")
+    __slots__ = (
+        *("_hidden", "_of_instant", "_shipped", "_truth"),
+        *("estimate", "measured", "seen", "state"),
+    )
 
     estimate: Estimate
     seen: Seen
     measured: Measured
     state: State
-    own_shipped: Shipped
-    """`shipped`, which is never hidden from the batch itself"""
 
     def __init__(self, flights: "TaskBatch", state: State) -> None:
         super().__init__(flights)
         self._hidden = False
-        self._truth = Truth(flights, self)
-        self._keep(state)
-
-    def _keep(self, state: State) -> None:
-        """The groups, which stay while their arrays come and go."""
-        flights = self._flights
-        self.__dict__.update(
-            estimate=Estimate(flights),
-            seen=Seen(flights),
-            measured=Measured(flights),
-            state=state,
-            own_shipped=Shipped(flights),
-        )
+        self._truth, self._shipped = Truth(flights, self), Shipped(flights)
+        for name, group in (
+            ("estimate", Estimate(flights)),
+            ("measured", Measured(flights)),
+            ("seen", Seen(flights)),
+            ("state", state),
+        ):
+            object.__setattr__(self, name, group)
+        groups = (self, self._truth, self.estimate, self.seen, self.measured)
+        self._of_instant = [group.__dict__ for group in groups]
 
     def forget(self) -> None:
         """Drop the arrays of the present instant; those of the step stay."""
-        mine = self.__dict__
-        kept = {name: mine[name] for name in _GROUPS}
-        mine.clear()
-        mine.update(kept)
-        for group in (self._truth, self.estimate, self.seen, self.measured):
-            group.forget()
+        for arrays in self._of_instant:
+            arrays.clear()
 
     def step_over(self) -> None:
         """Forget all arrays, as a step has been flown."""
         self.forget()
-        self.own_shipped.forget()
+        self._shipped.step_over()
 
     def begin(self, chosen: Truths) -> None:
         """Forget what belongs to the last episodes of flights that have begun others."""
         self.forget()
-        self.own_shipped.begin(chosen)
+        self._shipped.begin(chosen)
 
     def hide(self, hidden: bool) -> None:
         """Whether the truth is hidden, as from `observe`."""
@@ -83,89 +77,101 @@ class View(Group):
 
     # ---- what may be hidden -------------------------------------------------------------------
 
-    def _open(self, name: str) -> None:
-        if self._hidden:
-            raise HiddenTruthError(
-                f"observe cannot read the truth (view.{name}), which no controller knows: read "
-                "view.seen or view.estimate, or set privileged = True in the task"
-            )
+    def _refuse(self, name: str) -> NoReturn:
+        raise HiddenTruthError(
+            f"observe cannot read the truth (view.{name}), which no controller knows: read "
+            "view.seen or view.estimate, or set privileged = True in the task"
+        )
 
     @property
     def truth(self) -> Truth:
         """The true state; `observe` reads it only if the task is privileged."""
-        self._open("truth")
+        if self._hidden:
+            self._refuse("truth")
         return self._truth
 
     @property
     def shipped(self) -> Shipped:
         """Built-in reward and endings of the step, which follow from the truth."""
-        self._open("shipped")
-        return self.own_shipped
+        if self._hidden:
+            self._refuse("shipped")
+        return self._shipped
 
     @property
     def position(self) -> Floats:
         """(n, 3) true position in I [m]."""
-        self._open("position")
+        if self._hidden:
+            self._refuse("position")
         return self._truth.position
 
     @property
     def velocity(self) -> Floats:
         """(n, 3) true velocity in I [m/s]."""
-        self._open("velocity")
+        if self._hidden:
+            self._refuse("velocity")
         return self._truth.velocity
 
     @property
     def R_BI(self) -> Floats:
         """(n, 3, 3) true attitude, v_B = R_BI v_I."""
-        self._open("R_BI")
+        if self._hidden:
+            self._refuse("R_BI")
         return self._truth.R_BI
 
     @property
     def quaternion(self) -> Floats:
         """(n, 4) true attitude (w, x, y, z), B to I."""
-        self._open("quaternion")
+        if self._hidden:
+            self._refuse("quaternion")
         return self._truth.quaternion
 
     @property
     def body_rates(self) -> Floats:
         """(n, 3) true body rates [rad/s]."""
-        self._open("body_rates")
+        if self._hidden:
+            self._refuse("body_rates")
         return self._truth.body_rates
 
     @property
     def rotor_speeds(self) -> Floats:
         """(n, 4) true rotor speeds [rad/s]."""
-        self._open("rotor_speeds")
+        if self._hidden:
+            self._refuse("rotor_speeds")
         return self._truth.rotor_speeds
 
     @property
     def accel_bias(self) -> Floats:
         """(n, 3) true bias of the accelerometer in B [m/s^2]."""
-        self._open("accel_bias")
+        if self._hidden:
+            self._refuse("accel_bias")
         return self._truth.accel_bias
 
     @property
     def gyro_bias(self) -> Floats:
         """(n, 3) true bias of the gyro [rad/s]."""
-        self._open("gyro_bias")
+        if self._hidden:
+            self._refuse("gyro_bias")
         return self._truth.gyro_bias
 
     @property
     def position_error(self) -> Floats:
         """(n,) distance of the true position from the reference [m]."""
-        self._open("position_error")
+        if self._hidden:
+            self._refuse("position_error")
         return self._truth.position_error
 
     @property
     def estimation_error(self) -> Floats:
         """(n,) distance of the seen from the true position [m]."""
-        self._open("estimation_error")
+        if self._hidden:
+            self._refuse("estimation_error")
         return self._truth.estimation_error
 
     @property
     def obstacle_distance(self) -> Floats:
         """(n,) distance of the true position from the nearest obstacle's surface [m]."""
-        self._open("obstacle_distance")
+        if self._hidden:
+            self._refuse("obstacle_distance")
         return self._truth.obstacle_distance
 
     # ---- what everybody knows -----------------------------------------------------------------
@@ -185,7 +191,7 @@ class View(Group):
     @Lazy
     def step(self) -> NDArray[np.int64]:
         """(n,) steps since the start of the episode."""
-        return self._flights.columns("step").astype(np.int64)
+        return self._flights.counts("step")  # type: ignore[no-any-return]
 
     @Lazy
     def began(self) -> Truths:
@@ -226,7 +232,7 @@ class View(Group):
     @Lazy
     def gate_passed(self) -> Truths:
         """(n,) whether this step passed a gate."""
-        return (self.gates_passed > self._flights.before.gates_passed) & ~self._flights.began
+        return (self.gates_passed > self._flights.gates_before) & ~self._flights.began
 
     @Lazy
     def features(self) -> Floats:

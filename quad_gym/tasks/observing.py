@@ -1,0 +1,127 @@
+"""Observations with a task's own numbers: joined with the shipped ones, checked, within bounds."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.tasks import answers
+from quad_gym.tasks.task import TaskError, label
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.batch import TaskBatch
+
+Singles = NDArray[np.float32]
+
+_SQUARABLE = 1e15
+"""Numbers whose squares have a sum in single precision."""
+
+
+class Part(NamedTuple):
+    """One part of what `observe` returns."""
+
+    size: int
+    low: float
+    high: float
+
+
+class Joiner:
+    """Makes observations: the shipped numbers that stay, the task's, the privileged ones.
+
+    Args:
+        count: Number of flights.
+        parts: What `observe` returns, by name.
+        shipped: How many numbers the shipped observation has.
+        split: Where the task's stand: after so many of them.
+        kept: Which of these stay; None: all.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        parts: Mapping[str, Part],
+        shipped: int,
+        split: int,
+        kept: Sequence[int] | None,
+    ) -> None:
+        self._sizes = {name: part.size for name, part in parts.items()}
+        self._names = tuple(parts)
+        self._shapes = [(count, part.size) for part in parts.values()]
+        self._split, self._rest = split, shipped - split
+        self._kept: slice | NDArray[np.intp] = slice(0, split)
+        if kept is not None and len(kept) < split:
+            self._kept = np.array(kept, np.intp)
+        self._begin = split if kept is None else len(kept)
+        self.size = self._begin + sum(self._sizes.values()) + self._rest
+        """how many numbers an observation has"""
+        bounds = [(part.low, part.high) for part in parts.values() for _ in range(part.size)]
+        self._low, self._high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
+        self._least = self._low.max(initial=-_SQUARABLE)
+        self._most = self._high.min(initial=_SQUARABLE)
+        self._surely_within = 0.99 * float(max(min(-self._least, self._most), 0.0)) ** 2
+
+    def join(self, flights: "TaskBatch", value: Any, shipped: Singles) -> Singles:
+        """The observations that the environment shows.
+
+        Args:
+            flights: Whose.
+            value: What `observe` has returned.
+            shipped: The shipped observations, (n, k).
+
+        Raises:
+            TaskError: If something is wrong with what it has returned.
+        """
+        if not self._is_as_at_first(value):
+            value = self._checked(flights, value)
+        parts = list(value.values())
+        if self._begin:
+            parts.insert(0, shipped[:, self._kept])
+        if self._rest:
+            parts.append(shipped[:, self._split :])
+        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        flat = joined.ravel()
+        if not np.dot(flat, flat) <= self._surely_within:  # NaN is not, either
+            self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
+        return joined
+
+    def _is_as_at_first(self, value: Any) -> bool:
+        """Whether `observe` has returned floats of the names and shapes that it had at first."""
+        if type(value) is not dict or tuple(value) != self._names:
+            return False
+        for part, shape in zip(value.values(), self._shapes, strict=True):
+            if (
+                type(part) is not np.ndarray
+                or part.shape != shape
+                or part.dtype is not answers.FLOAT
+            ):
+                return False
+        return True
+
+    def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
+        """What `observe` has returned, (n, k) each by name, in the order of the observation."""
+        found = answers.parts(flights.custom, value, flights.count)
+        sizes = {name: part.shape[1] for name, part in found.items()}
+        if sizes != self._sizes:
+            raise TaskError(
+                f"{label(flights.custom)}.observe must return as many numbers as at first, "
+                f"{self._sizes}, got {sizes}"
+            )
+        return {name: found[name] for name in self._sizes}
+
+    def _hold(self, flights: "TaskBatch", ours: Singles, own: Mapping[str, Any]) -> None:
+        """Hold the task's part of observations within its bounds.
+
+        Raises:
+            TaskError: If it is not finite, of flights whose state is; others' is made finite.
+        """
+        if ours.min() >= self._least and ours.max() <= self._most:
+            return  # clipping takes long
+        if not np.isfinite(ours).all():
+            for name, values in own.items():
+                sound = np.isfinite(values).all(axis=1)
+                if not sound.all():
+                    sound |= ~flights.finite(~sound)
+                    answers.require(sound, flights.custom, "observe", values, f"finite {name!r}")
+            np.nan_to_num(ours, copy=False)
+        np.clip(ours, self._low, self._high, out=ours)

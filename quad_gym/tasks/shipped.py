@@ -1,0 +1,70 @@
+"""What a view says of the built-in reward and endings of a step."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.tasks.lazy import Group, Lazy, frozen
+
+Floats = NDArray[np.float64]
+Truths = NDArray[np.bool_]
+
+_JUDGED = ("reward", "terminated", "truncated", "ending")
+
+
+class Shipped(Group):
+    """What the id's task says of the step; nothing of flights that have begun an episode since."""
+
+    __slots__ = ("_begun",)
+
+    def __init__(self, flights: Any) -> None:
+        super().__init__(flights)
+        self._begun: Truths | None = None
+
+    def _result(self, name: str) -> Floats:
+        found: Floats = self._flights.result(name)
+        return found if self._begun is None else np.where(self._begun, 0.0, found)
+
+    @Lazy
+    def reward(self) -> Floats:
+        """(n,) as with `reward_per="step"`."""
+        reward, scale = self._result("reward"), self._flights.reward_scale
+        return reward if scale == 1.0 else reward / scale
+
+    @Lazy
+    def terminated(self) -> Truths:
+        """(n,) crashed, or through the last gate."""
+        return self._result("terminated") > 0.0
+
+    @Lazy
+    def truncated(self) -> Truths:
+        """(n,) time limit, failed filter, or lost with `end_when_lost`; also where terminated."""
+        flights = self._flights
+        over = self._result("filter_status") > 0.0
+        if flights.max_steps:
+            over |= self._result("episode_steps") >= flights.max_steps
+        if flights.task.end_when_lost:
+            over |= self._result("filter_lost") > 0.0
+        return over & ~flights.began
+
+    @Lazy
+    def ending(self) -> NDArray[np.int64]:
+        """(n,) see `quad_gym.records.Ending`."""
+        return self._result("ending").astype(np.int64)
+
+    def read(self) -> None:
+        """Make all arrays, before the task's own answers take the place of what they come from."""
+        for name in _JUDGED:
+            getattr(self, name)
+
+    def step_over(self) -> None:
+        """Forget what was said of the last step."""
+        self.__dict__.clear()
+        self._begun = None
+
+    def begin(self, chosen: Truths) -> None:
+        """Forget what was said of flights that have begun an episode since."""
+        self._begun = chosen if self._begun is None else self._begun | chosen
+        for name, value in self.__dict__.items():
+            self.__dict__[name] = frozen(np.where(chosen, value.dtype.type(0), value))
