@@ -54,7 +54,15 @@ from quad_gym.analysis.reports import (
     write_json,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import TRACKING, EnvId, FilterStart, Seed, SuiteName, usage_errors
+from quad_gym.commands.options import (
+    TRACKING,
+    EnvId,
+    FilterStart,
+    Seed,
+    SuiteName,
+    known_id,
+    usage_errors,
+)
 from quad_gym.envs import IDS
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import FIELD_FILTER
@@ -151,8 +159,7 @@ class Args:
             object.__setattr__(self, "output", Path("results") / folder)
         if self.count < 2:
             raise ValueError(f"--episodes must be at least 2, got {self.flights}")
-        if self.env_id not in TRACKING:
-            raise ValueError(f"ENV_ID must be a task of tracking, got {self.env_id!r}")
+        known_id("ENV_ID", self.env_id, TRACKING)
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
         if self.matrix and self.recovery:

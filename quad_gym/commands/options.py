@@ -8,16 +8,18 @@ custom on Unix.
 import ast
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
+from quad_gym.commands.help_texts import registry
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
 USAGE_ERROR = 2
@@ -55,7 +57,7 @@ def parse(
         elif equals or given:
             unnamed.append(value if equals else given.pop(0))
     words = unnamed + words  # first, as an option before them may take any number of words
-    return tyro.cli(kind, args=words, description=description, prog=program)
+    return tyro.cli(kind, args=words, description=description, prog=program, registry=registry())
 
 
 @contextmanager
@@ -184,6 +186,26 @@ def full_id(name: str) -> str:
     return _ID_OF_TASK.get(name, name)
 
 
+def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
+    """The id that is given, as it is or by its short name.
+
+    Args:
+        name: Of the argument.
+        given: Its value.
+        ids: Those that it may be.
+
+    Raises:
+        ValueError: If it is none of them.
+    """
+    found, ids = full_id(given), tuple(ids)
+    if found not in ids:
+        raise ValueError(
+            f"{name} must be one of {', '.join(ids)}, got {given!r}"
+            + did_you_mean(given, (*ids, *(IDS[env_id] for env_id in ids)))
+        )
+    return found
+
+
 EnvId = tyro.conf.Positional[
     Annotated[
         str,
@@ -210,6 +232,15 @@ FilterStart = tyro.conf.arg(name="filter-start")
 
 SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(ALL_SUITES)}")]
 """The name of a sensor suite."""
+
+OwnSuite = Annotated[
+    str | None,
+    tyro.conf.arg(
+        help=f"sensor suite: {', '.join(ALL_SUITES)}; if not given, the task's own, which for most "
+        "is standard"
+    ),
+]
+"""The name of a sensor suite, or None for the task's own."""
 
 SuiteNames = Annotated[
     tuple[str, ...], tyro.conf.arg(help=f"sensor suites, of {', '.join(SUITES)}")

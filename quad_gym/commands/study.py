@@ -32,7 +32,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
-from quad_gym.commands.options import EnvId, Keywords, leave, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, known_id, leave, usage_errors
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
@@ -88,8 +88,7 @@ def studied(args: Args) -> StudiedTask:
         ValueError: If it is not studied, or an option does not belong to it.
     """
     ids = {env_id: task for env_id, task in IDS.items() if task in STUDIED}
-    if args.env_id not in ids:
-        raise ValueError(f"ENV_ID must be one of {', '.join(ids)}, got {args.env_id!r}")
+    known_id("ENV_ID", args.env_id, ids)
     about = STUDIED[ids[args.env_id]]
     if args.success_within is None:
         return about

@@ -35,6 +35,7 @@ from quad_gym.commands.options import (
     SuiteName,
     flying_options,
     full_id,
+    known_id,
     leave,
     refuse_overwriting,
     usage_errors,
@@ -194,9 +195,8 @@ def configure(args: Args) -> Search:
         ValueError: If an option is invalid.
         OSError: If nothing can be written to the folder.
     """
-    for env_id in map(full_id, args.env_ids):
-        if env_id not in TRACKING:
-            raise ValueError(f"--env-ids must be among {', '.join(TRACKING)}, got {env_id!r}")
+    for env_id in args.env_ids:
+        known_id("--env-ids", env_id, TRACKING)
     for name, least in (("candidates", 1), ("episodes", 1), ("fresh_episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             option_name = name.replace("_", "-")

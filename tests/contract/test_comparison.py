@@ -138,7 +138,7 @@ def nobody_is_in_group(group):
 
 def test_compare_refuses_nonsense(tmp_path):
     for more, message in (
-        (["QuadGym/Waypoints-v0"], "task of tracking"),
+        (["QuadGym/Waypoints-v0"], "ENV_ID must be one of QuadGym/Hover-v0"),
         (["--sensors", "sonar"], "sensors must be one of"),
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--env", "observation=truth"], "leave observation"),

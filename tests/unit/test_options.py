@@ -12,10 +12,12 @@ from quad_gym.commands.options import (
     Keywords,
     SuiteNames,
     flying_options,
+    known_id,
     leave,
     parse,
     usage_errors,
 )
+from quad_gym.envs import IDS
 from tests.console import plain
 
 
@@ -77,6 +79,46 @@ def test_help_has_description_defaults_and_texts(capsys):
     assert "50 % of the other if not given" in text
     assert "QuadGym/Waypoints-v0" in text
     assert "consumer" in text
+
+
+def test_help_reads_as_people_write(capsys):
+    with pytest.raises(SystemExit):
+        parse(Args, ["--help"], program="it")
+    text = plain(capsys.readouterr().out)
+    assert "None" not in text
+    assert "(default: )" not in text
+    assert "--rate FLOAT rate [Hz]; 50 % of the other if not given --gains" in text
+    assert "--output PATH folder --sensors NAME ... sensor suites" in text
+    assert "--camera, --no-camera see (default: yes)" in text
+
+
+def test_what_may_be_left_out_has_the_errors_of_what_it_is(capsys):
+    for line, told in (("--rate x", "--rate: must be a number, got 'x'"), ("--seeds 1.5", "whole")):
+        with pytest.raises(SystemExit):
+            parse(Args, line.split(), program="it")
+        message = plain(capsys.readouterr().err)
+        assert told in message
+        assert "None" not in message
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("circel", "circle"),
+        ("Circle", "circle"),
+        ("QuadGym/Cirle-v0", "QuadGym/Circle-v0"),
+        ("lookaround", "look_around"),
+    ],
+)
+def test_a_misspelt_id_is_refused_with_the_one_that_may_be_meant(given, meant):
+    with pytest.raises(ValueError, match=rf"ENV_ID must be one of .*; did you mean {meant}\?$"):
+        known_id("ENV_ID", given)
+    assert known_id("ENV_ID", meant) in IDS
+
+
+def test_ids_that_a_command_does_not_fly_are_not_suggested():
+    with pytest.raises(ValueError, match=r"got 'waypoints'$"):
+        known_id("ENV_ID", "waypoints", ["QuadGym/Circle-v0"])
 
 
 @pytest.mark.parametrize(
