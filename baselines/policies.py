@@ -214,11 +214,9 @@ def _require_agreement(
 
 def _difference(trained: Sequence[str], here: Sequence[str]) -> str:
     """Sizes of two lists of names, and which names only one of them has."""
-    words = f"{len(trained)} fields, and the environment gives {len(here)}"
     lacking = [name for name in trained if name not in here]
     more = [name for name in here if name not in trained]
-    if lacking:
-        words += f", without {', '.join(lacking)}"
-    if more:
-        words += f", and {', '.join(more)} in addition"
-    return words if lacking or more else f"{words} in another order"
+    words = [f"lacks {', '.join(lacking)}"] if lacking else []
+    words += [f"adds {', '.join(more)}"] if more else []
+    found = f"it {' and '.join(words)}" if words else "in another order"
+    return f"{len(trained)} fields, and the environment gives {len(here)} ({found})"

@@ -177,7 +177,8 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
                 f"{seconds:.2f} s" if any(done) else "-",
             ]
         else:
-            row += [_with_interval(episodes.mean_error), f"{1e3 * found['late_error']:.1f}"]
+            late = f"{1e3 * found['late_error']:.1f}"
+            row += [_with_interval(episodes.mean_error), "-" if late == "nan" else late]
         rows.append(
             [
                 *row,
