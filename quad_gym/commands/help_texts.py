@@ -103,10 +103,11 @@ def _explained(field: StructFieldSpec) -> StructFieldSpec:
     hint = tyro.conf.arg(
         help_behavior_hint=_default, metavar=_metavar(get_args(kind)[0]) if several else None
     )
+    explained: Any = Annotated[(kind, hint, *about)]
     text = field.helptext() if callable(field.helptext) else field.helptext
     return replace(
         field,
-        type=Annotated[(kind, hint, *about)],
+        type=explained,
         helptext=None if text is None else " ".join(text.split()),
     )
 

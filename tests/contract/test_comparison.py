@@ -97,6 +97,16 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
         (["--policy", "missing.zip"], "there is no policy"),
         (["--observation", "guess"], "observation must be one of"),
         (["--observation", "estimat"], "did you mean estimate?"),
+        (
+            ["--policy", "pretrained", "--env", "include_covariance=true"],
+            "trained with observations of 9 fields, and the environment gives 14 (it adds "
+            "position_sigma, velocity_sigma, attitude_sigma, accel_bias_sigma, gyro_bias_sigma):",
+        ),
+        (
+            ["--policy", "pretrained", "--env", "layout=absolute"],
+            "and the environment gives 13 (it lacks position_error, velocity_error, up, heading "
+            "and adds position, ",
+        ),
         (["--observation"], "--observation must name at least one"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--policy", "pretrained", "--env", "action=motor"], "trained with action ctbr"),
