@@ -42,9 +42,9 @@ from quad_gym.commands.compare_report import (
 )
 from quad_gym.commands.options import (
     TRACKING,
-    EnvId,
     Keywords,
     SuiteNames,
+    TrackingId,
     known_id,
     leave,
     usage_errors,
@@ -63,7 +63,7 @@ SOURCES: tuple[Source, ...] = ("truth", "noisy", "estimate")
 class Args:
     """Options of the comparison."""
 
-    env_id: EnvId = "QuadGym/Circle-v0"
+    env_id: TrackingId = "QuadGym/Circle-v0"
     sensors: SuiteNames = ("standard",)
     train_on: tuple[Source, ...] = SOURCES
     """what to train on"""

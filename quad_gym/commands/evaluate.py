@@ -57,7 +57,8 @@ class Args:
     pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz); if not
     given, pd, and pretrained where it fits"""
     observation: tuple[str, ...] = ("truth", "estimate")
-    """what to fly on: estimate, truth, noisy"""
+    """what to fly on: truth, estimate, noisy, or sensors (raw measurements, for policies that have
+    learned on them)"""
     sensors: OwnSuite = None
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false gnss_rate=10"""

@@ -4,6 +4,8 @@ tyro's own help has `{None}|INT` for a number that may be left out, and `(defaul
 The rules below, for all commands, leave that to the explanation, which says what happens then.
 """
 
+import shutil
+import textwrap
 from dataclasses import is_dataclass, replace
 from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
@@ -44,6 +46,16 @@ def registry() -> ConstructorRegistry:
         return replace(spec, fields=tuple(_explained(field) for field in spec.fields))
 
     return rules
+
+
+def wrapped(text: str) -> str:
+    """Paragraphs as wide as the terminal, at most 100 columns; indented lines as they are."""
+    width = min(shutil.get_terminal_size().columns, 100)
+    found = []
+    for paragraph in text.strip().split("\n\n"):
+        filled = textwrap.fill(" ".join(paragraph.split()), width, break_on_hyphens=False)
+        found.append(paragraph if paragraph[0] == " " else filled)
+    return "\n\n".join(found) + "\n"
 
 
 def _name(info: PrimitiveTypeInfo) -> _Spec:

@@ -37,6 +37,7 @@ from quad_gym.commands.options import (
     full_id,
     known_id,
     leave,
+    one_of,
     refuse_overwriting,
     usage_errors,
 )
@@ -59,7 +60,8 @@ class Args:
     FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--start": "--gains", "--tasks": "--env-ids"}
 
     env_ids: Annotated[
-        tuple[str, ...], arg(help=f"what to fly: {', '.join(TRACKING)}, or short, as circle")
+        tuple[str, ...],
+        arg(help=f"{one_of(TRACKING)}; if not given, all of them", help_behavior_hint=""),
     ] = TRACKING
     observation: Literal["estimate", "truth", "noisy"] = "estimate"
     """what control sees"""
