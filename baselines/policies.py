@@ -4,7 +4,7 @@ import json
 import pickle
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,22 @@ from baselines.mlp import MlpPolicy
 from baselines.pd import REACH_OF_GAPS, PDPolicy
 from quad_gym import IDS, PDGains
 from quad_gym.evaluation import Policy
+from quad_gym.params import checks as check
 
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 """Folder of the policies that ship."""
+
+NAMES = (
+    "pd",
+    "pd:tuned",
+    "pd:lab",
+    "pd:features",
+    "pd:features_when_unsure",
+    "pd:slow",
+    "pd:waiting",
+    "pretrained",
+)
+"""Policies that have names, see `load_policy`."""
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -83,7 +96,7 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     if file.suffix != ".zip":
         raise ValueError(
             "policy must be pd, pd:lab, pd:FILE.json, pretrained, or a .npz or .zip file, "
-            f"got {name!r}"
+            f"got {name!r}{check.did_you_mean(name, NAMES)}"
         )
     return _stable_baselines_policy(file, env)
 
@@ -109,7 +122,8 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
 def _gains_of(file: Path) -> PDGains:
     """PD gains as `scripts/tune.py` writes them."""
     if not file.exists():
-        raise ValueError(f"there are no gains {file}")
+        name = f"pd:{file}"
+        raise ValueError(f"there are no gains {file}{check.did_you_mean(name, NAMES)}")
     try:
         return PDGains(**json.loads(file.read_text(encoding="utf-8"))["gains"])
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
@@ -183,8 +197,26 @@ def _require_agreement(
     """Refuse a policy whose actions or observations mean something else here."""
     trained, here = record.get("interface", {}), interface_of(env)
     for name in trained:
-        if trained[name] != here[name]:
+        if trained[name] == here[name]:
+            continue
+        if name == "observation":
+            keywords = record.get("plan", {}).get("environment", {})
+            had = "".join(f" {key}={value}" for key, value in keywords.items())
             raise ValueError(
-                f"{file} was trained with {name} {trained[name]}, and the environment has "
-                f"{here[name]}"
+                f"{file} was trained with observations of "
+                f"{_difference(trained[name], here[name])}: make it with the keywords that the "
+                f"policy was trained with{had and ','}{had}"
             )
+        raise ValueError(
+            f"{file} was trained with {name} {trained[name]}, and the environment has {here[name]}"
+        )
+
+
+def _difference(trained: Sequence[str], here: Sequence[str]) -> str:
+    """Sizes of two lists of names, and which names only one of them has."""
+    lacking = [name for name in trained if name not in here]
+    more = [name for name in here if name not in trained]
+    words = [f"lacks {', '.join(lacking)}"] if lacking else []
+    words += [f"adds {', '.join(more)}"] if more else []
+    found = f"it {' and '.join(words)}" if words else "in another order"
+    return f"{len(trained)} fields, and the environment gives {len(here)} ({found})"

@@ -16,6 +16,7 @@ from baselines.policies import load_policy, pretrained_file
 from quad_gym.envs import keywords_of
 from quad_gym.envs.spaces import ObservationField, layout_bounds
 from quad_gym.packing.flight import params_record
+from quad_gym.params import checks as check
 
 _AGREEMENT = 1e-4
 """Largest difference between a network and the policy that it was taken from."""
@@ -90,6 +91,9 @@ def controller_of(
     if env_id is not None:
         keywords_of(env_id)  # refuses unknown ids
     file = pretrained_file(env_id) if policy == "pretrained" and env_id else Path(policy)
+    if not file.exists():
+        meant = check.did_you_mean(policy, ("pretrained", "filter"))
+        raise ValueError(f"there is no policy {file}{meant}")
     record = _record_of(file)
     plan = record.get("plan", {})
     if env_id is None:

@@ -28,6 +28,12 @@ def versions(*packages: str) -> dict[str, str | None]:
     return found
 
 
+def short_name(policy: str) -> str:
+    """A policy's name for tables and pictures: of a file, its folder and its name."""
+    path = Path(policy)
+    return f"{path.parent.name}/{path.stem}".lstrip("/") if path.suffix else policy
+
+
 def require_writable(option: str, folder: Path) -> None:
     """Make a folder if it is missing, and see that files can be written there.
 

@@ -2,16 +2,12 @@
 
 import numpy as np
 
+from quad_gym.kernels.task.heights import GATE_SPREAD, LOWEST_GATE, RANDOM_RISE
 from quad_gym.params.randomization import DrawingTable
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS
-
-GATE_HEIGHTS = (0.7, 1.3)
-"""Lowest and highest gate of a course, over `TaskParams.height`."""
-RANDOM_RISE = 0.3
-"""How far a random trajectory leads up or down, over `TaskParams.radius`: typically less."""
 
 
 def check_standing(
@@ -58,7 +54,7 @@ def check_standing(
 def _reference_heights(task: TaskParams) -> list[tuple[float, float]]:
     """Between which heights each reference of a task begins [m]."""
     if task.kind == "waypoints":
-        return [(GATE_HEIGHTS[0] * task.height, GATE_HEIGHTS[1] * task.height)]
+        return [(LOWEST_GATE * task.height, (LOWEST_GATE + GATE_SPREAD) * task.height)]
     if task.kind == "random_trajectory":
         rise = RANDOM_RISE * task.radius
         return [(task.height - rise, task.height + rise)]

@@ -1,5 +1,8 @@
 """Fly the report's circle on the true state, on the estimate, and on it without the camera.
 
+    quad-gym circle
+    quad-gym circle --episodes 100 --gains tuned --gnss-rate 10
+
 A quadrotor starts at rest on the ground, below a point that moves on a horizontal circle, and a PD
 controller follows that point at every IMU sample. The controller is told either the true state or
 the estimate of an unscented Kalman filter that fuses GNSS, IMU and camera. What is lost by flying

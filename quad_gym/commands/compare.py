@@ -14,7 +14,9 @@ An interrupted comparison continues where it stopped when it is started again.
 """
 
 import multiprocessing
+import os
 import signal
+import threading
 import time
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
@@ -38,7 +40,15 @@ from quad_gym.commands.compare_report import (
     write_figures,
     write_page,
 )
-from quad_gym.commands.options import TRACKING, EnvId, Keywords, SuiteNames, leave, usage_errors
+from quad_gym.commands.options import (
+    TRACKING,
+    Keywords,
+    SuiteNames,
+    TrackingId,
+    known_id,
+    leave,
+    usage_errors,
+)
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
@@ -53,7 +63,7 @@ SOURCES: tuple[Source, ...] = ("truth", "noisy", "estimate")
 class Args:
     """Options of the comparison."""
 
-    env_id: EnvId = "QuadGym/Circle-v0"
+    env_id: TrackingId = "QuadGym/Circle-v0"
     sensors: SuiteNames = ("standard",)
     train_on: tuple[Source, ...] = SOURCES
     """what to train on"""
@@ -96,8 +106,7 @@ def configure(args: Args) -> Setting:
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     plots.require_matplotlib()
-    if args.env_id not in TRACKING:
-        raise ValueError(f"ENV_ID must be a task of tracking, got {args.env_id!r}")
+    known_id("ENV_ID", args.env_id, TRACKING)
     for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
@@ -192,15 +201,15 @@ def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
     total = setting.steps * len(setting.plans)
     context = multiprocessing.get_context("spawn")  # compiled kernels and torch do not fork well
     with (
-        ProcessPoolExecutor(min(jobs, len(setting.plans)), context) as pool,
+        ProcessPoolExecutor(min(jobs, len(setting.plans)), context, end_with_parent) as pool,
         tqdm(total=total, desc="training", unit=" steps", unit_scale=True) as bar,
     ):
-        waiting = {
-            pool.submit(train_one, plan, setting.run_folder(key)): key
-            for key, plan in setting.plans.items()
-        }
         done = {}
         try:
+            waiting = {
+                pool.submit(train_one, plan, setting.run_folder(key)): key
+                for key, plan in setting.plans.items()
+            }
             while waiting:
                 ended, _ = wait(waiting, timeout=2.0, return_when=FIRST_COMPLETED)
                 steps = sum(_steps_done(setting.run_folder(key)) for key in setting.plans)
@@ -223,11 +232,27 @@ def train_all(setting: Setting, jobs: int) -> dict[Any, Any]:
     return {key: done[key] for key in setting.plans}
 
 
+def end_with_parent() -> None:
+    """Make a process of the pool end when the comparison does, even if that is killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)  # a training writes a checkpoint, and ends
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def train_one(plan: Any, folder: Path) -> Any:
     """Train a policy, or go on with a training that was stopped; in a process of its own."""
     from baselines.training import train
 
-    return train(plan, folder, resume=True, tensorboard=False, quiet=True)
+    done = train(plan, folder, resume=True, tensorboard=False, quiet=True)
+    parent = multiprocessing.parent_process()
+    if parent is not None and not parent.is_alive():
+        os._exit(1)  # rather than begin with the next one that waits
+    return done
 
 
 def _steps_done(folder: Path) -> int:

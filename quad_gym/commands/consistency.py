@@ -54,7 +54,15 @@ from quad_gym.analysis.reports import (
     write_json,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import TRACKING, EnvId, FilterStart, Seed, SuiteName, usage_errors
+from quad_gym.commands.options import (
+    TRACKING,
+    FilterStart,
+    Seed,
+    SuiteName,
+    TrackingId,
+    known_id,
+    usage_errors,
+)
 from quad_gym.envs import IDS
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import FIELD_FILTER
@@ -73,7 +81,7 @@ class Args:
         "--task": "",
     }
 
-    env_id: EnvId = "QuadGym/RandomTrajectory-v0"
+    env_id: TrackingId = "QuadGym/RandomTrajectory-v0"
 
     flights: Annotated[int | None, arg(name="episodes")] = None
     """flights; if not given, 4000, or 400 in each cell of a matrix"""
@@ -112,23 +120,23 @@ class Args:
     """form of filter and IMU: as the suite has it, the report's, or with all corrections
     (formerly mended)"""
     samples: Literal["instant", "average"] | None = None
-    """in place of the form's"""
+    """what an IMU sample holds, in place of the form's"""
     integration: Literal["euler", "midpoint"] | None = None
-    """in place of the form's"""
+    """how the filter integrates them, in place of the form's"""
     covariance_reset: Literal["none", "turn"] | None = None
-    """in place of the form's"""
+    """whether the covariance turns with the attitude that is corrected, in place of the form's"""
     feature_noise_across: Literal["measured", "predicted", "projected"] | None = None
-    """in place of the form's"""
+    """direction across which the filter takes the camera's noise to lie, in place of the form's"""
     estimator: Literal["ukf", "ekf"] | None = None
-    """in place of the suite's"""
+    """the filter, in place of the suite's"""
     camera: bool = True
     """measure with the camera, if the suite has one"""
     imu_rate: float | None = None
-    """in place of the suite's [Hz]"""
+    """IMU samples and filter cycles per second [Hz]; if not given, the suite's"""
     gnss_rate: float | None = None
-    """in place of the suite's [Hz]"""
+    """GNSS fixes per second [Hz]; if not given, the suite's"""
     camera_rate: float | None = None
-    """in place of the suite's [Hz]"""
+    """images per second [Hz]; if not given, the suite's"""
 
     mass_factor: float = 1.0
     """true mass, as a multiple of what the controller believes"""
@@ -151,8 +159,7 @@ class Args:
             object.__setattr__(self, "output", Path("results") / folder)
         if self.count < 2:
             raise ValueError(f"--episodes must be at least 2, got {self.flights}")
-        if self.env_id not in TRACKING:
-            raise ValueError(f"ENV_ID must be a task of tracking, got {self.env_id!r}")
+        known_id("ENV_ID", self.env_id, TRACKING)
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
         if self.matrix and self.recovery:

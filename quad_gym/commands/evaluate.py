@@ -22,12 +22,20 @@ from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
 from quad_gym.analysis.metrics import bootstrap_interval
 from quad_gym.analysis.recording import Tracer
-from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import (
+    require_writable,
+    short_name,
+    text_table,
+    versions,
+    write_csv,
+    write_json,
+)
 from quad_gym.commands.options import (
     EnvId,
     Keywords,
-    SuiteName,
+    OwnSuite,
     free_folder,
+    known_id,
     leave,
     refuse_overwriting,
     sensors_of,
@@ -44,13 +52,14 @@ class Args:
     """Options of the evaluation."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
-    policy: tuple[str, ...] = ("pd", "pretrained")
-    """policies: pd (tuned gains), pd:lab (the report's), pd:FILE.json (of quad-gym tune),
-    pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz)"""
+    policy: tuple[str, ...] = ()
+    """who flies: pd (tuned gains), pd:lab (the report's), pd:FILE.json (of quad-gym tune),
+    pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz); if not
+    given, pd, and pretrained where it fits"""
     observation: tuple[str, ...] = ("truth", "estimate")
-    """what to fly on: estimate, truth, noisy"""
-    sensors: SuiteName | None = None
-    """if not given, the task's own, which for most is standard"""
+    """what to fly on: truth, estimate, noisy, or sensors (raw measurements, for policies that have
+    learned on them)"""
+    sensors: OwnSuite = None
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false gnss_rate=10"""
     episodes: int = 1000
@@ -80,26 +89,43 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
         OSError: If nothing can be written to the folder.
         ImportError: If a package is missing.
     """
-    if args.env_id not in IDS:
-        raise ValueError(f"ENV_ID must be one of {', '.join(IDS)}, got {args.env_id!r}")
+    known_id("ENV_ID", args.env_id)
     for name, least in (("episodes", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    if not args.observation:
+        raise ValueError("--observation must name at least one, got none")
     first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     if args.output is None and not args.overwrite:
         folder = free_folder(folder, "summary.json")
     refuse_overwriting(folder / "summary.json", args.overwrite)
+    policies = args.policy or default_policies(args)
     cases: dict[Case, tuple[Policy, Any]] = {}
     for observation in args.observation:
-        for name in args.policy:
+        for name in policies:
             env = make_flights(args, observation, args.episodes, name)
             cases[name, observation] = (load_policy(name, env), env)
     require_writable("--output", folder)
     if args.video != "none":
         checked_video_path(folder / f"video.{args.video}")
     return cases, folder
+
+
+def default_policies(args: Args) -> tuple[str, ...]:
+    """Tuned PD control, and the policy that ships, unless none does or it does not fit.
+
+    Raises:
+        ValueError: If an option is invalid.
+    """
+    load_policy("pd", make_flights(args, args.observation[0], 1, "pd"))
+    try:
+        load_policy("pretrained", make_flights(args, args.observation[0], 1, "pretrained"))
+    except ValueError as error:
+        print(f"PD control flies alone: {error}.")
+        return ("pd",)
+    return ("pd", "pretrained")
 
 
 def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
@@ -129,7 +155,7 @@ def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path
         env = make_flights(args, observation, 1, name)
         about = {"env_id": args.env_id, "policy": name, "observation": observation}
         flight = flight_of(load_policy(name, env), env, seed=args.seed, about=about)
-        stem = _short(name).replace("/", "_").replace(":", "_")
+        stem = short_name(name).replace("/", "_").replace(":", "_")
         files.append(folder / f"video_{stem}_{observation}.{args.video}")
         save_video(flight, files[-1])
     return files
@@ -142,7 +168,7 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
     rows = []
     for (name, observation), episodes in results.items():
         found = episodes.summary()
-        row = [f"{_short(name)} on {observation}"]
+        row = [f"{short_name(name)} on {observation}"]
         if course:
             done = episodes.ending == "last_gate"
             steps = episodes.lengths[done].sum() / max(int(done.sum()), 1)
@@ -152,7 +178,8 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
                 f"{seconds:.2f} s" if any(done) else "-",
             ]
         else:
-            row += [_with_interval(episodes.mean_error), f"{1e3 * found['late_error']:.1f}"]
+            late = f"{1e3 * found['late_error']:.1f}"
+            row += [_with_interval(episodes.mean_error), "-" if late == "nan" else late]
         rows.append(
             [
                 *row,
@@ -176,12 +203,6 @@ def _with_interval(values: Any) -> str:
         return f"{1e3 * values.mean():.1f}"
     low, high = bootstrap_interval(values)
     return f"{1e3 * values.mean():.1f} [{1e3 * low:.1f}, {1e3 * high:.1f}]"
-
-
-def _short(name: str) -> str:
-    """A policy's name for the table: of a file, its folder and its name."""
-    path = Path(name)
-    return f"{path.parent.name}/{path.stem}" if path.suffix else name
 
 
 def write(
@@ -211,7 +232,7 @@ def write(
         write_csv(folder / "episodes.csv", columns),
         write_json(folder / "summary.json", summary),
     ]
-    labels = {case: f"{_short(case[0])} on {case[1]}" for case in results}
+    labels = {case: f"{short_name(case[0])} on {case[1]}" for case in results}
     figures = {
         "paths": paths_figure({labels[c]: t.trace(0) for c, t in tracers.items()}),
         "errors": error_over_time_figure(

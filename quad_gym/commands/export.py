@@ -40,7 +40,7 @@ class Args:
         Annotated[
             str | None,
             tyro.conf.arg(
-                metavar="ENV_ID",
+                metavar="[ENV_ID]",
                 help="what the policy flies; if not given, as its training record says",
             ),
         ]

@@ -15,7 +15,8 @@ program.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -31,7 +32,8 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
     EnvId,
     Keywords,
-    SuiteName,
+    OwnSuite,
+    known_id,
     leave,
     sensors_of,
     usage_errors,
@@ -69,8 +71,7 @@ class Args:
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as control_rate=100 estimator=ekf"""
 
-    sensors: SuiteName | None = None
-    """if not given, the task's own, which for most is standard"""
+    sensors: OwnSuite = None
     camera: bool = True
     """measure with the camera, if the suite has one"""
     gnss_rate: float | None = None
@@ -134,8 +135,7 @@ def check_options(args: Args) -> None:
         ValueError: If one does.
         ImportError: If a library that draws or writes a file is not installed.
     """
-    if args.env_id not in IDS:
-        raise ValueError(f"ENV_ID must be one of {', '.join(IDS)}, got {args.env_id!r}")
+    known_id("ENV_ID", args.env_id)
     for name in ("speed", "fps"):
         value = getattr(args, name)
         if not (math.isfinite(value) and value > 0.0):
@@ -292,6 +292,11 @@ def write(flight: Flight, path: Path, args: Args) -> list[Path]:
         recording.save(path)
         recording.disconnect()  # which completes the file
         return [path]
+
+    def progress(times: Iterable[float]) -> Iterator[float]:
+        yield from tqdm(times, desc="drawing", unit=" pictures")
+        print(f"encoding {path} ...", file=sys.stderr, flush=True)
+
     video = save_video(
         flight,
         path,
@@ -299,7 +304,7 @@ def write(flight: Flight, path: Path, args: Args) -> list[Path]:
         size=args.size,
         fps=args.fps,
         speed=args.speed,
-        progress=lambda times: tqdm(times, desc="drawing", unit=" pictures"),
+        progress=progress,
     )
     return [video, flight.save(path.with_suffix(".npz"))] if args.replay is None else [video]
 

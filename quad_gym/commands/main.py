@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from quad_gym.commands.options import USAGE_ERROR, parse
+from quad_gym.params.checks import did_you_mean
 
 COMMANDS = {
     "circle": "fly the laboratory's experiment over many seeds: tables and figures",
@@ -54,8 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if not words or words[0] not in COMMANDS:
         got = f"got {words[0]!r}" if words else "none given"
+        meant = did_you_mean(words[0], COMMANDS) if words else ""
         print(
-            f"{PROGRAM}: error: the command must be one of {', '.join(COMMANDS)}, {got} "
+            f"{PROGRAM}: error: the command must be one of {', '.join(COMMANDS)}, {got}{meant} "
             "(--help explains them)",
             file=sys.stderr,
         )

@@ -6,18 +6,21 @@ custom on Unix.
 """
 
 import ast
+import os
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
+from quad_gym.commands.help_texts import registry, wrapped
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
 USAGE_ERROR = 2
@@ -55,7 +58,18 @@ def parse(
         elif equals or given:
             unnamed.append(value if equals else given.pop(0))
     words = unnamed + words  # first, as an option before them may take any number of words
-    return tyro.cli(kind, args=words, description=description, prog=program)
+    try:
+        if {"-h", "--help"} & set(words):
+            words = ["--help"]  # with others, tyro leaves out what they give
+            if description:  # of which it would join the lines, and wrap none
+                print(wrapped(description))
+                description = ""
+        return tyro.cli(
+            kind, args=words, description=description, prog=program, registry=registry()
+        )
+    except BrokenPipeError:  # nobody reads the help to its end, as of `--help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
 
 
 @contextmanager
@@ -70,7 +84,8 @@ def usage_errors(
     try:
         yield
     except kinds as error:
-        print(f"error: {error}", file=sys.stderr)
+        missing = isinstance(error, FileNotFoundError) and error.filename
+        print(f"error: {f'there is no {missing}' if missing else error}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
 
 
@@ -184,6 +199,32 @@ def full_id(name: str) -> str:
     return _ID_OF_TASK.get(name, name)
 
 
+def one_of(ids: Iterable[str]) -> str:
+    """The help of an option that chooses among ids."""
+    ids = list(ids)
+    return f"what to fly: {', '.join(IDS[env_id] for env_id in ids)}, or an id such as {ids[0]}"
+
+
+def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
+    """The id that is given, as it is or by its short name.
+
+    Args:
+        name: Of the argument.
+        given: Its value.
+        ids: Those that it may be.
+
+    Raises:
+        ValueError: If it is none of them.
+    """
+    found, ids = full_id(given), tuple(ids)
+    if found not in ids:
+        raise ValueError(
+            f"{name} must be one of {', '.join(ids)}, got {given!r}"
+            + did_you_mean(given, (*ids, *(IDS[env_id] for env_id in ids)))
+        )
+    return found
+
+
 EnvId = tyro.conf.Positional[
     Annotated[
         str,
@@ -192,12 +233,15 @@ EnvId = tyro.conf.Positional[
             metavar="ENV_ID",
             instance_from_str=lambda words: full_id(words[0]),
             is_instance=lambda value: isinstance(value, str),
-            str_from_instance=lambda value: [value],
+            str_from_instance=lambda value: [IDS.get(value, value)],
         ),
-        tyro.conf.arg(help=f"what to fly: {', '.join(IDS)}, or short: {', '.join(_ID_OF_TASK)}"),
+        tyro.conf.arg(help=one_of(IDS)),
     ]
 ]
 """The id of an environment, or its task, given without the option's name."""
+
+TrackingId = Annotated[EnvId, tyro.conf.arg(help=one_of(TRACKING))]
+"""The same, of tasks in which a reference is followed."""
 
 Episodes = Annotated[int, tyro.conf.arg(name="episodes")]
 """How many are flown."""
@@ -210,6 +254,15 @@ FilterStart = tyro.conf.arg(name="filter-start")
 
 SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(ALL_SUITES)}")]
 """The name of a sensor suite."""
+
+OwnSuite = Annotated[
+    str | None,
+    tyro.conf.arg(
+        help=f"sensor suite: {', '.join(ALL_SUITES)}; if not given, the task's own, which for most "
+        "is standard"
+    ),
+]
+"""The name of a sensor suite, or None for the task's own."""
 
 SuiteNames = Annotated[
     tuple[str, ...], tyro.conf.arg(help=f"sensor suites, of {', '.join(SUITES)}")

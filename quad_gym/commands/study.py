@@ -19,10 +19,11 @@ import time
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
+from tyro.conf import arg
 
 from baselines.arms import Arm
 from baselines.keeping import EVALUATIONS, RunError
@@ -32,7 +33,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
-from quad_gym.commands.options import EnvId, Keywords, leave, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, known_id, leave, one_of, usage_errors
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
@@ -40,6 +41,7 @@ from quad_gym.commands.study_tasks import STUDIED, WITHIN, StudiedTask, stays
 from quad_gym.commands.study_words import conclusions
 from quad_gym.params import checks as check
 
+STUDIED_IDS = tuple(env_id for env_id, task in IDS.items() if task in STUDIED)
 QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 
 
@@ -47,7 +49,7 @@ QUICK_SEEDS, QUICK_EPISODES, QUICK_STEPS = 2, 100, 300_000
 class Args:
     """Options of the study."""
 
-    env_id: EnvId = "QuadGym/LookAround-v0"
+    env_id: Annotated[EnvId, arg(help=one_of(STUDIED_IDS))] = "QuadGym/LookAround-v0"
     arms: tuple[str, ...] = ()
     """names of arms; if not given, those that carry the conclusions, or all of --arms-file"""
     arms_file: Path | None = None
@@ -87,10 +89,8 @@ def studied(args: Args) -> StudiedTask:
     Raises:
         ValueError: If it is not studied, or an option does not belong to it.
     """
-    ids = {env_id: task for env_id, task in IDS.items() if task in STUDIED}
-    if args.env_id not in ids:
-        raise ValueError(f"ENV_ID must be one of {', '.join(ids)}, got {args.env_id!r}")
-    about = STUDIED[ids[args.env_id]]
+    known_id("ENV_ID", args.env_id, STUDIED_IDS)
+    about = STUDIED[IDS[args.env_id]]
     if args.success_within is None:
         return about
     within = check.positive("--success-within", args.success_within)

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from quad_gym import IDS
-from quad_gym.commands.options import Keywords, leave, usage_errors, value_of
+from quad_gym.commands.options import Keywords, full_id, leave, usage_errors, value_of
 from quad_gym.params import checks as check
 
 
@@ -32,7 +32,7 @@ class Args:
         Annotated[Path | None, tyro.conf.arg(help="what to train, in TOML: see docs/sweeps.md")]
     ] = None
     env_ids: tuple[str, ...] = ()
-    """ids of environments; if not given, QuadGym/Circle-v0"""
+    """what to fly: ids of environments, or their short names; if not given, circle"""
     arms: tuple[str, ...] = ()
     """names of arms, as quad-gym study has them; if not given, the environment as --env has it"""
     arms_file: Path | None = None
@@ -89,7 +89,7 @@ def configure(args: Args) -> tuple[list[Any], Path]:
         check.whole("--jobs", args.jobs)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], {"threads": "--threads"})
-    name = IDS.get(given["env_ids"][0], "") if given.get("env_ids") else "circle"
+    name = IDS.get(full_id(given["env_ids"][0]), "") if given.get("env_ids") else "circle"
     name = name if args.file is None else args.file.stem
     folder = args.output or Path("results/sweep") / name
     trainings = expand(given, _arms(given, args), folder, threads=args.threads)

@@ -14,6 +14,7 @@ from baselines.keeping import has_checkpoint
 from baselines.plans import Plan, description
 from baselines.recipes import Recipe, recipe
 from quad_gym import IDS
+from quad_gym.commands.options import known_id
 from quad_gym.params import checks as check
 
 RECORD = "training.json"
@@ -119,7 +120,7 @@ def expand(
     """
     spec = Spec(**given)
     groups = [
-        (env_id, arm, dict(axes))
+        (known_id("env_ids", env_id), arm, dict(axes))
         for env_id in _listed("env_ids", spec.env_ids)
         for arm in _listed("arms", spec.arms) or [None]
         for axes in _products(spec)
@@ -127,7 +128,6 @@ def expand(
     found = []
     for seed in _seeds(spec.seeds):
         for env_id, arm, axes in groups:
-            check.choice("env_ids", env_id, tuple(IDS))
             plan = _plan(spec, env_id, None if arm is None else arms[arm], axes, seed, threads)
             name = _name(spec, env_id, arm, axes)
             found.append(Training(name, plan, folder / "runs" / name / f"seed_{seed}"))

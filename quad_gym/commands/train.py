@@ -2,12 +2,15 @@
 
     quad-gym train QuadGym/Circle-v0
     quad-gym train QuadGym/Hover-v0 --algorithm sac --seed 3 --env observation=truth
+    quad-gym train circle --engine compiled
+    quad-gym train circle --resume
 
-The hyper-parameters are those of baselines/recipes.py for the task and the algorithm. While
+The hyperparameters are those of baselines/recipes.py for the task and the algorithm. While
 training, the policy is evaluated on the task itself, by its true position error, and kept: last.zip
-and best.zip (.npz with --engine compiled), which quad-gym evaluate flies, with training.json
-(everything needed to repeat the run), evaluations.csv, and TensorBoard's files. A run that was
-interrupted, by Ctrl-C or otherwise, continues with --resume, exactly from its last evaluation.
+and best.zip (.npz with --engine compiled), which quad-gym evaluate flies. Beside them are
+training.json (everything needed to repeat the run), evaluations.csv, and TensorBoard's files. A run
+that was interrupted, by Ctrl-C or otherwise, continues exactly from its last evaluation with
+--resume.
 """
 
 import importlib.util
@@ -18,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import IDS
-from quad_gym.commands.options import EnvId, Keywords, flying_options, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, flying_options, known_id, usage_errors
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class Args:
     algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
     """how to learn"""
     engine: Literal["sb3", "compiled"] = "sb3"
-    """what trains: Stable-Baselines3, or the compiled PPO, some times faster and without torch"""
+    """what trains: Stable-Baselines3, or the compiled PPO, which is several times faster
+    and needs no torch"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=rtk camera=false"""
     steps: int | None = None
@@ -73,6 +77,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     from baselines.recipes import recipe
     from quad_gym.analysis.reports import require_writable
 
+    known_id("ENV_ID", args.env_id)
     chosen = recipe(args.env_id, args.algorithm)
     given = {"steps": args.steps, "n_envs": args.n_envs}
     chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})

@@ -35,7 +35,9 @@ from quad_gym.commands.options import (
     SuiteName,
     flying_options,
     full_id,
+    known_id,
     leave,
+    one_of,
     refuse_overwriting,
     usage_errors,
 )
@@ -58,7 +60,8 @@ class Args:
     FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--start": "--gains", "--tasks": "--env-ids"}
 
     env_ids: Annotated[
-        tuple[str, ...], arg(help=f"what to fly: {', '.join(TRACKING)}, or short, as circle")
+        tuple[str, ...],
+        arg(help=f"{one_of(TRACKING)}; if not given, all of them", help_behavior_hint=""),
     ] = TRACKING
     observation: Literal["estimate", "truth", "noisy"] = "estimate"
     """what control sees"""
@@ -194,9 +197,8 @@ def configure(args: Args) -> Search:
         ValueError: If an option is invalid.
         OSError: If nothing can be written to the folder.
     """
-    for env_id in map(full_id, args.env_ids):
-        if env_id not in TRACKING:
-            raise ValueError(f"--env-ids must be among {', '.join(TRACKING)}, got {env_id!r}")
+    for env_id in args.env_ids:
+        known_id("--env-ids", env_id, TRACKING)
     for name, least in (("candidates", 1), ("episodes", 1), ("fresh_episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             option_name = name.replace("_", "-")

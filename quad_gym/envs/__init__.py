@@ -63,8 +63,15 @@ def keywords_of(env_id: str) -> dict[str, Any]:
     if spec is None or spec.entry_point != _ENTRY_POINTS["entry_point"]:
         raise ValueError(
             f"env_id must be one of {', '.join(IDS)}, or of register_task, got {env_id!r}"
+            + check.did_you_mean(env_id, (*IDS, *_registered()))
         )
     return dict(spec.kwargs)
+
+
+def _registered() -> list[str]:
+    """The ids of `register_task`."""
+    ours = _ENTRY_POINTS["entry_point"]
+    return [env_id for env_id, spec in registry.items() if spec.entry_point == ours]
 
 
 def make_sb3_vec_env(

@@ -22,6 +22,7 @@ from quad_gym.faults import (
     SensorLoss,
     WrongAssociations,
 )
+from quad_gym.params import checks as check
 from quad_gym.params.sensors import AID_PARAMS, SensorSuite
 from quad_gym.records import FAULT_KINDS
 
@@ -111,10 +112,8 @@ def _named(names: str, sensors: SensorSuite) -> Iterable[Fault]:
         if name == ALL:
             everything = (fault for preset in PRESETS.values() for fault in preset)
             yield from (fault for fault in everything if _possible(fault, sensors))
-        elif name in PRESETS:
-            yield from PRESETS[name]
         else:
-            raise ValueError(f"faults must be one of {', '.join([*PRESETS, ALL])}, got {name!r}")
+            yield from PRESETS[check.choice("faults", name, (*PRESETS, ALL))]
 
 
 def _possible(fault: Fault, sensors: SensorSuite) -> bool:

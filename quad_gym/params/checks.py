@@ -30,10 +30,25 @@ class NotResetError(RuntimeError, ValueError):
 def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
     """Refuse the first of `given` that is not `known`, and name the one that may be meant."""
     for name in sorted(set(given) - set(known)):
-        close = difflib.get_close_matches(name, known, n=1)
-        meant = f"did you mean {close[0]}?" if close else f"it takes {', '.join(known)}"
+        close = closest(name, known)
+        meant = f"did you mean {close}?" if close else f"it takes {', '.join(known)}"
         words = f"unexpected keyword argument '{name}'"  # Python's, for which libraries look
         raise UnknownKeywordError(f"{name} is not a keyword of {of} ({words}); {meant}")
+
+
+def closest(name: Any, known: Iterable[str]) -> str | None:
+    """The one of `known` that a misspelt name may stand for, whatever its case; None: none."""
+    if not isinstance(name, str):
+        return None
+    by_case = {word.lower(): word for word in known}
+    close = difflib.get_close_matches(name.lower(), by_case, n=1)
+    return by_case[close[0]] if close else None
+
+
+def did_you_mean(name: Any, known: Iterable[str]) -> str:
+    """The end of a message that refuses a name: the one that may be meant, if there is one."""
+    close = closest(name, known)
+    return f"; did you mean {close}?" if close else ""
 
 
 def _no_number(value: Any) -> bool:
@@ -124,7 +139,10 @@ def instance(name: str, value: Any, kind: type) -> None:
 def choice(name: str, value: Any, choices: Sequence[str]) -> str:
     """`value`, if it is one of `choices`."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        raise ValueError(
+            f"{name} must be one of {', '.join(choices)}, got {value!r}"
+            + did_you_mean(value, choices)
+        )
     return str(value)
 
 

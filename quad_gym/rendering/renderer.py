@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.analysis.reports import short_name
 from quad_gym.flights.record import Flight
 from quad_gym.flights.stage import Stage
 from quad_gym.params import checks as check
@@ -134,8 +135,9 @@ class Renderer:
                 entries.append((words, PURPLE))
         elif stage.observation == "noisy":
             entries.append(("what the controller sees", VERMILLION))
-        warnings = self._warnings(flight)
-        lines = [title, *[words for words, _ in entries], *warnings]
+        policy, warnings = flight.about.get("policy"), self._warnings(flight)
+        flown_by = [f"flown by {short_name(str(policy))}"] if policy else []
+        lines = [title, *flown_by, *[words for words, _ in entries], *warnings]
         width = 26 + max(
             canvas.width_of(words, large if k == 0 else small) for k, words in enumerate(lines)
         )
@@ -147,6 +149,9 @@ class Renderer:
         canvas.text(title, x, y, large)
         canvas.text(clock, 6 + width - 6, y, large, INK, 1.0)
         y += canvas.line_height(large) + 2
+        for words in flown_by:
+            canvas.text(words, x, y, small)
+            y += step
         for words, color in entries:
             if color == PURPLE:
                 canvas.text("x", x + 1, y - 1, small, color)

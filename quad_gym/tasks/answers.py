@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.params.checks import did_you_mean
+from quad_gym.tasks.fields import VIEW_FIELDS
+from quad_gym.tasks.lazy import Group
 from quad_gym.tasks.task import Task, TaskError, label
 
 Floats = NDArray[np.float64]
@@ -28,7 +31,19 @@ def ask(task: Task, method: str, *arguments: Any) -> Any:
     except Exception as error:
         raise TaskError(
             f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
+            + _meant(error)
         ) from error
+
+
+def _meant(error: Exception) -> str:
+    """The end of a message about an attribute that there is not: the one that may be meant."""
+    if not isinstance(error, AttributeError) or error.name is None:
+        return ""
+    if isinstance(error.obj, Group):  # in another group?
+        for field in VIEW_FIELDS:
+            if field.name.rpartition(".")[2] == error.name:
+                return f"; did you mean view.{field.name}?"
+    return did_you_mean(error.name, [name for name in dir(error.obj) if name[0] != "_"])
 
 
 def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]:

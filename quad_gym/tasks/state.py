@@ -50,6 +50,9 @@ class State:
     def __setattr__(self, name: str, value: Any) -> None:
         self.__getattr__(name)[:] = value
 
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self._arrays]  # from which Python suggests names
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._arrays)
 

@@ -10,6 +10,7 @@ import pytest
 import quad_gym
 from quad_gym.commands.benchmark import against, interfaces, learning, rendering, stages
 from quad_gym.commands.benchmark import main as script
+from quad_gym.commands.benchmark.timing import Timing, by_turns
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.kernels.compiling.stages import needed_stages
@@ -75,6 +76,14 @@ def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
     assert set(ticks - ticks.min()) == set(range(40))
     batch.restore(blocks)
     assert batch.read("position_valid").mean() == pytest.approx(1 / 20, abs=0.02)
+
+
+def test_what_takes_turns_is_timed_by_turns():
+    order, slow, fast = [], iter([4.0, 2.0, 3.0]), iter([1.0, 1.0, 1.5])
+    jobs = [lambda: order.append("slow") or next(slow), lambda: order.append("fast") or next(fast)]
+    timings = by_turns(jobs, 3, order.append)
+    assert order == [0, "slow", "fast", 1, "slow", "fast", 2, "slow", "fast"]
+    assert timings == [Timing(2.0, 0.5), Timing(1.0, 0.0)]
 
 
 def test_the_rendering_section_has_every_task_and_view(tmp_path, capsys, monkeypatch):

@@ -3,20 +3,26 @@
 import csv
 import json
 import os
+import signal
 import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from quad_gym.commands import compare as command
+from quad_gym.commands import evaluate
 from tests import console_commands
 from tests.console import plain
 from tests.console_commands import run
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def read_csv(file):
@@ -51,6 +57,38 @@ def test_evaluate_writes_what_it_prints(tmp_path):
             assert (tmp_path / f"out/{name}.{ending}").stat().st_size > 1000
 
 
+def test_evaluate_flies_what_there_is(tmp_path, capsys):
+    few = ("--episodes", 2, "--observation", "truth", "--env", "duration=0.2")
+    done = run("evaluate", "trajectory", *few, where=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = "PD control flies alone: no policy ships for QuadGym/Trajectory-v0"
+    assert done.stdout.startswith(told)
+    assert "pd on truth" in done.stdout
+    for args, told, policies in (
+        (("QuadGym/OutageDash-v0",), "no policy ships for QuadGym/OutageDash-v0", ["pd"]),
+        (("QuadGym/Circle-v0", {"action": "attitude"}), "trained with action ctbr", ["pd"]),
+        (("QuadGym/Circle-v0",), "", ["pd", "pretrained"]),
+    ):
+        env_id, env = args[0], dict(*args[1:])
+        folder = tmp_path / "made"
+        cases, _ = evaluate.configure(
+            evaluate.Args(env_id=env_id, env=env, observation=("truth",), output=folder, episodes=2)
+        )
+        assert [name for name, _ in cases] == policies
+        assert told in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("asked", [("pretrained",), ("pd", "pretrained")])
+def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path, asked):
+    done = run("evaluate", "trajectory", "--policy", *asked, where=tmp_path)
+    assert done.returncode == 2
+    assert "error: no policy ships for QuadGym/Trajectory-v0" in done.stderr
+    wrong = run("evaluate", "circle", "--env", "acton=motor", where=tmp_path)
+    assert wrong.returncode == 2
+    assert "did you mean action?" in wrong.stderr
+    assert "alone" not in wrong.stdout
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -58,6 +96,18 @@ def test_evaluate_writes_what_it_prints(tmp_path):
         (["--policy", "nobody"], "policy must be pd"),
         (["--policy", "missing.zip"], "there is no policy"),
         (["--observation", "guess"], "observation must be one of"),
+        (["--observation", "estimat"], "did you mean estimate?"),
+        (
+            ["--policy", "pretrained", "--env", "include_covariance=true"],
+            "trained with observations of 9 fields, and the environment gives 14 (it adds "
+            "position_sigma, velocity_sigma, attitude_sigma, accel_bias_sigma, gyro_bias_sigma):",
+        ),
+        (
+            ["--policy", "pretrained", "--env", "layout=absolute"],
+            "and the environment gives 13 (it lacks position_error, velocity_error, up, heading "
+            "and adds position, ",
+        ),
+        (["--observation"], "--observation must name at least one"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--policy", "pretrained", "--env", "action=motor"], "trained with action ctbr"),
         (["QuadGym/Hover-v0", "--policy", "pretrained", "--env", "wings=2"], "wings is not"),
@@ -90,7 +140,7 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     (tmp_path / "out/runs/standard/truth/seed_0/flown_on_truth.npz").unlink()
     before = kept.stat().st_mtime_ns
     with monkeypatch.context() as patch:  # no further process that imports torch
-        patch.setattr(command, "ProcessPoolExecutor", lambda jobs, _: ThreadPoolExecutor(jobs))
+        patch.setattr(command, "ProcessPoolExecutor", lambda jobs, *_: ThreadPoolExecutor(jobs))
         again = compare(tmp_path)
     assert again.returncode == 0, again.stderr
     assert kept.stat().st_mtime_ns == before
@@ -121,6 +171,46 @@ def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_no_process(tm
         assert not record["finished"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_processes_end_with_the_comparison_however_that_ends(tmp_path, number):
+    (tmp_path / "driver.py").write_text(DRIVER)
+    process = subprocess.Popen(
+        [sys.executable, "driver.py"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        start_new_session=True,
+    )
+    wait_until((tmp_path / "busy").exists, seconds=100.0)
+    process.send_signal(number)
+    assert process.wait(timeout=60) == -number
+    wait_until(lambda: nobody_is_in_group(process.pid), seconds=60.0)
+
+
+DRIVER = """
+import multiprocessing, time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+
+def begin():
+    from quad_gym.commands.compare import end_with_parent
+
+    end_with_parent()
+
+
+def work():
+    Path("busy").touch()
+    time.sleep(1000.0)
+
+
+if __name__ == "__main__":
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin)
+    pool.submit(work)
+    pool.submit(work)
+    time.sleep(1000.0)
+"""
+
+
 def wait_until(condition, seconds=1200.0):
     end = time.monotonic() + seconds
     while not condition():
@@ -138,7 +228,7 @@ def nobody_is_in_group(group):
 
 def test_compare_refuses_nonsense(tmp_path):
     for more, message in (
-        (["QuadGym/Waypoints-v0"], "task of tracking"),
+        (["QuadGym/Waypoints-v0"], "ENV_ID must be one of QuadGym/Hover-v0"),
         (["--sensors", "sonar"], "sensors must be one of"),
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--env", "observation=truth"], "leave observation"),

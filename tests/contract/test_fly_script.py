@@ -38,8 +38,10 @@ def test_a_flight_becomes_a_video_with_its_numbers_beside_it(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "time limit after 1.00 s" in done.stdout
     assert "Wrote new/hover.gif" in done.stdout
+    assert done.stderr.index("drawing: 100%") < done.stderr.index("encoding new/hover.gif ...")
     flight = Flight.load(tmp_path / "new" / "hover.npz")
     assert (len(flight), flight.about["seed"], flight.about["task"]) == (51, 4, "hover")
+    assert flight.about["policy"] == "pd"
 
     done = fly("--replay", "new/hover.npz", *size, "--output", "again.gif", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -97,6 +99,12 @@ def test_faults_come_and_go_at_the_given_time(tmp_path):
         (("--size", 10, 10, "--output", "a.gif"), "render_size"),
         (("--replay", "nowhere.npz"), "nowhere.npz"),
         (("--policy", "me"), "policy must be"),
+        (("--policy", "pretraind"), "did you mean pretrained?"),
+        (("--sensors", "standart"), "did you mean standard?"),
+        (("--fault", "gnss_outtage"), "did you mean gnss_outage?"),
+        (("circel",), "did you mean circle?"),
+        (("--env", "worl=calm"), "did you mean world?"),
+        (("--env", "world=clam"), "did you mean calm?"),
         (("--gnss-rate", 77), "gnss_rate"),
         (("--duration", 0), "--duration"),
     ],

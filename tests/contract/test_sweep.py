@@ -126,7 +126,7 @@ def test_an_invalid_file_gets_one_clear_line(tmp_path, text, message):
         (["--retries", "-1"], "--retries must be at least 0"),
         (["--threads", "0"], "threads must be at least 1"),
         (["--options", "mem_gb=4"], "--options are of slurm and ray"),
-        (["nowhere.toml"], "No such file"),
+        (["nowhere.toml"], "there is no nowhere.toml"),
     ],
 )
 def test_wrong_options_end_the_sweep_before_it_begins(tmp_path, options, message):

@@ -37,7 +37,7 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--env-ids", "QuadGym/Waypoints-v0"], "--env-ids must be among"),
+        (["--env-ids", "QuadGym/Waypoints-v0"], "--env-ids must be one of"),
         (["--candidates", "0"], "--candidates must be at least 1"),
         (["--env", "sensors=rtk"], "leave sensors to --sensors"),
         (["--sensors", "sonar"], "sensors must be one of"),

@@ -224,6 +224,20 @@ def test_a_view_knows_faults_by_name():
     assert all(active.all() for active in view.truth.faults.values())
 
 
+def test_errors_tell_python_which_names_it_may_suggest():
+    _, view = flown(steps=1)
+    for group, misspelt, meant in (
+        (view, "positon", "position"),
+        (view, "reference_postion", "reference_position"),
+        (view.seen, "velocty", "velocity"),
+        (view.estimate, "covarance", "covariance"),
+    ):
+        with pytest.raises(AttributeError) as caught:
+            getattr(group, misspelt)
+        assert (caught.value.name, caught.value.obj) == (misspelt, group)
+        assert meant in dir(group)
+
+
 def test_without_a_filter_the_estimate_says_what_is_missing():
     _, view = flown(observation="truth")
     with pytest.raises(ValueError, match=r"view.estimate needs a filter"):

@@ -1,6 +1,8 @@
 """From dataclasses to command lines."""
 
 import shlex
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,10 +14,12 @@ from quad_gym.commands.options import (
     Keywords,
     SuiteNames,
     flying_options,
+    known_id,
     leave,
     parse,
     usage_errors,
 )
+from quad_gym.envs import IDS
 from tests.console import plain
 
 
@@ -75,8 +79,79 @@ def test_help_has_description_defaults_and_texts(capsys):
     for part in ("What it does.", "(default: 10)", "(default: 1.0 2.0)", "--no-camera"):
         assert part in text
     assert "50 % of the other if not given" in text
-    assert "QuadGym/Waypoints-v0" in text
+    assert "random_trajectory, waypoints, " in text
+    assert "or an id such as QuadGym/Hover-v0 (default: circle)" in text
     assert "consumer" in text
+
+
+def test_help_reads_as_people_write(capsys):
+    with pytest.raises(SystemExit):
+        parse(Args, ["--help"], program="it")
+    text = plain(capsys.readouterr().out)
+    assert "None" not in text
+    assert "(default: )" not in text
+    assert "--rate FLOAT rate [Hz]; 50 % of the other if not given --gains" in text
+    assert "--output PATH folder --sensors NAME ... sensor suites" in text
+    assert "--camera, --no-camera see (default: yes)" in text
+
+
+def test_help_wraps_paragraphs_and_keeps_examples_as_they_are(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    example = "    it circle --kind b --seeds 3 --rate 2.5 --gains 3 4 --no-camera --output some"
+    text = f"What it does.\n\n{example}\n    it hover\n\n" + "many\nwords " * 40
+    with pytest.raises(SystemExit) as end:
+        parse(Args, ["hover", "--help"], description=text, program="it")
+    assert end.value.code == 0
+    told = capsys.readouterr().out
+    assert told.startswith(f"What it does.\n\n{example}\n    it hover\n\nmany words many")
+    lines = told.splitlines()
+    assert max(len(line) for line in lines if line != example) <= 60
+    assert "what to fly" in told  # although an id is given
+
+
+def test_help_that_nobody_reads_to_its_end_is_no_error():
+    script = "from quad_gym.commands.main import main; main(['train', '--help'])"
+    line = [sys.executable, "-c", script]
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.close()
+    process.wait(timeout=100)
+    assert process.stderr.read() == ""
+    process.stderr.close()
+
+
+def test_a_file_that_is_not_there_is_named(capsys, tmp_path):
+    with pytest.raises(SystemExit), usage_errors():
+        (tmp_path / "plan.toml").read_text()
+    assert capsys.readouterr().err == f"error: there is no {tmp_path / 'plan.toml'}\n"
+
+
+def test_what_may_be_left_out_has_the_errors_of_what_it_is(capsys):
+    for line, told in (("--rate x", "--rate: must be a number, got 'x'"), ("--seeds 1.5", "whole")):
+        with pytest.raises(SystemExit):
+            parse(Args, line.split(), program="it")
+        message = plain(capsys.readouterr().err)
+        assert told in message
+        assert "None" not in message
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("circel", "circle"),
+        ("Circle", "circle"),
+        ("QuadGym/Cirle-v0", "QuadGym/Circle-v0"),
+        ("lookaround", "look_around"),
+    ],
+)
+def test_a_misspelt_id_is_refused_with_the_one_that_may_be_meant(given, meant):
+    with pytest.raises(ValueError, match=rf"ENV_ID must be one of .*; did you mean {meant}\?$"):
+        known_id("ENV_ID", given)
+    assert known_id("ENV_ID", meant) in IDS
+
+
+def test_ids_that_a_command_does_not_fly_are_not_suggested():
+    with pytest.raises(ValueError, match=r"got 'waypoints'$"):
+        known_id("ENV_ID", "waypoints", ["QuadGym/Circle-v0"])
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,15 @@ valid even where times are not.
 
 import json
 import os
-import statistics
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from quad_gym.analysis.reports import text_table
-from quad_gym.commands.benchmark.timing import Effort, Row, percent
+from quad_gym.commands.benchmark.timing import Effort, Row, by_turns, percent
 
 WORKER = Path(__file__).resolve().parent / "worker.py"
 HERE = Path(__file__).resolve().parents[3]
@@ -120,18 +120,14 @@ def time_against(folder: Path, envs: int, threads: int, effort: Effort) -> list[
             try:
                 longest = max(checkout.ask(make=row) for checkout in both)
                 calls = max(1, round(effort.seconds / longest))
-                turns = [
-                    [checkout.ask(calls=calls) / row["envs"] for checkout in both]
-                    for _ in range(max(effort.repeats, FEWEST_TURNS))
-                ]
+                jobs = [partial(checkout.ask, calls=calls) for checkout in both]
+                mine, others = by_turns(jobs, max(effort.repeats, FEWEST_TURNS))
             except RefusedError as error:
                 print(f"  {row['name']}: left out: {error}", file=sys.stderr, flush=True)
                 continue
-            mine, others = zip(*turns, strict=True)
-            best, other = min(mine), min(others)
-            spread = max(statistics.median(mine) / best, statistics.median(others) / other) - 1.0
+            best, other = (timing.per(row["envs"]).best for timing in (mine, others))
             found.append({**row, "seconds": best, "other": other, "ratio": best / other})
-            found[-1]["spread"] = spread
+            found[-1]["spread"] = max(mine.spread, others.spread)
             print(f"  {row['name']}: {best / other:.3f}", file=sys.stderr, flush=True)
     return found
 

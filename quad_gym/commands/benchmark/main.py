@@ -1,5 +1,9 @@
 """Measure what quad_gym costs: filter, tick, options, environments, memory, pictures, compiling.
 
+    quad-gym benchmark
+    quad-gym benchmark --only interfaces --n-envs 256
+    quad-gym benchmark --only compile
+
 Every figure is the best of some repeats, as other load on the machine can only slow it down;
 "spread" is how much longer the median of the repeats took. All ratios are taken within one run.
 

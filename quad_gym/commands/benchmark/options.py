@@ -3,8 +3,6 @@
 Batches take turns, so that other load on the machine slows all of them alike.
 """
 
-import itertools
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +11,7 @@ from typing import Any
 import quad_gym
 from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
+from quad_gym.commands.benchmark.timing import Effort, Row, by_turns, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.suites import SUITES
 from quad_gym.records import Control
@@ -117,18 +115,17 @@ def time_options(count: int, effort: Effort) -> list[Row]:
             batch.step()
         turns[name] = turn_of(batch, batch.step if name in OPTIONS else batch.reset)
     number = max(2, round(effort.repeats * effort.seconds / (TICKS * count * turns[OFF]())))
-    times: dict[str, list[float]] = {name: [] for name in turns}
-    for k, (name, turn) in itertools.product(range(number), turns.items()):
-        if name == OFF and k % 20 == 0:
-            print(f"  turn {k + 1} of {number}", file=sys.stderr, flush=True)
-        times[name].append(turn())
-    off = min(times[OFF])
-    rows = []
-    for name, found in times.items():
-        best = min(found)
-        timing = Timing(best, statistics.median(found) / best - 1.0)
-        rows.append(report(name, timing, times_off=best / off, suite=suite_of(name)))
-    return rows
+
+    def say(turn: int) -> None:
+        if turn % 20 == 0:
+            print(f"  turn {turn + 1} of {number}", file=sys.stderr, flush=True)
+
+    timings = dict(zip(turns, by_turns(turns.values(), number, say), strict=True))
+    off = timings[OFF].best
+    return [
+        report(name, timing, times_off=timing.best / off, suite=suite_of(name))
+        for name, timing in timings.items()
+    ]
 
 
 def suite_of(name: str) -> str:

@@ -1,8 +1,8 @@
 """A task of a user's own in the benchmark: the circle written anew in NumPy, beside what ships."""
 
 import math
-import statistics
-import time
+from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.reports import text_table
 from quad_gym.commands.benchmark.interfaces import random_actions
-from quad_gym.commands.benchmark.timing import Effort, Row, Timing, percent, report
+from quad_gym.commands.benchmark.timing import Effort, Row, by_turns, lasting, percent, report
 from quad_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -73,32 +73,27 @@ def time_own_task(effort: Effort, threads: int) -> list[Row]:
             "control_rate": 50.0,
             "threads": threads,
         }
-        steps = []
+        envs, steps = [], []
         for custom in (None, OwnCircle()):
             more: dict[str, Any] = {} if custom is None else {"custom": custom}
             env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **options, **more)
             env.reset(seed=0)
-            steps.append((env, random_actions(count)))
-        times: list[list[float]] = [[], []]
-        calls = 1
-        for turn in range(4 * effort.repeats):
-            for (env, actions), found in zip(steps, times, strict=True):
-                began = time.perf_counter()
-                for _ in range(calls):
-                    env.step(next(actions))
-                found.append((time.perf_counter() - began) / calls)
-            if turn == 2:  # the first turns warm up
-                calls = max(1, round(effort.seconds / 4.0 / min(times[0])))
-                times = [[], []]
-        for env, _ in steps:
+            envs.append(env)
+            steps.append(partial(_step, env, random_actions(count)))
+        once = by_turns([partial(lasting, step, 1) for step in steps], 3)  # and to warm up
+        calls = max(1, round(effort.seconds / 4.0 / once[0].best))
+        found = by_turns([partial(lasting, step, calls) for step in steps], 4 * effort.repeats)
+        for env in envs:
             env.close()
-        shipped, own = (min(found) for found in times)
-        for name, found, best in (("shipped", times[0], shipped), ("own, in NumPy", times[1], own)):
-            timing = Timing(best, statistics.median(found) / best - 1.0).per(count)
-            rows.append(
-                report(f"circle {name}, {count} flights", timing, envs=count, share=shipped / best)
-            )
+        for name, timing in zip(("shipped", "own, in NumPy"), found, strict=True):
+            share = found[0].best / timing.best
+            label = f"circle {name}, {count} flights"
+            rows.append(report(label, timing.per(count), envs=count, share=share))
     return rows
+
+
+def _step(env: Any, actions: Iterator[Any]) -> None:
+    env.step(next(actions))
 
 
 def own_task_table(rows: list[Row]) -> str:

@@ -3,7 +3,7 @@
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -51,10 +51,38 @@ def measure(
     times = []
     for _ in range(effort.repeats):
         before()
-        began = time.perf_counter()
-        for _ in range(calls):
-            work()
-        times.append((time.perf_counter() - began) / calls)
+        times.append(lasting(work, calls))
+    return _timing(times)
+
+
+def by_turns(
+    jobs: Iterable[Callable[[], float]],
+    turns: int,
+    before: Callable[[int], Any] = lambda turn: None,
+) -> list[Timing]:
+    """Time some jobs that take turns, so that other load on the machine slows all of them alike.
+
+    Args:
+        jobs: Each does its work and returns how long that took [s].
+        turns: Of each job.
+        before: Called with the number of a turn before that.
+    """
+    jobs, times = list(jobs), []
+    for turn in range(turns):
+        before(turn)
+        times.append([job() for job in jobs])
+    return [_timing(own) for own in zip(*times, strict=True)]
+
+
+def lasting(work: Callable[[], Any], calls: int) -> float:
+    """Seconds that one of some calls takes."""
+    began = time.perf_counter()
+    for _ in range(calls):
+        work()
+    return (time.perf_counter() - began) / calls
+
+
+def _timing(times: Sequence[float]) -> Timing:
     best = min(times)
     return Timing(best, statistics.median(times) / best - 1.0)
 

@@ -11,6 +11,7 @@ from quad_gym.kernels.measurements.clock import first_wait
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.follow import draw_path
+from quad_gym.kernels.task.heights import GATE_SPREAD, LOWEST_GATE, RANDOM_RISE
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import (
     COLUMNS,
@@ -70,8 +71,8 @@ def _draw_series(flight, settings, stream, mask):
         n_a, n_b = six_normals(stream, DRAW_SERIES + 3 * k)
         fall = 1.0 / ((k + 1.0) * (k + 1.0))
         rate = (k + 1.0) * omega
-        a = (fall * n_a[0], fall * n_a[1], 0.3 * fall * n_a[2])
-        b = (fall * n_b[0], fall * n_b[1], 0.3 * fall * n_b[2])
+        a = (fall * n_a[0], fall * n_a[1], RANDOM_RISE * fall * n_a[2])
+        b = (fall * n_b[0], fall * n_b[1], RANDOM_RISE * fall * n_b[2])
         keep3(flight.ref_cos[k], mask, a)
         keep3(flight.ref_sin[k], mask, b)
         size = math.sqrt(
@@ -98,7 +99,7 @@ def _draw_gates(flight, settings, stream, mask):
         turn, where = uniform_pair(stream, DRAW_GATES + 1 + 2 * k)
         up, side = uniform_pair(stream, DRAW_GATES + 2 + 2 * k)
         distance = settings.radius * (0.4 + 0.6 * where)
-        height = settings.height * (0.7 + 0.6 * up)
+        height = settings.height * (LOWEST_GATE + GATE_SPREAD * up)
         used = k < settings.gate_count
         s, c = sin_cos(azimuth)
         # places beyond the last gate repeat it, so that the preview ends there
