@@ -262,3 +262,47 @@ def test_a_view_is_of_the_episode_that_the_step_belongs_to():
         rewards = [float(env.step(np.zeros((1, 4)))[1][0]) for _ in range(5)]
         assert sum(b.sum() for _, b in said) == began
         assert rewards == ([1.0, 2.0, 3.0, 1.0, 2.0] if not began else [1.0, 2.0, 3.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        lambda view: view.position,
+        lambda view: view.time[3:],
+        lambda view: view.seen.preview[:2, 1],
+        lambda view: view.R_BI,
+    ],
+)
+def test_arrays_that_a_task_keeps_stay_as_they_were(part):
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    view, kept = env.flights.batch.view, []
+    for _ in range(4):
+        env.step(np.full((FLIGHTS, 4), 0.1))
+        kept.append((part(view), part(view).copy()))
+    for array, before in kept:
+        np.testing.assert_array_equal(array, before)
+    assert len({array.tobytes() for array, _ in kept}) == 4
+
+
+def test_what_nobody_keeps_is_written_to_the_same_memory():
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    places = set()
+    for _ in range(4):
+        env.step(np.zeros((FLIGHTS, 4)))
+        places.add(env.flights.batch.view.position.ctypes.data)
+    assert len(places) == 1
+
+
+def test_progress_is_the_same_after_a_snapshot_has_been_restored():
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
+    instant, progress = batch.snapshot(), []
+    for _ in range(2):
+        for _ in range(3):
+            batch.step(actions)
+            progress.append(batch.view.truth.progress)
+        batch.restore(instant)
+    np.testing.assert_array_equal(progress[:3], progress[3:])

@@ -1,0 +1,98 @@
+"""What a task says of rewards and endings, in results and records, against a plain reference."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Ending
+
+FLIGHTS, STEPS, LIMIT = 13, 60, 40
+
+
+class Said:
+    """Answers of a task, drawn anew for every step."""
+
+    def __init__(self, methods):
+        self.rng, self.methods = np.random.default_rng(7), methods
+
+    def draw(self):
+        rng = self.rng
+        self.reward = rng.normal(size=FLIGHTS)
+        self.terminated, self.truncated = (rng.random(FLIGHTS) < p for p in (0.02, 0.05))
+
+    def task(self):
+        answers = {name: lambda view, name=name: getattr(self, name) for name in self.methods}
+        return quad_gym.Task.of(**answers)
+
+
+def expected_endings(said, plain):
+    """Terminated, truncated and why, from the rules, of what the built-in task says."""
+    crashed = plain.result("terminated") > 0.0
+    late, failed = plain.result("episode_steps") >= LIMIT, plain.result("filter_status") > 0.0
+    terminated = said.terminated if "terminated" in said.methods else crashed
+    truncated = said.truncated if "truncated" in said.methods else late | failed
+    truncated = truncated & ~terminated
+    why = np.where(terminated | truncated, float(Ending.TASK), 0.0)
+    why[truncated & late] = Ending.TIME_LIMIT
+    why[truncated & failed] = Ending.FILTER_FAILED
+    why = np.where(terminated & crashed, plain.result("ending"), why)
+    return terminated, truncated, why
+
+
+@pytest.mark.parametrize(
+    "methods",
+    [
+        ("reward",),
+        ("terminated",),
+        ("truncated", "reward"),
+        ("reward", "terminated", "truncated"),
+    ],
+)
+@pytest.mark.parametrize("per", ["step", "second"])
+def test_results_and_records_say_what_the_task_has_said(methods, per):
+    said = Said(methods)
+    keywords = {"autoreset_mode": "Disabled", "max_episode_steps": LIMIT, "max_tilt": 0.5}
+    keywords["reward_per"] = per
+    own = QuadVectorEnv(FLIGHTS, "hover", custom=said.task(), **keywords)
+    plain = QuadVectorEnv(FLIGHTS, "hover", **keywords)
+    for env in (own, plain):
+        env.reset(seed=5)
+    own, plain = own.flights.batch, plain.flights.batch
+    rng, returns, endings = np.random.default_rng(2), np.zeros(FLIGHTS), set()
+    for _ in range(STEPS):
+        actions = rng.uniform(-0.6, 0.7, (FLIGHTS, 4))
+        said.draw()
+        own.step(actions)
+        plain.step(actions)
+        terminated, truncated, why = expected_endings(said, plain)
+        reward = plain.result("reward")
+        if "reward" in methods:
+            reward = said.reward * (0.02 if per == "second" else 1.0)
+        returns = returns + reward
+        for name, values in {
+            **{"terminated": terminated, "truncated": truncated, "ending": why},
+            **{"reward": reward, "episode_return": returns},
+        }.items():
+            np.testing.assert_array_equal(own.result(name), values, name)
+            np.testing.assert_array_equal(own.read(name), values, name)
+        endings |= set(why.astype(int))
+    assert len(endings) >= 3, "too few kinds of endings came"
+
+
+def test_returns_go_on_after_a_snapshot_has_been_restored():
+    said = Said(("reward",))
+    batch = QuadVectorEnv(FLIGHTS, "hover", custom=said.task()).flights.batch
+    batch.reset(seeds=range(FLIGHTS))
+    actions = np.full((FLIGHTS, 4), 0.05)
+    said.draw()
+    batch.step(actions)
+    instant, returns = batch.snapshot(), batch.read("episode_return")
+    batch.step(actions)
+    batch.restore(instant)
+    batch.step(actions)
+    np.testing.assert_array_equal(batch.read("episode_return"), returns + said.reward)
+    mask = np.arange(FLIGHTS) < 4
+    batch.reset(mask=mask)
+    batch.step(actions)
+    np.testing.assert_array_equal(batch.read("episode_return")[mask], said.reward[mask])
