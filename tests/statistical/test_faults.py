@@ -16,6 +16,7 @@ from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import CameraOcclusion, GnssOutage, GnssOutliers, PositionJump
 from quad_gym.records import POSITION_BLOCK, Gate, Source
 from tests.field_flights import fly, nees, state_errors, steps
+from tests.filter_states import set_at_rest
 from tests.unit.alarms import ALARM, alarm_score
 
 LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
@@ -48,14 +49,7 @@ def test_uncertainty_at_rest_grows_in_closed_form(kind, suite):
     sigma_a, sigma_g = suite.imu.accel_noise_density, suite.imu.gyro_noise_density
     r, v, e, b_a, b_g = 0.01, 0.02, 1e-3, 2e-3, 1e-5
     filter_ = kind(suite)
-    filter_.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=np.diag(np.repeat([r, v, e, b_a, b_g], 3)) ** 2,
-    )
+    set_at_rest(filter_, np.diag(np.repeat([r, v, e, b_a, b_g], 3)) ** 2)
     t = 0.0
     for seconds in (10.0, 60.0):
         while t < seconds - dt / 2:

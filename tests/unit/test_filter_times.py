@@ -9,6 +9,7 @@ import quad_gym
 from quad_gym.estimation import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.packing.flight import params_record
 from quad_gym.params.vehicle import VehicleParams
+from tests.filter_states import set_like
 from tests.level_flights import R_IG
 
 KINDS = (UnscentedKalmanFilter, ExtendedKalmanFilter)
@@ -63,22 +64,8 @@ def test_a_tick_by_name_is_a_tick(kind):
         plain.predict(gyro, accel)
         named.predict(gyro, accel, dt=TICK)
         named.predict(gyro, accel, dt=2.0 * TICK)  # and back
-        named.set_state(
-            position=plain.position,
-            velocity=plain.velocity,
-            R_BI=plain.R_BI,
-            accel_bias=plain.accel_bias,
-            gyro_bias=plain.gyro_bias,
-            covariance=plain.covariance,
-        )
-        plain.set_state(
-            position=plain.position,
-            velocity=plain.velocity,
-            R_BI=plain.R_BI,
-            accel_bias=plain.accel_bias,
-            gyro_bias=plain.gyro_bias,
-            covariance=plain.covariance,
-        )
+        set_like(named, plain)
+        set_like(plain, plain)
         assert_same(plain, named)
 
 

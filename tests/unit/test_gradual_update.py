@@ -8,6 +8,7 @@ import quad_gym
 from quad_gym.records import Gate
 from quad_gym.sensors import Camera
 from tests.field_flights import fly, state_errors
+from tests.filter_states import set_at_rest
 from tests.unit.alarms import ALARM
 
 INDOOR = quad_gym.sensor_suite("indoor").simplified()
@@ -25,14 +26,7 @@ def started(above, sigma, gate=0.0):
     suite = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=gate))
     ukf = quad_gym.UnscentedKalmanFilter(suite)
     P = np.diag(np.repeat([0.05, 0.03, sigma, 0.2, 0.01], 3) ** 2)
-    ukf.set_state(
-        position=(0.5, -0.3, 1.2),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=P,
-    )
+    set_at_rest(ukf, P, position=(0.5, -0.3, 1.2))
     camera = Camera(suite.camera, rng=np.random.default_rng(3))
     return ukf, camera.measure((0.53, -0.35, 1.22), np.eye(3))
 
@@ -100,14 +94,7 @@ def test_a_filter_without_a_gate_leaves_out_what_it_cannot_place(distance):
     suite = suite.replace(camera=camera)
     ukf = quad_gym.UnscentedKalmanFilter(suite)
     covariance = np.diag(np.repeat([1.0, 0.1, 0.01, 0.2, 0.01], 3) ** 2)
-    ukf.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=covariance,
-    )
+    set_at_rest(ukf, covariance)
     pixels = Camera(camera, rng=np.random.default_rng(3)).measure((0.1, 0.4, 0.2), np.eye(3))
     assert np.isfinite(pixels).all()
     for name in ("innovation", "innovation_sigma", "block_nis"):

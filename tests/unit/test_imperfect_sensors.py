@@ -19,6 +19,7 @@ from quad_gym.params.world import WorldParams
 from quad_gym.records import Autoreset, Control, Source
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from quad_gym.vehicle import state_derivative
+from tests.filter_states import set_at_rest
 
 LAB, STANDARD = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("standard")
 HOVER = TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e6, max_tilt=math.pi)
@@ -196,14 +197,7 @@ def test_the_filter_counts_the_vibration_of_rotors_that_lift_what_it_measures(li
     """In a tick: white noise, and vibration by the square of the specific force over g."""
     imu = STANDARD.imu.replace(accel_vibration=0.3, gyro_vibration=0.02)
     kalman = quad_gym.UnscentedKalmanFilter(STANDARD.replace(imu=imu))
-    kalman.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=1e-16 * np.eye(15),
-    )
+    set_at_rest(kalman, 1e-16 * np.eye(15))
     kalman.predict(np.zeros(3), (0.0, 0.0, lift * VehicleParams().gravity))
     added = np.diag(kalman.covariance) / imu.dt**2
     accel = imu.accel_noise_density**2 * imu.rate + (0.3 * lift) ** 2
@@ -348,14 +342,7 @@ def test_a_maneuver_costs_the_filter_what_errors_of_scale_and_alignment_may_do_i
     covariances = []
     for suite in suites:
         ukf = kind(suite)
-        ukf.set_state(
-            position=np.zeros(3),
-            velocity=np.zeros(3),
-            R_BI=np.eye(3),
-            accel_bias=np.zeros(3),
-            gyro_bias=np.zeros(3),
-            covariance=np.diag(np.full(15, 1e-6)),
-        )
+        set_at_rest(ukf, np.diag(np.full(15, 1e-6)))
         ukf.predict(np.array([0.1, 0.2, -0.3]), accel)
         covariances.append(ukf.covariance)
     aligned, scaled, noisy, exact = covariances

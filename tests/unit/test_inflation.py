@@ -11,6 +11,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.records import FEATURE_BLOCKS, POSITION_BLOCK
 from tests.field_flights import steps
+from tests.filter_states import set_at_rest
 
 MOST = np.repeat([100.0, 20.0, math.nan, 2.0, 0.1], 3)  # of attitude: tilt 0.2, heading pi/sqrt 3
 
@@ -34,14 +35,7 @@ def started(deviations, seed=0):
     mixed = np.eye(15) + 0.3 * rng.standard_normal((15, 15))
     P = mixed @ mixed.T
     scaled = np.array(deviations) / np.sqrt(np.diag(P))
-    ukf.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=R_BI,
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=P * np.outer(scaled, scaled),
-    )
+    set_at_rest(ukf, P * np.outer(scaled, scaled), R_BI=R_BI)
     return ukf
 
 

@@ -17,6 +17,7 @@ from quad_gym.records import (
 )
 from tests.circle_flight import record_circle
 from tests.field_flights import fly, measured_now, state_errors, steps
+from tests.filter_states import set_like
 from tests.lane_filter import EIGHT, STATE, LaneFilter
 from tests.reference_ukf import PlainUKF
 
@@ -103,14 +104,7 @@ def test_a_rejected_block_is_as_good_as_not_measured(wrong):
     assert k > 100
     without = warm(CONSISTENT, k)
     gated = UnscentedKalmanFilter(GATED)
-    gated.set_state(
-        position=without.position,
-        velocity=without.velocity,
-        R_BI=without.R_BI,
-        accel_bias=without.accel_bias,
-        gyro_bias=without.gyro_bias,
-        covariance=without.covariance,
-    )
+    set_like(gated, without)
     value = {
         "gnss_position_G": RECORDING.gnss_position[k] + 0.5,
         "gnss_baseline_G": RECORDING.gnss_baseline[k] @ np.diag([-1.0, -1.0, 1.0]),

@@ -6,6 +6,7 @@ import pytest
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from tests.field_flights import fly, nees, steps
+from tests.filter_states import set_at_rest
 
 FLIGHTS = 400
 BAND = 5 * np.sqrt(2 * 15 / FLIGHTS)
@@ -63,14 +64,7 @@ def test_a_vehicle_that_spins_up_on_the_spot_stays_there(kind, tolerance):
     arm, rate = np.array([0.3, -0.2, 0.1]), 4.0
     suite = mounted("lab", tuple(arm))
     kalman = kind(sensors=suite)
-    kalman.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=1e-14 * np.eye(15),
-    )
+    set_at_rest(kalman, 1e-14 * np.eye(15))
     w_before = None
     for tick in range(200):
         w = np.array([0.0, 0.0, rate * tick * suite.imu.dt])

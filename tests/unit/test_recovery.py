@@ -13,6 +13,7 @@ from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import AccelBiasStep, GnssRamp, GyroBiasStep
 from tests.field_flights import fly, state_errors, steps
+from tests.filter_states import set_at_rest
 
 FLIGHTS = 256
 STEP = GyroBiasStep(start=3.0, size=math.radians(1.0))
@@ -185,14 +186,7 @@ def test_a_filter_alone_doubts_itself_after_any_start(kind):
     kalman = kind(sensors=suite)
     R_IG = quad_gym.frames.ecef_to_enu(suite.gnss.reference_antenna_G)
     antenna, baseline = np.array(suite.gnss.primary_antenna_B), suite.gnss.baseline_B
-    kalman.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=1e-4 * np.eye(15),
-    )
+    set_at_rest(kalman, 1e-4 * np.eye(15))
     away = np.array([5.0, 0.0, 0.0])
     for tick in range(1200):
         kalman.predict(np.zeros(3), (0.0, 0.0, 9.8))

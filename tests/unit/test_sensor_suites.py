@@ -10,6 +10,7 @@ from quad_gym.params.suites import SUITES
 from quad_gym.records import VELOCITY_BLOCK
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import attitudes, fly, state_errors, steps
+from tests.filter_states import set_at_rest
 from tests.reference_ukf import east_north_up
 from tests.unit.alarms import ALARM, assert_normal
 
@@ -223,14 +224,7 @@ def test_the_friendly_filter_takes_no_fix_without_gnss():
     ukf = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("indoor").simplified())
     with pytest.raises(ValueError, match="set_state"):
         ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-    ukf.set_state(
-        position=np.zeros(3),
-        velocity=np.zeros(3),
-        R_BI=np.eye(3),
-        accel_bias=np.zeros(3),
-        gyro_bias=np.zeros(3),
-        covariance=np.eye(15) * 1e-2,
-    )
+    set_at_rest(ukf, np.eye(15) * 1e-2)
     with pytest.raises(ValueError, match="GNSS"):
         ukf.update(gnss_position_G=(0.0, 0.0, 0.0))
 
