@@ -90,7 +90,8 @@ class FlightBatch(FlightMemory):
             `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn
             from the covariance that it has reached.
         innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
-            "innovation_sigma", "block_nis"; a gate keeps them anyway.
+            "innovation_sigma", "block_nis"; a gate keeps them anyway, and so does a filter that
+            meets `faults`, or whose task has `end_when_lost`.
         threads: Threads to use; None: as many as there are cores.
         true_vehicle: The vehicle as it is, where it differs from the nominal one that the
             controller knows.
@@ -169,12 +170,9 @@ class FlightBatch(FlightMemory):
             needed = include_covariance or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = check.flag("run_filter", run_filter)
-        watches = self.innovations or self.sensors.estimator.gate_false_alarm > 0.0
-        if self.task.end_when_lost and not (run_filter and watches):
-            raise ValueError(
-                "end_when_lost needs a filter that watches its innovations: a suite whose filter "
-                "gates, such as 'rtk', or innovations=True"
-            )
+        if self.task.end_when_lost and not run_filter:
+            raise ValueError("end_when_lost needs a filter, and none runs here")
+        watches = self.innovations or bool(self.faults) or self.task.end_when_lost
         if run_filter:
             self.sensors.require_filter()
 
@@ -207,7 +205,7 @@ class FlightBatch(FlightMemory):
             privileged=privileged,
             autoreset=Autoreset(autoreset),
             run_filter=run_filter,
-            innovations=innovations,
+            innovations=run_filter and watches,
             lever_drawn=self.randomization.known
             and bool({"lever_arm_B", "center_of_mass_B"} & set(self.randomization.names)),
             gnss_drifts=true_sensors.drifts,

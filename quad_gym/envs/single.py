@@ -123,8 +123,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;
-    `filter_status`, 0 while all is well; `filter_lost`, whether a filter that gates (or keeps
-    its innovations) finds that its covariance does not explain what it measures; `gates_passed`.
+    `filter_status`, 0 while all is well; `filter_lost`, whether a filter that gates (any,
+    with `faults`, `end_when_lost` or `innovations`) finds that its covariance does not explain what
+    it measures; `gates_passed`.
     With `randomization` also `drawn`, the parameters of the episode by name. With `faults` also
     `faults`: whether each is active now, by name. With `innovations=True` also `innovations`: the last innovations of the filter, their
     squares (NIS) and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
@@ -153,7 +154,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "standard" has the laboratory's sensors and a consistent filter; "lab" is the report's
             form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
-            block by block; a suite whose filter gates keeps them for the latter anyway.
+            block by block; a filter that gates, or any with `faults` or `end_when_lost`, keeps them
+            for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.

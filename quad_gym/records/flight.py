@@ -175,7 +175,7 @@ _FILTER_FIELDS = (
     Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
     Field("corrected_tick", (), "ticks", "when the last of them was"),
     Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
-    Field("doubt_tick", (), "ticks", "when the filter last doubted itself"),
+    Field("doubt_tick", (), "ticks", "when the filter last doubted itself; of one that mends nothing, how long its biases remember later"),
     Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
     Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
 )
@@ -192,6 +192,8 @@ _WATCH_FIELDS = (
     Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
     Field("gate", (MAX_BLOCKS,), "-", "what became of it, see Gate"),
     Field("rejections", (MAX_BLOCKS,), "-", "rejected since the start of the episode"),
+    Field("corrected_long", (6,), "m/s^2, rad/s", "as corrected, over a longer time"),
+    Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
 )
 _LATE_FIELDS = (
     # what the IMU has summed up since the start of the episode, biases and gravity included
@@ -212,6 +214,8 @@ _LATE_FIELDS = (
 _SLOW_FIELDS = (
     # the slow errors of sensors, where the filter estimates them
     Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
+    Field("drift_corrected", (3,), "m", "sum of the last corrections of the drift of GNSS positions, where that is estimated"),
+    Field("drift_corrected_variance", (3,), "m^2", "its variance in a filter that is right"),
     Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
 )
 _AID_FIELDS = (

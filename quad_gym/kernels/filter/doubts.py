@@ -1,16 +1,19 @@
 """What a filter doubts that notices that it is wrong: what it adds to its covariance.
 
 What may be wrong is not only what the sensor measures. An innovation that has grown for a time T
-since the last acceptance may come from biases, so their variances grow likewise: nu / T of an angle
+since the last acceptance may come from biases, so their deviations become: nu / T of an angle
 for the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g of
-that for the tilt. What each measurement doubts is in its file in `kernels/measurements/`.
+that for the tilt. What each measurement doubts is in its file in `kernels/measurements/`. Variances
+are raised to the square of these, not increased by it, so that doubts that repeat do not add up:
+what is doubted is never larger than the largest innovation tells.
 
 Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
 states is multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and
-position, too, and correlations say how. Slow errors of sensors keep theirs: a constant one
-that has become uncertain may stay so, such as hard iron, and the heading with it. The biases get
-more than that: sixteen times their deviation for a drift, three times the corrections that go one
-way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
+position, too, and correlations say how. So is that of the drift of GNSS positions, for which an
+error of the position has been taken; no more than drift can be. Slow errors of aiding sensors keep
+theirs: a constant one that has become uncertain may stay so, such as hard iron, and the heading
+with it. The biases get more than that: sixteen times their deviation for a drift, three times the
+corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
 
 No alarm inflates a deviation beyond `_MOST_POSITION` and its like. What nothing measures for a
 time, such as the heading in hover without a baseline, or the position in an outage of GNSS, would
@@ -26,11 +29,18 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
-from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
+from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
+from quad_gym.kernels.filter.jumps import (
+    doubt_position_and_drift,
+    drifts_suddenly,
+    forget_drift_corrections,
+)
 from quad_gym.kernels.filter.recovery import (
     MOST_ACCEL_BIAS,
+    MOST_ANGLE,
     MOST_GYRO_BIAS,
     MOST_TILT,
+    camera_fits,
     forget_corrections,
     one_way,
     suspect_group,
@@ -42,6 +52,7 @@ from quad_gym.kernels.maths.linalg import (
     add_outer,
     apply,
     dot,
+    load3,
     load33,
     load_block,
     multiply,
@@ -60,8 +71,8 @@ _FACTOR, _BIAS_FACTOR = 16.0, 240.0
 """Of the covariance, and what is added of the biases' variances, where innovations drift."""
 _REMAINING = 9.0
 """Square of how many times the sum of corrections may still be missing."""
-_MOST_POSITION, _MOST_VELOCITY, _MOST_HEADING = 100.0, 20.0, math.pi / math.sqrt(3.0)
-"""Largest deviations that inflation leads to [m], [m/s], [rad]; the last of any angle."""
+_MOST_POSITION, _MOST_VELOCITY = 100.0, 20.0
+"""Largest deviations that inflation leads to [m], [m/s]."""
 
 
 @kernel
@@ -102,37 +113,56 @@ def _shrink_block(P, row, M, states):
 
 @kernel
 def _shrink_axes(P, row, most, inflated, states):
-    """Bound the inflation of three states, each by itself."""
-    a = _share(P[row, row], most, inflated)
-    b = _share(P[row + 1, row + 1], most, inflated)
-    c = _share(P[row + 2, row + 2], most, inflated)
+    """Bound the inflation of three states, each by itself, to three deviations."""
+    a = _share(P[row, row], most[0], inflated)
+    b = _share(P[row + 1, row + 1], most[1], inflated)
+    c = _share(P[row + 2, row + 2], most[2], inflated)
     zero = 0.0 * a
     _shrink_block(P, row, ((a, zero, zero), (zero, b, zero), (zero, zero, c)), states)
 
 
 @kernel
-def bound_inflation(flight, P, inflated, states):
+def drift_sigma(p):
+    """Stationary deviations of the drift of GNSS positions."""
+    a, s = load3(p.slow_decay[0:3]), load3(p.slow_drive[0:3])
+    return (
+        s[0] / math.sqrt((1.0 - a[0]) * (1.0 + a[0])),
+        s[1] / math.sqrt((1.0 - a[1]) * (1.0 + a[1])),
+        s[2] / math.sqrt((1.0 - a[2]) * (1.0 + a[2])),
+    )
+
+
+@kernel
+def bound_inflation(flight, p, P, inflated, states, slow):
     """Take back from P what inflation by `_FACTOR` has put beyond the largest deviations.
 
     Args:
         flight: Record; reads R_hat, for the vertical.
+        p: Parameters as the filter believes them.
         P: The inflated covariance, its lower triangle by blocks.
         inflated: Which lanes are.
         states: How many states there are, slow errors included.
+        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
     R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
     k = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
     heading = dot(k, apply(P_ee, k))
     both = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
     tilted = _share(both, MOST_TILT, inflated)
-    turned = _share(heading, _MOST_HEADING, inflated) - tilted
+    turned = _share(heading, MOST_ANGLE, inflated) - tilted
     zero = 0.0 * tilted
     M = ((tilted, zero, zero), (zero, tilted, zero), (zero, zero, tilted))
     _shrink_block(P, E, add_outer(M, scale(turned, k), k), states)
-    _shrink_axes(P, R, _MOST_POSITION, inflated, states)
-    _shrink_axes(P, V, _MOST_VELOCITY, inflated, states)
-    _shrink_axes(P, BA, MOST_ACCEL_BIAS, inflated, states)
-    _shrink_axes(P, BG, MOST_GYRO_BIAS, inflated, states)
+    for row, most in (
+        (R, _MOST_POSITION),
+        (V, _MOST_VELOCITY),
+        (BA, MOST_ACCEL_BIAS),
+        (BG, MOST_GYRO_BIAS),
+    ):
+        _shrink_axes(P, row, (most, most, most), inflated, states)
+    if slow is not None:
+        if slow.estimates_drift:
+            _shrink_axes(P, D, drift_sigma(p), inflated, states)
 
 
 @kernel
@@ -160,7 +190,11 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
     gyro, corrected_g = one_way(flight, 3)
     drifting, accel, gyro = work.drifting > 0.0, mask & accel, mask & gyro
     inflated = drifting | accel | gyro
-    doubtful = inflated
+    moved = mask & (flight.tick < 0.0)  # nobody
+    if slow is not None:
+        if slow.estimates_drift:
+            moved = mask & drifts_suddenly(flight) & logical_not(camera_fits(flight, p))
+    doubtful = inflated | moved
     for group in range(SENSOR_GROUPS):
         doubtful = doubtful | (work.doubted[group] > 0.0)
     if not any_of(doubtful):
@@ -174,11 +208,16 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
     if slow is not None:
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)
-    bound_inflation(flight, P, inflated, states)
+        if slow.estimates_drift:
+            for j in range(0, D + 3, 3):
+                store_block(P, D, j, scale33(factor, load_block(P, D, j)))
+    bound_inflation(flight, p, P, inflated, states, slow)
     _doubt_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
     _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)
     doubt(flight, p, work, settings, slow, 0)
     if slow is not None:
+        if slow.estimates_drift:
+            doubt_position_and_drift(flight, P, moved)
         if slow.aids > 0:
             work.taking = select(doubtful, 1.0, 0.0)
             for s in range(AIDS):
@@ -203,3 +242,6 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
             mean = flight.innovation_drift[group, i]
             flight.innovation_drift[group, i] = select(doubtful, 0.0, mean)
     forget_corrections(flight, doubtful)
+    if slow is not None:
+        if slow.estimates_drift:
+            forget_drift_corrections(flight, moved)

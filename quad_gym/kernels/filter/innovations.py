@@ -7,7 +7,7 @@ See `measurements/gate.py` for one block. Where one kind of measurement has been
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.recovery import follow_ratio
+from quad_gym.kernels.filter.recovery import follow_ratio, forget_corrections
 from quad_gym.kernels.measurements.aid import judge_aids, mark_failed_aids
 from quad_gym.kernels.measurements.blocks import judge
 from quad_gym.kernels.measurements.blocks import mark_failed as mark_failed_blocks
@@ -64,6 +64,7 @@ def forget_innovations(flight, feature_count, mask):
         for i in range(3):
             flight.innovation[s, i] = select(mask, np.nan, flight.innovation[s, i])
             flight.innovation_sigma[s, i] = select(mask, np.nan, flight.innovation_sigma[s, i])
+    forget_corrections(flight, mask)
     for group in range(SENSOR_GROUPS):
         flight.rejected_in_row[group] = select(mask, 0.0, flight.rejected_in_row[group])
         flight.reopened[group] = select(mask, 0.0, flight.reopened[group])

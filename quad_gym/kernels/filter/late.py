@@ -15,6 +15,7 @@ measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 4
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
+from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.filter.preintegration import (
     NOISE,
     put_noise,
@@ -199,6 +200,8 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
     failed = arrived & old
     if (settings.form & _WATCH) != 0 and any_of(failed):
         forget_corrections(flight, failed)
+        if slow is not None:
+            forget_drift_corrections(flight, failed)
     status = flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     failures = select(failed, work.kept_failures + 1.0, flight.update_failures)

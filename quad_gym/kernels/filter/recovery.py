@@ -18,11 +18,13 @@ Source: for the drift of innovations R. K. Mehra and J. Peschon, Automatica 7, 1
 corrections are white with these variances follows from the whiteness of innovations.
 """
 
+import math
+
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, E
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import add_to_diagonal, load_block, store_block
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.maths.linalg import add_outer, apply, dot, load_block, scale, store_block
+from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import SENSOR_GROUPS
 
 DRIFT_ALARM = 0.55
@@ -31,13 +33,19 @@ _MEMORY = 0.02
 """Weight of the latest innovation in the mean: it deviates by sqrt(0.02 / 1.98) = 0.1."""
 _CORRECTION_TIME = 3.0
 """How long corrections of the biases are added up [s]."""
+_LONG_TIME = 12.0
+"""Likewise of errors that are small beside the noise: corrections of a bias make up for its error
+within P/Q, ten seconds and more, and show it all only by then [s]."""
 _ONE_WAY = 5.0
 """Deviations of their sum from which on they go one way."""
+_ONE_WAY_LONG = 24.0
+"""Likewise the normalized square of three long sums, chi-square: beyond with a probability of 2e-5,
+and, as these sums last, once in many hours."""
 _HARMLESS = 1.0 / _ONE_WAY**2
 """So that this sum is more than the bias's own deviation."""
 LARGEST = 3.0
 """Innovations count as no more deviations than that in the mean, for the sake of outliers."""
-LOST_RATIO, FOUND_RATIO = 2.0, 1.5
+LOST_RATIO, FOUND_RATIO = 2.1, 1.5
 """Mean NIS over its degrees of freedom at which a filter counts as lost, and as found again."""
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
 DOUBT_TIME = 1.0
@@ -47,7 +55,9 @@ FITTING_FEATURES = 3
 _FIT_TIME = 1.0
 """How long they do [s]."""
 MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
-"""Largest deviations that a doubt adds [m/s^2], [rad/s], [rad]."""
+"""Largest deviations that a doubt raises to [m/s^2], [rad/s], [rad]."""
+MOST_ANGLE = math.pi / math.sqrt(3.0)
+"""Largest deviation of an angle [rad]: of one that may be anything."""
 
 
 @kernel
@@ -74,19 +84,34 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
         columns: How many columns these are.
         ok: Which lanes.
     """
-    kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _CORRECTION_TIME, 0.0)
+    passed = (flight.tick - flight.corrected_tick) * p.dt
+    kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
+    kept_long = maximum(1.0 - passed / _LONG_TIME, 0.0)
     for i in range(6):
         variance = 0.0 * kept
         for j in range(columns):
             if j < 15:
                 variance = variance + L[BA + i, j] * L[BA + i, j]
             variance = variance - L9[BA + i, j] * L9[BA + i, j]
-        total = kept * flight.corrected[i] + dx[BA + i]
-        flight.corrected[i] = select(ok, total, flight.corrected[i])
-        variance = kept * kept * flight.corrected_variance[i] + maximum(variance, 0.0)
-        before = flight.corrected_variance[i]
-        flight.corrected_variance[i] = select(ok, variance, before)
+        variance = maximum(variance, 0.0)
+        before, spread = flight.corrected[i], flight.corrected_variance[i]
+        flight.corrected[i] = select(ok, kept * before + dx[BA + i], before)
+        flight.corrected_variance[i] = select(ok, kept * kept * spread + variance, spread)
+        before, spread = flight.corrected_long[i], flight.corrected_long_variance[i]
+        flight.corrected_long[i] = select(ok, kept_long * before + dx[BA + i], before)
+        total = kept_long * kept_long * spread + variance
+        flight.corrected_long_variance[i] = select(ok, total, spread)
     flight.corrected_tick = select(ok, flight.tick, flight.corrected_tick)
+
+
+@kernel
+def bias_variance(flight, row):
+    """Variance of a bias, by its row of the factor."""
+    variance = 0.0 * flight.tick
+    for j in range(15):
+        if j <= row:
+            variance = variance + flight.L[row, j] * flight.L[row, j]
+    return variance
 
 
 @kernel
@@ -97,16 +122,16 @@ def one_way(flight, first):
     what rounding leaves of corrections by measurements that do not tell of biases yet.
     """
     largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
-    for i in range(3):
-        variance, row = 0.0 * flight.tick, BA + first + i
-        for j in range(15):
-            if j <= row:
-                variance = variance + flight.L[row, j] * flight.L[row, j]
-        total = flight.corrected[first + i]
-        variance = _HARMLESS * variance + flight.corrected_variance[first + i]
-        largest = maximum(largest, total * total - _ONE_WAY * _ONE_WAY * variance)
-        square = maximum(square, total * total)
-    return largest > 0.0, square
+    together = square
+    for i in range(first, first + 3):
+        own = _HARMLESS * bias_variance(flight, BA + i)
+        total = flight.corrected[i] * flight.corrected[i]
+        variance = own + flight.corrected_variance[i]
+        largest = maximum(largest, total - _ONE_WAY * _ONE_WAY * variance)
+        slow = flight.corrected_long[i] * flight.corrected_long[i]
+        together = together + slow / (own + flight.corrected_long_variance[i])
+        square = maximum(square, maximum(total, slow))
+    return (largest > 0.0) | (together > _ONE_WAY_LONG), square
 
 
 @kernel
@@ -134,6 +159,9 @@ def forget_corrections(flight, mask):
     for i in range(6):
         flight.corrected[i] = select(mask, 0.0, flight.corrected[i])
         flight.corrected_variance[i] = select(mask, 0.0, flight.corrected_variance[i])
+        flight.corrected_long[i] = select(mask, 0.0, flight.corrected_long[i])
+        long = flight.corrected_long_variance[i]
+        flight.corrected_long_variance[i] = select(mask, 0.0, long)
     flight.corrected_tick = select(mask, flight.tick, flight.corrected_tick)
 
 
@@ -145,7 +173,6 @@ def begin_recovery(flight, mask):
         for i in range(3):
             drift = flight.innovation_drift[group, i]
             flight.innovation_drift[group, i] = select(mask, 0.0, drift)
-    forget_corrections(flight, mask)
     flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
     flight.lost = select(mask, 0.0, flight.lost)
     flight.doubt_tick = select(mask, -1e9, flight.doubt_tick)
@@ -177,35 +204,68 @@ def time_of(flight, p, group):
 
 
 @kernel
+def raise_diagonal(P, first, least):
+    """Raise three variances of P from the row `first` on to at least `least`."""
+    for i in range(first, first + 3):
+        P[i, i] = maximum(P[i, i], least)
+
+
+@kernel
 def doubt_acceleration(p, P, acceleration, doubted):
-    """Add to the variances of accelerometer biases, and of the tilt by what g makes of it."""
+    """Raise the deviations of accelerometer biases, and of the tilt to what g makes of it."""
     bounded = minimum(acceleration, MOST_ACCEL_BIAS)
-    more = select(doubted > 0.0, bounded * bounded, 0.0)
-    store_block(P, BA, BA, add_to_diagonal(load_block(P, BA, BA), more))
+    raise_diagonal(P, BA, select(doubted > 0.0, bounded * bounded, 0.0))
     tilt = minimum(acceleration / p.gravity, MOST_TILT)
-    more = select(doubted > 0.0, tilt * tilt, 0.0)
-    store_block(P, E, E, add_to_diagonal(load_block(P, E, E), more))
+    raise_diagonal(P, E, select(doubted > 0.0, tilt * tilt, 0.0))
 
 
 @kernel
 def doubt_rate(P, rate, doubted):
-    """Add to the variances of gyro biases."""
+    """Raise the deviations of gyro biases."""
     bounded = minimum(rate, MOST_GYRO_BIAS)
-    more = select(doubted > 0.0, bounded * bounded, 0.0)
-    store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), more))
+    raise_diagonal(P, BG, select(doubted > 0.0, bounded * bounded, 0.0))
+
+
+@kernel
+def doubt_heading(P, vertical, square, doubted):
+    """Raise the variance of the heading, the angle about the `vertical` in B."""
+    P_ee = load_block(P, E, E)
+    heading = dot(vertical, apply(P_ee, vertical))
+    wanted = select(doubted, minimum(square, MOST_ANGLE * MOST_ANGLE), 0.0)
+    more = maximum(wanted - heading, 0.0)
+    store_block(P, E, E, add_outer(P_ee, scale(more, vertical), vertical))
+
+
+@kernel
+def _bias_memory(flight, p):
+    """How long what is wrong with a bias takes to fall to a third by corrections [s].
+
+    Of a bias of variance P that is driven by Q in a second, an update takes away what Q has put in,
+    so that its error falls at the rate Q/P. Innovations show an error of n deviations as n over the
+    root of two, by all of them together: what is left when they no longer tell is up to some seven.
+    """
+    accel, gyro = 0.0 * flight.tick, 0.0 * flight.tick
+    for i in range(3):
+        accel = maximum(accel, bias_variance(flight, BA + i))
+        gyro = maximum(gyro, bias_variance(flight, BG + i))
+    accel = accel / (p.accel_bias_drive * p.accel_bias_drive)
+    return p.dt * maximum(accel, gyro / (p.gyro_bias_drive * p.gyro_bias_drive))
 
 
 @kernel
 def tell_drifts(flight, p, mask):
     """Count a filter that only watches its innovations as lost while they drift, where `mask`.
 
-    The mean of a sensor that no longer measures stays what it was, and tells nothing of now.
+    The mean of a sensor that no longer measures stays what it was, and tells nothing of now. As
+    nothing is mended, the filter stays lost for as long as its biases remember.
     """
-    drifting = mask & (flight.tick < 0.0)  # nobody
+    drifting = flight.nis_ratio > LOST_RATIO
     for group in range(SENSOR_GROUPS):
         recent = (flight.tick - flight.accepted_tick[group]) * p.dt <= DOUBT_TIME
         drifting = drifting | (recent & drifts(flight, group))
     accel, _ = one_way(flight, 0)
     gyro, _ = one_way(flight, 3)
-    drifting = drifting | accel | gyro
-    flight.doubt_tick = select(mask & drifting, flight.tick, flight.doubt_tick)
+    drifting = mask & (drifting | accel | gyro)
+    if any_of(drifting):
+        rest = maximum(_bias_memory(flight, p) - DOUBT_TIME, 0.0) / p.dt
+        flight.doubt_tick = select(drifting, flight.tick + rest, flight.doubt_tick)

@@ -25,6 +25,7 @@ is None` is decided as they are compiled, so that a filter without d has none of
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
+from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.maths.linalg import (
     load3,
     load_block,
@@ -46,6 +47,7 @@ def begin_slow(flight, p, slow, mask):
         for j in range(D + slow.slow_states):
             value = p.slow_sigma[i] if j == D + i else 0.0 * p.slow_sigma[i]
             flight.L_slow[i, j] = select(mask, value, flight.L_slow[i, j])
+    forget_drift_corrections(flight, mask)
 
 
 @kernel

@@ -18,6 +18,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.doubts import raise_doubts
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
+from quad_gym.kernels.filter.jumps import follow_drift_corrections
 from quad_gym.kernels.filter.recovery import follow_corrections, tell_drifts
 from quad_gym.kernels.filter.slow import load_slow, shift_slow
 from quad_gym.kernels.maths.elementary import is_finite
@@ -283,6 +284,9 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
     keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))
     keep3(flight.v_hat, ok, add(load3(flight.v_hat), (dx[V], dx[V + 1], dx[V + 2])))
     if (form & _WATCH) != 0:
+        if slow is not None:
+            if slow.estimates_drift:
+                follow_drift_corrections(flight, p, L9, dx, columns, ok)
         follow_corrections(flight, p, L, L9, dx, columns, ok)
     R_BI = multiply(euler_to_dcm((dx[E], dx[E + 1], dx[E + 2])), load33(flight.R_hat))
     keep33(flight.R_hat, ok, R_BI)

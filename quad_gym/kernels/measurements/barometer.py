@@ -7,6 +7,7 @@ filter (`filter/slow.py`). The model is linear, so that sigma points and derivat
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.measurements.aid import aid_due, begin_aid, deliver
 from quad_gym.kernels.measurements.aid_stage import aid_stage
@@ -52,12 +53,12 @@ def _expect(flight, p, work, settings, k):
 
 @kernel
 def _doubt(flight, p, work, settings, mask):
-    """Add the square of a rejected innovation to the variance of the slow error, and of height."""
+    """Raise the variances of slow error and height to the square of a rejected innovation."""
     doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
     nu, k = flight.innovation[AID_BLOCKS + _S, 0], D + settings.aid_scalar[_S]
-    more = select(doubted, nu * nu, 0.0)
-    work.P[k, k] = work.P[k, k] + more
-    work.P[R + 2, R + 2] = work.P[R + 2, R + 2] + more
+    square = select(doubted, nu * nu, 0.0)
+    work.P[k, k] = maximum(work.P[k, k], square)
+    work.P[R + 2, R + 2] = maximum(work.P[R + 2, R + 2], square)
 
 
 barometer_stage = aid_stage(Aid.BAROMETER, begin_aid, _measure, _expect, _doubt)

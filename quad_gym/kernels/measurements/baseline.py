@@ -14,6 +14,7 @@ from quad_gym.kernels.filter.directions import direction_noise
 from quad_gym.kernels.filter.error_state import E
 from quad_gym.kernels.filter.recovery import (
     camera_fits,
+    doubt_heading,
     doubt_rate,
     follow_drift,
     suspect_group,
@@ -153,7 +154,7 @@ def suspect(flight, p, work, settings, slow, k):
 
 @kernel
 def doubt(flight, p, work, settings, slow, k):
-    """Add to the covariance of what may be wrong, where baselines are doubted.
+    """Raise the variances of what may be wrong, where baselines are doubted.
 
     That is the heading by the innovation to the side, and roll and pitch by that up; the gyro may
     have led there.
@@ -162,9 +163,13 @@ def doubt(flight, p, work, settings, slow, k):
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
     side = select(doubted > 0.0, flight.innovation[BASELINE_BLOCK, 0], 0.0)
     up = select(doubted > 0.0, flight.innovation[BASELINE_BLOCK, 1], 0.0)
-    P_ee = add_to_diagonal(load_block(P, E, E), up * up)
-    P_ee = add_outer(P_ee, scale(side * side - up * up, vertical), vertical)
+    P_ee = load_block(P, E, E)
+    heading = dot(vertical, apply(P_ee, vertical))
+    tilt = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
+    more = maximum(up * up - tilt, 0.0)
+    P_ee = add_outer(add_to_diagonal(P_ee, more), scale(-more, vertical), vertical)
     store_block(P, E, E, P_ee)
+    doubt_heading(P, vertical, side * side, doubted > 0.0)
     turned = maximum(abs(side), abs(up))
     doubt_rate(P, turned / time_of(flight, p, BASELINE_BLOCK), doubted)
     return k

@@ -22,6 +22,7 @@ from quad_gym.kernels.filter.recovery import (
     LARGEST,
     doubt_rate,
     follow_drift,
+    raise_diagonal,
     suspect_group,
     time_of,
 )
@@ -29,7 +30,6 @@ from quad_gym.kernels.maths.elementary import clip, maximum
 from quad_gym.kernels.maths.linalg import (
     add_outer,
     add_scaled,
-    add_to_diagonal,
     apply,
     apply_transposed,
     cross,
@@ -37,13 +37,11 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load4,
     load33,
-    load_block,
     load_column3,
     norm,
     scale,
     select3,
     store3,
-    store_block,
     sub,
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
@@ -250,7 +248,7 @@ def suspect(flight, p, work, settings, slow, k):
 
 @kernel
 def doubt(flight, p, work, settings, slow, k):
-    """Add to the covariance of what may be wrong, where whole images are doubted.
+    """Raise the variances of what may be wrong, where whole images are doubted.
 
     That is the attitude by the largest innovation, or the position by what that is at the feature's
     distance; the gyro may have led there.
@@ -264,8 +262,8 @@ def doubt(flight, p, work, settings, slow, k):
         distance = norm(sub(load3(p.features[i]), load3(flight.r_hat)))
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
-    store_block(P, E, E, add_to_diagonal(load_block(P, E, E), angle))
-    store_block(P, R, R, add_to_diagonal(load_block(P, R, R), offset))
+    raise_diagonal(P, E, angle)
+    raise_diagonal(P, R, offset)
     doubt_rate(P, math.sqrt(angle) / time_of(flight, p, FEATURE_BLOCKS), doubted)
     return k
 

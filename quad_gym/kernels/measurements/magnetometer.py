@@ -24,16 +24,21 @@ innovation is left along s, so that the derivative ties the error of the heading
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
-from quad_gym.kernels.filter.recovery import drifts
-from quad_gym.kernels.maths.elementary import sin_cos
+from quad_gym.kernels.filter.error_state import BA, D, E, R, V
+from quad_gym.kernels.filter.recovery import (
+    MOST_ANGLE,
+    doubt_heading,
+    doubt_rate,
+    drifts,
+    raise_diagonal,
+)
+from quad_gym.kernels.maths.elementary import maximum, minimum, sin_cos
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add,
     add33,
     add_outer,
     add_scaled,
-    add_to_diagonal,
     apply,
     apply_transposed,
     cross,
@@ -240,28 +245,26 @@ def _expect(flight, p, work, settings, k):
 def _doubt(flight, p, work, settings, mask):
     """What the filter doubts where the field is not where it expects it.
 
-    The square of a rejected innovation is added to the variance of hard iron, and of the heading.
+    The variances of hard iron and of the heading are raised to the square of a rejected innovation.
     Where innovations drift, a gyro turns the attitude while the magnetometer pulls it back: the
-    square of their mean, as an angle, is added to the variances of the attitude, and as the turn of
-    `_DRIFT_TIME` to those of the gyro's biases.
+    variances of the attitude are raised to the square of their mean, as an angle, and those of the
+    gyro's biases to that of the turn in `_DRIFT_TIME`.
     """
     doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
     nu, k = load3(flight.innovation[AID_BLOCKS + _S]), D + settings.aid_vector[_S]
     m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
     square = nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2]
-    angle = select(doubted, square / (m[0] * m[0] + m[1] * m[1]), 0.0)
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    tilted = add_outer(load_block(P, E, E), scale(angle, vertical), vertical)
+    doubt_heading(P, vertical, square / (m[0] * m[0] + m[1] * m[1]), doubted)
     mean = load3(flight.innovation_drift[AID_GROUPS + _S])
     sigma = load3(flight.innovation_sigma[AID_BLOCKS + _S])
     off = (mean[0] * sigma[0], mean[1] * sigma[1], mean[2] * sigma[2])
     turned = dot(off, off) / (m[0] * m[0] + m[1] * m[1])
-    turned = select(mask & drifts(flight, AID_GROUPS + _S), turned, 0.0)
-    store_block(P, E, E, add_to_diagonal(tilted, turned))
-    rate = turned / (_DRIFT_TIME * _DRIFT_TIME)
-    store_block(P, BG, BG, add_to_diagonal(load_block(P, BG, BG), rate))
+    drifting = select(mask & drifts(flight, AID_GROUPS + _S), 1.0, 0.0)
+    raise_diagonal(P, E, drifting * minimum(turned, MOST_ANGLE * MOST_ANGLE))
+    doubt_rate(P, math.sqrt(turned) / _DRIFT_TIME, drifting)
     for i in range(3):
-        P[k + i, k + i] = P[k + i, k + i] + select(doubted, nu[i] * nu[i], 0.0)
+        P[k + i, k + i] = maximum(P[k + i, k + i], select(doubted, nu[i] * nu[i], 0.0))
 
 
 magnetometer_stage = aid_stage(Aid.MAGNETOMETER, _begin, _measure, _expect, _doubt, _align)

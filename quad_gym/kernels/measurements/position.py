@@ -19,7 +19,7 @@ from quad_gym.kernels.filter.recovery import (
     suspect_group,
     time_of,
 )
-from quad_gym.kernels.maths.elementary import exp, log
+from quad_gym.kernels.maths.elementary import exp, log, maximum
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
@@ -153,16 +153,17 @@ def suspect(flight, p, work, settings, slow, k):
 
 @kernel
 def doubt(flight, p, work, settings, slow, k):
-    """Add to the covariance of what may be wrong, where positions are doubted.
+    """Raise the variances of what may be wrong, where positions are doubted.
 
     That is the position itself, or its slow error; accelerometer and tilt may have led there.
     """
     nu, doubted, P = load3(flight.innovation[POSITION_BLOCK]), work.doubted[POSITION_BLOCK], work.P
     T = time_of(flight, p, POSITION_BLOCK)
     for i in range(3):
-        P[R + i, R + i] = P[R + i, R + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+        square = select(doubted > 0.0, nu[i] * nu[i], 0.0)
+        P[R + i, R + i] = maximum(P[R + i, R + i], square)
         if slow is not None:
             if slow.estimates_drift:
-                P[D + i, D + i] = P[D + i, D + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+                P[D + i, D + i] = maximum(P[D + i, D + i], square)
     doubt_acceleration(p, P, 2.0 * norm(nu) / (T * T), doubted)
     return k

@@ -7,6 +7,7 @@ arm's share turns with the error angles is neglected, so that the model is linea
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import V
 from quad_gym.kernels.filter.recovery import doubt_acceleration, suspect_group, time_of
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import (
     add,
     add_to_diagonal,
@@ -111,12 +112,12 @@ def suspect(flight, p, work, settings, slow, k):
 
 @kernel
 def doubt(flight, p, work, settings, slow, k):
-    """Add to the covariance of what may be wrong, where velocities are doubted.
+    """Raise the variances of what may be wrong, where velocities are doubted.
 
     That is the velocity; accelerometer and tilt may have led there.
     """
     nu, doubted, P = load3(flight.innovation[VELOCITY_BLOCK]), work.doubted[VELOCITY_BLOCK], work.P
     for i in range(3):
-        P[V + i, V + i] = P[V + i, V + i] + select(doubted > 0.0, nu[i] * nu[i], 0.0)
+        P[V + i, V + i] = maximum(P[V + i, V + i], select(doubted > 0.0, nu[i] * nu[i], 0.0))
     doubt_acceleration(p, P, norm(nu) / time_of(flight, p, VELOCITY_BLOCK), doubted)
     return k

@@ -1,0 +1,152 @@
+"""Filters that are wrong say so: without being asked where faults are flown, and long enough."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.faults import GnssJump, GyroBiasStep, PositionJump
+from quad_gym.records import Source
+from tests.field_flights import fly, nees, steps
+from tests.unit.test_inflation import R_BI, R_IG, SUITE, started
+
+STEP = GyroBiasStep(start=0.5, size=math.radians(3.0))
+NEVER = STEP.replace(start=1e6)
+RIGHT = stats.chi2.ppf(0.9973, 9)
+"""As `quad-gym consistency --recovery` has it, of position, velocity and attitude."""
+
+
+def hovering(**keywords):
+    batch = FlightBatch(
+        16, task=TASK_DEFAULTS["hover"], gains="tuned", filter_start="warm", **keywords
+    )
+    batch.reset(seeds=range(16))
+    return batch
+
+
+def silent(batch):
+    """(n,) whether a flight is neither right nor told."""
+    return (nees(batch, slice(0, 9)) > RIGHT) & ~(batch.read("lost") > 0.0)
+
+
+# ---- who watches -------------------------------------------------------------------------------
+
+
+def test_flights_of_the_default_suite_that_meet_faults_say_that_they_are_lost():
+    env = QuadVectorEnv(16, "hover", faults=STEP, start="hover", filter_start="warm")
+    _, info = env.reset(seed=0)
+    assert not info["filter_lost"].any()
+    lost = np.zeros(16, bool)
+    for _ in range(150):
+        *_, info = env.step(np.zeros((16, 4)))
+        lost |= info["filter_lost"]
+    assert lost.mean() > 0.9
+    assert "innovations" not in info
+
+
+@pytest.mark.parametrize("suite", ["standard", "lab"])
+def test_watching_changes_no_bit_of_a_flight(suite):
+    plain, watching = hovering(sensors=suite), hovering(sensors=suite, faults=NEVER)
+    for batch in (plain, watching):
+        steps(batch, 1.0)
+    for name in ("r", "q", "r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L"):
+        np.testing.assert_array_equal(plain.read(name), watching.read(name))
+    assert np.isnan(plain.read("block_nis")).all()
+    assert np.isfinite(watching.read("block_nis")[:, 0]).all()
+
+
+def test_flights_that_end_when_lost_watch():
+    task = TASK_DEFAULTS["hover"].replace(end_when_lost=True)
+    batch = FlightBatch(2, task=task)
+    batch.reset(seeds=[0, 1])
+    steps(batch, 0.1)
+    assert np.isfinite(batch.read("block_nis")[:, 0]).all()
+
+
+def test_flights_on_the_truth_have_no_filter_that_watches():
+    batch = hovering(source=Source.TRUTH, faults="rotor_loss")
+    steps(batch, 0.1)
+    assert np.isnan(batch.read("block_nis")).all()
+
+
+# ---- without a gate ------------------------------------------------------------------------------
+
+
+def test_a_filter_that_mends_nothing_stays_lost_for_as_long_as_its_biases_remember():
+    """P/Q of the slowest bias, by NumPy; a decay of variance P - Q is one of the error by Q/P."""
+    batch = hovering(sensors="standard", faults=STEP)
+    steps(batch, 1.5)
+    imu, L = batch.sensors.imu, batch.read("L")
+    variance = np.einsum("nij,nij->ni", L, L)[:, 9:15]
+    drive = [2.0 * s**2 / tau for s, tau in ((imu.accel_bias_sigma, imu.accel_bias_tau),
+                                             (imu.gyro_bias_sigma, imu.gyro_bias_tau))]  # fmt: skip
+    memory = (variance / np.repeat(drive, 3)).max(axis=1)
+    held = (batch.read("doubt_tick") - batch.read("tick")) * imu.dt + 1.0
+    assert (batch.read("lost") > 0.0).all()
+    np.testing.assert_allclose(held, memory, rtol=1e-3)
+    assert (memory > 2.0).all()
+
+
+def test_flights_without_a_gate_are_not_wrong_in_silence_after_a_jump_of_gnss():
+    fault = GnssJump(start=1.0, duration=2.0, size=0.5)
+    batch = fly(quad_gym.sensor_suite("standard"), 128, filter_start="warm", faults=fault)
+    steps(batch, 5.0)
+    found = []
+    for _ in range(8):
+        steps(batch, 0.5)
+        found.append(silent(batch).mean())
+    assert np.mean(found) <= 0.01, found
+
+
+# ---- a drift that is none ------------------------------------------------------------------------
+
+
+def test_corrections_of_the_drift_have_the_variance_that_they_are_given():
+    """Their sums over a second in deviations, 3 x 256 of them, are standard normal."""
+    batch = fly(quad_gym.sensor_suite("consumer"), 256, start="hover", filter_start="warm")
+    steps(batch, 5.0)
+    scaled = batch.read("drift_corrected") / np.sqrt(batch.read("drift_corrected_variance"))
+    assert 0.85 < (scaled**2).mean() < 1.15  # 2.9 deviations of the mean of so many
+    # what drives the drift, 2 sigma^2/T in a second, adds up with weights exp(-2 t/1.5 s)
+    driven = 0.6 * math.sqrt(2.0 / 60.0 * 1.5 / 2.0)
+    level = np.sqrt(batch.read("drift_corrected_variance"))[:, :2]
+    assert np.median(level) == pytest.approx(driven, rel=0.05)
+
+
+@pytest.mark.parametrize("size", [1.0, 1.5])
+def test_a_jump_of_the_vehicle_is_not_taken_for_drift_of_gnss(size):
+    fault = PositionJump(start=2.0, size=size, direction=(1.0, -1.0, 0.0))
+    batch = fly(quad_gym.sensor_suite("consumer"), 128, filter_start="warm", faults=fault)
+    steps(batch, 8.0)
+    assert silent(batch).mean() <= 0.1  # all else that is seen of it are ten fixes or so
+
+
+# ---- doubts that repeat --------------------------------------------------------------------------
+
+
+def test_doubts_of_rejections_do_not_add_up():
+    """Velocities ever farther off along x, each rejected for the last time; along y they are not.
+
+    The variance of what is doubted becomes that of the largest innovation, not the sum of all.
+    """
+    ukf = started(np.repeat([0.1, 0.05, 0.02, 0.05, 0.005], 3))
+    off = np.array([5.0, 1.0, 0.0])
+    for _ in range(6):
+        ukf._engine.blocks["rejected_in_row"][:, 2] = 9.0
+        lever = np.cross(
+            ukf._engine.read("w_meas")[0] - ukf.gyro_bias, SUITE.gnss.primary_antenna_B
+        )
+        expected = ukf.velocity + ukf.R_BI.T @ lever
+        ukf.update(gnss_velocity_G=R_IG.T @ (expected + off))
+        ukf.predict(np.zeros(3), R_BI @ (0.0, 0.0, 9.8))
+        off[0] *= 10.0
+    assert ukf._engine.read("reopened")[0, 2] == 6.0
+    sigma = np.sqrt(np.diag(ukf.covariance))
+    assert sigma[3] == pytest.approx(off[0] / 10.0, rel=0.01)
+    assert sigma[4] == pytest.approx(1.0, rel=0.05)
+    assert (sigma[9:12] < 1.01 * 2.0).all()  # MOST_ACCEL_BIAS
