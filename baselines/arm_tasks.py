@@ -11,7 +11,7 @@ from baselines import residuals
 from baselines.pd import MARGIN, SIGMAS
 from quad_gym.params import checks as check
 from quad_gym.tasks.look_around import LookAround
-from quad_gym.tasks.outage_dash import PAID_SPEED, OutageDash, gaps_behind, gaps_of, westward
+from quad_gym.tasks.outage_dash import OutageDash, gaps_of
 from quad_gym.tasks.rewards import Crash
 from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import Observed
@@ -38,6 +38,15 @@ RECALLED_EVERY = 5
 
 _RECALLED = 12
 """What is recalled of each: errors of position and velocity, vertical, body rates."""
+
+_SCALES = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "next_gap": 12.0}
+"""What parts of the observation of `OutageDash` are divided by, in their units."""
+
+_MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
+"""Of the gaps of `OutageDash` [m]."""
+
+STEADY_CRASH_COST = 200.0
+"""Of a crash in `Steady`."""
 
 _CRASH = Crash()
 
@@ -202,33 +211,57 @@ class ResidualRace(SeenRace):
         return view.state.residual
 
 
-class Wary(OutageDash):
-    """`OutageDash` whose observation also says how unsure the filter is for the next two gaps.
+class Scaled(OutageDash):
+    """`OutageDash` whose observation is in numbers of the order of one.
 
-    As log2(2 sigma / room), sigma the largest standard deviation of the position, and room what is
+    Gaps are 12 m apart, and body rates a few tenths of rad/s: in units of SI, a network learns
+    from the former alone for long. The position error is divided by 6 m, the velocity error by
+    4 m/s, the body rates by 2 rad/s, the way from gap to gap by 12 m; widths w become
+    (w - 4.5 m) / 1.5 m.
+    """
+
+    observes: Mapping[str, Observed] = {
+        **OutageDash.observes,
+        **dict.fromkeys(("gap_width", "next_width"), Observed("-", "-", -50.0, 50.0)),
+    }
+
+    def observe(self, view: "View") -> Parts:
+        """As `OutageDash`, scaled."""
+        parts = super().observe(view)
+        for name, scale in _SCALES.items():
+            parts[name] = parts[name] / scale
+        for name in ("gap_width", "next_width"):
+            parts[name] = (parts[name] - _MIDDLE_WIDTH) / _HALF_RANGE
+        return parts
+
+
+class Wary(Scaled):
+    """`Scaled` whose observation also says how unsure the filter is for the next two gaps.
+
+    As log4(2 sigma / room), sigma the largest standard deviation of the position, and room what is
     left beside a vehicle in the middle of the gap: half its width, less 0.5 m. Above 0, two
     standard deviations do not fit through.
     """
 
     observes: Mapping[str, Observed] = {
-        **OutageDash.observes,
-        "doubt": Observed("log2", "-", -8.0, 8.0),
+        **Scaled.observes,
+        "doubt": Observed("log4", "-", -4.0, 4.0),
     }
 
     def observe(self, view: "View") -> Parts:
-        """As `OutageDash`, and `doubt` (n, 2)."""
+        """As `Scaled`, and `doubt` (n, 2)."""
         parts = super().observe(view)
-        widths = np.stack([parts["gap_width"], parts["next_width"]], axis=1)
-        return {**parts, "doubt": doubts(view, widths)}
+        scaled = np.stack([parts["gap_width"], parts["next_width"]], axis=1)
+        return {**parts, "doubt": doubts(view, _HALF_RANGE * scaled + _MIDDLE_WIDTH)}
 
 
-class Steady(OutageDash):
-    """`OutageDash` for training: crashes forfeit nothing, and episodes begin all along the course.
+class Steady(Scaled):
+    """`Scaled` for training: crashes cost the same everywhere, and episodes begin along the course.
 
     Sums of up to 660 that are lost all at once make learning unsteady. So do flights that come to
     the same gap, and lose GNSS, at the same time: a batch shows one part of the course alone, and
     what was learned of the others is lost. Episodes begin before the first wall, or halfway between
-    two walls, with equal chances.
+    two walls, with equal chances. A crash costs `STEADY_CRASH_COST`, and forfeits nothing.
     """
 
     def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike]:
@@ -242,33 +275,19 @@ class Steady(OutageDash):
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) see the class."""
-        return super().reward(view) + _CRASH(view) * view.state.earned
+        less = self._crash_cost + view.state.earned - STEADY_CRASH_COST
+        return super().reward(view) + _CRASH(view) * less
 
 
-class Waiting(Steady, Wary):
-    """`Wary` that in training pays for standing still where the next gap is too narrow.
-
-    That is while `doubt` is above 0: there, 0.1 min(speed, 5) is a cost, and progress is not paid
-    for. Crashes cost what they do in `Steady`.
-    """
-
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) see the class."""
-        gaps = gaps_of(view)
-        through = gaps_behind(gaps, view.seen.position)
-        width = gaps.widths[np.arange(view.count), through]
-        unsure = doubts(view, width[:, np.newaxis])[:, 0] > 0.0
-        progress = westward(view)
-        moving = np.minimum(np.linalg.norm(view.velocity, axis=1), PAID_SPEED)
-        change = np.where(unsure, -moving - progress, 0.0)
-        return super().reward(view) + self._weight * change
+class SteadyWary(Steady, Wary):
+    """`Wary` for training, as `Steady` is."""
 
 
 def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, k) log2(2 sigma / room) for gaps of widths (n, k) [m]; see `Wary`."""
+    """(n, k) log4(2 sigma / room) for gaps of widths (n, k) [m]; see `Wary`."""
     try:
         sigma = view.estimate.position_sigma.max(axis=1)
     except ValueError:  # no filter runs: who sees the truth has no doubt
         sigma = np.zeros(view.count)
     ratio = SIGMAS * sigma[:, np.newaxis] / (0.5 * widths - MARGIN)
-    return np.asarray(np.log2(np.maximum(ratio, 2.0**-8)))
+    return np.asarray(0.5 * np.log2(np.maximum(ratio, 2.0**-8)))

@@ -141,6 +141,7 @@ STALE_RACE = (
 )
 """Those of `QuadGym/StaleRace-v0`."""
 
+_SCALED = {"custom": "baselines.arm_tasks:Scaled"}
 _WARY = {"custom": "baselines.arm_tasks:Wary"}
 _STEADY = {"custom": "baselines.arm_tasks:Steady"}
 
@@ -153,20 +154,26 @@ OUTAGE_DASH = (
         policy="pd:waiting",
         environment=_SIGMAS,
     ),
-    Arm(name="truth", label="truth", training=_TRUTH, learning=_STEADY),
     Arm(
-        name="covariance",
-        label="estimate + 15 standard deviations",
-        environment=_SIGMAS,
+        name="truth",
+        label="truth",
+        environment=_SCALED,
+        training=_TRUTH,
         learning=_STEADY,
     ),
+    Arm(name="estimate", label="estimate", environment=_SCALED, learning=_STEADY),
     Arm(
-        name="waiting",
-        label="estimate + doubt, paid for standing still while unsure",
+        name="sigma",
+        label="estimate + doubt",
         environment=_WARY,
-        learning={"custom": "baselines.arm_tasks:Waiting"},
+        learning={"custom": "baselines.arm_tasks:SteadyWary"},
     ),
-    Arm(name="truth_on_truth", label="truth, flown on it", flies="truth", environment=_TRUTH),
+    Arm(
+        name="truth_on_truth",
+        label="truth, flown on it",
+        flies="truth",
+        environment={**_SCALED, **_TRUTH},
+    ),
 )
 """Those of `QuadGym/OutageDash-v0`."""
 

@@ -95,7 +95,9 @@ class PDPolicy:
     | "wrench" | thrust and torque N |
     | "ctbr" | thrust and the body rates (K/Kd) e at which N would be zero but for w x J w |
     | "attitude" | thrust, roll and pitch of z*, yaw rate (K/Kd) e |
-    | "velocity" | the velocity whose error the inner loop turns into F (`layout="absolute"` only) |
+    | "velocity" | the velocity whose error the inner loop turns into F: needs `layout="absolute"` |
+
+    Where there are gaps, as on OutageDash, "velocity" needs no such layout.
 
     F is kept from pointing down or far sideways (`LEAST_LIFT`, `MOST_TILT`), as it would between
     gates; on the report's circle it never does.
@@ -163,7 +165,7 @@ class PDPolicy:
             raise ValueError(
                 f"env must observe {missing[0]}: its task replaces the observation that ships"
             )
-        if flights.action == "velocity" and flights.layout != "absolute":
+        if flights.action == "velocity" and flights.layout != "absolute" and not self._gaps:
             raise ValueError(
                 'env must have layout="absolute" for action="velocity", as the relative layout '
                 "holds no velocity"
@@ -252,7 +254,8 @@ class PDPolicy:
         if not self._absolute:
             at_rest = {"reference_acceleration": np.zeros_like(part["up"])}
             parts = {**at_rest, **part}
-            return _Seen(**{name: parts[name] for name in _RELATIVE_FIELDS}, velocity=None)
+            velocity = -part["velocity_error"] if self._gaps else None  # gaps are at rest
+            return _Seen(**{name: parts[name] for name in _RELATIVE_FIELDS}, velocity=velocity)
         R_BI = part["R_BI"].reshape(-1, 3, 3)
 
         def in_body(v_I: Array) -> Array:

@@ -107,8 +107,10 @@ STUDIED: Mapping[str, StudiedTask] = {
     ),
     "outage_dash": StudiedTask(
         arms=ARMS_OF["outage_dash"],
-        carrying=("pd", "pd_slow", "pd_waiting", "truth", "waiting", "truth_on_truth"),
-        evaluations=6,
+        carrying=(
+            *("pd", "pd_slow", "pd_waiting", "truth", "estimate", "sigma", "truth_on_truth"),
+        ),
+        evaluations=10,
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
         columns={

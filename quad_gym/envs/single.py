@@ -51,7 +51,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; unless given, a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; unless given, 10 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a cost of looking at them | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
-    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west; GNSS fails for 5 to 15 s | hovering before the first wall | 35 s |
+    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west, on velocity commands; GNSS fails for 5 to 15 s | hovering before the first wall | 45 s |
 
     Reward and observation of the last three are specified in classes of their own:
     `quad_gym.tasks.look_around.LookAround`, `stale_race.StaleRace` and `outage_dash.OutageDash`.
@@ -144,7 +144,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         task: The kind of task; `gymnasium.make` fills it in from the id.
         observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the
             converged filter's errors), or "sensors".
-        action: "ctbr", "motor", "wrench", "attitude" or "velocity".
+        action: "ctbr", "motor", "wrench", "attitude" or "velocity"; by default "velocity" on
+            `OutageDash`, "ctbr" elsewhere.
         layout: "relative" or "absolute".
         include_covariance: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
@@ -164,7 +165,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         estimator: "ukf" or "ekf", in place of the suite's.
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
             no GNSS; "warm": it has been running for 10 s before the episode and has converged.
-        control_rate: Actions per second, 50 by default; divides the IMU rate [Hz].
+        control_rate: Actions per second, by default 10 on `OutageDash`, 50 elsewhere; divides the IMU
+            rate [Hz].
         action_delay: How much later than commanded the vehicle carries out an action, in control
             steps (whole ticks), at most 10; 0 by default. Until the first action arrives it carries
             out zeros, which hover. `last_action` in the observation is the commanded one.

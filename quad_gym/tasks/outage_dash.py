@@ -17,19 +17,18 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-PROGRESS_WEIGHT = 0.1
-"""Of the speed along the course, as far as it is paid for [s/m]."""
+PROGRESS_WEIGHT = 5.0
+"""Of each meter along the course, as far as its speed is paid for [1/m]."""
 
 PAID_SPEED = 5.0
 """No more than this is paid for [m/s]: faster, an outage would be over after some gaps."""
 
 CRASH_COST = 50.0
-"""On top of what the course flown so far has earned. A cost that is the same all along keeps
-learning policies before the first gap where it is high (200), and lets them hurry on through an
-outage where it is not (100)."""
+"""On top of what the course flown so far has earned: who takes a risk in each outage would gain by
+it if a crash cost the same all along."""
 
 ACTION_COST, RATE_COST = 0.02, 0.002
-"""Of |change of action|^2 and |body rates|^2, as those that ship."""
+"""Of |change of action|^2 and |body rates|^2 in each step, as those that ship."""
 
 _COSTS: Piece = -ACTION_COST * Effort() - RATE_COST * BodyRates()
 _CRASH = Crash()
@@ -59,8 +58,12 @@ class OutageDash(Task):
     that hurries on through an outage hits a wall; one that waits for its end needs the time, and
     drifts. How far to go on depends on the filter's uncertainty and on the width of the next gap.
 
-    At 5 m/s the course takes 27 s of the 35 s, and nothing is paid for time that is left: at that
-    speed, 8 s of waiting cost nothing, and longer waiting costs the end of the course.
+    At 5 m/s the course takes 27 s of the 45 s, and nothing is paid for time that is left: there is
+    time to wait for the end of every outage, and none to fly the whole course slowly.
+
+    Actions command velocities (`action="velocity"`) ten times a second (`control_rate=10`). An
+    inner loop carries them out on the estimate: the task is to decide how far to go on, not to
+    stabilize the vehicle. Other kinds of actions, and rates, are keywords as everywhere.
 
     ## Course
     It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
@@ -71,13 +74,13 @@ class OutageDash(Task):
     GNSS (position and velocity) fails once, from a time in [2, 8] s on, for a time in [5, 15] s.
 
     ## Reward
-    In each step, with the true speed v to the west [m/s] until the last gap is 12 m behind, the
-    size d of the change of the action and the size w of the body rates [rad/s]
+    In each step of h seconds, with the true speed v to the west [m/s] until the last gap is 12 m
+    behind, the size d of the change of the action and the size w of the body rates [rad/s]
 
-        0.1 min(v, 5) - 0.02 d^2 - 0.002 w^2
+        5 h min(v, 5) - 0.02 d^2 - 0.002 w^2
 
-    At most 0.5 a step, so 660 for the course of 132 m. A crash forfeits the course: it costs 50,
-    and the sum of 0.1 min(v, 5) so far.
+    At most 2.5 a step of 0.1 s, and 660 for the course of 132 m. A crash forfeits the course: it
+    costs 50, and the sum of 5 h min(v, 5) so far.
 
     ## Observation
     In place of the built-in observation, as the controller sees it:
@@ -100,11 +103,11 @@ class OutageDash(Task):
 
     ## Endings
     The finish, 12 m behind the last wall. Beside it those of `QuadEnv`: touching a wall, leaving
-    the geofence, the ground at height 0, tipping over; the time limit of 35 s.
+    the geofence, the ground at height 0, tipping over; the time limit of 45 s.
     `info["gates_passed"]` counts the gaps that are 0.7 m behind.
 
     Args:
-        progress_weight: Of v in the reward.
+        progress_weight: Of h v in the reward [1/m].
         crash_cost: What a crash costs on top of what it forfeits.
 
     Raises:
@@ -137,14 +140,14 @@ class OutageDash(Task):
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Add up what the course has earned, `view.state.earned` (n,), and count gaps."""
-        view.state.earned = view.state.earned + self._weight * westward(view)
+        view.state.earned = view.state.earned + self._weight * view.period * westward(view)
         behind = gaps_behind(gaps_of(view), view.position)
         view.state.gates_passed = np.maximum(view.state.gates_passed, behind)
 
     def reward(self, view: "View") -> Floats:
         """(n,) see the class."""
         forfeited = _CRASH(view) * (self._crash_cost + view.state.earned)
-        return self._weight * westward(view) + _COSTS(view) - forfeited
+        return self._weight * view.period * westward(view) + _COSTS(view) - forfeited
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) whether the vehicle has crashed, or is beyond the finish."""

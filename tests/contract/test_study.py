@@ -55,7 +55,7 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
     ("task", "arms"),
     [
         ("stale_race", ["pd", "truth", "covariance", "truth_on_truth", "covariance_stamped"]),
-        ("outage_dash", ["pd_waiting", "truth", "waiting", "truth_on_truth"]),
+        ("outage_dash", ["pd_waiting", "truth", "sigma", "truth_on_truth"]),
     ],
 )
 def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, capsys):

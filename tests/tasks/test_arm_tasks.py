@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quad_gym.faults import GnssOutage
+from baselines.arm_tasks import STEADY_CRASH_COST
 
 ID = "QuadGym/LookAround-v0"
 
@@ -116,49 +116,51 @@ def test_doubt_says_whether_two_standard_deviations_fit_through_the_gap():
     env, observations = make("Wary", task="QuadGym/OutageDash-v0")
     for _ in range(10):
         room = 0.5 * next_width(env) - 0.5
-        expected = np.log2(2.0 * largest_sigma(env)[:, np.newaxis] / room)
+        expected = 0.5 * np.log2(2.0 * largest_sigma(env)[:, np.newaxis] / room)
         np.testing.assert_allclose(part(env, observations, "doubt"), expected, atol=1e-4)
         observations, *_ = env.step(np.zeros((6, 4), np.float32))
     env, observations = make("Wary", task="QuadGym/OutageDash-v0", observation="truth")
-    np.testing.assert_array_equal(part(env, observations, "doubt"), -8.0)
+    np.testing.assert_array_equal(part(env, observations, "doubt"), -4.0)
 
 
-def test_waiting_is_paid_for_standing_still_while_unsure():
-    faults = [GnssOutage(start=0.0)]
-    plain, waiting = (
-        make(name, task="QuadGym/OutageDash-v0", faults=faults)[0] for name in ("Steady", "Waiting")
-    )
-    batch, cases = waiting.unwrapped.flights.batch, set()
-    action = np.zeros((6, 4), np.float32)
-    action[:, 0] = 0.05
-    for _ in range(400):
-        reward = plain.step(action)[1]
-        observed, paid, *_ = waiting.step(action)
-        if not plain.unwrapped.flights.batch.view.shipped.terminated.any():
-            unsure = part(waiting, observed, "doubt")[:, 0] > 0.0
-            v = batch.read("v")
-            lost = 0.1 * (np.minimum(np.linalg.norm(v, axis=1), 5.0) + np.minimum(-v[:, 0], 5.0))
-            np.testing.assert_allclose(paid, reward - np.where(unsure, lost, 0.0), atol=1e-9)
-            cases |= set(unsure.tolist())
-        else:
-            break
-    assert cases == {True, False}
-
-
-def test_a_steady_crash_forfeits_nothing():
-    plain, steady = (
-        make(name, task="QuadGym/OutageDash-v0", observation="truth")[0]
-        for name in ("Wary", "Steady")
-    )
-    action = np.full((6, 4), -0.5, np.float32)
-    for _ in range(200):
-        _, a, over, *_ = plain.step(action)
-        b = steady.step(action)[1]
-        earned = plain.unwrapped.flights.batch.view.state.earned
-        np.testing.assert_allclose(b, a + np.where(over, earned, 0.0), atol=1e-9)
+def test_a_steady_crash_costs_the_same_everywhere():
+    env, _ = make("SteadyWary", task="QuadGym/OutageDash-v0", observation="truth")
+    batch, last, action = env.unwrapped.flights.batch, np.zeros((6, 4)), np.zeros((6, 4))
+    action[:, :3] = 0.3, 0.0, -0.5  # on, and down to the ground
+    for _ in range(60):
+        _, reward, over, *_ = env.step(action)
+        effort = ((action - last) ** 2).sum(axis=1)
+        paid = 0.5 * np.minimum(-batch.read("v")[:, 0], 5.0)
+        costs = 0.02 * effort + 0.002 * (batch.read("w") ** 2).sum(axis=1)
+        np.testing.assert_allclose(reward, paid - costs - STEADY_CRASH_COST * over, atol=1e-9)
         if over.any():
             return
+        last = action
     raise AssertionError("nobody crashed")
+
+
+def test_steady_episodes_begin_before_the_first_wall_or_between_two():
+    env = gymnasium.make_vec(
+        "QuadGym/OutageDash-v0", num_envs=300, custom="baselines.arm_tasks:Steady"
+    )
+    env.reset(seed=0)
+    x = env.unwrapped.flights.batch.read("r")[:, 0]
+    found, count = np.unique(np.round(x, 6), return_counts=True)
+    np.testing.assert_allclose(found, [*np.arange(-54.0, 43.0, 12.0), 60.0])
+    assert count.min() > 10
+
+
+def test_scaled_observations_are_those_of_the_task_over_their_scales():
+    plain = gymnasium.make_vec("QuadGym/OutageDash-v0", num_envs=6)
+    seen = plain.reset(seed=3)[0]
+    env, scaled = make("Scaled", task="QuadGym/OutageDash-v0")
+    for name, scale in (("position_error", 6.0), ("next_gap", 12.0), ("velocity_error", 4.0)):
+        expected = part(plain, seen, name) / scale
+        np.testing.assert_allclose(part(env, scaled, name), expected, atol=1e-6)
+    for name in ("gap_width", "next_width"):
+        expected = (part(plain, seen, name) - 4.5) / 1.5
+        np.testing.assert_allclose(part(env, scaled, name), expected, atol=1e-6)
+    np.testing.assert_allclose(part(env, scaled, "up"), part(plain, seen, "up"), atol=1e-6)
 
 
 def test_being_sure_is_paid_for():

@@ -12,6 +12,7 @@ from quad_gym.evaluation import roll_out
 from quad_gym.tasks.outage_dash import OutageDash
 
 ID = "QuadGym/OutageDash-v0"
+FAST = {"action": "ctbr", "control_rate": 50.0}
 SHOWN = {
     **{"position_error": 3, "velocity_error": 3, "up": 3, "heading": 3, "body_rates": 3},
     **{"gap_width": 1, "next_gap": 3, "next_width": 1, "course_share": 1},
@@ -41,7 +42,9 @@ def edges(batch):
 def test_what_the_task_is_by_default():
     flights = make(1).unwrapped.flights
     assert flights.name == "outage_dash"
-    assert flights.batch.max_steps == 1750
+    assert flights.batch.max_steps == 450
+    assert flights.action == "velocity"
+    assert flights.control_rate == 10.0
     assert flights.batch.sensors == quad_gym.sensor_suite("consumer")
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
     assert [f.name for f in flights.table] == ["last_action", *SHOWN]
@@ -61,19 +64,21 @@ def test_gaps_are_where_the_specification_says():
     assert np.abs(np.corrcoef(north[:, 0], width[:, 0])[0, 1]) < 0.2
 
 
-def test_the_reward_is_that_of_its_equation():
-    env, rng = make(30, observation="truth"), np.random.default_rng(0)
+@pytest.mark.parametrize("keywords", [{}, FAST])
+def test_the_reward_is_that_of_its_equation(keywords):
+    env, rng = make(30, observation="truth", **keywords), np.random.default_rng(0)
     env.reset(seed=0)
     batch, crashes, over = env.unwrapped.flights.batch, 0, np.zeros(30, bool)
+    h, down = (0.02, (0.3, 0.0, 0.0, 0.0)) if keywords else (0.1, (-0.5, 0.0, 0.3, 0.0))
     last, earned = np.zeros((30, 4)), np.zeros(30)
     for _ in range(150):
-        action = np.clip(actions(rng, 30) - (0.3, 0.0, 0.0, 0.0), -1.0, 1.0)  # down to the ground
+        action = np.clip(actions(rng, 30) - down, -1.0, 1.0)  # to the ground
         _, reward, terminated, truncated, _ = env.step(action)
         effort = ((action - last) ** 2).sum(axis=1)
         rates = (batch.read("w") ** 2).sum(axis=1)
-        paid = np.minimum(-batch.read("v")[:, 0], 5.0)
-        earned += 0.1 * paid
-        expected = 0.1 * paid - 0.02 * effort - 0.002 * rates - (50.0 + earned) * terminated
+        paid = 5.0 * h * np.minimum(-batch.read("v")[:, 0], 5.0)
+        earned += paid
+        expected = paid - 0.02 * effort - 0.002 * rates - (50.0 + earned) * terminated
         np.testing.assert_allclose(reward, expected, atol=1e-9)
         over = terminated | truncated
         crashes += over.sum()
@@ -85,7 +90,7 @@ def test_the_reward_is_that_of_its_equation():
 
 @pytest.mark.parametrize("observation", ["estimate", "truth"])
 def test_the_observation_is_what_the_source_believes(observation):
-    env = make(12, observation=observation)
+    env = make(12, observation=observation, **FAST)
     policy = PDPolicy(env)
     observed, _ = env.reset(seed=5)
     batch, passed = env.unwrapped.flights.batch, set()
@@ -117,7 +122,7 @@ def test_the_observation_is_what_the_source_believes(observation):
 
 
 def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
-    env = make(2, observation="truth")
+    env = make(2, observation="truth", **FAST)
     env.reset(seed=0, options={"position": (-65.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
     observed, reward, *_ = env.step(np.zeros((2, 4), np.float32))
     np.testing.assert_array_equal(part(env, observed, "gap_width"), 6.0)
@@ -133,7 +138,7 @@ def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
 
 @pytest.mark.parametrize("mode", ["Disabled", "SameStep", "NextStep"])
 def test_gaps_are_counted_by_the_true_position(mode):
-    env = gymnasium.make_vec(ID, num_envs=8, observation="truth", autoreset_mode=mode)
+    env = gymnasium.make_vec(ID, num_envs=8, observation="truth", autoreset_mode=mode, **FAST)
     policy = PDPolicy(env)
     observed, _ = env.reset(
         seed=1, options={"position": (-21.0, 1.5, 4.0), "velocity": (-4.0, 0.0, 0.0)}
@@ -158,7 +163,7 @@ def test_gaps_are_counted_by_the_true_position(mode):
 
 
 def test_the_standard_deviations_tell_that_gnss_is_gone():
-    env = make(16, include_covariance=True)
+    env = make(16, include_covariance=True, **FAST)
     assert env.unwrapped.flights.space.shape == (40,)
     policy = PDPolicy(env, max_position_error=0.2)
     observed, _ = env.reset(seed=2)
@@ -189,7 +194,7 @@ def test_flights_on_the_truth_have_no_outage_and_asking_for_one_is_refused():
 
 
 def test_fixed_rules_are_neither_lost_nor_safe():
-    """Of 400 flights 0, 36 and 12 % crash."""
+    """Of 150 flights 0, 28 and 7 % crash."""
     crashed, returns = {}, {}
     for name, shown in (
         ("pd", {"observation": "truth"}),
@@ -201,9 +206,10 @@ def test_fixed_rules_are_neither_lost_nor_safe():
         case = f"{name} {shown.get('observation', '')}".strip()
         crashed[case], returns[case] = flown.crashed.mean(), flown.returns.mean()
     assert crashed["pd truth"] == 0.0
-    assert crashed["pd"] > 0.25
+    assert crashed["pd"] > 0.2
     assert crashed["pd:waiting"] < crashed["pd"] - 0.1
-    assert max(returns["pd"], returns["pd:waiting"]) < returns["pd truth"] - 80.0
+    assert returns["pd"] < returns["pd:waiting"] - 60.0
+    assert returns["pd:waiting"] < returns["pd truth"] - 20.0
 
 
 def test_rules_that_need_what_is_not_shown_are_refused():
