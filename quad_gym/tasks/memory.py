@@ -45,7 +45,8 @@ class ReadableBatch(FlightBatch):
         self.shown_of_flights = self.shown.T
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        if getrefcount(self._shown) > _OUR_REFERENCES:  # somebody keeps what was shown
+        if self._crew is None or getrefcount(self._shown) > _OUR_REFERENCES:
+            # somebody keeps what was shown, or its references cannot tell
             self._show_in(np.empty_like(self._shown))
         return super()._run(command)
 
@@ -55,8 +56,14 @@ class ReadableBatch(FlightBatch):
         return calls
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what looks into other memory than a copy's."""
-        return super().__getstate__() | {"_fields": {}}
+        """All but the arrays that look into its memory, which a copy makes anew."""
+        looking: dict[str, Any] = {"_fields": {}, "shown": None, "shown_of_flights": None}
+        return super().__getstate__() | looking
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Look into memory of its own."""
+        self.__dict__.update(state)
+        self._show_in(self._shown)
 
     def _field(self, name: str) -> NDArray[Any]:
         """A field of the flights' records, (blocks, ..., lanes), found once."""

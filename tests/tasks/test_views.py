@@ -1,5 +1,6 @@
 """What a view shows, against closed forms and the records of the flights."""
 
+import copy
 import inspect
 import re
 
@@ -283,6 +284,18 @@ def test_arrays_that_a_task_keeps_stay_as_they_were(part):
     for array, before in kept:
         np.testing.assert_array_equal(array, before)
     assert len({array.tobytes() for array, _ in kept}) == 4
+
+
+def test_arrays_of_a_copy_stay_as_they_were():
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    other = copy.deepcopy(env)
+    for one in (other, env):
+        kept = one.flights.batch.view.position
+        before = kept.copy()
+        one.step(np.full((FLIGHTS, 4), 0.1))
+        np.testing.assert_array_equal(kept, before)
+        assert (one.flights.batch.view.position != before).any()
 
 
 def test_what_nobody_keeps_is_written_to_the_same_memory():
