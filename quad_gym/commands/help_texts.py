@@ -6,6 +6,7 @@ The rules below, for all commands, leave that to the explanation, which says wha
 
 import shutil
 import textwrap
+from contextlib import suppress
 from dataclasses import is_dataclass, replace
 from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
@@ -81,7 +82,11 @@ def _number(info: PrimitiveTypeInfo) -> _Spec:
         try:
             return kind(words[0])
         except ValueError:
-            raise ValueError(f"must be {wanted}, got {words[0]!r}") from None
+            pass
+        with suppress(ValueError, OverflowError):
+            if float(words[0]) == int(float(words[0])):  # such as 1e6
+                return int(float(words[0]))
+        raise ValueError(f"must be {wanted}, got {words[0]!r}")
 
     return PrimitiveConstructorSpec(
         nargs=1,

@@ -63,15 +63,18 @@ def keywords_of(env_id: str) -> dict[str, Any]:
     if spec is None or spec.entry_point != _ENTRY_POINTS["entry_point"]:
         raise ValueError(
             f"env_id must be one of {', '.join(IDS)}, or of register_task, got {env_id!r}"
-            + check.did_you_mean(env_id, (*IDS, *_registered()))
+            + _meant(env_id)
         )
     return dict(spec.kwargs)
 
 
-def _registered() -> list[str]:
-    """The ids of `register_task`."""
+def _meant(env_id: Any) -> str:
+    """The end of a message that refuses an id: the one that may be meant."""
     ours = _ENTRY_POINTS["entry_point"]
-    return [env_id for env_id, spec in registry.items() if spec.entry_point == ours]
+    registered = [env_id for env_id, spec in registry.items() if spec.entry_point == ours]
+    id_of_task = {task: env_id for env_id, task in IDS.items()}
+    close = check.closest(env_id, (*registered, *id_of_task))
+    return f"; did you mean {id_of_task.get(close, close)}?" if close else ""
 
 
 def make_sb3_vec_env(

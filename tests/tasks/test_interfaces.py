@@ -11,6 +11,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import quad_gym
 from baselines import PDPolicy
+from quad_gym.envs import keywords_of
 from quad_gym.evaluation import evaluate, roll_out
 from quad_gym.tasks import Observed
 from tests import console_commands
@@ -62,6 +63,9 @@ def test_registration_refuses_wrong_ids():
         quad_gym.register_task("QuadGym/Hover-v0", Chase)
     with pytest.raises(ValueError, match="base must be one of"):
         quad_gym.register_task("Mine/Chase-v0", Chase, "CartPole-v1")
+    for wrong in ("circle", "circel", "QuadGym/Cirle-v0", "quadgym/circle-v0"):
+        with pytest.raises(ValueError, match=r"; did you mean QuadGym/Circle-v0\?$"):
+            keywords_of(wrong)
     with pytest.raises(ValueError, match=r"env_id must be one of .* got 'CartPole-v1'"):
         quad_gym.make_sb3_vec_env("CartPole-v1")
 

@@ -119,6 +119,19 @@ def test_help_that_nobody_reads_to_its_end_is_no_error():
     process.stderr.close()
 
 
+@pytest.mark.parametrize(("word", "seeds"), [("1e3", 1000), ("2.0", 2), ("1_000", 1000)])
+def test_whole_numbers_may_be_written_as_others(word, seeds):
+    given = parse(Args, ["--seeds", word]).seeds
+    assert (type(given), given) == (int, seeds)
+
+
+@pytest.mark.parametrize("word", ["1.5", "inf", "nan", "1e999", "", "one"])
+def test_what_is_no_whole_number_is_refused(word, capsys):
+    with pytest.raises(SystemExit):
+        parse(Args, ["--seeds", word])
+    assert "must be a whole number" in plain(capsys.readouterr().err)
+
+
 def test_a_file_that_is_not_there_is_named(capsys, tmp_path):
     with pytest.raises(SystemExit), usage_errors():
         (tmp_path / "plan.toml").read_text()
