@@ -9,11 +9,11 @@ what is doubted is never larger than the largest innovation tells.
 
 Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
 states is multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and
-position, too, and correlations say how. So is that of the drift of GNSS positions, for which an
-error of the position has been taken; no more than drift can be. Slow errors of aiding sensors keep
-theirs: a constant one that has become uncertain may stay so, such as hard iron, and the heading
-with it. The biases get more than that: sixteen times their deviation for a drift, three times the
-corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
+position, too, and correlations say how. So is the variance of the drift of GNSS positions, for
+which an error of the position may have been taken; to no more than drift can be. Slow errors of
+aiding sensors keep theirs: a constant one that has become uncertain may stay so, such as hard iron,
+and the heading with it. The biases get more than that: sixteen times their deviation for a drift,
+three times the corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
 
 No alarm inflates a deviation beyond `_MOST_POSITION` and its like. What nothing measures for a
 time, such as the heading in hover without a baseline, or the position in an outage of GNSS, would
@@ -52,7 +52,6 @@ from quad_gym.kernels.maths.linalg import (
     add_outer,
     apply,
     dot,
-    load3,
     load33,
     load_block,
     multiply,
@@ -113,36 +112,37 @@ def _shrink_block(P, row, M, states):
 
 @kernel
 def _shrink_axes(P, row, most, inflated, states):
-    """Bound the inflation of three states, each by itself, to three deviations."""
-    a = _share(P[row, row], most[0], inflated)
-    b = _share(P[row + 1, row + 1], most[1], inflated)
-    c = _share(P[row + 2, row + 2], most[2], inflated)
+    """Bound the inflation of three states, each by itself."""
+    a = _share(P[row, row], most, inflated)
+    b = _share(P[row + 1, row + 1], most, inflated)
+    c = _share(P[row + 2, row + 2], most, inflated)
     zero = 0.0 * a
     _shrink_block(P, row, ((a, zero, zero), (zero, b, zero), (zero, zero, c)), states)
 
 
 @kernel
-def drift_sigma(p):
-    """Stationary deviations of the drift of GNSS positions."""
-    a, s = load3(p.slow_decay[0:3]), load3(p.slow_drive[0:3])
-    return (
-        s[0] / math.sqrt((1.0 - a[0]) * (1.0 + a[0])),
-        s[1] / math.sqrt((1.0 - a[1]) * (1.0 + a[1])),
-        s[2] / math.sqrt((1.0 - a[2]) * (1.0 + a[2])),
-    )
+def inflate_drift(p, P, inflated):
+    """Inflate the drift of GNSS positions, to no more than its stationary deviation.
+
+    Its correlations stay as they are: position and drift that are inflated unequally would be told
+    apart by the fix that tells their sum.
+    """
+    for i in range(3):
+        a, s = p.slow_decay[i], p.slow_drive[i]
+        most = s * s / ((1.0 - a) * (1.0 + a))
+        wanted = select(inflated, minimum(_FACTOR * P[D + i, D + i], most), 0.0)
+        P[D + i, D + i] = maximum(P[D + i, D + i], wanted)
 
 
 @kernel
-def bound_inflation(flight, p, P, inflated, states, slow):
+def bound_inflation(flight, P, inflated, states):
     """Take back from P what inflation by `_FACTOR` has put beyond the largest deviations.
 
     Args:
         flight: Record; reads R_hat, for the vertical.
-        p: Parameters as the filter believes them.
         P: The inflated covariance, its lower triangle by blocks.
         inflated: Which lanes are.
         states: How many states there are, slow errors included.
-        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
     R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
     k = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
@@ -159,10 +159,7 @@ def bound_inflation(flight, p, P, inflated, states, slow):
         (BA, MOST_ACCEL_BIAS),
         (BG, MOST_GYRO_BIAS),
     ):
-        _shrink_axes(P, row, (most, most, most), inflated, states)
-    if slow is not None:
-        if slow.estimates_drift:
-            _shrink_axes(P, D, drift_sigma(p), inflated, states)
+        _shrink_axes(P, row, most, inflated, states)
 
 
 @kernel
@@ -209,9 +206,8 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)
         if slow.estimates_drift:
-            for j in range(0, D + 3, 3):
-                store_block(P, D, j, scale33(factor, load_block(P, D, j)))
-    bound_inflation(flight, p, P, inflated, states, slow)
+            inflate_drift(p, P, inflated)
+    bound_inflation(flight, P, inflated, states)
     _doubt_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
     _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)
     doubt(flight, p, work, settings, slow, 0)
