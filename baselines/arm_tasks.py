@@ -45,7 +45,7 @@ _SCALES = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "nex
 _MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
 """Of the gaps of `OutageDash` [m]."""
 
-STEADY_CRASH_COST = 50.0
+STEADY_CRASH_COST = 100.0
 """Of a crash in `Steady`."""
 
 _CRASH = Crash()
