@@ -145,13 +145,13 @@ def test_a_ramp_of_gnss_loses_no_flight_that_sees_markers(speed):
 
 @pytest.mark.parametrize("name", ["rtk", "indoor", "consumer"])
 def test_a_sound_filter_hardly_ever_takes_itself_for_lost(name):
-    """Over 256 flights of 10 s: the alarm levels stand for far less than one in a thousand."""
+    """Over 256 flights of 10 s: at one alarm in an hour, three come with a probability of 4 %."""
     batch = fly(quad_gym.sensor_suite(name), FLIGHTS, start="hover", filter_start="warm")
     alarms = np.zeros(FLIGHTS, bool)
     for _ in range(40):
         steps(batch, 0.25)
         alarms |= batch.read("lost") > 0.0
-    assert alarms.sum() <= 1, alarms.sum()
+    assert alarms.sum() <= 2, alarms.sum()
 
 
 def test_info_tells_of_it_and_episodes_can_end_with_it():
