@@ -137,6 +137,8 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
         "innovation_drift",
         "corrected",
         "corrected_variance",
+        "corrected_long",
+        "corrected_long_variance",
         "corrected_tick",
         "nis_ratio",
         "lost",
