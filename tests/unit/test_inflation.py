@@ -111,10 +111,10 @@ def test_alarms_that_repeat_leave_what_nothing_measures_bounded():
     assert math.sqrt(k @ ukf.covariance[6:9, 6:9] @ k) < 2.0
 
 
-def test_a_sensor_that_no_longer_measures_does_not_keep_a_filter_lost():
+def test_a_sensor_that_no_longer_measures_raises_no_more_alarms():
     """Without a gate nothing begins its mean anew; the camera goes on.
 
-    The filter stays lost for as long as its biases remember, but since the last fix.
+    The filter stays lost for as long as biases may err, but from the last fix on.
     """
     batch = FlightBatch(
         8,

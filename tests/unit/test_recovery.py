@@ -80,7 +80,7 @@ def test_a_camera_alone_finds_a_small_gyro_step_by_corrections_that_go_one_way()
 
 
 def test_a_filter_without_a_gate_says_that_a_gyro_has_changed_and_leaves_its_estimate_alone():
-    """Its gyro bias errs for long, as nothing is inflated; flights are those of before."""
+    """Its gyro bias errs for long, as nothing is inflated."""
     found = []
     for start in (0.5, 1e6):
         batch = FlightBatch(

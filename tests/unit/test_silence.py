@@ -77,19 +77,23 @@ def test_flights_on_the_truth_have_no_filter_that_watches():
 # ---- without a gate ------------------------------------------------------------------------------
 
 
-def test_a_filter_that_mends_nothing_stays_lost_for_as_long_as_its_biases_remember():
-    """P/Q of the slowest bias, by NumPy; a decay of variance P - Q is one of the error by Q/P."""
-    batch = hovering(sensors="standard", faults=STEP)
-    steps(batch, 1.5)
-    imu, L = batch.sensors.imu, batch.read("L")
-    variance = np.einsum("nij,nij->ni", L, L)[:, 9:15]
-    drive = [2.0 * s**2 / tau for s, tau in ((imu.accel_bias_sigma, imu.accel_bias_tau),
-                                             (imu.gyro_bias_sigma, imu.gyro_bias_tau))]  # fmt: skip
-    memory = (variance / np.repeat(drive, 3)).max(axis=1)
-    held = (batch.read("doubt_tick") - batch.read("tick")) * imu.dt + 1.0
-    assert (batch.read("lost") > 0.0).all()
-    np.testing.assert_allclose(held, memory, rtol=1e-3)
-    assert (memory > 2.0).all()
+@pytest.mark.parametrize("tau", [100.0, 1e6])
+def test_a_filter_that_mends_nothing_is_lost_for_about_as_long_as_it_is_wrong(tau):
+    """Of biases that hardly change, the filter becomes surer and surer, and its errors last."""
+    suite = quad_gym.sensor_suite("standard")
+    imu = suite.imu.replace(accel_bias_tau=tau, gyro_bias_tau=tau)
+    jump = GnssJump(start=1.0, duration=0.3, size=0.5)
+    batch = hovering(sensors=suite.replace(imu=imu), faults=jump)
+    lost, wrong = [], []
+    for _ in range(90):
+        steps(batch, 1.0)
+        lost.append(batch.read("lost") > 0.0)
+        wrong.append(nees(batch, slice(0, 9)) > RIGHT)
+        held = (batch.read("doubt_tick") - batch.read("tick")) * imu.dt
+        assert held.max() < 60.0  # not P/Q of biases that hardly change, 1e5 s
+    assert np.mean(lost[1:4]) == 1.0
+    assert np.mean(np.array(wrong) & ~np.array(lost)) <= 0.02
+    assert np.mean(lost[65:]) <= 0.02 + 2.0 * np.mean(wrong[30:])
 
 
 def test_flights_without_a_gate_are_not_wrong_in_silence_after_a_jump_of_gnss():
@@ -122,8 +126,12 @@ def test_corrections_of_the_drift_have_the_variance_that_they_are_given():
 def test_a_jump_of_the_vehicle_is_not_taken_for_drift_of_gnss(size):
     fault = PositionJump(start=2.0, size=size, direction=(1.0, -1.0, 0.0))
     batch = fly(quad_gym.sensor_suite("consumer"), 128, filter_start="warm", faults=fault)
-    steps(batch, 8.0)
-    assert silent(batch).mean() <= 0.1  # all else that is seen of it are ten fixes or so
+    steps(batch, 2.0)
+    found = []
+    for _ in range(5):
+        steps(batch, 2.0)
+        found.append(silent(batch).mean())
+    assert np.mean(found) <= 0.1, found  # all else that is seen of it are ten fixes or so
 
 
 # ---- doubts that repeat --------------------------------------------------------------------------

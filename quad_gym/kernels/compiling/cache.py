@@ -29,8 +29,8 @@ from quad_gym.kernels.compiling.digest import closure_of, digest_of_function
 from quad_gym.kernels.compiling.locks import locked, say
 from quad_gym.records import WIDTH
 
-_FORM = 2
-"""Of what a file holds; another number for another form, so that an old file is not found."""
+_FORM = 3
+"""Of what a file holds and how it is compiled; with another number, no older file is found."""
 KEPT = 8
 """Files of a function that are kept: of other sources, processors or signatures, the latest."""
 _LOCATORS = (

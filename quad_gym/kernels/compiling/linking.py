@@ -38,7 +38,7 @@ class _AlignedLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
         for function in ir_module.functions:
             if not function.is_declaration:
                 function.attributes.alignstack = _LANES_BYTES
-                function.attributes.add("nounwind")  # llvmlite leaves out an alignment alone
+                function.attributes.add("uwtable")  # llvmlite leaves out an alignment alone
         super().add_ir_module(ir_module)
 
 

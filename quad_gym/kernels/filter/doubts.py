@@ -1,4 +1,4 @@
-"""What a filter doubts that notices that it is wrong: what it adds to its covariance.
+"""What a filter doubts that notices that it is wrong: what becomes of its covariance.
 
 What may be wrong is not only what the sensor measures. An innovation that has grown for a time T
 since the last acceptance may come from biases, so their deviations become: nu / T of an angle
@@ -15,7 +15,7 @@ aiding sensors keep theirs: a constant one that has become uncertain may stay so
 and the heading with it. The biases get more than that: sixteen times their deviation for a drift,
 three times the corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
 
-No alarm inflates a deviation beyond `_MOST_POSITION` and its like. What nothing measures for a
+No alarm inflates a deviation beyond `MOST_POSITION` and its like. What nothing measures for a
 time, such as the heading in hover without a baseline, or the position in an outage of GNSS, would
 otherwise grow fourfold with each alarm, until sigma points mean nothing. The bounds act as a
 congruence P -> M P M with M diagonal in the position, velocity and biases, and in tilt and heading,
@@ -39,11 +39,14 @@ from quad_gym.kernels.filter.recovery import (
     MOST_ACCEL_BIAS,
     MOST_ANGLE,
     MOST_GYRO_BIAS,
+    MOST_POSITION,
     MOST_TILT,
+    MOST_VELOCITY,
     camera_fits,
     forget_corrections,
     one_way,
     suspect_group,
+    variance_of,
 )
 from quad_gym.kernels.filter.slow import fill_slow, keep_slow_factor
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
@@ -70,25 +73,19 @@ _FACTOR, _BIAS_FACTOR = 16.0, 240.0
 """Of the covariance, and what is added of the biases' variances, where innovations drift."""
 _REMAINING = 9.0
 """Square of how many times the sum of corrections may still be missing."""
-_MOST_POSITION, _MOST_VELOCITY = 100.0, 20.0
-"""Largest deviations that inflation leads to [m], [m/s]."""
 
 
 @kernel
-def _variance_of(flight, row):
+def _mean_variance(flight, row):
     """Mean variance of the three states from a row of the covariance on."""
-    total = 0.0 * flight.tick
-    for i in range(3):
-        for j in range(15):
-            if j <= row + i:
-                total = total + flight.L[row + i, j] * flight.L[row + i, j]
-    return total / 3.0
+    total = variance_of(flight, row) + variance_of(flight, row + 1)
+    return (total + variance_of(flight, row + 2)) / 3.0
 
 
 @kernel
 def _doubt_biases(flight, P, row, drifting, going, square, most):
     """Add to the variances of three biases from a row on, up to `most`."""
-    more = select(drifting, minimum(_BIAS_FACTOR * _variance_of(flight, row), most * most), 0.0)
+    more = select(drifting, minimum(_BIAS_FACTOR * _mean_variance(flight, row), most * most), 0.0)
     more = more + select(going, minimum(_REMAINING * square, most * most), 0.0)
     for i in range(row, row + 3):
         P[i, i] = P[i, i] + minimum(more, maximum(most * most - P[i, i], 0.0))
@@ -121,11 +118,12 @@ def _shrink_axes(P, row, most, inflated, states):
 
 
 @kernel
-def inflate_drift(p, P, inflated):
+def _inflate_drift(p, P, inflated):
     """Inflate the drift of GNSS positions, to no more than its stationary deviation.
 
-    Its correlations stay as they are: position and drift that are inflated unequally would be told
-    apart by the fix that tells their sum.
+    Its covariances with the other states stay as they are, so that correlations become weaker:
+    with the same ones, the fix that tells the sum of position and drift would tell unequally
+    inflated ones apart.
     """
     for i in range(3):
         a, s = p.slow_decay[i], p.slow_drive[i]
@@ -154,8 +152,8 @@ def bound_inflation(flight, P, inflated, states):
     M = ((tilted, zero, zero), (zero, tilted, zero), (zero, zero, tilted))
     _shrink_block(P, E, add_outer(M, scale(turned, k), k), states)
     for row, most in (
-        (R, _MOST_POSITION),
-        (V, _MOST_VELOCITY),
+        (R, MOST_POSITION),
+        (V, MOST_VELOCITY),
         (BA, MOST_ACCEL_BIAS),
         (BG, MOST_GYRO_BIAS),
     ):
@@ -206,7 +204,7 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
         states = 15 + slow.slow_states
         fill_slow(flight, slow, P)
         if slow.estimates_drift:
-            inflate_drift(p, P, inflated)
+            _inflate_drift(p, P, inflated)
     bound_inflation(flight, P, inflated, states)
     _doubt_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
     _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)

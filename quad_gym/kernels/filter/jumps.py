@@ -12,7 +12,8 @@ Source: ours.
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.maths.elementary import maximum
+from quad_gym.kernels.filter.recovery import MOST_POSITION, variance_of
+from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.simd.lanes import select
 
 _TIME = 1.5
@@ -59,9 +60,7 @@ def drifts_suddenly(flight):
     """
     square, limit = 0.0 * flight.tick, select(flight.lost > 0.0, _LIKELY, _SUDDEN)
     for i in range(3):
-        own = 0.0 * square
-        for j in range(R + i + 1):
-            own = own + flight.L[R + i, j] * flight.L[R + i, j]
+        own = variance_of(flight, R + i)
         total, variance = flight.drift_corrected[i], flight.drift_corrected_variance[i]
         square = square + total * total / (own / limit + variance)
     return square > limit
@@ -72,7 +71,8 @@ def doubt_position_and_drift(flight, P, doubted):
     """Raise the variances of position and drift to what a jump may have been."""
     for i in range(3):
         total = flight.drift_corrected[i]
-        wanted = select(doubted, _REMAINING * total * total, 0.0)
+        most = minimum(_REMAINING * total * total, MOST_POSITION * MOST_POSITION)
+        wanted = select(doubted, most, 0.0)
         P[R + i, R + i] = maximum(P[R + i, R + i], wanted)
         P[D + i, D + i] = maximum(P[D + i, D + i], wanted)
 

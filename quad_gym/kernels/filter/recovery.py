@@ -1,6 +1,6 @@
 """A filter that notices that it is wrong: what tells it, and when it counts as lost.
 
-Three things tell a filter that its covariance does not explain what is measured.
+Four things tell a filter that its covariance does not explain what is measured; three are here.
 
 * **Rejections.** A kind of measurement was rejected `gate_patience` times in a row. Then the filter
   is more likely wrong than the sensor - unless GNSS is rejected while the camera's features fit,
@@ -11,6 +11,7 @@ Three things tell a filter that its covariance does not explain what is measured
   each with the variance that its update takes away, P- less P+. That is no more than the biases'
   driving noise puts in, so that their sum over some seconds shows a bias that has changed long
   before innovations do, in which attitude and position may make up for each other.
+* **Jumps of the drift** of GNSS positions, see `jumps.py`.
 
 What a filter doubts then is in `doubts.py`.
 
@@ -50,12 +51,17 @@ LOST_RATIO, FOUND_RATIO = 2.1, 1.5
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
 DOUBT_TIME = 1.0
 """How long a filter counts as lost after a doubt, at least [s]."""
+_LONGEST_MEMORY = 60.0
+"""How long it does at most where nothing is mended [s]: what a bias that hardly any measurement
+tells of does by then shows again."""
 FITTING_FEATURES = 3
 """Features of an image that speak for the estimate against GNSS."""
 _FIT_TIME = 1.0
 """How long they do [s]."""
 MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
 """Largest deviations that a doubt raises to [m/s^2], [rad/s], [rad]."""
+MOST_POSITION, MOST_VELOCITY = 100.0, 20.0
+"""Likewise [m], [m/s]."""
 MOST_ANGLE = math.pi / math.sqrt(3.0)
 """Largest deviation of an angle [rad]: of one that may be anything."""
 
@@ -105,8 +111,8 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
 
 
 @kernel
-def bias_variance(flight, row):
-    """Variance of a bias, by its row of the factor."""
+def variance_of(flight, row):
+    """Variance of a state, by its row of the factor."""
     variance = 0.0 * flight.tick
     for j in range(15):
         if j <= row:
@@ -124,7 +130,7 @@ def one_way(flight, first):
     largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
     together = square
     for i in range(first, first + 3):
-        own = _HARMLESS * bias_variance(flight, BA + i)
+        own = _HARMLESS * variance_of(flight, BA + i)
         total = flight.corrected[i] * flight.corrected[i]
         variance = own + flight.corrected_variance[i]
         largest = maximum(largest, total - _ONE_WAY * _ONE_WAY * variance)
@@ -237,19 +243,18 @@ def doubt_heading(P, vertical, square, doubted):
 
 
 @kernel
-def _bias_memory(flight, p):
+def _memory(flight, p, i, drive):
     """How long what is wrong with a bias takes to fall to a third by corrections [s].
 
-    Of a bias of variance P that is driven by Q in a second, an update takes away what Q has put in,
-    so that its error falls at the rate Q/P. Innovations show an error of n deviations as n over the
-    root of two, by all of them together: what is left when they no longer tell is up to some seven.
+    Of its variance P updates take away what they have lately, so that an error falls at the rate of
+    that over P. In the long run that is the Q that drives the bias; where a start has left P
+    larger, it is more. Innovations show an error of n deviations as n over the root of two, by all
+    of them together: what is left when they no longer tell is up to some seven.
     """
-    accel, gyro = 0.0 * flight.tick, 0.0 * flight.tick
-    for i in range(3):
-        accel = maximum(accel, bias_variance(flight, BA + i))
-        gyro = maximum(gyro, bias_variance(flight, BG + i))
-    accel = accel / (p.accel_bias_drive * p.accel_bias_drive)
-    return p.dt * maximum(accel, gyro / (p.gyro_bias_drive * p.gyro_bias_drive))
+    variance = variance_of(flight, BA + i)
+    taken = flight.corrected_long_variance[i] / (0.5 * _LONG_TIME)
+    driven = drive * drive / p.dt
+    return minimum(variance / maximum(taken, driven), _LONGEST_MEMORY)
 
 
 @kernel
@@ -267,5 +272,9 @@ def tell_drifts(flight, p, mask):
     gyro, _ = one_way(flight, 3)
     drifting = mask & (drifting | accel | gyro)
     if any_of(drifting):
-        rest = maximum(_bias_memory(flight, p) - DOUBT_TIME, 0.0) / p.dt
-        flight.doubt_tick = select(drifting, flight.tick + rest, flight.doubt_tick)
+        memory = DOUBT_TIME + 0.0 * p.dt
+        for i in range(3):
+            memory = maximum(memory, _memory(flight, p, i, p.accel_bias_drive))
+            memory = maximum(memory, _memory(flight, p, 3 + i, p.gyro_bias_drive))
+        held = maximum(flight.doubt_tick, flight.tick + (memory - DOUBT_TIME) / p.dt)
+        flight.doubt_tick = select(drifting, held, flight.doubt_tick)

@@ -20,13 +20,14 @@ from quad_gym.kernels.filter.error_state import E, R
 from quad_gym.kernels.filter.recovery import (
     FITTING_FEATURES,
     LARGEST,
+    MOST_ANGLE,
     doubt_rate,
     follow_drift,
     raise_diagonal,
     suspect_group,
     time_of,
 )
-from quad_gym.kernels.maths.elementary import clip, maximum
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum
 from quad_gym.kernels.maths.linalg import (
     add_outer,
     add_scaled,
@@ -262,7 +263,7 @@ def doubt(flight, p, work, settings, slow, k):
         distance = norm(sub(load3(p.features[i]), load3(flight.r_hat)))
         angle = maximum(angle, square)
         offset = maximum(offset, square * distance * distance)
-    raise_diagonal(P, E, angle)
+    raise_diagonal(P, E, minimum(angle, MOST_ANGLE * MOST_ANGLE))
     raise_diagonal(P, R, offset)
     doubt_rate(P, math.sqrt(angle) / time_of(flight, p, FEATURE_BLOCKS), doubted)
     return k
