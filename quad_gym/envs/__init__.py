@@ -71,8 +71,8 @@ def keywords_of(env_id: str) -> dict[str, Any]:
 def _meant(env_id: Any) -> str:
     """The end of a message that refuses an id: the one that may be meant."""
     ours = _ENTRY_POINTS["entry_point"]
-    registered = [env_id for env_id, spec in registry.items() if spec.entry_point == ours]
-    id_of_task = {task: env_id for env_id, task in IDS.items()}
+    registered = [name for name, spec in registry.items() if spec.entry_point == ours]
+    id_of_task = {task: name for name, task in IDS.items()}
     close = check.closest(env_id, (*registered, *id_of_task))
     return f"; did you mean {id_of_task.get(close, close)}?" if close else ""
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from quad_gym.params.checks import did_you_mean
 from quad_gym.tasks.fields import VIEW_FIELDS
 from quad_gym.tasks.lazy import Group
+from quad_gym.tasks.state import State
 from quad_gym.tasks.task import Task, TaskError, label
 
 Floats = NDArray[np.float64]
@@ -39,6 +40,8 @@ def _meant(error: Exception) -> str:
     """The end of a message about an attribute that there is not: the one that may be meant."""
     if not isinstance(error, AttributeError) or error.name is None:
         return ""
+    if not isinstance(error.obj, Group | State):
+        return ""  # the user's own object, which may answer anything
     if isinstance(error.obj, Group):  # in another group?
         for field in VIEW_FIELDS:
             if field.name.rpartition(".")[2] == error.name:

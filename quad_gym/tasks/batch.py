@@ -133,10 +133,7 @@ class TaskBatch(ReadableBatch):
             )
         if not self._begun:
             self._require_begun()
-        self.error_before = self.shown[_POSITION_ERROR].copy()
-        self.gates_before = self.shown[_GATE_NEXT].copy()
-        if self._counts_gates:
-            self.gates_before = self.columns("gate_next")
+        self._remember()
         self.view.step_over()
         shipped = super().step(actions)
         try:
@@ -144,6 +141,13 @@ class TaskBatch(ReadableBatch):
         except BaseException:
             self._failed = np.ones(self.count, bool)
             raise
+
+    def _remember(self) -> None:
+        """Keep what the next step is compared with."""
+        self.error_before = self.shown[_POSITION_ERROR].copy()
+        self.gates_before = self.shown[_GATE_NEXT].copy()
+        if self._counts_gates:
+            self.gates_before = self.columns("gate_next")
 
     def _after_step(self, shipped: Singles) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
@@ -315,7 +319,9 @@ class TaskBatch(ReadableBatch):
         if len(self._state):
             self._state.read_from(snapshot["state"])
         self._returns[:] = self.columns("episode_return")
-        self.show_anew("position_error", "gate_next")
+        self.began = self.shown[_TIME] == 0.0
+        self.began_some = bool(np.count_nonzero(self.began))
+        self._remember()  # nothing is known of the step before: no progress, no gate
         self._failed = np.zeros(self.count, bool)
         self._view = None
 

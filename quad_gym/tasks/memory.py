@@ -1,4 +1,8 @@
-"""Flights whose memory a view reads, and to which a task writes its rewards and endings."""
+"""`ReadableBatch`: flights that show each instant to the views of a task.
+
+The compiled code writes what is shown; views look into that memory, without a copy. Rewards and
+endings of a task are written by `quad_gym.kernels.task.settle`.
+"""
 
 from sys import getrefcount
 from typing import Any
@@ -10,18 +14,20 @@ from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import SETTLE
-from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
+from quad_gym.records import SHOWN_SIZE, WIDTH, Command
 
 Floats = NDArray[np.float64]
 
 _GAP = 8
 """Numbers between two rows of what is shown: a line of the cache."""
-_OUR_REFERENCES = 5
-"""To the memory of what is shown: the batch's, those of two arrays, the calls', the argument."""
 
 
 class ReadableBatch(FlightBatch):
-    """A `FlightBatch` with what the views of a task read, as new arrays of all flights."""
+    """A `FlightBatch` with what the views of a task read.
+
+    `shown` is memory that the next step overwrites, unless somebody keeps an array of it: then the
+    step writes to other memory. Other fields are read as new arrays.
+    """
 
     def __init__(self, count: int, **keywords: Any) -> None:
         super().__init__(count, **keywords)
@@ -30,30 +36,48 @@ class ReadableBatch(FlightBatch):
         self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
         # rows that lie a power of two apart would share a few lines of the cache
-        self._show_in(np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
+        self._look_into(np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
 
     shown: Floats
-    """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` after the last step or reset; read-only"""
+    """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` at the present instant; read-only"""
+    _own_references: int
+    """To the memory of what is shown, where nobody keeps it; measured, as interpreters differ."""
 
-    def _show_in(self, memory: Floats) -> None:
-        """Let the next step or reset write what is shown to other memory."""
-        if self._crew is not None:
-            self._crew.gather()  # nobody may still write to the memory that goes
-            self._calls.show_into(memory)
+    def _look_into(self, memory: Floats) -> None:
+        """Let `shown` be what other memory holds."""
         self._shown, self.shown = memory, memory[:, : self.count]
         self.shown.setflags(write=False)
         self.shown_of_flights = self.shown.T
 
+    def _references(self) -> int:
+        """How many references there are to the memory of what is shown."""
+        return getrefcount(self._shown)
+
     def _run(self, command: Command) -> NDArray[np.float32]:
-        if self._crew is None or getrefcount(self._shown) > _OUR_REFERENCES:
-            # somebody keeps what was shown, or its references cannot tell
-            self._show_in(np.empty_like(self._shown))
+        if self._crew is not None and self._references() > self._own_references:
+            # somebody keeps what was shown
+            self._crew.gather()  # nobody may still write to the memory that goes
+            self._look_into(np.empty_like(self._shown))
+            self._calls.show_into(self._shown)
         return super()._run(command)
 
     def _calls_of_threads(self) -> Calls:
         calls = super()._calls_of_threads()
+        self._look_into(np.empty_like(self._shown))  # nobody else knows of it yet
         calls.show_into(self._shown)
+        self._own_references = self._references()
         return calls
+
+    def restore(self, snapshot: NDArray[Any]) -> None:
+        """Bring all flights back to a snapshot; `shown` is of its instant then.
+
+        Raises:
+            ValueError: If the snapshot is of another size or kind.
+        """
+        super().restore(snapshot)
+        self._resets[:] = 0
+        self._run(Command.RESET)  # of no flight, which shows and observes all of them
+        self._blocks[:] = snapshot  # what fills the last block has begun anew
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the arrays that look into its memory, which a copy makes anew."""
@@ -63,7 +87,7 @@ class ReadableBatch(FlightBatch):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Look into memory of its own."""
         self.__dict__.update(state)
-        self._show_in(self._shown)
+        self._look_into(self._shown)
 
     def _field(self, name: str) -> NDArray[Any]:
         """A field of the flights' records, (blocks, ..., lanes), found once."""
@@ -101,13 +125,6 @@ class ReadableBatch(FlightBatch):
         lanes = field.flatten()
         lanes[: self.count] = values
         field[:] = lanes.reshape(field.shape)
-
-    def show_anew(self, *names: str) -> None:
-        """Let `shown` say what the records say of some fields, as these have changed since."""
-        memory = self._shown.copy()
-        for name in names:
-            memory[SHOWN[name], : self.count] = self.columns(name)
-        self._show_in(memory)
 
     def gates(self) -> Floats:
         """(n, gates, 3) of a course in I [m]; none elsewhere."""

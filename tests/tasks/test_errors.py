@@ -264,3 +264,17 @@ def test_a_method_whose_name_is_nearly_right_is_warned_of():
 
             def pieces(self, view):
                 return view.time
+
+
+def test_no_name_is_suggested_of_an_object_of_the_user():
+    class Silent:
+        """Does not say what it has."""
+
+        def __dir__(self):
+            raise RuntimeError("nobody may ask")
+
+    env = QuadVectorEnv(2, "hover", custom=quad_gym.Task.of(reward=lambda view: Silent().gain))
+    env.reset(seed=0)
+    with pytest.raises(TaskError, match=r"reward failed.*no attribute 'gain'$") as caught:
+        env.step(np.zeros((2, 4)))
+    assert isinstance(caught.value.__cause__, AttributeError)

@@ -6,6 +6,7 @@ import pytest
 import quad_gym
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
+from tests.contract.comparing import assert_same
 
 FLIGHTS, STEPS, LIMIT = 13, 60, 40
 
@@ -24,6 +25,19 @@ class Said:
     def task(self):
         answers = {name: lambda view, name=name: getattr(self, name) for name in self.methods}
         return quad_gym.Task.of(**answers)
+
+
+class Same(quad_gym.Task):
+    """Says of each step what the built-in task says."""
+
+    def reward(self, view):
+        return view.shipped.reward
+
+    def terminated(self, view):
+        return view.shipped.terminated
+
+    def truncated(self, view):
+        return view.shipped.truncated
 
 
 def expected_endings(said, plain):
@@ -96,3 +110,32 @@ def test_returns_go_on_after_a_snapshot_has_been_restored():
     batch.reset(mask=mask)
     batch.step(actions)
     np.testing.assert_array_equal(batch.read("episode_return")[mask], said.reward[mask])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize(
+    ("task", "sensors", "faults"), [("hover", "rtk", "all"), ("waypoints", "standard", "gnss_jump")]
+)
+def test_a_task_that_says_what_is_built_in_changes_nothing(task, sensors, faults, mode):
+    keywords = {"sensors": sensors, "faults": faults, "end_when_lost": True, "reward_per": "step"}
+    keywords |= {"autoreset_mode": mode, "max_episode_steps": 90, "max_tilt": 0.25}
+    plain = QuadVectorEnv(FLIGHTS, task, **keywords)
+    same = QuadVectorEnv(FLIGHTS, task, custom=Same(), **keywords)
+    rng, seen = np.random.default_rng(3), set()
+    assert_same(plain.reset(seed=3), same.reset(seed=3))
+    for env in (plain, same):
+        env.flights.batch.switch_faults(True)
+    for _ in range(140):
+        actions = rng.uniform(-0.12, 0.12, (FLIGHTS, 4)).astype(np.float32)
+        step = plain.step(actions)
+        assert_same(step, same.step(actions))
+        batch, other = plain.flights.batch, same.flights.batch
+        np.testing.assert_array_equal(other.results, batch.results)
+        for name in ("reward", "terminated", "truncated", "ending", "episode_return"):
+            np.testing.assert_array_equal(other.read(name), batch.read(name), name)
+        seen |= set(batch.result("ending").astype(int))
+        over = step[2] | step[3]
+        if mode == "Disabled" and over.any():
+            options = {"reset_mask": over}
+            assert_same(plain.reset(options=options), same.reset(options=options))
+    assert seen >= {Ending.TIME_LIMIT, Ending.FILTER_LOST}, seen

@@ -319,3 +319,35 @@ def test_progress_is_the_same_after_a_snapshot_has_been_restored():
             progress.append(batch.view.truth.progress)
         batch.restore(instant)
     np.testing.assert_array_equal(progress[:3], progress[3:])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize("task", ["circle", "waypoints"])
+def test_a_view_is_of_the_instant_that_has_been_restored(task, mode):
+    env = QuadVectorEnv(
+        *(FLIGHTS, task), custom=Nothing(), sensors="rtk", max_episode_steps=20, autoreset_mode=mode
+    )
+    env.reset(seed=1)
+    batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
+    names = [f.name for f in every_name() if f.shape and not f.shape.startswith("dict")]
+    of_a_step = ("shipped.", "truth.progress", "gate_passed")
+    names = [name for name in names if not name.startswith(of_a_step)]
+    assert {"time", "began", "truth.position", "truth.position_error", "observation"} <= set(names)
+
+    def shown():
+        return {name: np.array(value_of(batch.view, name)) for name in names}
+
+    for steps in (0, 13, 7 + (mode == "NextStep")):  # at the start, later, and as others begin
+        for _ in range(steps):
+            batch.step(actions)
+        instant, before = batch.snapshot(), shown()
+        batch.step(actions)
+        batch.step(actions)
+        kept = batch.view.position
+        while_away = kept.copy()
+        batch.restore(instant)
+        for name, values in shown().items():
+            np.testing.assert_array_equal(values, before[name], name)
+        np.testing.assert_array_equal(batch.view.truth.progress, np.zeros(FLIGHTS))
+        np.testing.assert_array_equal(kept, while_away)
+        assert batch.snapshot().tobytes() == instant.tobytes()

@@ -1,4 +1,4 @@
-"""What a user's task has judged of a step takes the place of the built-in judgment."""
+"""Rewards and endings of a user's task: written to results and records, over the built-in ones."""
 
 import math
 from enum import IntEnum, auto
@@ -52,7 +52,7 @@ def _block(call, flight):
 
 
 @kernel
-def _exists(block, lane):
+def _is_finite(block, lane):
     """Whether the true state of a flight is finite."""
     total = 0.0
     for i in range(3):
@@ -69,16 +69,16 @@ def _result(call, row):
 
 
 @kernel
-def _pay(call, verdict, scale):
+def _write_rewards(call, verdict, scale):
     """Write rewards and returns, if all rewards are sound; return how many are not.
 
-    A flight that begins, or that is no more, has no reward.
+    A flight that begins an episode, or whose state is no longer finite, has no reward.
     """
     count, wrong = call[_COUNT], 0
     rewards, began = _floats_at(verdict[_REWARDS], count), _bytes_at(verdict[_BEGAN], count)
     for flight in range(count):
         sound = abs(rewards[flight]) <= LARGEST_REWARD  # NaN is not
-        if began[flight] or not (sound or _exists(_block(call, flight), flight % WIDTH)):
+        if began[flight] or not (sound or _is_finite(_block(call, flight), flight % WIDTH)):
             rewards[flight] = 0.0
         elif not sound:
             wrong += 1
@@ -96,7 +96,7 @@ def _pay(call, verdict, scale):
 
 
 @kernel
-def _end(call, verdict, settings):
+def _write_endings(call, verdict, settings):
     """Write which flights are terminated and truncated, and why; return how many are."""
     count, ended = call[_COUNT], 0
     terminates, truncates = verdict[_TERMINATES], verdict[_TRUNCATES]
@@ -107,31 +107,31 @@ def _end(call, verdict, settings):
     steps = _result(call, _EPISODE_STEPS)
     for flight in range(count):
         crashed, done = terminated[flight] > 0.0, terminated[flight] + truncated[flight] > 0.0
-        late = settings.max_steps > 0.0 and steps[flight] >= settings.max_steps
-        strays = settings.end_when_lost > 0.0 and lost[flight] > 0.0
-        cut = late or strays or status[flight] > 0.0
-        flies, falls, stops = began[flight] == 0, crashed, cut
+        timed_out = settings.max_steps > 0.0 and steps[flight] >= settings.max_steps
+        is_lost = settings.end_when_lost > 0.0 and lost[flight] > 0.0
+        built_in_cut = timed_out or is_lost or status[flight] > 0.0
+        flies, ends, is_cut = began[flight] == 0, crashed, built_in_cut
         if terminates:
-            falls = terminating[flight] > 0
-            if crashed and not falls:  # but nobody flies on in a state that is no more
-                falls = not _exists(_block(call, flight), flight % WIDTH)
+            ends = terminating[flight] > 0
+            if crashed and not ends:  # but nobody flies on in a state that is not finite
+                ends = not _is_finite(_block(call, flight), flight % WIDTH)
         if truncates:
-            stops = truncating[flight] > 0
-        falls = falls and flies
-        stops = stops and flies and not falls
-        if not (done or falls or stops):
+            is_cut = truncating[flight] > 0
+        ends = ends and flies
+        is_cut = is_cut and flies and not ends
+        if not (done or ends or is_cut):
             continue  # almost always
-        why = _TASK if falls or stops else 0.0
-        if falls and crashed:
+        why = _TASK if ends or is_cut else 0.0
+        if ends and crashed:
             why = ending[flight]
-        elif stops and cut:
-            why = _FAILED if status[flight] > 0.0 else _LOST if strays else _TIME_LIMIT
+        elif is_cut and built_in_cut:
+            why = _FAILED if status[flight] > 0.0 else _LOST if is_lost else _TIME_LIMIT
         block, lane = _block(call, flight), flight % WIDTH
-        block.terminated[lane] = terminated[flight] = 1.0 if falls else 0.0
-        block.truncated[lane] = truncated[flight] = 1.0 if stops else 0.0
+        block.terminated[lane] = terminated[flight] = 1.0 if ends else 0.0
+        block.truncated[lane] = truncated[flight] = 1.0 if is_cut else 0.0
         block.ending[lane] = ending[flight] = why
-        block.needs_reset[lane] = 1.0 if falls or stops else 0.0
-        if falls or stops:
+        block.needs_reset[lane] = 1.0 if ends or is_cut else 0.0
+        if ends or is_cut:
             ended += 1
     return ended
 
@@ -149,11 +149,11 @@ def settle(call, verdict, scale):
         scale: What rewards are multiplied by.
 
     Returns:
-        How many flights a step has ended; or, if rewards are not finite, less their number: nothing
-        has been written then.
+        How many episodes have ended; or minus the number of unsound rewards: nothing has been
+        written then.
     """
     if verdict[_REWARDS]:
-        wrong = _pay(call, verdict, scale)
+        wrong = _write_rewards(call, verdict, scale)
         if wrong > 0:
             return -wrong
-    return _end(call, verdict, _settings_at(call[_SETTINGS]))
+    return _write_endings(call, verdict, _settings_at(call[_SETTINGS]))
