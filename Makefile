@@ -58,8 +58,9 @@ study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
 	$(BIN)/quad-gym study look_around --page docs/where-it-matters.md
 	$(BIN)/quad-gym study --arms-file baselines/arms_misled.py --section misled --episodes 200 \
 		--page docs/where-it-matters.md
-	$(BIN)/quad-gym study stale_race --seeds 3 --episodes 200 --page docs/where-it-matters.md
-	$(BIN)/quad-gym study outage_dash --seeds 5 --episodes 400 --page docs/where-it-matters.md
+	$(BIN)/quad-gym study stale_race --seeds 5 --episodes 400 --page docs/where-it-matters.md
+	$(BIN)/quad-gym study outage_dash --arms pd pd_slow pd_waiting --episodes 400 \
+		--page docs/where-it-matters.md
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"

@@ -1,7 +1,7 @@
 """Variants of tasks for the arms of a study: for training, and some for evaluation."""
 
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,6 +44,8 @@ _SCALES = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "nex
 
 _MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
 """Of the gaps of `OutageDash` [m]."""
+
+_WIDTHS = ("gap_width", "next_width")
 
 STEADY_CRASH_COST = 100.0
 """Of a crash in `Steady`."""
@@ -211,28 +213,44 @@ class ResidualRace(SeenRace):
         return view.state.residual
 
 
+def _scaled(name: str, value: Any) -> Any:
+    """What `Scaled` shows for a value of a part of `OutageDash`."""
+    if name in _WIDTHS:
+        return (value - _MIDDLE_WIDTH) / _HALF_RANGE
+    return value / _SCALES.get(name, 1.0)
+
+
+def _shown_as(name: str) -> str:
+    """The name that `Scaled` gives to a part of `OutageDash`."""
+    return f"{name}_scaled" if name in (*_SCALES, *_WIDTHS) else name
+
+
+def _in_numbers(name: str, part: Observed) -> Observed:
+    """A part of `OutageDash` as `Scaled` declares it: without a unit, its bounds scaled."""
+    if _shown_as(name) == name:
+        return part
+    return Observed("-", part.frame, _scaled(name, part.low), _scaled(name, part.high))
+
+
 class Scaled(OutageDash):
     """`OutageDash` whose observation is in numbers of the order of one.
 
     Gaps are 12 m apart, and body rates a few tenths of rad/s: in units of SI, a network learns
     from the former alone for long. The position error is divided by 6 m, the velocity error by
     4 m/s, the body rates by 2 rad/s, the way from gap to gap by 12 m; widths w become
-    (w - 4.5 m) / 1.5 m.
+    (w - 4.5 m) / 1.5 m. Such parts have names of their own, as `position_error_scaled`, so that
+    policies that fly `OutageDash` are refused here, and those of here are refused there.
     """
 
     observes: Mapping[str, Observed] = {
-        **OutageDash.observes,
-        **dict.fromkeys(("gap_width", "next_width"), Observed("-", "-", -50.0, 50.0)),
+        _shown_as(name): _in_numbers(name, part) for name, part in OutageDash.observes.items()
     }
 
     def observe(self, view: "View") -> Parts:
         """As `OutageDash`, scaled."""
-        parts = super().observe(view)
-        for name, scale in _SCALES.items():
-            parts[name] = parts[name] / scale
-        for name in ("gap_width", "next_width"):
-            parts[name] = (parts[name] - _MIDDLE_WIDTH) / _HALF_RANGE
-        return parts
+        return {
+            _shown_as(name): _scaled(name, part) for name, part in super().observe(view).items()
+        }
 
 
 class Wary(Scaled):
@@ -251,17 +269,18 @@ class Wary(Scaled):
     def observe(self, view: "View") -> Parts:
         """As `Scaled`, and `doubt` (n, 2)."""
         parts = super().observe(view)
-        scaled = np.stack([parts["gap_width"], parts["next_width"]], axis=1)
+        scaled = np.stack([parts[f"{name}_scaled"] for name in _WIDTHS], axis=1)
         return {**parts, "doubt": doubts(view, _HALF_RANGE * scaled + _MIDDLE_WIDTH)}
 
 
 class Steady(Scaled):
     """`Scaled` for training: crashes cost the same everywhere, and episodes begin along the course.
 
-    Sums of up to 660 that are lost all at once make learning unsteady. So do flights that come to
-    the same gap, and lose GNSS, at the same time: a batch shows one part of the course alone, and
-    what was learned of the others is lost. Episodes begin before the first wall, or halfway between
-    two walls, with equal chances. A crash costs `STEADY_CRASH_COST`, and forfeits nothing.
+    A crash costs `STEADY_CRASH_COST`, and forfeits nothing. That makes hurrying pay late in the
+    course, but sums of up to 660 that are lost all at once make learning unsteady. So do flights
+    that come to the same gap, and lose GNSS, at the same time: a batch shows one part of the course
+    alone, and what was learned of the others is lost. Episodes begin before the first wall, or
+    halfway between two walls, with equal chances.
     """
 
     def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike]:

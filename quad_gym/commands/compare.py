@@ -45,15 +45,18 @@ from quad_gym.commands.options import (
     Keywords,
     SuiteNames,
     TrackingId,
-    known_id,
     leave,
     usage_errors,
+    with_full_id,
 )
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200
+GRACE = 60.0
+"""What a training has to write a checkpoint once the comparison is gone [s]."""
+
 FLOWN_ON = ("truth", "estimate")
 Source = Literal["truth", "noisy", "estimate"]
 SOURCES: tuple[Source, ...] = ("truth", "noisy", "estimate")
@@ -106,7 +109,7 @@ def configure(args: Args) -> Setting:
     except ImportError as error:
         raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
     plots.require_matplotlib()
-    known_id("ENV_ID", args.env_id, TRACKING)
+    args = with_full_id(args, TRACKING)
     for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
@@ -240,6 +243,8 @@ def end_with_parent() -> None:
     def watch() -> None:
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)  # a training writes a checkpoint, and ends
+        time.sleep(GRACE)
+        os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
@@ -248,11 +253,12 @@ def train_one(plan: Any, folder: Path) -> Any:
     """Train a policy, or go on with a training that was stopped; in a process of its own."""
     from baselines.training import train
 
-    done = train(plan, folder, resume=True, tensorboard=False, quiet=True)
-    parent = multiprocessing.parent_process()
-    if parent is not None and not parent.is_alive():
-        os._exit(1)  # rather than begin with the next one that waits
-    return done
+    try:
+        return train(plan, folder, resume=True, tensorboard=False, quiet=True)
+    finally:
+        parent = multiprocessing.parent_process()
+        if parent is not None and not parent.is_alive():
+            os._exit(1)  # rather than begin with the next one that waits
 
 
 def _steps_done(folder: Path) -> int:

@@ -122,11 +122,12 @@ class Args:
     samples: Literal["instant", "average"] | None = None
     """what an IMU sample holds, in place of the form's"""
     integration: Literal["euler", "midpoint"] | None = None
-    """how the filter integrates them, in place of the form's"""
+    """how the filter integrates IMU samples, in place of the form's"""
     covariance_reset: Literal["none", "turn"] | None = None
     """whether the covariance turns with the attitude that is corrected, in place of the form's"""
     feature_noise_across: Literal["measured", "predicted", "projected"] | None = None
-    """direction across which the filter takes the camera's noise to lie, in place of the form's"""
+    """direction to which the filter assumes camera noise is perpendicular, in place of the
+    form's"""
     estimator: Literal["ukf", "ekf"] | None = None
     """the filter, in place of the suite's"""
     camera: bool = True
@@ -159,7 +160,7 @@ class Args:
             object.__setattr__(self, "output", Path("results") / folder)
         if self.count < 2:
             raise ValueError(f"--episodes must be at least 2, got {self.flights}")
-        known_id("ENV_ID", self.env_id, TRACKING)
+        object.__setattr__(self, "env_id", known_id("ENV_ID", self.env_id, TRACKING))
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
         if self.matrix and self.recovery:

@@ -83,9 +83,9 @@ class Trial:
         """Why filters may stay wrong in silence."""
         gated = self.flown.estimator.gate_false_alarm > 0.0
         if not gated:
-            return "no gate, so it mends nothing"
+            return "no gate, so it cannot correct itself"
         if self.what == "position_jump" and self.flown.drifts:
-            return "a jump is seen only until the drift has followed it"
+            return "the drift estimate absorbs the jump"
         return ""
 
 

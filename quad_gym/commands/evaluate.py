@@ -9,7 +9,7 @@ with), and figures of paths and errors over time (PNG and SVG).
 """
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,11 +35,11 @@ from quad_gym.commands.options import (
     Keywords,
     OwnSuite,
     free_folder,
-    known_id,
     leave,
     refuse_overwriting,
     sensors_of,
     usage_errors,
+    with_full_id,
 )
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.faults.presets import felt_without_sensors
@@ -52,7 +52,7 @@ class Args:
     """Options of the evaluation."""
 
     env_id: EnvId = "QuadGym/Circle-v0"
-    policy: tuple[str, ...] = ()
+    policy: tuple[str, ...] | None = None
     """who flies: pd (tuned gains), pd:lab (the report's), pd:FILE.json (of quad-gym tune),
     pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz); if not
     given, pd, and pretrained where it fits"""
@@ -89,12 +89,19 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
         OSError: If nothing can be written to the folder.
         ImportError: If a package is missing.
     """
-    known_id("ENV_ID", args.env_id)
+    args = with_full_id(args)
     for name, least in (("episodes", 1), ("seed", 0)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     if not args.observation:
         raise ValueError("--observation must name at least one, got none")
+    if args.policy == ():
+        raise ValueError("--policy must name at least one, got none")
+    if args.policy is None and "sensors" in args.observation:
+        raise ValueError(
+            "--observation sensors shows no state, which PD control needs: name a --policy that "
+            "was trained on it"
+        )
     first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
@@ -225,7 +232,7 @@ def write(
             for (name, observation), episodes in results.items()
         ],
         "units": {"errors": "m", "rates": "share of episodes"},
-        "arguments": args,
+        "arguments": replace(args, policy=tuple(dict.fromkeys(name for name, _ in results))),
         "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
     }
     written = [
@@ -249,6 +256,7 @@ def main(args: Args) -> None:
     from tqdm import tqdm
 
     with usage_errors():
+        args = with_full_id(args)
         cases, folder = configure(args)
     began = time.perf_counter()
     results, tracers = {}, {}

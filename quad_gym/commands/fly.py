@@ -33,10 +33,10 @@ from quad_gym.commands.options import (
     EnvId,
     Keywords,
     OwnSuite,
-    known_id,
     leave,
     sensors_of,
     usage_errors,
+    with_full_id,
 )
 from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
@@ -62,8 +62,8 @@ class Args:
     task), or a file of quad-gym train (.zip or .npz)"""
     observation: Literal["estimate", "truth", "noisy", "sensors"] = "estimate"
     """what the controller sees"""
-    action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] = "ctbr"
-    """what the controller commands"""
+    action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] | None = None
+    """what the controller commands; if not given, the task's"""
     seed: int = 0
     """of the episode; in the window, the next ones follow it"""
     duration: float | None = None
@@ -82,7 +82,8 @@ class Args:
         tuple[str, ...],
         arg(
             name="faults",
-            help=f"what goes wrong, one or several (also joined by +): {', '.join(FAULTS)}",
+            help="what goes wrong, one or several (also joined by +), in place of the task's own: "
+            f"{', '.join(FAULTS)}",
         ),
     ] = ()
     fault_time: tuple[float, float] | None = None
@@ -135,7 +136,7 @@ def check_options(args: Args) -> None:
         ValueError: If one does.
         ImportError: If a library that draws or writes a file is not installed.
     """
-    known_id("ENV_ID", args.env_id)
+    args = with_full_id(args)
     for name in ("speed", "fps"):
         value = getattr(args, name)
         if not (math.isfinite(value) and value > 0.0):
@@ -179,23 +180,26 @@ def make_env(args: Args) -> Any:
     Raises:
         ValueError: If an option is invalid.
     """
+    args = with_full_id(args)
     options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
     given = leave(args.env, {**named, "faults": "--faults"})
     keywords = {**keywords_of_policy(args.policy, args.env_id), **given}
     if not args.camera:
         keywords["camera"] = False
+    if args.action is not None:
+        keywords["action"] = args.action
+    if args.fault:
+        keywords["faults"] = faults_of_args(args)
     return gymnasium.make_vec(
         args.env_id,
         num_envs=1,
         autoreset_mode="Disabled",
         observation=args.observation,
-        action=args.action,
         sensors=sensors_of(args.env_id, args.sensors),
         gnss_rate=args.gnss_rate,
         camera_rate=args.camera_rate,
         duration=args.duration,
-        faults=faults_of_args(args),
         **keywords,
     )
 
@@ -312,6 +316,7 @@ def write(flight: Flight, path: Path, args: Args) -> list[Path]:
 def main(args: Args) -> None:
     """Fly or replay, and show or write."""
     with usage_errors():
+        args = with_full_id(args)
         check_options(args)
         saved = Flight.load(args.replay) if args.replay else None
         env = make_env(args) if saved is None else None

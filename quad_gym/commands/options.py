@@ -11,6 +11,7 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -223,6 +224,20 @@ def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
             + did_you_mean(given, (*ids, *(IDS[env_id] for env_id in ids)))
         )
     return found
+
+
+def with_full_id(args: _Args, ids: Iterable[str] = IDS) -> _Args:
+    """Options whose `env_id` is the id, if it was given by its short name.
+
+    Args:
+        args: A dataclass with the field `env_id`.
+        ids: Those that it may be.
+
+    Raises:
+        ValueError: If it is none of them.
+    """
+    found = known_id("ENV_ID", args.env_id, ids)  # type: ignore[attr-defined]
+    return replace(args, env_id=found)  # type: ignore[type-var]
 
 
 EnvId = tyro.conf.Positional[

@@ -2,7 +2,7 @@
 
     quad-gym study                                   # LookAround, 5 seeds
     quad-gym study stale_race
-    quad-gym study outage_dash --arms pd_waiting truth covariance --seeds 10
+    quad-gym study outage_dash --arms truth estimate sigma --seeds 10
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
@@ -33,7 +33,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
-from quad_gym.commands.options import EnvId, Keywords, known_id, leave, one_of, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, leave, one_of, usage_errors, with_full_id
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
@@ -89,7 +89,7 @@ def studied(args: Args) -> StudiedTask:
     Raises:
         ValueError: If it is not studied, or an option does not belong to it.
     """
-    known_id("ENV_ID", args.env_id, STUDIED_IDS)
+    args = with_full_id(args, STUDIED_IDS)
     about = STUDIED[IDS[args.env_id]]
     if args.success_within is None:
         return about
@@ -140,6 +140,7 @@ def configure(args: Args) -> Study:
     from baselines.compiled_ppo.run import make_compiled
 
     plots.require_matplotlib()
+    args = with_full_id(args, STUDIED_IDS)
     about = studied(args)
     for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
         if getattr(args, name) < least:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import IDS
-from quad_gym.commands.options import EnvId, Keywords, flying_options, known_id, usage_errors
+from quad_gym.commands.options import EnvId, Keywords, flying_options, usage_errors, with_full_id
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     from baselines.recipes import recipe
     from quad_gym.analysis.reports import require_writable
 
-    known_id("ENV_ID", args.env_id)
+    args = with_full_id(args)
     chosen = recipe(args.env_id, args.algorithm)
     given = {"steps": args.steps, "n_envs": args.n_envs}
     chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})

@@ -86,7 +86,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     | `action` | a[0] | a[1], a[2], a[3] |
     |---|---|---|
-    | `"ctbr"` (default) | thrust m g (1 + a) | body rates 6, 6, 3 rad/s |
+    | `"ctbr"` (default of most tasks) | thrust m g (1 + a) | body rates 6, 6, 3 rad/s |
     | `"motor"` | each: voltage = hover voltage (1 + a), at most 12 V | |
     | `"wrench"` | thrust m g (1 + a) | torque 1.6, 1.6, 0.19 N m |
     | `"attitude"` | thrust m g (1 + a) | roll, pitch 45 deg, yaw rate 3 rad/s |

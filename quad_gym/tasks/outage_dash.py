@@ -24,8 +24,8 @@ PAID_SPEED = 5.0
 """No more than this is paid for [m/s]: faster, an outage would be over after some gaps."""
 
 CRASH_COST = 50.0
-"""On top of what the course flown so far has earned: who takes a risk in each outage would gain by
-it if a crash cost the same all along."""
+"""On top of what the course has earned so far. A constant cost would make hurrying through the
+outage pay late in the course."""
 
 ACTION_COST, RATE_COST = 0.02, 0.002
 """Of |change of action|^2 and |body rates|^2 in each step, as those that ship."""

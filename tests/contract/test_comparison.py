@@ -61,6 +61,8 @@ def test_evaluate_flies_what_there_is(tmp_path, capsys):
     few = ("--episodes", 2, "--observation", "truth", "--env", "duration=0.2")
     done = run("evaluate", "trajectory", *few, where=tmp_path)
     assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "results/evaluate/trajectory/summary.json").read_text())
+    assert summary["arguments"]["policy"] == ["pd"]
     told = "PD control flies alone: no policy ships for QuadGym/Trajectory-v0"
     assert done.stdout.startswith(told)
     assert "pd on truth" in done.stdout
@@ -94,6 +96,8 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
     [
         (["QuadGym/Square-v0"], "ENV_ID must be one of"),
         (["--policy", "nobody"], "policy must be pd"),
+        (["--policy"], "--policy must name at least one"),
+        (["--observation", "sensors"], "name a --policy that was trained on it"),
         (["--policy", "missing.zip"], "there is no policy"),
         (["--observation", "guess"], "observation must be one of"),
         (["--observation", "estimat"], "did you mean estimate?"),
@@ -185,6 +189,61 @@ def test_processes_end_with_the_comparison_however_that_ends(tmp_path, number):
     assert process.wait(timeout=60) == -number
     wait_until(lambda: nobody_is_in_group(process.pid), seconds=60.0)
 
+
+@pytest.mark.parametrize("how", ["returns", "raises", "goes on"])
+def test_no_other_training_begins_once_the_comparison_is_gone(tmp_path, how):
+    (tmp_path / "driver.py").write_text(TRAINING_DRIVER)
+    process = subprocess.Popen(
+        [sys.executable, "driver.py", how],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        start_new_session=True,
+    )
+    wait_until((tmp_path / "first").exists, seconds=100.0)
+    process.kill()
+    process.wait(timeout=60)
+    wait_until(lambda: nobody_is_in_group(process.pid), seconds=60.0)
+    assert (tmp_path / "asked").exists()
+    assert not (tmp_path / "second").exists()
+
+
+TRAINING_DRIVER = """
+import multiprocessing, signal, sys, time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+
+def train(how, folder, **options):
+    asked = Path("asked")
+    signal.signal(signal.SIGTERM, lambda *_: asked.touch())
+    folder.touch()
+    while not asked.exists() or how == "goes on":
+        time.sleep(0.05)
+    if how == "raises":
+        raise OSError("no space left")
+
+
+def begin():
+    import baselines.training
+    from quad_gym.commands import compare
+
+    baselines.training.train = train
+    compare.GRACE = 1.0 if sys.argv[1] == "goes on" else 1000.0
+    compare.end_with_parent()
+
+
+def work(how, folder):
+    from quad_gym.commands.compare import train_one
+
+    train_one(how, folder)
+
+
+if __name__ == "__main__":
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin)
+    for folder in ("first", "second"):
+        pool.submit(work, sys.argv[1], Path(folder))
+    time.sleep(1000.0)
+"""
 
 DRIVER = """
 import multiprocessing, time

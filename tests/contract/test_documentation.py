@@ -19,6 +19,7 @@ import pytest
 import quad_gym
 from quad_gym.commands.main import COMMANDS
 from quad_gym.commands.options import parse
+from quad_gym.commands.study import arms_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -127,14 +128,17 @@ def test_command_lines_are_found():
 def exit_code(module, options):
     """What parsing the options of a command ends with; --help ends with 0."""
     try:
-        parse(importlib.import_module(f"quad_gym.commands.{module}").Args, options)
+        args = parse(importlib.import_module(f"quad_gym.commands.{module}").Args, options)
     except SystemExit as end:
         return end.code
+    if module == "study" and (args.arms_file is None or args.arms_file.exists()):
+        arms_of(args)  # refuses arms that there are not
     return 0
 
 
 @pytest.mark.parametrize(("file", "words"), LINES)
-def test_command_lines_parse(file, words):
+def test_command_lines_parse(file, words, monkeypatch):
+    monkeypatch.chdir(ROOT)  # files of arms are named from there
     command, *options = shlex.split(words, comments=True)
     assert command in COMMANDS
     name = "benchmark.main" if command == "benchmark" else command

@@ -54,6 +54,17 @@ def test_every_task_is_made_with_the_default_options(env_id):
     assert env.unwrapped.flights.batch.sensors.camera is not None or "outage" in IDS[env_id]
 
 
+def test_actions_and_faults_are_those_of_the_task_unless_they_are_given():
+    flights = script.make_env(script.Args(env_id="outage_dash")).unwrapped.flights
+    assert flights.action == "velocity"
+    assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
+    given = script.Args(env_id="outage_dash", action="ctbr", fault=("rotor_loss",))
+    flights = script.make_env(given).unwrapped.flights
+    assert flights.action == "ctbr"
+    assert [type(fault).__name__ for fault in flights.batch.faults] == ["RotorLoss"]
+    assert script.make_env(script.Args()).unwrapped.flights.action == "ctbr"
+
+
 @pytest.mark.parametrize("suite", ["standard", "consumer"])
 @pytest.mark.parametrize("camera", [True, False])
 def test_any_suite_is_made_with_and_without_a_camera(suite, camera):

@@ -6,6 +6,7 @@ from collections import defaultdict
 
 import pytest
 
+from quad_gym.commands import compare, consistency, evaluate, fly, study, train
 from quad_gym.commands.main import COMMANDS, main
 from quad_gym.commands.options import parse
 
@@ -75,6 +76,24 @@ def test_former_names_are_understood():
     assert parse(args_of("tune"), ["--tasks", "circle"]).env_ids == ("circle",)
     assert parse(args_of("tune"), ["--start", "tuned"]).start == "tuned"
     assert parse(args_of("compare"), ["--seeds", "2"]).seeds == 2  # of trainings
+
+
+def test_ids_may_be_short_without_the_command_line(tmp_path):
+    few = {"env_id": "circle", "output": tmp_path / "out"}
+    cases, _ = evaluate.configure(evaluate.Args(**few, policy=("pd",), episodes=2))
+    assert {env.unwrapped.flights.name for _, env in cases.values()} == {"circle"}
+    plan, _ = train.configure(train.Args(**few, engine="compiled"))
+    assert plan.env_id == "QuadGym/Circle-v0"
+    assert fly.make_env(fly.Args(env_id="circle")).unwrapped.flights.name == "circle"
+    race = study.Args(env_id="stale_race", arms=("pd",), output=tmp_path / "out")
+    assert study.configure(race).env_id == "QuadGym/StaleRace-v0"
+    assert consistency.Args(env_id="circle").env_id == "QuadGym/Circle-v0"
+
+
+def test_a_comparison_may_be_of_a_short_id(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    args = compare.Args(env_id="hover", seeds=1, train_on=("truth",), output=tmp_path / "out")
+    assert compare.configure(args).env_id == "QuadGym/Hover-v0"
 
 
 def test_ids_may_be_short():

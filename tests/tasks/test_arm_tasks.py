@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from baselines import PDPolicy
 from baselines.arm_tasks import STEADY_CRASH_COST
+from baselines.arms import OUTAGE_DASH
+from baselines.policies import interface_of, load_policy
 
 ID = "QuadGym/LookAround-v0"
 
@@ -154,13 +157,42 @@ def test_scaled_observations_are_those_of_the_task_over_their_scales():
     plain = gymnasium.make_vec("QuadGym/OutageDash-v0", num_envs=6)
     seen = plain.reset(seed=3)[0]
     env, scaled = make("Scaled", task="QuadGym/OutageDash-v0")
-    for name, scale in (("position_error", 6.0), ("next_gap", 12.0), ("velocity_error", 4.0)):
-        expected = part(plain, seen, name) / scale
-        np.testing.assert_allclose(part(env, scaled, name), expected, atol=1e-6)
-    for name in ("gap_width", "next_width"):
-        expected = (part(plain, seen, name) - 4.5) / 1.5
-        np.testing.assert_allclose(part(env, scaled, name), expected, atol=1e-6)
-    np.testing.assert_allclose(part(env, scaled, "up"), part(plain, seen, "up"), atol=1e-6)
+    scales = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "next_gap": 12.0}
+    for _ in range(5):
+        for name, scale in scales.items():
+            expected = part(plain, seen, name) / scale
+            np.testing.assert_allclose(part(env, scaled, f"{name}_scaled"), expected, atol=1e-6)
+        for name in ("gap_width", "next_width"):
+            expected = (part(plain, seen, name) - 4.5) / 1.5
+            np.testing.assert_allclose(part(env, scaled, f"{name}_scaled"), expected, atol=1e-6)
+        for name in ("up", "heading", "course_share"):
+            np.testing.assert_allclose(part(env, scaled, name), part(plain, seen, name), atol=1e-6)
+        action = np.full((6, 4), 0.2, np.float32)
+        seen, scaled = plain.step(action)[0], env.step(action)[0]
+    assert np.abs(part(plain, seen, "body_rates")).max() > 0.1
+
+
+@pytest.mark.parametrize("name", ["Scaled", "Wary", "Steady", "SteadyWary"])
+def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
+    env, _ = make(name, count=1, task="QuadGym/OutageDash-v0", include_covariance=True)
+    table = {field.name: field for field in env.unwrapped.flights.table}
+    scaled = ["position_error", "velocity_error", "body_rates"]
+    scaled += ["next_gap", "gap_width", "next_width"]
+    assert not table.keys() & set(scaled)
+    assert all(table[f"{part}_scaled"].unit == "-" for part in scaled)
+    for pace in ("steady", "waiting"):
+        with pytest.raises(ValueError, match="env must observe"):
+            PDPolicy(env, pace=pace)
+
+
+def test_rules_of_the_study_fly_the_plain_task_and_trained_arms_the_scaled_one():
+    for arm in OUTAGE_DASH:
+        keywords = {"observation": "estimate", **arm.environment}
+        env = gymnasium.make_vec("QuadGym/OutageDash-v0", num_envs=1, **keywords)
+        plain = "gap_width" in interface_of(env)["observation"]
+        assert plain == (arm.policy is not None), arm.name
+        if plain:
+            load_policy(arm.policy, env)
 
 
 def test_being_sure_is_paid_for():

@@ -194,7 +194,7 @@ def test_flights_on_the_truth_have_no_outage_and_asking_for_one_is_refused():
 
 
 def test_fixed_rules_are_neither_lost_nor_safe():
-    """Of 150 flights 0, 28 and 7 % crash."""
+    """Of 60 flights each, 0 crash on the truth, 19 on the estimate, and 6 of those that wait."""
     crashed, returns = {}, {}
     for name, shown in (
         ("pd", {"observation": "truth"}),
