@@ -83,7 +83,7 @@ class Args:
         arg(
             name="faults",
             help="what goes wrong, one or several (also joined by +), in place of the task's own: "
-            f"{', '.join(FAULTS)}",
+            f"{', '.join(FAULTS)}; or none",
         ),
     ] = ()
     fault_time: tuple[float, float] | None = None

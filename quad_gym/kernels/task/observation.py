@@ -41,7 +41,7 @@ def _upcoming_gate(flight, ahead):
 
 
 @kernel
-def previewed(flight, p, settings, i):
+def _previewed(flight, p, settings, i):
     """The reference a little later: in time, or on a course the gates after the next."""
     if settings.task == Task.WAYPOINTS:
         return _upcoming_gate(flight, 1.0 + i)
@@ -52,30 +52,32 @@ def previewed(flight, p, settings, i):
 
 
 @kernel
-def put_relative(flight, p, settings, row, k, r, v, R_BI, w_B):
-    """Write errors, directions and rates in the body frame from `k` on; return the next place."""
+def reference_shown(flight, p, settings):
+    """(r*, v*, a*, x*) of the present instant, and r* at the first and second preview."""
     r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
+    first, second = _previewed(flight, p, settings, 0), _previewed(flight, p, settings, 1)
+    return r_ref, v_ref, a_ref, x_ref, first, second
+
+
+@kernel
+def put_relative(reference, row, k, r, v, R_BI, w_B):
+    """Write errors, directions and rates in the body frame from `k` on; return the next place."""
+    r_ref, v_ref, a_ref, x_ref, first, second = reference
     k = _put3(row, k, apply(R_BI, sub(r_ref, r)))
     k = _put3(row, k, apply(R_BI, sub(v_ref, v)))
     k = _put3(row, k, (R_BI[0][2], R_BI[1][2], R_BI[2][2]))
     k = _put3(row, k, apply(R_BI, x_ref))
     k = _put3(row, k, w_B)
     k = _put3(row, k, apply(R_BI, a_ref))
-    for i in range(2):
-        k = _put3(row, k, apply(R_BI, sub(previewed(flight, p, settings, i), r_ref)))
-    return k
+    k = _put3(row, k, apply(R_BI, sub(first, r_ref)))
+    return _put3(row, k, apply(R_BI, sub(second, r_ref)))
 
 
 @kernel
 def _put_reference(flight, p, settings, row, k):
     """The reference in I."""
-    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-    k = _put3(row, k, r_ref)
-    k = _put3(row, k, v_ref)
-    k = _put3(row, k, a_ref)
-    k = _put3(row, k, x_ref)
-    for i in range(2):
-        k = _put3(row, k, previewed(flight, p, settings, i))
+    for vector in reference_shown(flight, p, settings):
+        k = _put3(row, k, vector)
     return k
 
 
@@ -194,17 +196,9 @@ def observe(flight, p, settings, row):
     elif settings.layout == Layout.ABSOLUTE:
         k = _put_absolute(flight, p, settings, row)
     else:
-        k = put_relative(
-            flight,
-            p,
-            settings,
-            row,
-            0,
-            load3(flight.r_seen),
-            load3(flight.v_seen),
-            load33(flight.R_seen),
-            load3(flight.w_seen),
-        )
+        r, v, w = load3(flight.r_seen), load3(flight.v_seen), load3(flight.w_seen)
+        reference = reference_shown(flight, p, settings)
+        k = put_relative(reference, row, 0, r, v, load33(flight.R_seen), w)
     for i in range(4):
         row[k + i] = flight.action[i]
     k += 4

@@ -4,8 +4,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3, load4, load33
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.task.observation import previewed, put_relative
-from quad_gym.kernels.task.reference import evaluate_reference
+from quad_gym.kernels.task.observation import put_relative, reference_shown
 
 
 @kernel
@@ -28,9 +27,8 @@ def _put_matrix(row, k, R):
 @kernel
 def _show(flight, p, settings, row):
     """Write the numbers of `quad_gym.records.SHOWN`, in its order."""
-    time = flight.tick * p.dt
-    r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, time, settings.harmonics)
-    row[0] = time
+    reference = reference_shown(flight, p, settings)
+    row[0] = flight.tick * p.dt
     k = _put(row, 1, load3(flight.r), 3)
     k = _put(row, k, load3(flight.v), 3)
     k = _put(row, k, load4(flight.q), 4)
@@ -40,15 +38,11 @@ def _show(flight, p, settings, row):
     k = _put(row, k, load3(flight.v_seen), 3)
     k = _put_matrix(row, k, flight.R_seen)
     r, v, w = load3(flight.r_seen), load3(flight.v_seen), load3(flight.w_seen)
-    k = put_relative(flight, p, settings, row, k, r, v, load33(flight.R_seen), w)
+    k = put_relative(reference, row, k, r, v, load33(flight.R_seen), w)
     k = _put(row, k, flight.action, 4)
     k = _put(row, k, flight.last_action, 4)
-    k = _put(row, k, r_ref, 3)
-    k = _put(row, k, v_ref, 3)
-    k = _put(row, k, a_ref, 3)
-    k = _put(row, k, x_ref, 3)
-    for i in range(2):
-        k = _put(row, k, previewed(flight, p, settings, i), 3)
+    for vector in reference:
+        k = _put(row, k, vector, 3)
     row[k] = flight.position_error
     row[k + 1] = flight.gate_next
 
