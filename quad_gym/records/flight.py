@@ -175,7 +175,7 @@ _FILTER_FIELDS = (
     Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
     Field("corrected_tick", (), "ticks", "when the last of them was"),
     Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
-    Field("doubt_tick", (), "ticks", "when the filter last doubted itself; of one that mends nothing, how long its biases remember later"),
+    Field("doubt_tick", (), "ticks", "when the filter last doubted itself; of one without a gate, later by the time that its biases take to be corrected"),
     Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
     Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
 )
