@@ -78,6 +78,8 @@ def results():
 '''
 PREPARE = """
 import os
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which jobs in the background ignore
 os.environ["PARENT"] = str(os.getpid())
 import parts_of_test as parts
 from quad_gym.kernels.compiling.workers import prepare
