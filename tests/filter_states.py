@@ -3,8 +3,8 @@
 import numpy as np
 
 
-def set_at_rest(kalman, covariance, **told):
-    """Set a filter to rest at the origin, level and without biases, but for what it is told."""
+def at_rest(**told):
+    """The state at rest at the origin, level and without biases, but for what is told."""
     state = {
         "position": np.zeros(3),
         "velocity": np.zeros(3),
@@ -12,7 +12,12 @@ def set_at_rest(kalman, covariance, **told):
         "accel_bias": np.zeros(3),
         "gyro_bias": np.zeros(3),
     }
-    kalman.set_state(**(state | told), covariance=covariance)
+    return state | told
+
+
+def set_at_rest(kalman, covariance, **told):
+    """Set a filter to that state."""
+    kalman.set_state(**at_rest(**told), covariance=covariance)
 
 
 def set_like(kalman, other):

@@ -13,6 +13,7 @@ from quad_gym.estimation import LOG_COLUMNS, Log, Stream, read_log, replay
 from quad_gym.estimation.player import Player
 from quad_gym.frames import ecef_to_geodetic, geodetic_to_ecef
 from tests.console_commands import run
+from tests.filter_states import at_rest
 from tests.logged_flights import PX4, RTK, Recorded, errors_in_flight, errors_in_replay, flown
 
 SECONDS = 10.0
@@ -253,15 +254,7 @@ def test_starts_may_be_told(table):
     assert not replay(short, sensors=suite).heading_known[0]
     told = replay(short, sensors=suite, start={"heading": 3.1, "heading_sigma": 0.1})
     assert told.heading_known.all()
-    state = {
-        "position": np.zeros(3),
-        "velocity": np.zeros(3),
-        "R_BI": np.eye(3),
-        "accel_bias": np.zeros(3),
-        "gyro_bias": np.zeros(3),
-        "covariance": np.eye(15),
-    }
-    given = replay(short, sensors=suite, start=state)
+    given = replay(short, sensors=suite, start=at_rest(covariance=np.eye(15)))
     assert given.time[0] == short["time"][np.isfinite(short["gyro_x"])][0]
     with pytest.raises(ValueError, match="keywords of set_state"):
         replay(short, sensors=suite, start={"position": np.zeros(3)})

@@ -34,6 +34,15 @@ def silent(batch):
     return (nees(batch, slice(0, 9)) > RIGHT) & ~(batch.read("lost") > 0.0)
 
 
+def share_silent(batch, times, every):
+    """Mean share of flights that are, at the end of each of so many spans of `every` seconds."""
+    found = []
+    for _ in range(times):
+        steps(batch, every)
+        found.append(silent(batch).mean())
+    return np.mean(found)
+
+
 # ---- who watches -------------------------------------------------------------------------------
 
 
@@ -100,11 +109,7 @@ def test_flights_without_a_gate_are_not_wrong_in_silence_after_a_jump_of_gnss():
     fault = GnssJump(start=1.0, duration=2.0, size=0.5)
     batch = fly(quad_gym.sensor_suite("standard"), 128, filter_start="warm", faults=fault)
     steps(batch, 5.0)
-    found = []
-    for _ in range(8):
-        steps(batch, 0.5)
-        found.append(silent(batch).mean())
-    assert np.mean(found) <= 0.01, found
+    assert share_silent(batch, times=8, every=0.5) <= 0.01
 
 
 # ---- a drift that is none ------------------------------------------------------------------------
@@ -127,11 +132,8 @@ def test_a_jump_of_the_vehicle_is_not_taken_for_drift_of_gnss(size):
     fault = PositionJump(start=2.0, size=size, direction=(1.0, -1.0, 0.0))
     batch = fly(quad_gym.sensor_suite("consumer"), 128, filter_start="warm", faults=fault)
     steps(batch, 2.0)
-    found = []
-    for _ in range(5):
-        steps(batch, 2.0)
-        found.append(silent(batch).mean())
-    assert np.mean(found) <= 0.1, found  # all else that is seen of it are ten fixes or so
+    # all else that is seen of it are ten fixes or so
+    assert share_silent(batch, times=5, every=2.0) <= 0.1
 
 
 # ---- doubts that repeat --------------------------------------------------------------------------
