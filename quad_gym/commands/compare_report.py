@@ -26,6 +26,7 @@ NAMES = {
     "noisy": "trained on truth with noise",
     "estimate": "trained on the estimate",
 }
+_ENGINES = {"sb3": "Stable-Baselines3", "compiled": "the compiled engine"}
 MANY_CRASHES = 0.01
 """Share of episodes beyond which errors of those that crashed distort the mean."""
 ONE_SEED = (
@@ -40,6 +41,7 @@ class Setting:
 
     env_id: str
     algorithm: str
+    engine: str
     steps: int
     suites: tuple[str, ...]
     sources: tuple[str, ...]
@@ -62,6 +64,7 @@ class Setting:
         some = next(iter(self.plans.values()))
         return {
             "env_id": self.env_id,
+            "engine": self.engine,
             "recipe": some.recipe,
             "sensors": self.suites,
             "trained_on": self.sources,
@@ -277,7 +280,8 @@ def write_page(
     setting = comparison.setting
     parts = [
         f"<h1>{html.escape(setting.env_id)}: what the estimate costs</h1>",
-        f"<p>{html.escape(setting.algorithm.upper())}, {setting.steps:,} steps for each of "
+        f"<p>{html.escape(setting.algorithm.upper())} ({_ENGINES[setting.engine]}), "
+        f"{setting.steps:,} steps for each of "
         f"{len(setting.plans)} policies, training seeds {', '.join(map(str, setting.seeds))}; "
         f"{seconds / 60:.1f} minutes of training. Each policy flew {setting.episodes:,} episodes "
         "on the truth and on the estimate.</p>",

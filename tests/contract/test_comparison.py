@@ -154,6 +154,19 @@ def test_compare_reports_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert "holds another comparison" in other.stderr
 
 
+def test_compare_trains_with_the_compiled_engine(tmp_path):
+    done = compare(tmp_path, "--engine", "compiled", "--train-on", "estimate")
+    assert done.returncode == 0, done.stderr
+    assert "trained on the estimate" in done.stdout
+    folder = tmp_path / "out/runs/standard/estimate/seed_0"
+    assert {file.name for file in folder.glob("best.*")} == {"best.npz"}
+    assert json.loads((folder / "training.json").read_text())["plan"]["engine"] == "compiled"
+    assert "PPO (the compiled engine)" in (tmp_path / "out/report.html").read_text()
+    other = compare(tmp_path, "--train-on", "estimate")
+    assert other.returncode == 2
+    assert "holds another comparison (different: engine)" in other.stderr
+
+
 @pytest.mark.slow  # three processes with torch; a training that is killed: test_training.py
 def test_compare_that_is_terminated_keeps_its_trainings_and_leaves_no_process(tmp_path):
     options = ["--steps", "300000", "--env", "duration=0.2", "--output", tmp_path / "out"]
@@ -291,6 +304,7 @@ def test_compare_refuses_nonsense(tmp_path):
         (["--sensors", "sonar"], "sensors must be one of"),
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--env", "observation=truth"], "leave observation"),
+        (["--engine", "compiled", "--algorithm", "sac"], "engine"),
     ):
         done = run("compare", *more, "--output", tmp_path / "x", where=tmp_path)
         assert done.returncode == 2, more
