@@ -40,8 +40,8 @@ $(VENV)/.writer: $(VENV)/.user
 	$(BYTECODE)
 	touch $@
 
-demo: $(VENV)/.trainer  ## train on truth, noise and the estimate, one seed each, and compare: some minutes
-	$(BIN)/quad-gym compare --quick
+demo: $(VENV)/.user  ## train on truth, noise and the estimate, one seed each, and compare: a minute or two
+	$(BIN)/quad-gym compare --quick --engine compiled
 
 circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
 	$(BIN)/quad-gym circle --output results/circle
@@ -51,8 +51,8 @@ animation: setup  ## the animation of README
 		--faults gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
 	rm .github/images/outage.npz
 
-compare: $(VENV)/.trainer  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
-	$(BIN)/quad-gym compare --sensors standard rtk --output results/compare/circle
+compare: $(VENV)/.user  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
+	$(BIN)/quad-gym compare --engine compiled --sensors standard rtk
 
 study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
 	$(BIN)/quad-gym study look_around --page docs/where-it-matters.md
