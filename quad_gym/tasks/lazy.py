@@ -11,6 +11,9 @@ from quad_gym.records import SHOWN, SHOWN_SHAPES
 
 T = TypeVar("T")
 
+Place = tuple[dict[str, Any], str]
+"""Where an array is kept: attributes of a group, and its name in them."""
+
 
 class Lazy(Generic[T]):
     """A read-only array of a `Group`, made by a method when it is first read."""
@@ -33,28 +36,32 @@ class Lazy(Generic[T]):
         if group is None:
             return self
         value = frozen(self._make(group))
-        group.__dict__[self._name] = value
+        group._keep(self._name, value)
         return value
 
 
 class Shown:
     """An array of a `Group` that the kernels show, see `quad_gym.records.SHOWN`.
 
+    It looks into the memory of what is shown, and stays as long as that; a matrix is copied.
+
     Args:
         name: Which.
         meaning: Shape, meaning, unit and frame.
-        first: How many of its numbers, the first ones, as (n, first); None: all of them.
+        part: Which of its numbers, as a vector; None: all of them.
     """
 
-    def __init__(self, name: str, meaning: str, first: int | None = None) -> None:
+    def __init__(self, name: str, meaning: str, part: slice | None = None) -> None:
         rows, self._shape, self.__doc__ = SHOWN[name], SHOWN_SHAPES[name], meaning
-        chosen = rows if first is None else slice(rows.start, rows.start + first)
-        self._key = (slice(None), chosen if self._shape else rows.start)
-        self._is_matrix = len(self._shape) > 1 and first is None
+        if part is not None:
+            chosen = range(rows.start, rows.stop)[part]
+            rows = slice(chosen.start, chosen.stop, chosen.step)
+        self._rows = rows if self._shape else rows.start
+        self._is_matrix = len(self._shape) > 1 and part is None
 
     def __set_name__(self, owner: type, name: str) -> None:
         """Learn what it is called."""
-        self._name = name
+        self._name, self._source = name, f"_shown_{name}"
 
     @overload
     def __get__(self, group: None, owner: type) -> "Shown": ...
@@ -66,14 +73,15 @@ class Shown:
         """Take it; from then on it is an ordinary attribute of the group."""
         if group is None:
             return self
-        if self._is_matrix:
-            # in memory as for a single flight, so that products with it have the same bits
-            rows = group._flights.shown[self._key[1]]
-            value = np.ascontiguousarray(rows.T).reshape(-1, *self._shape)
-            value.setflags(write=False)
-        else:
-            value = group._flights.shown_of_flights[self._key]
-        group.__dict__[self._name] = value
+        if not self._is_matrix:
+            return group._flights.look(self._rows, (), group.__dict__, self._name)
+        shown = group.__dict__.get(self._source)
+        if shown is None:
+            shown = group._flights.look(self._rows, self._shape, group.__dict__, self._source)
+        # in memory as for a single flight, so that products with it have the same bits
+        value = shown.copy()
+        value.setflags(write=False)
+        group._keep(self._name, value)
         return value
 
 
@@ -88,12 +96,28 @@ def frozen(value: Any) -> Any:
 
 
 class Group:
-    """Some arrays of a view. What it knows of the flights is in slots; what it has made, is not."""
+    """Some arrays of a view. What it knows of the flights is in slots; what it has made, is not.
 
-    __slots__ = ("__dict__", "_flights")
+    Args:
+        flights: What it shows.
+        kept: Where to note the arrays that are dropped at the next step: their places by name.
+    """
 
-    def __init__(self, flights: Any) -> None:
-        self._flights = flights
+    __slots__ = ("__dict__", "_flights", "_kept")
+
+    def __init__(self, flights: Any, kept: "list[Place]") -> None:
+        self._flights, self._kept = flights, kept
+
+    def _keep(self, name: str, value: Any) -> None:
+        """Keep an array until `forget`."""
+        self.__dict__[name] = value
+        self._kept.append((self.__dict__, name))
+
+    def forget(self) -> None:
+        """Drop the arrays that were kept, of all groups that note them in the same place."""
+        for arrays, name in self._kept:
+            del arrays[name]
+        self._kept.clear()
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name[0] != "_":

@@ -14,19 +14,36 @@ from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import SETTLE
-from quad_gym.records import SHOWN_SIZE, WIDTH, Command
+from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
+from quad_gym.tasks.lazy import Place
 
 Floats = NDArray[np.float64]
 
 _GAP = 8
 """Numbers between two rows of what is shown: a line of the cache."""
+_TIME = SHOWN["time"].start
+_COMPARED = slice(SHOWN["position_error"].start, SHOWN["gate_next"].stop)
+"""What a step is compared with the one before in."""
+
+
+def _references_of_one() -> int:
+    """References of one array of a view; measured, as interpreters differ."""
+    memory = np.zeros(1)
+    before = getrefcount(memory)
+    looking: list[Floats] = [memory[:]]
+    place = {"": looking[0]}
+    return len(place) * (getrefcount(memory) - before + sum(map(getrefcount, looking)))
+
+
+_REFERENCES_OF_ONE = _references_of_one()
 
 
 class ReadableBatch(FlightBatch):
     """A `FlightBatch` with what the views of a task read.
 
     `shown` is memory that the next step overwrites, unless somebody keeps an array of it: then the
-    step writes to other memory. Other fields are read as new arrays.
+    step writes to other memory. The arrays of views stay as long as their memory. Other fields are
+    read as new arrays.
     """
 
     def __init__(self, count: int, **keywords: Any) -> None:
@@ -35,23 +52,50 @@ class ReadableBatch(FlightBatch):
         self._stages |= {Stage.SHOW}
         self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
+        self._looking: list[Floats] = []
+        self._places: list[Place] = []
+        self._bare_references = 0
         # rows that lie a power of two apart would share a few lines of the cache
         self._look_into(np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
 
     shown: Floats
     """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` at the present instant; read-only"""
     _own_references: int
-    """To the memory of what is shown, where nobody keeps it; measured, as interpreters differ."""
+    """To what is shown, and to the arrays that look into it, where nobody else keeps any."""
 
     def _look_into(self, memory: Floats) -> None:
         """Let `shown` be what other memory holds."""
+        for arrays, name in self._places:
+            del arrays[name]
+        self._places, self._looking = [], []
+        self._own_references = self._bare_references
         self._shown, self.shown = memory, memory[:, : self.count]
         self.shown.setflags(write=False)
-        self.shown_of_flights = self.shown.T
+        self.time_shown, self.compared_shown = self.shown[_TIME], self.shown[_COMPARED]
+
+    def look(
+        self, rows: int | slice, shape: tuple[int, ...], place: dict[str, Any], name: str
+    ) -> Floats:
+        """An array (n, ...) that looks into what is shown, and stays as long as its memory.
+
+        Args:
+            rows: Of `shown`.
+            shape: Of what a flight has there; (): a number, or a vector.
+            place: Attributes that are to have it.
+            name: Its name in them.
+        """
+        array = self.shown[rows].T
+        if shape:
+            array = array.reshape(-1, *shape)
+        place[name] = array
+        self._looking.append(array)
+        self._places.append((place, name))
+        self._own_references += _REFERENCES_OF_ONE
+        return array
 
     def _references(self) -> int:
         """How many references there are to the memory of what is shown."""
-        return getrefcount(self._shown)
+        return getrefcount(self._shown) + sum(map(getrefcount, self._looking))
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         if self._crew is not None and self._references() > self._own_references:
@@ -65,7 +109,7 @@ class ReadableBatch(FlightBatch):
         calls = super()._calls_of_threads()
         self._look_into(np.empty_like(self._shown))  # nobody else knows of it yet
         calls.show_into(self._shown)
-        self._own_references = self._references()
+        self._bare_references = self._own_references = self._references()
         return calls
 
     def restore(self, snapshot: NDArray[Any]) -> None:
@@ -81,7 +125,8 @@ class ReadableBatch(FlightBatch):
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the arrays that look into its memory, which a copy makes anew."""
-        looking: dict[str, Any] = {"_fields": {}, "shown": None, "shown_of_flights": None}
+        looking: dict[str, Any] = {"_fields": {}, "_places": [], "_looking": []}
+        looking |= {"shown": None, "time_shown": None, "compared_shown": None}
         return super().__getstate__() | looking
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -114,7 +159,8 @@ class ReadableBatch(FlightBatch):
 
     def counts(self, name: str) -> NDArray[np.int64]:
         """A field of the flights' records as whole numbers, (n,)."""
-        return self._field(name).astype(np.int64).ravel()[: self.count]
+        values = self._field(name).astype(np.int64).reshape(-1)
+        return values if len(values) == self.count else values[: self.count]
 
     def write(self, name: str, values: NDArray[Any]) -> None:
         """Write a field of the flights' records, (n,)."""

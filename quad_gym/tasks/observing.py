@@ -1,6 +1,7 @@
 """Observations with a task's own numbers: joined with the shipped ones, checked, within bounds."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
     from quad_gym.tasks.batch import TaskBatch
 
 Singles = NDArray[np.float32]
+
+_KIND = attrgetter("__class__", "dtype", "shape")
+"""What tells arrays apart that observations can be made of."""
 
 _SQUARABLE = 1e15
 """Numbers whose squares have a sum in single precision."""
@@ -47,7 +51,9 @@ class Joiner:
     ) -> None:
         self._sizes = {name: part.size for name, part in parts.items()}
         self._names = tuple(parts)
-        self._shapes = [(count, part.size) for part in parts.values()]
+        self._kinds = [
+            (np.ndarray, answers.FLOAT, (count, part.size)) for part in parts.values()
+        ]
         self._split, self._rest = split, shipped - split
         self._kept: slice | NDArray[np.intp] = slice(0, split)
         if kept is not None and len(kept) < split:
@@ -80,8 +86,8 @@ class Joiner:
         if self._rest:
             parts.append(shipped[:, self._split :])
         joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
-        flat = joined.ravel()
-        if not np.dot(flat, flat) <= self._surely_within:  # NaN is not, either
+        flat = joined.reshape(-1)
+        if not flat.dot(flat) <= self._surely_within:  # NaN is not, either
             self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
         return joined
 
@@ -89,14 +95,10 @@ class Joiner:
         """Whether `observe` has returned floats of the names and shapes that it had at first."""
         if type(value) is not dict or tuple(value) != self._names:
             return False
-        for part, shape in zip(value.values(), self._shapes, strict=True):
-            if (
-                type(part) is not np.ndarray
-                or part.shape != shape
-                or part.dtype is not answers.FLOAT
-            ):
-                return False
-        return True
+        try:
+            return list(map(_KIND, value.values())) == self._kinds
+        except AttributeError:  # no array
+            return False
 
     def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
         """What `observe` has returned, (n, k) each by name, in the order of the observation."""

@@ -89,6 +89,7 @@ def test_the_truth_is_that_of_the_records():
     R_IB = Rotation.from_quat(view.quaternion, scalar_first=True).as_matrix()
     np.testing.assert_allclose(view.R_BI, R_IB.transpose(0, 2, 1), atol=1e-12)
     np.testing.assert_array_equal(view.truth.forward, view.R_BI[:, 0])
+    np.testing.assert_array_equal(view.truth.up, view.R_BI[:, :, 2])
     assert view.position is view.truth.position
 
 

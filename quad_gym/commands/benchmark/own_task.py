@@ -31,19 +31,19 @@ class OwnCircle(Task):
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) closeness and heading less changes of the action and body rates, a second."""
         error, change, rates = view.position_error, view.action - view.last_action, view.body_rates
-        facing = np.einsum("ni,ni->n", view.truth.forward, view.reference_heading)
-        costs = 0.02 * np.einsum("ni,ni->n", change, change)
-        costs += 0.002 * np.einsum("ni,ni->n", rates, rates)
-        return np.exp(-2.0 * error) + 0.5 * np.exp(-20.0 * error) + 0.1 * facing - costs
+        closeness = np.exp(-2.0 * error) + 0.5 * np.exp(-20.0 * error)
+        facing = np.vecdot(view.truth.forward, view.reference_heading)
+        costs = 0.02 * np.vecdot(change, change) + 0.002 * np.vecdot(rates, rates)
+        return closeness + 0.1 * facing - costs
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) too far from the reference, tipped over, or on the ground."""
-        tipped = view.R_BI[:, 2, 2] < LEAST_UP
+        tipped = view.truth.up[:, 2] < LEAST_UP
         return (view.position_error > 3.0) | tipped | (view.position[:, 2] < -0.5)
 
     def truncated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) out of time, or with a filter that has failed."""
-        return (view.step >= 500) | (view.estimate.status != 0)
+        return np.logical_or(view.step >= 500, view.estimate.status)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
         """Errors, directions, rates, reference and action, in the body frame."""
