@@ -329,7 +329,7 @@ class TaskBatch(ReadableBatch):
         self.began_some = bool(np.count_nonzero(self.began))
         self._remember()  # nothing is known of the step before: no progress, no gate
         self._failed = None
-        self._view = None
+        self.view.step_over()
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads and the view, which a copy makes anew."""

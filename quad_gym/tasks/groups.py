@@ -222,11 +222,13 @@ class Estimate(Group):
     accel_bias_covariance, accel_bias_sigma = _covariance("accelerometer bias [m/s^2]", 9)
     gyro_bias_covariance, gyro_bias_sigma = _covariance("gyro bias [rad/s]", 12)
 
-    @Lazy
+    _status = Shown("filter_status", "(n,) what has failed so far.")
+
+    @property
     def status(self) -> NDArray[np.int64]:
         """(n,) what has failed so far, see `FilterStatus`; 0: nothing."""
         self._need_filter()
-        return self._flights.counts("filter_status")  # type: ignore[no-any-return]
+        return self._status
 
     @Lazy
     def lost(self) -> Truths:

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.records import SHOWN, SHOWN_SHAPES
+from quad_gym.records import SHOWN, SHOWN_KINDS, SHOWN_SHAPES
 
 T = TypeVar("T")
 
@@ -35,9 +35,7 @@ class Lazy(Generic[T]):
         """Make it; from then on it is an ordinary attribute of the group."""
         if group is None:
             return self
-        value = frozen(self._make(group))
-        group._keep(self._name, value)
-        return value
+        return group._keep(self._name, self._make(group))
 
 
 class Shown:
@@ -57,7 +55,15 @@ class Shown:
             chosen = range(rows.start, rows.stop)[part]
             rows = slice(chosen.start, chosen.stop, chosen.step)
         self._rows = rows if self._shape else rows.start
+        self._kind = SHOWN_KINDS[name]
         self._is_matrix = len(self._shape) > 1 and part is None
+
+    def into(self, shown: NDArray[np.float64]) -> NDArray[Any]:
+        """(n, ...) looking into what is shown."""
+        found = shown[self._rows].T
+        if self._is_matrix:
+            found = found.reshape(-1, *self._shape)
+        return found if self._kind == found.dtype else found.view(self._kind)
 
     def __set_name__(self, owner: type, name: str) -> None:
         """Learn what it is called."""
@@ -67,28 +73,25 @@ class Shown:
     def __get__(self, group: None, owner: type) -> "Shown": ...
 
     @overload
-    def __get__(self, group: object, owner: type) -> NDArray[np.float64]: ...
+    def __get__(self, group: object, owner: type) -> NDArray[Any]: ...
 
     def __get__(self, group: Any, owner: type) -> Any:
         """Take it; from then on it is an ordinary attribute of the group."""
         if group is None:
             return self
         if not self._is_matrix:
-            return group._flights.look(self._rows, (), group.__dict__, self._name)
+            return group._flights.look(self, group.__dict__, self._name)
         shown = group.__dict__.get(self._source)
         if shown is None:
-            shown = group._flights.look(self._rows, self._shape, group.__dict__, self._source)
+            shown = group._flights.look(self, group.__dict__, self._source)
         # in memory as for a single flight, so that products with it have the same bits
-        value = shown.copy()
-        value.setflags(write=False)
-        group._keep(self._name, value)
-        return value
+        return group._keep(self._name, shown.copy())
 
 
 def frozen(value: Any) -> Any:
     """An array that cannot be written to, or a mapping of them."""
     if isinstance(value, np.ndarray):
-        value.setflags(write=False)
+        value.setflags(False)
         return value
     if isinstance(value, dict):
         return MappingProxyType({name: frozen(part) for name, part in value.items()})
@@ -108,10 +111,12 @@ class Group:
     def __init__(self, flights: Any, kept: "list[Place]") -> None:
         self._flights, self._kept = flights, kept
 
-    def _keep(self, name: str, value: Any) -> None:
-        """Keep an array until `forget`."""
-        self.__dict__[name] = value
-        self._kept.append((self.__dict__, name))
+    def _keep(self, name: str, value: Any) -> Any:
+        """Keep what cannot be written to any more until `forget`; return it."""
+        arrays = self.__dict__
+        arrays[name] = value = frozen(value)
+        self._kept.append((arrays, name))
+        return value
 
     def forget(self) -> None:
         """Drop the arrays that were kept, of all groups that note them in the same place."""

@@ -15,7 +15,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import SETTLE
 from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
-from quad_gym.tasks.lazy import Place
+from quad_gym.tasks.lazy import Place, Shown
 
 Floats = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class ReadableBatch(FlightBatch):
         self._stages |= {Stage.SHOW}
         self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
-        self._looking: list[Floats] = []
+        self._looking: list[NDArray[Any]] = []
         self._places: list[Place] = []
         self._bare_references = 0
         # rows that lie a power of two apart would share a few lines of the cache
@@ -73,20 +73,15 @@ class ReadableBatch(FlightBatch):
         self.shown.setflags(write=False)
         self.time_shown, self.compared_shown = self.shown[_TIME], self.shown[_COMPARED]
 
-    def look(
-        self, rows: int | slice, shape: tuple[int, ...], place: dict[str, Any], name: str
-    ) -> Floats:
+    def look(self, at: Shown, place: dict[str, Any], name: str) -> NDArray[Any]:
         """An array (n, ...) that looks into what is shown, and stays as long as its memory.
 
         Args:
-            rows: Of `shown`.
-            shape: Of what a flight has there; (): a number, or a vector.
+            at: What it looks at.
             place: Attributes that are to have it.
             name: Its name in them.
         """
-        array = self.shown[rows].T
-        if shape:
-            array = array.reshape(-1, *shape)
+        array = at.into(self.shown)
         place[name] = array
         self._looking.append(array)
         self._places.append((place, name))

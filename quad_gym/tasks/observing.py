@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 Singles = NDArray[np.float32]
 
-_KIND = attrgetter("__class__", "dtype", "shape")
-"""What tells arrays apart that observations can be made of."""
+_ARRAYS, _SHAPE = {np.ndarray}, attrgetter("shape")
 
 _SQUARABLE = 1e15
 """Numbers whose squares have a sum in single precision."""
@@ -51,9 +50,7 @@ class Joiner:
     ) -> None:
         self._sizes = {name: part.size for name, part in parts.items()}
         self._names = tuple(parts)
-        self._kinds = [
-            (np.ndarray, answers.FLOAT, (count, part.size)) for part in parts.values()
-        ]
+        self._shapes = [(count, part.size) for part in parts.values()]
         self._split, self._rest = split, shipped - split
         self._kept: slice | NDArray[np.intp] = slice(0, split)
         if kept is not None and len(kept) < split:
@@ -85,20 +82,22 @@ class Joiner:
             parts.insert(0, shipped[:, self._kept])
         if self._rest:
             parts.append(shipped[:, self._split :])
-        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        try:
+            joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        except TypeError:  # the kinds of numbers have not been looked at yet
+            self._checked(flights, value)
+            raise
         flat = joined.reshape(-1)
         if not flat.dot(flat) <= self._surely_within:  # NaN is not, either
             self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
         return joined
 
     def _is_as_at_first(self, value: Any) -> bool:
-        """Whether `observe` has returned floats of the names and shapes that it had at first."""
+        """Whether `observe` has returned arrays of the names and shapes that it had at first."""
         if type(value) is not dict or tuple(value) != self._names:
             return False
-        try:
-            return list(map(_KIND, value.values())) == self._kinds
-        except AttributeError:  # no array
-            return False
+        parts = value.values()
+        return set(map(type, parts)) == _ARRAYS and list(map(_SHAPE, parts)) == self._shapes
 
     def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
         """What `observe` has returned, (n, k) each by name, in the order of the observation."""

@@ -182,10 +182,7 @@ class View(Group):
 
     time = Shown("time", "(n,) since the start of the episode [s].")
 
-    @Lazy
-    def step(self) -> NDArray[np.int64]:
-        """(n,) steps since the start of the episode."""
-        return self._flights.counts("step")  # type: ignore[no-any-return]
+    step = Shown("step", "(n,) steps since the start of the episode.")
 
     @Lazy
     def began(self) -> Truths:
