@@ -31,7 +31,7 @@ SHOWN_FIELDS = (
     Field("preview", (2, 3), "m", "the reference a little later, or the gates after the next, in I"),
     Field("position_error", (), "m", "distance of the true position from the reference"),
     Field("gate_next", (), "-", "gates passed so far"),
-    # last, as they are no numbers of the flights' lanes
+    # whole numbers come last
     Field("step", (), "steps", "since the start of the episode", "i8"),
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "i8"),
 )
@@ -46,9 +46,9 @@ for _field in SHOWN_FIELDS:
         _size *= _length
     SHOWN[_field.name] = slice(_first, _first + _size)
 SHOWN_SIZE = max(rows.stop for rows in SHOWN.values())
-"""Numbers that are shown."""
+"""Rows, numbers that are shown."""
 SHOWN_FLOATS = SHOWN["step"].start
-"""How many of them are no whole numbers; they come first."""
+"""How many rows are float64; those after them are int64."""
 SHOWN_SHAPES = {field.name: field.shape for field in SHOWN_FIELDS}
 """The shape of each field."""
 SHOWN_KINDS = {field.name: np.dtype(field.kind) for field in SHOWN_FIELDS}

@@ -91,7 +91,7 @@ class Shown:
 def frozen(value: Any) -> Any:
     """An array that cannot be written to, or a mapping of them."""
     if isinstance(value, np.ndarray):
-        value.setflags(False)
+        value.setflags(write=False)
         return value
     if isinstance(value, dict):
         return MappingProxyType({name: frozen(part) for name, part in value.items()})

@@ -31,8 +31,8 @@ def _references_of_one() -> int:
     memory = np.zeros(1)
     before = getrefcount(memory)
     looking: list[Floats] = [memory[:]]
-    place = {"": looking[0]}
-    return len(place) * (getrefcount(memory) - before + sum(map(getrefcount, looking)))
+    kept = (looking, {"": looking[0]})  # as `look` does
+    return getrefcount(memory) - before + sum(map(getrefcount, kept[0]))
 
 
 _REFERENCES_OF_ONE = _references_of_one()
@@ -89,7 +89,7 @@ class ReadableBatch(FlightBatch):
         return array
 
     def _references(self) -> int:
-        """How many references there are to the memory of what is shown."""
+        """How many references there are to what is shown, and to the arrays that look into it."""
         return getrefcount(self._shown) + sum(map(getrefcount, self._looking))
 
     def _run(self, command: Command) -> NDArray[np.float32]:
@@ -149,8 +149,14 @@ class ReadableBatch(FlightBatch):
 
     def rows(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (n, ...)."""
-        values = self.columns(name)
-        return values.T if values.ndim == 2 else np.ascontiguousarray(np.moveaxis(values, -1, 0))
+        if name not in self._fields and not self._room.holds(name):
+            return self.read(name)
+        values = self._field(name)
+        if values.ndim == 3:
+            return self.columns(name).T
+        last = values.ndim - 1
+        values = values.transpose(0, last, *range(1, last))
+        return values.reshape(-1, *values.shape[2:])[: self.count]
 
     def counts(self, name: str) -> NDArray[np.int64]:
         """A field of the flights' records as whole numbers, (n,)."""
@@ -169,8 +175,9 @@ class ReadableBatch(FlightBatch):
 
     def gates(self) -> Floats:
         """(n, gates, 3) of a course in I [m]; none elsewhere."""
-        gates = self.task.gate_count if self.task.kind == "waypoints" else 0
-        return self.rows("gates")[:, :gates]
+        if self.task.kind != "waypoints":
+            return np.zeros((self.count, 0, 3))
+        return self.rows("gates")[:, : self.task.gate_count]
 
     def obstacle_centers(self) -> Floats:
         """(n, k, 3) where the middles of the world's obstacles are in I [m]."""

@@ -84,10 +84,10 @@ class Joiner:
             parts.append(shipped[:, self._split :])
         try:
             joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
-        except TypeError:  # the kinds of numbers have not been looked at yet
-            self._checked(flights, value)
+        except TypeError:
+            self._checked(flights, value)  # says which are no numbers
             raise
-        flat = joined.reshape(-1)
+        flat = joined.ravel(order="K")  # as it lies in memory
         if not flat.dot(flat) <= self._surely_within:  # NaN is not, either
             self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
         return joined
