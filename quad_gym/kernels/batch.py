@@ -21,7 +21,8 @@ from quad_gym.records import (
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
     SETTINGS,
-    SHOWN_SIZE,
+    SHOWN,
+    SHOWN_FLOATS,
     WIDTH,
     WORK_BLOCK,
     Autoreset,
@@ -58,6 +59,7 @@ _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
 _RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
 _SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
+_SHOWN_STEP, _SHOWN_STATUS = SHOWN["step"].start, SHOWN["filter_status"].start
 
 _CORE = offset_of(FLIGHT_BLOCK, "r")
 _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
@@ -68,6 +70,7 @@ _params_at = lanes_at(PARAMS_BLOCK)
 _work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
 _settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
 _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
+_wholes_at = array_at("i8")
 
 
 @kernel
@@ -145,8 +148,14 @@ def _show(call, index, flight, world, model, settings, work, stages):
     """Show the present instant to a user's task."""
     call_stage(stages, _SHOW, flight, world, model, settings, work, 0)
     here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
-    for k in range(SHOWN_SIZE):
+    for k in range(SHOWN_FLOATS):
         store_lanes(here + k * pitch, work.observation[k])
+    block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
+    step = _wholes_at(here + _SHOWN_STEP * pitch, WIDTH)
+    status = _wholes_at(here + _SHOWN_STATUS * pitch, WIDTH)
+    for lane in range(WIDTH):
+        step[lane] = int(block.step[lane])
+        status[lane] = block.filter_status[lane]
 
 
 @kernel

@@ -76,6 +76,8 @@ from quad_gym.records.settings import (
 )
 from quad_gym.records.shown import (
     SHOWN,
+    SHOWN_FLOATS,
+    SHOWN_KINDS,
     SHOWN_SHAPES,
     SHOWN_SIZE,
 )
@@ -240,6 +242,8 @@ __all__ = [
     "SETTINGS",
     "SETTINGS_FIELDS",
     "SHOWN",
+    "SHOWN_FLOATS",
+    "SHOWN_KINDS",
     "SHOWN_SHAPES",
     "SHOWN_SIZE",
     "STAMP",

@@ -1,5 +1,7 @@
 """What a user's task is shown of a flight at the end of a step: a row for each number."""
 
+import numpy as np
+
 from quad_gym.records.sizes import Field
 
 # fmt: off
@@ -29,6 +31,9 @@ SHOWN_FIELDS = (
     Field("preview", (2, 3), "m", "the reference a little later, or the gates after the next, in I"),
     Field("position_error", (), "m", "distance of the true position from the reference"),
     Field("gate_next", (), "-", "gates passed so far"),
+    # whole numbers come last
+    Field("step", (), "steps", "since the start of the episode", "i8"),
+    Field("filter_status", (), "bits", "failures so far, see FilterStatus", "i8"),
 )
 # fmt: on
 
@@ -41,6 +46,10 @@ for _field in SHOWN_FIELDS:
         _size *= _length
     SHOWN[_field.name] = slice(_first, _first + _size)
 SHOWN_SIZE = max(rows.stop for rows in SHOWN.values())
-"""Numbers that are shown."""
+"""Rows, numbers that are shown."""
+SHOWN_FLOATS = SHOWN["step"].start
+"""How many rows are float64; those after them are int64."""
 SHOWN_SHAPES = {field.name: field.shape for field in SHOWN_FIELDS}
 """The shape of each field."""
+SHOWN_KINDS = {field.name: np.dtype(field.kind) for field in SHOWN_FIELDS}
+"""The type of each field's numbers."""

@@ -11,11 +11,12 @@ from quad_gym.tasks.fields import VIEW_FIELDS
 from quad_gym.tasks.lazy import Group
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import Task, TaskError, label
+from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-FLOAT, _TRUTH = np.dtype(np.float64), np.dtype(np.bool_)
+_FLOAT, _TRUTH = np.dtype(np.float64), np.dtype(np.bool_)
 
 LONE = "observed"
 """What the table of observations calls an array that `observe` returns without a name."""
@@ -30,10 +31,15 @@ def ask(task: Task, method: str, *arguments: Any) -> Any:
     try:
         return getattr(task, method)(*arguments)
     except Exception as error:
-        raise TaskError(
-            f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
-            + _meant(error)
-        ) from error
+        raise _failure(task, method, error) from error
+
+
+def _failure(task: Task, method: str, error: Exception) -> TaskError:
+    """What to raise where a method has raised an error."""
+    return TaskError(
+        f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
+        + _meant(error)
+    )
 
 
 def _meant(error: Exception) -> str:
@@ -66,13 +72,17 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
     return found
 
 
-def reward(task: Task, value: Any, count: int) -> NDArray[Any]:
-    """(n,) rewards; they may still be NaN or infinite.
+def reward(task: Task, view: View, count: int) -> NDArray[Any]:
+    """(n,) rewards that a task pays; they may still be NaN or infinite.
 
     Raises:
-        TaskError: If it has another shape, or is no array of numbers.
+        TaskError: If it fails, or returns another shape, or no array of numbers.
     """
-    if type(value) is np.ndarray and value.dtype is FLOAT and value.shape == (count,):
+    try:
+        value: Any = task.reward(view)
+    except Exception as error:
+        raise _failure(task, "reward", error) from error
+    if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (count,):
         return value  # almost always
     found = numbers(task, "reward", value)
     if found.shape != (count,):
@@ -83,12 +93,16 @@ def reward(task: Task, value: Any, count: int) -> NDArray[Any]:
     return found
 
 
-def truths(task: Task, method: str, value: Any, count: int) -> Truths:
-    """(n,) truth values.
+def truths(task: Task, method: str, view: View, count: int) -> Truths:
+    """(n,) truth values that a method returns.
 
     Raises:
-        TaskError: If it is something else.
+        TaskError: If it fails, or returns something else.
     """
+    try:
+        value: Any = getattr(task, method)(view)
+    except Exception as error:
+        raise _failure(task, method, error) from error
     if type(value) is np.ndarray and value.dtype is _TRUTH and value.shape == (count,):
         return value  # almost always
     found = numbers(task, method, value)

@@ -43,6 +43,7 @@ VIEW_FIELDS = (
     ViewField("truth.velocity", "(n, 3)", "m/s", "I", "`view.velocity`"),
     ViewField("truth.R_BI", "(n, 3, 3)", "-", "I to B", "attitude, v_B = R_BI v_I; `view.R_BI`"),
     ViewField("truth.forward", "(n, 3)", "-", "I", "the body x axis: first row of R_BI"),
+    ViewField("truth.up", "(n, 3)", "-", "B", "the vertical: last column of R_BI; its z is the cosine of the tilt"),
     ViewField("truth.quaternion", "(n, 4)", "-", "B to I", "the same as (w, x, y, z); `view.quaternion`"),
     ViewField("truth.body_rates", "(n, 3)", "rad/s", "B", "`view.body_rates`"),
     ViewField("truth.rotor_speeds", "(n, 4)", "rad/s", "-", "`view.rotor_speeds`"),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
 from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.tasks.lazy import Group, Lazy, Shown
+from quad_gym.tasks.lazy import Group, Lazy, Place, Shown
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
@@ -22,8 +22,8 @@ class Truth(Group):
 
     __slots__ = ("_view",)
 
-    def __init__(self, flights: Any, view: "View") -> None:
-        super().__init__(flights)
+    def __init__(self, flights: Any, kept: list[Place], view: "View") -> None:
+        super().__init__(flights, kept)
         self._view = view
 
     position = Shown("r", "(n, 3) in I [m].")
@@ -34,7 +34,9 @@ class Truth(Group):
 
     R_BI = Shown("R_BI", "(n, 3, 3), v_B = R_BI v_I.")
 
-    forward = Shown("R_BI", "(n, 3) the body x axis in I, first row of `R_BI`.", 3)
+    forward = Shown("R_BI", "(n, 3) the body x axis in I, first row of `R_BI`.", slice(0, 3))
+
+    up = Shown("R_BI", "(n, 3) the vertical in B, last column of `R_BI`.", slice(2, None, 3))
 
     body_rates = Shown("w", "(n, 3) [rad/s].")
 
@@ -220,11 +222,13 @@ class Estimate(Group):
     accel_bias_covariance, accel_bias_sigma = _covariance("accelerometer bias [m/s^2]", 9)
     gyro_bias_covariance, gyro_bias_sigma = _covariance("gyro bias [rad/s]", 12)
 
-    @Lazy
+    _status = Shown("filter_status", "(n,) what has failed so far.")
+
+    @property
     def status(self) -> NDArray[np.int64]:
         """(n,) what has failed so far, see `FilterStatus`; 0: nothing."""
         self._need_filter()
-        return self._flights.counts("filter_status")  # type: ignore[no-any-return]
+        return self._status
 
     @Lazy
     def lost(self) -> Truths:

@@ -1,6 +1,7 @@
 """Observations with a task's own numbers: joined with the shipped ones, checked, within bounds."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from quad_gym.tasks.batch import TaskBatch
 
 Singles = NDArray[np.float32]
+
+_ARRAYS, _SHAPE = {np.ndarray}, attrgetter("shape")
 
 _SQUARABLE = 1e15
 """Numbers whose squares have a sum in single precision."""
@@ -79,24 +82,22 @@ class Joiner:
             parts.insert(0, shipped[:, self._kept])
         if self._rest:
             parts.append(shipped[:, self._split :])
-        joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
-        flat = joined.ravel()
-        if not np.dot(flat, flat) <= self._surely_within:  # NaN is not, either
+        try:
+            joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+        except TypeError:
+            self._checked(flights, value)  # says which are no numbers
+            raise
+        flat = joined.ravel(order="K")  # as it lies in memory
+        if not flat.dot(flat) <= self._surely_within:  # NaN is not, either
             self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
         return joined
 
     def _is_as_at_first(self, value: Any) -> bool:
-        """Whether `observe` has returned floats of the names and shapes that it had at first."""
+        """Whether `observe` has returned arrays of the names and shapes that it had at first."""
         if type(value) is not dict or tuple(value) != self._names:
             return False
-        for part, shape in zip(value.values(), self._shapes, strict=True):
-            if (
-                type(part) is not np.ndarray
-                or part.shape != shape
-                or part.dtype is not answers.FLOAT
-            ):
-                return False
-        return True
+        parts = value.values()
+        return set(map(type, parts)) == _ARRAYS and list(map(_SHAPE, parts)) == self._shapes
 
     def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
         """What `observe` has returned, (n, k) each by name, in the order of the observation."""

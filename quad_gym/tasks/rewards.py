@@ -24,13 +24,11 @@ Floats = NDArray[np.float64]
 BLOCKS = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 """Blocks of the filter's covariance."""
 
-_CRASHES = [
-    int(ending)
-    for ending in (
-        *(Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.ON_THE_GROUND),
-        *(Ending.COLLISION, Ending.LEFT_GEOFENCE),
-    )
-]
+_CRASHES = (
+    *(Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.ON_THE_GROUND),
+    *(Ending.COLLISION, Ending.LEFT_GEOFENCE),
+)
+_CRASHED = np.array([float(ending in _CRASHES) for ending in range(max(Ending) + 1)])
 
 
 class Piece:
@@ -177,7 +175,7 @@ class Crash(Piece):
 
     def __call__(self, view: "View") -> Floats:
         """(n,) 0 or 1."""
-        return np.isin(view.shipped.ending, _CRASHES).astype(np.float64)
+        return _CRASHED[view.shipped.ending]
 
 
 @dataclass(frozen=True)
@@ -212,8 +210,13 @@ class Visibility(Piece):
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
-    """(n,) products of rows, summed from the first column to the last."""
-    return np.asarray(sum(a[:, i] * b[:, i] for i in range(1, a.shape[1])) + a[:, 0] * b[:, 0])
+    """(n,) products of rows with at least three columns; `einsum` takes longer for few flights."""
+    first, second, *others = (a * b).T
+    total = second + others[0]
+    for column in others[1:]:
+        total += column
+    total += first
+    return total
 
 
 _COSTS = shipped.ACTION_COST * Effort() + shipped.RATE_COST * BodyRates()

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.tasks.lazy import Group, Lazy, frozen
+from quad_gym.tasks.lazy import Group, Lazy, Place, frozen
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -18,8 +18,8 @@ class Shipped(Group):
 
     __slots__ = ("_begun",)
 
-    def __init__(self, flights: Any) -> None:
-        super().__init__(flights)
+    def __init__(self, flights: Any, kept: list[Place]) -> None:
+        super().__init__(flights, kept)
         self._begun: Truths | None = None
 
     def _result(self, name: str) -> Floats:
@@ -60,8 +60,9 @@ class Shipped(Group):
 
     def step_over(self) -> None:
         """Forget what was said of the last step."""
-        self.__dict__.clear()
-        self._begun = None
+        self.forget()
+        if self._begun is not None:
+            self._begun = None
 
     def begin(self, chosen: Truths) -> None:
         """Forget what was said of flights that have begun an episode since."""

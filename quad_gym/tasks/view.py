@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.records import SHOWN
 from quad_gym.tasks.groups import Estimate, Measured, Seen, Truth
-from quad_gym.tasks.lazy import Group, Lazy, Shown
+from quad_gym.tasks.lazy import Group, Lazy, Place, Shown
 from quad_gym.tasks.shipped import Shipped
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
@@ -33,7 +33,7 @@ class View(Group):
     """
 
     __slots__ = (
-        *("_hidden", "_of_instant", "_shipped", "_truth"),
+        *("_hidden", "_shipped", "_truth"),
         *("estimate", "measured", "seen", "state"),
     )
 
@@ -43,23 +43,17 @@ class View(Group):
     state: State
 
     def __init__(self, flights: "TaskBatch", state: State) -> None:
-        super().__init__(flights)
+        of_instant: list[Place] = []
+        super().__init__(flights, of_instant)
         self._hidden = False
-        self._truth, self._shipped = Truth(flights, self), Shipped(flights)
+        self._truth, self._shipped = Truth(flights, of_instant, self), Shipped(flights, [])
         for name, group in (
-            ("estimate", Estimate(flights)),
-            ("measured", Measured(flights)),
-            ("seen", Seen(flights)),
+            ("estimate", Estimate(flights, of_instant)),
+            ("measured", Measured(flights, of_instant)),
+            ("seen", Seen(flights, of_instant)),
             ("state", state),
         ):
             object.__setattr__(self, name, group)
-        groups = (self, self._truth, self.estimate, self.seen, self.measured)
-        self._of_instant = [group.__dict__ for group in groups]
-
-    def forget(self) -> None:
-        """Drop the arrays of the present instant; those of the step stay."""
-        for arrays in self._of_instant:
-            arrays.clear()
 
     def step_over(self) -> None:
         """Forget all arrays, as a step has been flown."""
@@ -73,7 +67,7 @@ class View(Group):
 
     def hide(self, hidden: bool) -> None:
         """Whether the truth is hidden, as from `observe`."""
-        self._hidden = hidden
+        object.__setattr__(self, "_hidden", hidden)  # without asking whether it may be set
 
     # ---- what may be hidden -------------------------------------------------------------------
 
@@ -188,10 +182,7 @@ class View(Group):
 
     time = Shown("time", "(n,) since the start of the episode [s].")
 
-    @Lazy
-    def step(self) -> NDArray[np.int64]:
-        """(n,) steps since the start of the episode."""
-        return self._flights.counts("step")  # type: ignore[no-any-return]
+    step = Shown("step", "(n,) steps since the start of the episode.")
 
     @Lazy
     def began(self) -> Truths:

@@ -89,6 +89,7 @@ def test_the_truth_is_that_of_the_records():
     R_IB = Rotation.from_quat(view.quaternion, scalar_first=True).as_matrix()
     np.testing.assert_allclose(view.R_BI, R_IB.transpose(0, 2, 1), atol=1e-12)
     np.testing.assert_array_equal(view.truth.forward, view.R_BI[:, 0])
+    np.testing.assert_array_equal(view.truth.up, view.R_BI[:, :, 2])
     assert view.position is view.truth.position
 
 
@@ -119,6 +120,14 @@ def test_the_estimate_and_its_covariance_are_those_of_the_filter():
     error[:, 12:] = batch.read("b_g") - batch.read("b_g_hat")
     expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
     np.testing.assert_allclose(view.truth.nees, expected, rtol=0.02)
+
+
+def test_failures_of_the_filter_are_whole_numbers():
+    batch, view = flown()
+    batch._blocks["filter_status"][0, 3] = 4
+    batch.step(np.zeros((FLIGHTS, 4)))
+    assert list(view.estimate.status) == [0, 0, 0, 4, 0]
+    assert list(view.step) == [21] * FLIGHTS
 
 
 def test_the_reference_of_a_circle_is_its_closed_form():
@@ -272,6 +281,9 @@ def test_a_view_is_of_the_episode_that_the_step_belongs_to():
         lambda view: view.time[3:],
         lambda view: view.seen.preview[:2, 1],
         lambda view: view.R_BI,
+        lambda view: view.step,
+        lambda view: view.reference_velocity[1:],
+        lambda view: memoryview(view.velocity),
     ],
 )
 def test_arrays_that_a_task_keeps_stay_as_they_were(part):
@@ -280,7 +292,7 @@ def test_arrays_that_a_task_keeps_stay_as_they_were(part):
     view, kept = env.flights.batch.view, []
     for _ in range(4):
         env.step(np.full((FLIGHTS, 4), 0.1))
-        kept.append((part(view), part(view).copy()))
+        kept.append((part(view), np.array(part(view))))
     for array, before in kept:
         np.testing.assert_array_equal(array, before)
     assert len({array.tobytes() for array, _ in kept}) == 4
@@ -304,8 +316,25 @@ def test_what_nobody_keeps_is_written_to_the_same_memory():
     places = set()
     for _ in range(4):
         env.step(np.zeros((FLIGHTS, 4)))
-        places.add(env.flights.batch.view.position.ctypes.data)
+        view = env.flights.batch.view
+        places.add((id(view.position), view.position.ctypes.data, view.step.ctypes.data))
     assert len(places) == 1
+
+
+def test_restoring_again_and_again_takes_no_more_memory():
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    batch = env.flights.batch
+    instant, memory = batch.snapshot(), set()
+    for _ in range(5):
+        positions = batch.view.position.copy()
+        assert batch.view.R_BI.shape == (FLIGHTS, 3, 3)
+        batch.step(np.full((FLIGHTS, 4), 0.1))
+        assert (batch.view.position != positions).any()
+        memory.add((id(batch._shown), len(batch._looking)))
+        batch.restore(instant)
+        np.testing.assert_array_equal(batch.view.position, positions)
+    assert len(memory) == 1
 
 
 def test_progress_is_the_same_after_a_snapshot_has_been_restored():

@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 
 COUNTS = (8, 1024)
 """Flights in the batches."""
-LEAST_UP = math.cos(math.radians(100.0))
-"""Of the body z axis, below which an episode ends."""
+
+# Arrays of no axes: NumPy would make one of a Python number in every step, which takes a while.
+NEAR_RATE, FINE_RATE, FINE_WEIGHT = np.array(-2.0), np.array(-20.0), np.array(0.5)
+HEADING_WEIGHT, ACTION_COST, RATE_COST = np.array(0.1), np.array(0.02), np.array(0.002)
+FAR, LOW, MOST_STEPS = np.array(3.0), np.array(-0.5), np.array(500)
+TIPPED = np.array(math.cos(math.radians(100.0)))
 
 
 class OwnCircle(Task):
@@ -31,19 +35,19 @@ class OwnCircle(Task):
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) closeness and heading less changes of the action and body rates, a second."""
         error, change, rates = view.position_error, view.action - view.last_action, view.body_rates
-        facing = np.einsum("ni,ni->n", view.truth.forward, view.reference_heading)
-        costs = 0.02 * np.einsum("ni,ni->n", change, change)
-        costs += 0.002 * np.einsum("ni,ni->n", rates, rates)
-        return np.exp(-2.0 * error) + 0.5 * np.exp(-20.0 * error) + 0.1 * facing - costs
+        closeness = np.exp(NEAR_RATE * error) + FINE_WEIGHT * np.exp(FINE_RATE * error)
+        facing = np.vecdot(view.truth.forward, view.reference_heading)
+        costs = ACTION_COST * np.vecdot(change, change) + RATE_COST * np.vecdot(rates, rates)
+        return closeness + HEADING_WEIGHT * facing - costs
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) too far from the reference, tipped over, or on the ground."""
-        tipped = view.R_BI[:, 2, 2] < LEAST_UP
-        return (view.position_error > 3.0) | tipped | (view.position[:, 2] < -0.5)
+        away, grounded = view.position_error > FAR, view.position[:, 2] < LOW
+        return away | grounded | (view.truth.up[:, 2] < TIPPED)
 
     def truncated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) out of time, or with a filter that has failed."""
-        return (view.step >= 500) | (view.estimate.status != 0)
+        return np.logical_or(view.step >= MOST_STEPS, view.estimate.status)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
         """Errors, directions, rates, reference and action, in the body frame."""

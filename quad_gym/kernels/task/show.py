@@ -26,7 +26,7 @@ def _put_matrix(row, k, R):
 
 @kernel
 def _show(flight, p, settings, row):
-    """Write the numbers of `quad_gym.records.SHOWN`, in its order."""
+    """Write the numbers of `quad_gym.records.SHOWN`, in its order, but for whole ones."""
     reference = reference_shown(flight, p, settings)
     row[0] = flight.tick * p.dt
     k = _put(row, 1, load3(flight.r), 3)
