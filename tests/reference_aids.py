@@ -1,9 +1,10 @@
 """The plain filter of `reference_ukf.py` with a barometer and a magnetometer.
 
 Slow errors come behind b_g: the drift of GNSS positions, if there is one; hard iron b (three); then
-one each, the barometer's bias and the error of the declination. What the filter believes to be
-constant has a driving noise so small that 45 digits do not notice it. As there: UKF and, by
-numerical derivatives, EKF, in any number type.
+one each, the barometer's bias and the error of the declination. Where the covariance turns with the
+attitude, hard iron turns so that what the field tells of both together stays as it is. What the
+filter believes to be constant has a driving noise so small that 45 digits do not notice it. As
+there: UKF and, by numerical derivatives, EKF, in any number type.
 """
 
 import math
@@ -13,6 +14,12 @@ import numpy as np
 from tests.reference_ukf import PlainEKF, PlainUKF, array_of, block_diagonal, rotation_312
 
 NOTHING = "1e-44"
+
+
+def cross_matrix(v):
+    """[v x], such that [v x] e = v x e."""
+    x, y, z = v
+    return np.array([[0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x]])
 
 
 class Aided:
@@ -53,7 +60,7 @@ class Aided:
         if self.drifts:
             self.tail_start[:3, :3] = number("1e-30") * eye[:3, :3]
         self.zeros = array_of(number, np.zeros(12 + len(tail)))
-        self.pending = []
+        self.pending, self.field_before = [], None
 
     def initialize(self, gnss_position_G, gnss_baseline_G):
         super().initialize(gnss_position_G, gnss_baseline_G)
@@ -96,7 +103,18 @@ class Aided:
         self.aiding = [model for _, _, model in pending]
         z = np.concatenate([z, *(value for value, _, _ in pending)])
         noise = block_diagonal(noise, *(block for _, block, _ in pending)) if pending else noise
+        if self.hard_iron is not None:
+            self.field_before = self.R @ self.field
         super()._condition(z, noise, models)
+
+    def _turn(self, e):
+        turn = super()._turn(e)
+        if self.field_before is not None:
+            after = cross_matrix(rotation_312(e) @ self.field_before)
+            before = cross_matrix(self.field_before)
+            turn[self.hard_iron, 6:9] = before - after @ turn[6:9, 6:9]
+            self.field_before = None
+        return turn
 
     def _predicted(self, models, points):
         others = [super()._predicted(models, points)] if models else []

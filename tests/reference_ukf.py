@@ -216,9 +216,13 @@ class PlainUKF:
         self.R = rotation_312(e) @ self.R
         self.P = (P + P.T) / 2
         if self.sensors.estimator.covariance_reset == "turn":
-            turn = eye_of(self.number, self.states)
-            turn[6:9, 6:9] = inverse33(euler_rate_matrix(e[np.newaxis])[0])
+            turn = self._turn(e)
             self.P = turn @ self.P @ turn.T
+
+    def _turn(self, e):
+        turn = eye_of(self.number, self.states)
+        turn[6:9, 6:9] = inverse33(euler_rate_matrix(e[np.newaxis])[0])
+        return turn
 
     def _state(self):
         return np.concatenate([self.r, self.v, self.zeros[:3], self.b_a, self.b_g, self.d])

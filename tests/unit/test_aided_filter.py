@@ -12,7 +12,7 @@ from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.records import AID_BLOCKS, Aid, Gate
 from tests.circle_flight import record_circle
 from tests.reference_aids import AidedEKF, AidedUKF
-from tests.reference_ukf import array_of
+from tests.reference_ukf import PlainUKF, array_of, rotation_312
 
 LAB = quad_gym.sensor_suite("lab")
 BOTH = {"barometer": BarometerParams(bias_tau=20.0), "magnetometer": MagnetometerParams()}
@@ -120,6 +120,32 @@ def test_normalized_innovations_are_those_of_the_plain_filter(kind):
     expected = [nu[0] ** 2 / S[0, 0], nu[1:] @ np.linalg.solve(S[1:, 1:], nu[1:])]
     tolerance = 1e-6 if kind is ExtendedKalmanFilter else 0.02  # the sigma points' second order
     np.testing.assert_allclose(ours.block_nis[-2:], expected, rtol=tolerance)
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_a_velocity_tells_the_heading_of_a_vehicle_that_turns(kind):
+    """The antenna goes by w x l, seen from I: by the linear update, with numerical derivatives."""
+    one_antenna = LAB.gnss.replace(secondary_antenna_B=None, velocity_sigma=0.02)
+    suite = LAB.replace(gnss=one_antenna, camera=None, barometer=BOTH["barometer"])
+    ours = kind(suite)
+    ours.initialize(np.zeros(3), heading=0.7, heading_sigma=0.05)
+    w_B, lever_B = np.array([1.0, -2.0, 6.0]), np.array(one_antenna.primary_antenna_B)
+    ours.predict(w_B, ours.R_BI @ (0.0, 0.0, 9.81))
+    P, v, R_BI = ours.covariance, ours.velocity, ours.R_BI
+
+    def antenna(x):
+        return v + x[3:6] + (rotation_312(x[np.newaxis, 6:9])[0] @ R_BI).T @ np.cross(w_B, lever_B)
+
+    H = np.array([(antenna(1e-6 * e) - antenna(-1e-6 * e)) / 2e-6 for e in np.eye(15)]).T
+    S = H @ P @ H.T + 0.02**2 * np.eye(3)
+    expected = P - P @ H.T @ np.linalg.solve(S, H @ P)
+    R_IG = PlainUKF(LAB).R_IG
+    ours.update(gnss_velocity_G=R_IG.T @ antenna(np.zeros(15)))
+    sigma = np.sqrt(np.diag(P))
+    tolerance = 1e-5 if kind is ExtendedKalmanFilter else 0.02  # the sigma points' second order
+    gap = (ours.covariance - expected) / np.outer(sigma, sigma)
+    assert abs(gap).max() < tolerance
+    assert ours.covariance[8, 8] < 0.8 * P[8, 8]
 
 
 def test_what_is_beyond_the_gate_is_left_out_and_at_last_believed():

@@ -68,10 +68,17 @@ def drifts_suddenly(flight):
 
 @kernel
 def doubt_position_and_drift(flight, P, doubted):
-    """Raise the variances of position and drift to what a jump may have been."""
+    """Raise the variances of position and drift to what a jump may have been.
+
+    Some axes follow it later than others, so that none is raised by less than the mean.
+    """
+    mean = 0.0 * flight.tick
+    for i in range(3):
+        mean = mean + flight.drift_corrected[i] * flight.drift_corrected[i] / 3.0
     for i in range(3):
         total = flight.drift_corrected[i]
-        most = minimum(_REMAINING * total * total, MOST_POSITION * MOST_POSITION)
+        square = maximum(total * total, mean)
+        most = minimum(_REMAINING * square, MOST_POSITION * MOST_POSITION)
         wanted = select(doubted, most, 0.0)
         P[R + i, R + i] = maximum(P[R + i, R + i], wanted)
         P[D + i, D + i] = maximum(P[D + i, D + i], wanted)

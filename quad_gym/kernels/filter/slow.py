@@ -27,16 +27,25 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.maths.linalg import (
+    apply,
+    cross,
     load3,
+    load33,
     load_block,
+    load_column3,
     multiply,
     scale,
     store_block,
+    sub,
     sum_of_outers,
     sum_of_squares,
     transpose,
 )
+from quad_gym.kernels.maths.rotation import euler_to_dcm
 from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import Aid
+
+_MAGNETOMETER = int(Aid.MAGNETOMETER)
 
 
 @kernel
@@ -134,6 +143,35 @@ def load_slow(flight, slow, columns):
     for i in range(slow.slow_states):
         for j in range(last + 1):
             columns[D + i, last - j] = flight.L_slow[i, j]
+
+
+@kernel
+def turn_iron(flight, slow, p, L9, T, correction, columns):
+    """Let a magnetometer's hard iron go with the attitude as an update turns that, as in the field.
+
+    The field tells the sum b + (R m_I) x e, with hard iron b and error angles e, much better than
+    either. The update took R m_I as it was estimated before; where it corrects the attitude by
+    degrees, the sum is another one from then on. Were that taken for known, the next field, from
+    another tilt, would seem to tell the heading. So b takes up the difference.
+
+    Args:
+        flight: Record; R_hat is that before the update.
+        slow: The settings.
+        p: Parameters as the filter believes them.
+        L9: The factor that the update has made, its columns last first.
+        T: By which the errors of the attitude turn, as of `reset_matrix`.
+        correction: Of the attitude, as error angles.
+        columns: How many columns there are.
+    """
+    first = slow.aid_vector[_MAGNETOMETER]
+    if first >= 0:
+        before = apply(load33(flight.R_hat), load3(p.aid_numbers[_MAGNETOMETER]))
+        after = apply(euler_to_dcm(correction), before)
+        for j in range(columns - 9, columns):
+            e = load_column3(L9, E, j)
+            more = sub(cross(apply(T, e), after), cross(e, before))
+            for i in range(3):
+                L9[D + first + i, j] = L9[D + first + i, j] + more[i]
 
 
 @kernel

@@ -20,7 +20,7 @@ from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, t
 from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
 from quad_gym.kernels.filter.jumps import follow_drift_corrections
 from quad_gym.kernels.filter.recovery import follow_corrections, tell_drifts
-from quad_gym.kernels.filter.slow import load_slow, shift_slow
+from quad_gym.kernels.filter.slow import load_slow, shift_slow, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import (
@@ -278,7 +278,11 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
         dx[i] = shift
         total = total + shift
     if (form & _TURN) != 0:
-        turn_factor(L9, reset_matrix((dx[E], dx[E + 1], dx[E + 2])), states, columns)
+        correction = (dx[E], dx[E + 1], dx[E + 2])
+        T = reset_matrix(correction)
+        if slow is not None:
+            turn_iron(flight, slow, p, L9, T, correction, columns)
+        turn_factor(L9, T, states, columns)
     wanted = mask & (measured > 0.0)
     ok = wanted & (pivot > 0.0) & is_finite(total)
     keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))

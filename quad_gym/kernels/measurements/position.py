@@ -14,12 +14,14 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, E, R
 from quad_gym.kernels.filter.recovery import (
+    MOST_POSITION,
     camera_fits,
     doubt_acceleration,
+    drifts,
     suspect_group,
     time_of,
 )
-from quad_gym.kernels.maths.elementary import exp, log, maximum
+from quad_gym.kernels.maths.elementary import exp, log, maximum, minimum
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
@@ -42,10 +44,13 @@ from quad_gym.kernels.measurements.rows import (
 )
 from quad_gym.kernels.measurements.triples import triple_functions
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, FilterForm, Sensor
+from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, SENSOR_GROUPS, FilterForm, Sensor
 
 SENSOR = Sensor.GNSS
 _EKF = int(FilterForm.EKF)
+_REMAINING = 9.0
+"""Square of how many times an innovation a jump may be: the drift of GNSS has followed it in part,
+and what is left is shared among the position and the drift."""
 
 count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
     "position", POSITION_BLOCK
@@ -161,9 +166,25 @@ def doubt(flight, p, work, settings, slow, k):
     T = time_of(flight, p, POSITION_BLOCK)
     for i in range(3):
         square = select(doubted > 0.0, nu[i] * nu[i], 0.0)
-        P[R + i, R + i] = maximum(P[R + i, R + i], square)
         if slow is not None:
             if slow.estimates_drift:
+                most = minimum(_REMAINING * nu[i] * nu[i], MOST_POSITION * MOST_POSITION)
+                square = select(_is_elsewhere(flight, work), most, 0.0)
                 P[D + i, D + i] = maximum(P[D + i, D + i], square)
+        P[R + i, R + i] = maximum(P[R + i, R + i], square)
     doubt_acceleration(p, P, 2.0 * norm(nu) / (T * T), doubted)
     return k
+
+
+@kernel
+def _is_elsewhere(flight, work):
+    """Where the vehicle, or GNSS, is likely to be elsewhere.
+
+    The filter doubts itself, for this sensor or another, while fixes are rejected; or fixes drift.
+    A jump shows in these as often as in the sum of the drift's corrections (`filter/jumps.py`).
+    """
+    doubted = work.drifting
+    for group in range(SENSOR_GROUPS):
+        doubted = maximum(doubted, work.doubted[group])
+    elsewhere = (doubted > 0.0) & (flight.rejected_in_row[POSITION_BLOCK] > 0.0)
+    return (work.taking > 0.0) & (elsewhere | drifts(flight, POSITION_BLOCK))

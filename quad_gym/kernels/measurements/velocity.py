@@ -1,11 +1,14 @@
 """GNSS velocity: of the primary antenna.
 
-It measures `z = v + R^T (w x l_p) + v_noise` in I, with body rates w from the gyro. That the lever
-arm's share turns with the error angles is neglected, so that the model is linear: dz = dv.
+It measures `z = v + R^T (w x l_p) + v_noise` in I, with body rates w from the gyro. The lever arm's
+share turns with the error angles. Only filters with slow errors count that (`filter/slow.py`): one
+whose heading comes from a magnetometer errs by some degrees, and a vehicle that turns by 6 rad/s by
+0.02 m/s then. Where two antennas tell the heading to half a degree it is neglected, so that the
+model is linear: dz = dv.
 """
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.filter.error_state import V
+from quad_gym.kernels.filter.error_state import E, V
 from quad_gym.kernels.filter.recovery import doubt_acceleration, suspect_group, time_of
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import (
@@ -34,9 +37,10 @@ from quad_gym.kernels.measurements.rows import (
 )
 from quad_gym.kernels.measurements.triples import triple_functions
 from quad_gym.kernels.simd.lanes import any_of, select
-from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK, Sensor
+from quad_gym.records import DRAW_VELOCITY, VELOCITY_BLOCK, FilterForm, Sensor
 
 SENSOR = Sensor.GNSS
+_EKF = int(FilterForm.EKF)
 
 count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
     "velocity", VELOCITY_BLOCK
@@ -70,6 +74,7 @@ def _center(flight, p, work, k, has):
     zero = 0.0 * variance
     nothing = (zero, zero, zero)
     put_noise(work, k, has, add_to_diagonal((nothing, nothing, nothing), variance))
+    return lever_B
 
 
 @kernel
@@ -78,12 +83,22 @@ def expect(flight, p, work, settings, slow, k):
     if not any_of(flight.velocity_valid > 0.0):
         return k
     L, last, has = flight.L, columns_of(slow) - 1, flight.velocity_valid > 0.0
-    _center(flight, p, work, k, has)
+    lever_B = _center(flight, p, work, k, has)
     clear_slow_columns(work, k, slow)
+    R_BI, inverse_c = load33(flight.R_hat), work.inverse_spread
     for j in range(9):
         dv = load_column3(L, V, j)
+        bent = scale(0.0, dv)
+        if slow is not None:
+            if (settings.form & _EKF) != 0:
+                turned = cross(load_column3(L, E, j), lever_B)
+            else:
+                turned = scale(inverse_c, apply_transposed(load33(work.odd[j]), lever_B))
+                even = scale(inverse_c, apply_transposed(load33(work.even[j]), lever_B))
+                bent = apply_transposed(R_BI, even)
+            dv = add(dv, apply_transposed(R_BI, turned))
         put_three(work.A[last - j], k, has, dv)
-        put_three(work.E[8 - j], k, has, scale(0.0, dv))
+        put_three(work.E[8 - j], k, has, bent)
     return k + 3
 
 
