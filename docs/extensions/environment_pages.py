@@ -54,11 +54,15 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _field_docs(kind: type) -> dict[str, str]:
-    """What is said below each field of a dataclass."""
-    found = ModuleAnalyzer.for_module(kind.__module__).find_attr_docs()
-    docs = {
-        name: " ".join(lines).strip() for (of, name), lines in found.items() if of == kind.__name__
-    }
+    """What is said below each field of a dataclass, inherited fields first."""
+    docs = {}
+    for part in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
+        found = ModuleAnalyzer.for_module(part.__module__).find_attr_docs()
+        docs |= {
+            name: " ".join(lines).strip()
+            for (of, name), lines in found.items()
+            if of == part.__name__
+        }
     for field in dataclasses.fields(kind):
         if field.name not in docs:
             raise ExtensionError(f"{kind.__name__}.{field.name} has no docstring")
@@ -196,7 +200,10 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         if ONE_TASK_KEYWORDS.get(key, defaults.kind) == defaults.kind
         and key not in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ())
     ]
-    rows += [(f"`{key}`", _value(value), "a keyword of every environment") for key, value in settings.items()]
+    rows += [
+        (f"`{key}`", _value(value), "a keyword of every environment")
+        for key, value in settings.items()
+    ]
     rows_seen = _observation_rows(
         quad_gym.observation_layout(), _meanings(sections["Observation space"])
     )
@@ -244,10 +251,11 @@ def _suites_page() -> str:
         "noisy": quad_gym.NoisyObservationParams,
     }.items():
         rows = []
-        for name, said in _field_docs(kind).items():
+        said = _field_docs(kind)
+        for name in (field.name for field in dataclasses.fields(kind)):
             of = (getattr(suite, part) for suite in suites.values())
             values = ["-" if p is None else _value(getattr(p, name)) for p in of]
-            unit = re.search(r"\[[^]\d][^]]*\]", said)  # no range, such as [0, 1)
+            unit = re.search(r"\[[^]\d][^]]*\]", said[name])  # no range, such as [0, 1)
             rows.append((f"`{name}`" + (f" {unit[0]}" if unit else ""), *values))
         text += f"\n## `{part}`: {kind.__name__}\n\n{_table(('', *suites), rows)}"
     return text
