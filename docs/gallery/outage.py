@@ -1,6 +1,6 @@
 """
-Watch the filter lose and find itself
-=====================================
+Watch the filter through a GNSS outage
+======================================
 
 GNSS fails for some seconds. A consistent filter knows how large its error may be. A filter that was
 misled during the outage notices it only when GNSS returns, and has to recover.
