@@ -2,8 +2,8 @@
 Reward looking at markers
 =========================
 
-Without GNSS, the filter knows the position only as well as the camera sees markers. This task rewards
-markers in view and a small covariance. Half of the vehicles start turned away from the markers.
+Without GNSS, the filter knows the position only as well as the camera sees markers. This task
+rewards markers in view and a small covariance. Half of the vehicles start turned away from them.
 """
 
 import gymnasium
