@@ -54,11 +54,15 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _field_docs(kind: type) -> dict[str, str]:
-    """What is said below each field of a dataclass."""
-    found = ModuleAnalyzer.for_module(kind.__module__).find_attr_docs()
-    docs = {
-        name: " ".join(lines).strip() for (of, name), lines in found.items() if of == kind.__name__
-    }
+    """What is said below each field of a dataclass, inherited fields first."""
+    docs = {}
+    for part in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
+        found = ModuleAnalyzer.for_module(part.__module__).find_attr_docs()
+        docs |= {
+            name: " ".join(lines).strip()
+            for (of, name), lines in found.items()
+            if of == part.__name__
+        }
     for field in dataclasses.fields(kind):
         if field.name not in docs:
             raise ExtensionError(f"{kind.__name__}.{field.name} has no docstring")
@@ -162,10 +166,15 @@ def _keywords_page() -> str:
     )
 
 
-def _task_sections(name: str) -> dict[str, str]:
-    """What the docstring of a task says, by its headings; "About" is what stands before them."""
+def _task_class(name: str) -> type[quad_gym.Task]:
     module, attribute = name.split(":")
-    text = inspect.getdoc(getattr(importlib.import_module(module), attribute)) or ""
+    found: type[quad_gym.Task] = getattr(importlib.import_module(module), attribute)
+    return found
+
+
+def _task_sections(task: type[quad_gym.Task]) -> dict[str, str]:
+    """What the docstring of a task says, by its headings; "About" is what stands before them."""
+    text = inspect.getdoc(task) or ""
     parts = re.split(r"^## (.+)$", text.split("\nArgs:")[0], flags=re.MULTILINE)
     about = "\n".join(parts[0].splitlines()[1:]).strip()
     return {"About": about} | {
@@ -182,7 +191,8 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
     reference, start, limit = (cell.strip() for cell in row[1].split("|"))
     own = BENCHMARKS.get(kind)
     defaults = TASK_DEFAULTS[kind] if own is None else own.task
-    spec = sections if own is None else sections | _task_sections(own.keywords["custom"])
+    task = None if own is None else _task_class(own.keywords["custom"])
+    spec = sections if task is None else sections | _task_sections(task)
     settings = {} if own is None else dict(own.keywords)
     rows = [
         (f"`{key}`", _value(getattr(defaults, key)), docs[key])
@@ -190,11 +200,18 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         if ONE_TASK_KEYWORDS.get(key, defaults.kind) == defaults.kind
         and key not in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ())
     ]
-    rows += [(f"`{key}`", _value(value), "of every environment") for key, value in settings.items()]
-    observation = _observation_rows(
+    rows += [
+        (f"`{key}`", _value(value), "a keyword of every environment")
+        for key, value in settings.items()
+    ]
+    rows_seen = _observation_rows(
         quad_gym.observation_layout(), _meanings(sections["Observation space"])
     )
-    head = ("slice", "name", "meaning", "unit", "frame", "bounds")
+    built_in = _table(("slice", "name", "meaning", "unit", "frame", "bounds"), rows_seen)
+    seen = spec["Observation"] if task is not None else ""
+    # a task's own observation takes the place of the built-in one, or follows it
+    observation = seen if task is not None and task.replaces_observation else built_in + "\n" + seen
+    shared = "Start and `info`" if own else "Reward, start, endings and `info`"
     parts = [
         f"# {name}\n\n`{env_id}`\n",
         f"{spec['About']}\n" if own else "",
@@ -202,10 +219,9 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         "```python\nimport gymnasium\n\nimport quad_gym\n\n"
         f'env = gymnasium.make("{env_id}")\n```\n',
         film_of(env_id),
-        "Reward, start, endings and `info` below are those of the specification that all "
-        "environments share, `help(quad_gym.QuadEnv)`.\n",
-        f"## Observation\n\n{_table(head, observation)}",
-        f"{spec['Observation']}\n" if own else "",
+        f"{shared} below are from the specification that all environments share, "
+        "`help(quad_gym.QuadEnv)`.\n",
+        f"## Observation\n\n{observation}\n",
         "The other layouts are under [Observations](../observations.md).\n",
         f"## Action\n\n{sections['Action space']}\n",
         f"## Keywords of the task\n\n{_table(('keyword', 'default here', 'meaning'), rows)}",
@@ -221,21 +237,26 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
 def _suites_page() -> str:
     """The numbers of every suite side by side."""
     suites = {name: quad_gym.sensor_suite(name) for name in ALL_SUITES}
-    text = "# Sensor suites in numbers\n\nThe fields of `quad_gym.SensorSuite`. Where they come "
-    text += "from is written beside them, in `quad_gym/params/`.\n"
+    text = "# Sensor suites in numbers\n\nThe fields of `quad_gym.SensorSuite`. Their meaning is "
+    text += "under [Parameters](../api/parameters.md), their sources are beside the numbers in "
+    text += "`quad_gym/params/`.\n"
     for part, kind in {
         "imu": quad_gym.ImuParams,
         "gnss": quad_gym.GnssParams,
         "camera": quad_gym.CameraParams,
+        "barometer": quad_gym.BarometerParams,
+        "magnetometer": quad_gym.MagnetometerParams,
         "placement": quad_gym.PlacementParams,
         "estimator": quad_gym.FilterParams,
         "noisy": quad_gym.NoisyObservationParams,
     }.items():
         rows = []
-        for field in dataclasses.fields(kind):
+        said = _field_docs(kind)
+        for name in (field.name for field in dataclasses.fields(kind)):
             of = (getattr(suite, part) for suite in suites.values())
-            values = ["-" if p is None else _value(getattr(p, field.name)) for p in of]
-            rows.append((f"`{field.name}`", *values))
+            values = ["-" if p is None else _value(getattr(p, name)) for p in of]
+            unit = re.search(r"\[[^]\d][^]]*\]", said[name])  # no range, such as [0, 1)
+            rows.append((f"`{name}`" + (f" {unit[0]}" if unit else ""), *values))
         text += f"\n## `{part}`: {kind.__name__}\n\n{_table(('', *suites), rows)}"
     return text
 

@@ -2,8 +2,8 @@
 Fly the circle on truth and on the estimate
 ===========================================
 
-The same controller flies the same circle twice: once it sees the true state, once the estimate of
-the filter. What does that cost?
+The same controller flies the same circle twice: once on the true state, once on the estimate of the
+filter. What does the estimate cost?
 """
 
 import gymnasium
@@ -14,8 +14,8 @@ import quad_gym
 from baselines import PDPolicy
 
 # %%
-# The controller computes its action from the observation alone. ``observation`` says what that
-# holds; everything else stays the same.
+# The controller computes its action from the observation alone. The keyword ``observation`` chooses
+# its source; everything else stays the same.
 
 STEPS = 500  # ten seconds at 50 actions per second
 

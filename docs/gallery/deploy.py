@@ -1,9 +1,9 @@
 """
-Take a policy to C
-==================
+Export a policy to C
+====================
 
-A trained policy is exported as one file of C99, compiled with the system's compiler, and flown in
-place of the policy: the flights are the same. :doc:`Deployment </deployment>` says how to feed it
+A trained policy is exported as a single C99 file, compiled with the system's compiler, and flown in
+place of the policy: the flights are the same. :doc:`Deployment </deployment>` says how to call it
 on an autopilot.
 """
 

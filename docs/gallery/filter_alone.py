@@ -1,9 +1,9 @@
 """
-The filter by itself, on a log
-==============================
+Run the filter on a log, step by step
+=====================================
 
-``UnscentedKalmanFilter`` filters any log of measurements. Here ``FlightBatch`` makes a log, and
-the filter by itself finds the estimate that the flight had.
+``UnscentedKalmanFilter`` filters any log of measurements. Here ``FlightBatch`` makes a log, and the
+filter alone reproduces the estimate of that flight.
 """
 
 import matplotlib.pyplot as plt

@@ -2,8 +2,8 @@
 Land on a pad
 =============
 
-A task of your own with ground that carries: the vehicle hovers, the pad lies up to a meter away,
-and PPO learns to set the vehicle down on it.
+Your own task, with ground on which the vehicle can stand: the vehicle starts hovering, the pad is
+up to a meter away, and PPO learns to land on it.
 """
 
 from pathlib import Path

@@ -1,9 +1,9 @@
 """
-Pay for knowing
-===============
+Reward looking at markers
+=========================
 
-Where there is no GNSS, the filter knows its position as well as the camera sees markers. This task
-pays for markers in view and for a sure filter. Half of the vehicles start turned away from them.
+Without GNSS, the filter knows the position only as well as the camera sees markers. This task
+rewards markers in view and a small covariance. Half of the vehicles start turned away from them.
 """
 
 import gymnasium
@@ -35,7 +35,8 @@ class LookAtMarkers(quad_gym.Task):
 
 
 # %%
-# PD control turns toward the markers by itself. Until then the filter grows unsure, and earns less:
+# PD control turns toward the markers by itself. Until then the standard deviation grows, and the
+# reward is smaller:
 
 figure, (of_reward, of_sigma) = plt.subplots(1, 2, figsize=(9, 4))
 for turned, label in ((0.0, "toward the markers"), (np.pi, "away from them")):

@@ -2,8 +2,9 @@
 Follow a moving target
 ======================
 
-A task of your own: a target wanders, and the vehicle sees it with noise of 5 cm. `quad_gym.Task`
-keeps the target of every flight, rewards, ends episodes, and adds where the target is seen.
+Your own task: a target wanders, and the vehicle sees it with noise of 5 cm. A `quad_gym.Task` keeps
+the target of each flight, computes the reward, ends episodes, and adds the seen target to the
+observation.
 """
 
 from pathlib import Path

@@ -1,9 +1,9 @@
 """
-Watch the filter lose and find itself
-=====================================
+Watch the filter through a GNSS outage
+======================================
 
-GNSS fails for some seconds. A good filter knows how wrong it is; a filter that has been deceived
-finds out late, and has to recover.
+GNSS fails for some seconds. A consistent filter knows how large its error may be. A filter that was
+misled during the outage notices it only when GNSS returns, and has to recover.
 """
 
 import gymnasium
@@ -18,7 +18,7 @@ FLIGHTS, SECONDS = 200, 20
 
 
 def fly(*faults):
-    """Error, claimed deviation and share of lost filters over time, over all flights."""
+    """Errors and claimed standard deviations (steps, flights), and the share of lost filters."""
     envs = gymnasium.make_vec(
         "QuadGym/Hover-v0",
         num_envs=FLIGHTS,
@@ -45,9 +45,9 @@ def fly(*faults):
 # Without GNSS, the covariance grows
 # ----------------------------------
 #
-# From 4 s to 8 s there are no fixes, and this vehicle has no camera. The filter goes on with the
-# IMU alone. Its error grows, and so does the deviation that it claims: three times that deviation
-# contains nearly all of the 200 flights.
+# From 4 s to 8 s there are no fixes, and this vehicle has no camera. The filter continues with the
+# IMU alone. Its error grows, and so does the standard deviation that it claims: nearly all of the
+# 200 flights stay within three of them.
 
 outage = GnssOutage(start=4.0, duration=4.0)
 errors, claimed, lost = fly(outage)
@@ -65,14 +65,15 @@ inside = (np.abs(errors) < 3 * claimed).mean()
 print(f"within 3 sigma: {100 * inside:.1f} % of all errors; lost filters: {100 * lost.max():.0f} %")
 
 # %%
-# Deceived during the outage
-# --------------------------
+# A bias step during the outage
+# -----------------------------
 #
-# Now the accelerometer's bias steps by 0.2 m/s² while there is no GNSS, ten times what the filter
-# holds for likely. Its error grows far beyond what it claims. When fixes return, they contradict
-# the estimate so much that the gate rejects them. After ten rejections in a row the filter doubts
-# itself, inflates its covariance, and takes the next fix. ``info["filter_lost"]`` tells when a
-# filter knows that its covariance does not explain what it measures.
+# Now the accelerometer's bias steps by 0.2 m/s² while there is no GNSS, ten times the standard
+# deviation that the filter assumes for it. The error grows far beyond what the filter claims. When
+# fixes return, they contradict the estimate so much that the gate rejects them. After ten
+# rejections in a row the filter inflates its covariance, and accepts the next fix.
+# ``info["filter_lost"]`` is true while the filter finds that its covariance does not explain what
+# it measures.
 
 step = AccelBiasStep(start=5.0, duration=float("inf"), size=(0.2, 0.2))
 errors, claimed, lost = fly(outage, step)
@@ -81,11 +82,11 @@ sizes = np.abs(errors)
 figure, (above, below) = plt.subplots(2, 1, sharex=True, height_ratios=(2, 1), figsize=(7, 5))
 for axes in (above, below):
     axes.axvspan(4, 8, color="0.9")
-above.semilogy(time, np.median(sizes, axis=1), color="C0", label="error: median")
-above.semilogy(time, np.percentile(sizes, 95, axis=1), "C0:", label="error: 95 % below")
-above.semilogy(time, np.median(claimed, axis=1), color="C1", label="deviation that is claimed")
-above.set(ylabel="east [m]", title="An outage, and a bias step within it")
-above.legend()
+above.semilogy(time, np.median(sizes, axis=1), color="C0", label="error, median")
+above.semilogy(time, np.percentile(sizes, 95, axis=1), "C0:", label="error, 95th percentile")
+above.semilogy(time, np.median(claimed, axis=1), color="C1", label="claimed deviation")
+above.set(ylabel="east [m]", ylim=(2e-3, 30), title="A bias step during the outage")
+above.legend(ncols=3, loc="upper right")
 below.fill_between(time, 100 * lost, color="C3", alpha=0.5)
 below.set(xlabel="time [s]", ylabel="lost filters [%]", ylim=(0, 105))
 
@@ -95,7 +96,7 @@ print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 
 # %%
 # One recovery is not always enough. Where the new bias is still mostly unknown, the estimate drifts
-# off again, which the upper curve of the error shows, until the filter doubts itself once more.
+# off again, as the 95th percentile shows, until the filter inflates its covariance once more.
 #
 # ``end_when_lost=True`` truncates an episode when its filter is lost. See
 # :doc:`/sensors-and-filter` for the thresholds, and :doc:`/filter-equations` for what is

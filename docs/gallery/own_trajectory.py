@@ -2,7 +2,8 @@
 Fly your own trajectory
 =======================
 
-Minimum snap through five points, and what the vehicle makes of it on the estimate.
+A minimum-snap trajectory through five points, and how closely the vehicle follows it on the
+estimate.
 """
 
 import gymnasium
@@ -13,7 +14,8 @@ import quad_gym
 from baselines import PDPolicy
 
 # %%
-# Times are chosen so that the larger of speed and acceleration just reaches its bound.
+# The times at the points are chosen such that either the speed or the acceleration just reaches its
+# limit. ``check`` lists what the flight demands of the vehicle.
 
 points = np.array([(0, 0, 1.5), (3, 1.5, 2), (3, -1.5, 1), (-3, 1.5, 2), (-3, -1.5, 1)])
 path = quad_gym.Trajectory.through(points, closed=True, max_speed=2.5, yaw="along")
@@ -21,7 +23,8 @@ print(path, path.times.round(2))
 print(path.check(quad_gym.vehicle_params("lab")))
 
 # %%
-# Twenty flights of it, each from the start; ``randomize=True`` would begin anywhere and turn it.
+# Twenty flights, each from the start of the trajectory. ``randomize=True`` would start each flight
+# at a random point, and turn the trajectory by a random angle.
 
 envs = gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=20, trajectory=path)
 policy, flown = PDPolicy(envs), []
@@ -32,7 +35,8 @@ for _ in range(envs.unwrapped.flights.batch.max_steps - 1):
 print(f"mean error in the last step: {1e3 * info['position_error'].mean():.0f} mm")
 
 # %%
-# From above, with the heading every half second; and how speed and acceleration use their bounds.
+# From above, with the heading every half second (arrows); speed and acceleration, with their limits
+# (dotted).
 
 t = np.linspace(0.0, path.duration, 600)
 figure, (above, over_time) = plt.subplots(1, 2, figsize=(10, 4))
@@ -49,6 +53,6 @@ for k, (name, bound) in enumerate((("speed [m/s]", 2.5), ("acceleration [m/s$^2$
     over_time.plot(t, np.linalg.norm(path(t, k), axis=1), color=f"C{k}", label=name)
     over_time.axhline(bound, color=f"C{k}", linestyle=":", linewidth=1.0)
 over_time.plot(path.times, 0.0 * path.times, "o", color="C3", clip_on=False)
-over_time.set(xlabel="time [s]", xlim=(0.0, path.duration), ylim=(0.0, None))
-over_time.legend()
+over_time.set(xlabel="time [s]", xlim=(0.0, path.duration), ylim=(0.0, 3.8))
+over_time.legend(ncols=2, loc="upper right")
 figure.tight_layout()

@@ -2,8 +2,8 @@
 Evaluate a trained policy
 =========================
 
-A policy for every task ships with the package. Here one of them flies against tuned PD control,
-on the truth and on the estimate.
+Trained policies for most tasks come with the package. Here one of them is compared with tuned PD
+control, on the truth and on the estimate.
 """
 
 import gymnasium

@@ -1,6 +1,6 @@
 """
-Replay a log
-============
+Replay a log with irregular times
+=================================
 
 ``replay`` takes a filter through the log of a flight: samples at irregular times, measurements that
 are late or missing. Here the log is that of a hobby vehicle with one GNSS antenna and no compass,

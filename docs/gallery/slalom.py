@@ -2,8 +2,8 @@
 A slalom between walls
 ======================
 
-A task of your own among obstacles: three walls stand across the way, each with a gap that is
-somewhere else in each episode, and PPO learns to fly through them.
+Your own task among obstacles: three walls block the way, each with a gap whose place differs in
+each episode. PPO learns to fly through the gaps.
 """
 
 from pathlib import Path
@@ -18,8 +18,8 @@ from baselines.mlp import MlpPolicy
 from baselines.recipes import Recipe
 
 # %%
-# Pairs of walls, 3 m apart, with gaps of 2 m whose middles shift by up to a meter. The second
-# wall of a pair follows the first.
+# Pairs of walls, 3 m apart, with gaps of 2 m whose centers shift by up to a meter. The second
+# wall of a pair shifts with the first.
 
 GAPS_AT = np.array([0.0, 3.0, 6.0])
 WALLS = []
@@ -52,8 +52,8 @@ class Slalom(quad_gym.Task):
 
 
 # %%
-# The actions are velocities. 1,200,000 steps take about a minute on two cores; the policy that they
-# lead to is kept beside this file.
+# Actions are velocities. 1,200,000 steps take about a minute on two cores; the trained policy is
+# kept beside this file.
 
 KEYWORDS = {
     "custom": Slalom(),
@@ -78,7 +78,8 @@ if not FILE.exists():
     model.policy().save(FILE)
 
 # %%
-# What it has learned, in 200 episodes with other seeds:
+# The trained policy in 200 episodes with other seeds. The figure shows 30 of them from above; gray
+# lines are the planes of the walls, whose gaps differ between episodes.
 
 policy = MlpPolicy.load(FILE)
 envs = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=200, **KEYWORDS)

@@ -3,8 +3,8 @@ A short training with Stable-Baselines3
 =======================================
 
 ``quad_gym.make_sb3_vec_env`` makes an ordinary vector environment of Stable-Baselines3. PPO
-learns to hover on the estimate in some ten seconds; the recipes behind ``quad-gym train`` go on
-for longer.
+learns to hover on the estimate in about ten seconds; the recipes of ``quad-gym train`` train
+longer.
 """
 
 import gymnasium

@@ -36,7 +36,8 @@ envs = gymnasium.make_vec(
 )
 envs.reset(seed=0)
 drawn = envs.unwrapped.flights.batch.drawn()
-print({name: values[:3].round(2) for name, values in drawn.items()})
+for name, values in drawn.items():
+    print(name, values[:3].round(2))
 
 # %%
 # PD control and the trained policy, neither of which knows the wind:
@@ -58,9 +59,10 @@ of_mass.set(xlabel="mass [kg]")
 of_wind.legend()
 
 # %%
-# The position error is what a controller without an integral part leaves: it grows with the wind,
-# and with how far the mass is from 0.78 kg. The error of the estimate hardly does: the IMU drives
-# the filter, which has no model of vehicle and air that could be wrong.
+# Neither controller has an integral term, so a position error remains: it grows with the wind, and
+# with the difference of the mass from 0.78 kg. The error of the estimate hardly grows: the IMU
+# drives the filter, which uses no model of vehicle or air that could be wrong.
 #
-# With ``privileged=True``, observations hold the wind and the draws for a critic;
-# ``Randomization(..., known=True)`` tells filter and controller the draws of vehicle and sensors.
+# With ``privileged=True``, observations include the wind and the drawn parameters for a critic.
+# With ``Randomization(..., known=True)``, filter and controller know the drawn parameters of
+# vehicle and sensors.

@@ -62,15 +62,15 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     | slice | name | meaning | unit | frame |
     |---|---|---|---|---|
-    | 0:3 | position_error | reference less position | m | B |
-    | 3:6 | velocity_error | reference less velocity | m/s | B |
-    | 6:9 | up | the vertical | - | B |
+    | 0:3 | position_error | reference minus position | m | B |
+    | 3:6 | velocity_error | reference minus velocity | m/s | B |
+    | 6:9 | up | the vertical, upward | - | B |
     | 9:12 | heading | the horizontal direction that body x is to point in | - | B |
     | 12:15 | body_rates | angular rate | rad/s | B |
-    | 15:18 | reference_acceleration | | m/s^2 | B |
-    | 18:21 | preview_1 | reference in 0.2 s (next gate) less the present one | m | B |
-    | 21:24 | preview_2 | reference in 0.4 s (the gate after) less the present one | m | B |
-    | 24:28 | last_action | | - | - |
+    | 15:18 | reference_acceleration | acceleration of the reference | m/s^2 | B |
+    | 18:21 | preview_1 | reference in 0.2 s (on a course: the gate after the next) minus the present one | m | B |
+    | 21:24 | preview_2 | reference in 0.4 s (on a course: the gate after that) minus the present one | m | B |
+    | 24:28 | last_action | the action before, as commanded | - | - |
 
     The body frame is that of the attitude that the controller sees. `layout="absolute"` gives
     position, velocity, rotation matrix, biases and reference in the inertial frame;
