@@ -20,7 +20,8 @@ from baselines import PDPolicy
 points = np.array([(0, 0, 1.5), (3, 1.5, 2), (3, -1.5, 1), (-3, 1.5, 2), (-3, -1.5, 1)])
 path = quad_gym.Trajectory.through(points, closed=True, max_speed=2.5, yaw="along")
 print(path, path.times.round(2))
-print(path.check(quad_gym.vehicle_params("lab")))
+for name, value in path.check(quad_gym.vehicle_params("lab"))._asdict().items():
+    print(name, np.round(value, 2))
 
 # %%
 # Twenty flights, each from the start of the trajectory. ``randomize=True`` would start each flight
@@ -55,4 +56,3 @@ for k, (name, bound) in enumerate((("speed [m/s]", 2.5), ("acceleration [m/s$^2$
 over_time.plot(path.times, 0.0 * path.times, "o", color="C3", clip_on=False)
 over_time.set(xlabel="time [s]", xlim=(0.0, path.duration), ylim=(0.0, 3.8))
 over_time.legend(ncols=2, loc="upper right")
-figure.tight_layout()
