@@ -148,10 +148,10 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),
-    # Waiting for GNSS pays if it is kept up for seconds: a pause of a tenth of a second is worth less
-    # than nothing, as the filter grows less sure in it. Noise that is drawn ten times a second
-    # averages out before that is found, so that in training actions are held for 0.25 s. Of what
-    # comes after 7 s of waiting, 0.998^28 = 95 % are left.
+    # Through an outage, half the speed saves few crashes, and waiting for its end most of them: a
+    # policy has to come upon pauses of seconds. Noise that is drawn ten times a second averages
+    # out, so that in training actions are held for 0.25 s. Of what comes after 7 s of waiting,
+    # 0.998^28 = 95 % are left.
     ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
         steps=1_200_000,
         reward_scale=0.02,
