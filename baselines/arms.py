@@ -169,6 +169,12 @@ OUTAGE_DASH = (
         learning={"custom": "baselines.arm_tasks:SteadyWary"},
     ),
     Arm(
+        name="unpaid",
+        label="estimate + doubt, not paid when unsure",
+        environment=_WARY,
+        learning={"custom": "baselines.arm_tasks:Unpaid"},
+    ),
+    Arm(
         name="truth_on_truth",
         label="truth, flown on it",
         flies="truth",
