@@ -144,6 +144,9 @@ STALE_RACE = (
 _SCALED = {"custom": "baselines.arm_tasks:Scaled"}
 _WARY = {"custom": "baselines.arm_tasks:Wary"}
 _STEADY = {"custom": "baselines.arm_tasks:Steady"}
+_PRESSED = {"gamma": 0.996}
+"""Who is not paid for hurrying needs no sight as far as the recipe's to wait, and flies faster with
+a shorter one."""
 
 OUTAGE_DASH = (
     Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
@@ -173,6 +176,7 @@ OUTAGE_DASH = (
         label="estimate + doubt, not paid when unsure",
         environment=_WARY,
         learning={"custom": "baselines.arm_tasks:Unpaid"},
+        parameters=_PRESSED,
     ),
     Arm(
         name="truth_on_truth",
