@@ -11,7 +11,7 @@ from baselines import residuals
 from baselines.pd import MARGIN, SIGMAS
 from quad_gym.params import checks as check
 from quad_gym.tasks.look_around import LookAround
-from quad_gym.tasks.outage_dash import OutageDash, gaps_behind, gaps_of, westward
+from quad_gym.tasks.outage_dash import OutageDash, gaps_of
 from quad_gym.tasks.rewards import Crash
 from quad_gym.tasks.stale_race import StaleRace
 from quad_gym.tasks.task import Observed
@@ -300,23 +300,6 @@ class Steady(Scaled):
 
 class SteadyWary(Steady, Wary):
     """`Wary` for training, as `Steady` is."""
-
-
-class Unpaid(SteadyWary):
-    """`SteadyWary` that pays for no progress while the filter is too unsure for the next gap.
-
-    That is, while `doubt` of the next gap is above 0. What is flown then is lost, so that slowing
-    down pays in the very step. Flying back costs as ever.
-    """
-
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) see the class."""
-        gaps = gaps_of(view)
-        through = gaps_behind(gaps, view.seen.position)
-        widths = gaps.widths[np.arange(view.count), through]
-        unsure = doubts(view, widths[:, np.newaxis])[:, 0] > 0.0
-        progress = self._weight * view.period * np.maximum(westward(view), 0.0)
-        return super().reward(view) - np.where(unsure, progress, 0.0)
 
 
 def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -144,9 +144,7 @@ STALE_RACE = (
 _SCALED = {"custom": "baselines.arm_tasks:Scaled"}
 _WARY = {"custom": "baselines.arm_tasks:Wary"}
 _STEADY = {"custom": "baselines.arm_tasks:Steady"}
-_PRESSED = {"gamma": 0.996}
-"""Who is not paid for hurrying needs no sight as far as the recipe's to wait, and flies faster with
-a shorter one."""
+_FARTHER_SIGHTED = {"gamma": 0.998}
 
 OUTAGE_DASH = (
     Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
@@ -163,6 +161,7 @@ OUTAGE_DASH = (
         environment=_SCALED,
         training=_TRUTH,
         learning=_STEADY,
+        parameters=_FARTHER_SIGHTED,
     ),
     Arm(name="estimate", label="estimate", environment=_SCALED, learning=_STEADY),
     Arm(
@@ -170,13 +169,6 @@ OUTAGE_DASH = (
         label="estimate + doubt",
         environment=_WARY,
         learning={"custom": "baselines.arm_tasks:SteadyWary"},
-    ),
-    Arm(
-        name="unpaid",
-        label="estimate + doubt, not paid when unsure",
-        environment=_WARY,
-        learning={"custom": "baselines.arm_tasks:Unpaid"},
-        parameters=_PRESSED,
     ),
     Arm(
         name="truth_on_truth",

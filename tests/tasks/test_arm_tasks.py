@@ -11,7 +11,6 @@ from baselines.arms import OUTAGE_DASH
 from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
 from baselines.recipes import recipe
-from quad_gym.faults import GnssOutage
 
 ID = "QuadGym/LookAround-v0"
 
@@ -145,27 +144,6 @@ def test_a_steady_crash_costs_the_same_everywhere():
     raise AssertionError("nobody crashed")
 
 
-def test_progress_is_unpaid_while_the_next_gap_is_too_narrow_for_the_doubt():
-    outage = [GnssOutage(start=1.0, duration=60.0)]
-    (plain, a), (unpaid, b) = (
-        make(name, task="QuadGym/OutageDash-v0", faults=outage) for name in ("SteadyWary", "Unpaid")
-    )
-    batch, action, ended = unpaid.unwrapped.flights.batch, np.zeros((6, 4)), np.zeros(6, bool)
-    cases = set()
-    for step in range(130):
-        action[:, 0] = 0.08 if step < 100 else -0.2  # on, and back
-        (a, paid, *_), (b, less, *over) = plain.step(action), unpaid.step(action)
-        np.testing.assert_array_equal(a, b)
-        unsure, speed = part(unpaid, b, "doubt")[:, 0] > 0.0, -batch.read("v")[:, 0]
-        expected = np.where(unsure, 0.5 * np.clip(speed, 0.0, 5.0), 0.0)
-        np.testing.assert_allclose((paid - less)[~ended], expected[~ended], atol=1e-9)
-        ended |= over[0] | over[1]
-        cases |= set(zip(unsure[~ended].tolist(), (speed[~ended] > 0.0).tolist(), strict=True))
-        if ended.any():
-            break
-    assert {(False, True), (True, True)} <= cases
-
-
 def test_steady_episodes_begin_before_the_first_wall_or_between_two():
     env = gymnasium.make_vec(
         "QuadGym/OutageDash-v0", num_envs=300, custom="baselines.arm_tasks:Steady"
@@ -196,7 +174,7 @@ def test_scaled_observations_are_those_of_the_task_over_their_scales():
     assert np.abs(part(plain, seen, "body_rates")).max() > 0.1
 
 
-@pytest.mark.parametrize("name", ["Scaled", "Wary", "Steady", "SteadyWary", "Unpaid"])
+@pytest.mark.parametrize("name", ["Scaled", "Wary", "Steady", "SteadyWary"])
 def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
     env, _ = make(name, count=1, task="QuadGym/OutageDash-v0", include_covariance=True)
     table = {field.name: field for field in env.unwrapped.flights.table}
