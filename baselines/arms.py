@@ -144,7 +144,6 @@ STALE_RACE = (
 _SCALED = {"custom": "baselines.arm_tasks:Scaled"}
 _WARY = {"custom": "baselines.arm_tasks:Wary"}
 _STEADY = {"custom": "baselines.arm_tasks:Steady"}
-_FARTHER_SIGHTED = {"gamma": 0.998}
 
 OUTAGE_DASH = (
     Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
@@ -161,7 +160,6 @@ OUTAGE_DASH = (
         environment=_SCALED,
         training=_TRUTH,
         learning=_STEADY,
-        parameters=_FARTHER_SIGHTED,
     ),
     Arm(name="estimate", label="estimate", environment=_SCALED, learning=_STEADY),
     Arm(
