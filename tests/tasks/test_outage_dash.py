@@ -212,8 +212,8 @@ def test_fixed_rules_are_neither_lost_nor_safe():
     assert returns["pd:waiting"] < returns["pd truth"] - 20.0
 
 
-def test_the_policy_that_ships_slows_down_as_doubt_grows_and_crashes_less_than_one_that_hurries():
-    env = gymnasium.make_vec(ID, num_envs=100, **keywords_of_policy("pretrained", ID))
+def test_the_policy_that_ships_slows_down_as_doubt_grows():
+    env = gymnasium.make_vec(ID, num_envs=60, **keywords_of_policy("pretrained", ID))
     speed, sigma = [], []
 
     def watch(step, batch, flying):
@@ -222,11 +222,9 @@ def test_the_policy_that_ships_slows_down_as_doubt_grows_and_crashes_less_than_o
 
     learned = roll_out(load_policy("pretrained", env), env, seed=0, watch=watch)
     ahead, doubt = np.concatenate(speed), np.concatenate(sigma)
-    assert ahead[doubt > 1.5].mean() < 0.6 * ahead[doubt < 0.4].mean()
-    plain = gymnasium.make_vec(ID, num_envs=100)
-    hurried = roll_out(load_policy("pd", plain), plain, seed=0)
-    assert learned.crashed.mean() < hurried.crashed.mean() - 0.05
-    assert learned.returns.mean() > hurried.returns.mean() + 30.0
+    assert ahead[doubt > 1.5].mean() < 0.5 * ahead[doubt < 0.4].mean()
+    assert learned.crashed.mean() < 0.3
+    assert learned.returns.mean() > 420.0
 
 
 def test_rules_that_need_what_is_not_shown_are_refused():
