@@ -110,7 +110,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         carrying=(
             *("pd", "pd_slow", "pd_waiting", "truth", "estimate", "sigma", "truth_on_truth"),
         ),
-        evaluations=10,
+        evaluations=12,
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
         columns={

@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 from baselines import PDPolicy
 from baselines.arm_tasks import STEADY_CRASH_COST
 from baselines.arms import OUTAGE_DASH
+from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
+from baselines.recipes import recipe
 
 ID = "QuadGym/LookAround-v0"
 
@@ -183,6 +185,15 @@ def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
     for pace in ("steady", "waiting"):
         with pytest.raises(ValueError, match="env must observe"):
             PDPolicy(env, pace=pace)
+
+
+def test_actions_are_held_longer_in_training_than_where_policies_are_judged():
+    shipped = recipe("QuadGym/OutageDash-v0").replace(n_envs=2)
+    plan = Plan(env_id="QuadGym/OutageDash-v0", recipe=shipped, episodes=2)
+    learned, judged = plan.make_vector_flights(), plan.make_judge()
+    assert learned.unwrapped.flights.control_rate == 4.0
+    assert interface_of(judged)["control_rate"] == 10.0
+    assert learned.observation_space == judged.observation_space
 
 
 def test_rules_of_the_study_fly_the_plain_task_and_trained_arms_the_scaled_one():

@@ -212,6 +212,21 @@ def test_fixed_rules_are_neither_lost_nor_safe():
     assert returns["pd:waiting"] < returns["pd truth"] - 20.0
 
 
+def test_the_policy_that_ships_slows_down_as_doubt_grows():
+    env = gymnasium.make_vec(ID, num_envs=60, **keywords_of_policy("pretrained", ID))
+    speed, sigma = [], []
+
+    def watch(step, batch, flying):
+        speed.append(-batch.view.velocity[flying, 0])
+        sigma.append(batch.view.estimate.position_sigma[flying].max(axis=1))
+
+    learned = roll_out(load_policy("pretrained", env), env, seed=0, watch=watch)
+    ahead, doubt = np.concatenate(speed), np.concatenate(sigma)
+    assert ahead[doubt > 1.5].mean() < 0.5 * ahead[doubt < 0.4].mean()
+    assert learned.crashed.mean() < 0.3
+    assert learned.returns.mean() > 420.0
+
+
 def test_rules_that_need_what_is_not_shown_are_refused():
     with pytest.raises(ValueError, match='env must observe position_sigma for pace="waiting"'):
         load_policy("pd:waiting", make(1))
