@@ -38,15 +38,10 @@ COMPARED_GATES = SHOWN["gate_next"].start - _COMPARED.start
 """The row of the gates passed."""
 
 
-def _most_references(arrays: list[NDArray[Any]]) -> int:
-    """The largest number of references to any of the arrays."""
-    return max(map(getrefcount, arrays), default=0)
-
-
 def _references_unless_kept() -> int:
     """To an array that was handed out; measured, as interpreters count differently."""
     attributes = {"": np.zeros(1)}
-    return _most_references([attributes[""]])
+    return max(map(getrefcount, [attributes[""]]))
 
 
 _UNLESS_KEPT = _references_unless_kept()
@@ -116,8 +111,10 @@ class ReadableBatch(FlightBatch):
     def _is_kept(self) -> bool:
         """Whether anybody keeps an array of the present memory."""
         arrays = self._handed_out
-        of_memory = getrefcount(self._memory) - len(arrays)
-        return of_memory > self._memory_references or _most_references(arrays) > _UNLESS_KEPT
+        return (
+            getrefcount(self._memory) - len(arrays) > self._memory_references
+            or max(map(getrefcount, arrays), default=0) > _UNLESS_KEPT
+        )
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         if self._crew is not None and self._is_kept():
