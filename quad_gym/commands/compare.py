@@ -181,7 +181,7 @@ def _require_same(setting: Setting) -> None:
     if not file.exists():
         write_json(file, described)
         return
-    before = json.loads(file.read_text(encoding="utf-8"))
+    before = {"engine": "sb3"} | json.loads(file.read_text(encoding="utf-8"))  # once the only one
     differing = [k for k in described if before.get(k) != described[k]]
     if differing:
         raise ValueError(

@@ -1,5 +1,7 @@
 """What a user's task is shown of a flight at the end of a step: a row for each number."""
 
+from math import prod
+
 import numpy as np
 
 from quad_gym.records.sizes import Field
@@ -41,14 +43,13 @@ SHOWN: dict[str, slice] = {}
 """The rows of each field."""
 for _field in SHOWN_FIELDS:
     _first = max((rows.stop for rows in SHOWN.values()), default=0)
-    _size = 1
-    for _length in _field.shape:
-        _size *= _length
-    SHOWN[_field.name] = slice(_first, _first + _size)
+    SHOWN[_field.name] = slice(_first, _first + prod(_field.shape))
 SHOWN_SIZE = max(rows.stop for rows in SHOWN.values())
 """Rows, numbers that are shown."""
-SHOWN_FLOATS = SHOWN["step"].start
+SHOWN_FLOATS = sum(prod(field.shape) for field in SHOWN_FIELDS if field.kind == "f8")
 """How many rows are float64; those after them are int64."""
+for _field in SHOWN_FIELDS:
+    assert (_field.kind == "f8") == (SHOWN[_field.name].stop <= SHOWN_FLOATS), _field.name
 SHOWN_SHAPES = {field.name: field.shape for field in SHOWN_FIELDS}
 """The shape of each field."""
 SHOWN_KINDS = {field.name: np.dtype(field.kind) for field in SHOWN_FIELDS}

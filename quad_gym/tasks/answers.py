@@ -1,7 +1,7 @@
 """What a task's methods return, checked; what is wrong names the method and the flights."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,9 @@ from quad_gym.tasks.fields import VIEW_FIELDS
 from quad_gym.tasks.lazy import Group
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import Task, TaskError, label
-from quad_gym.tasks.view import View
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.view import View
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -31,15 +33,10 @@ def ask(task: Task, method: str, *arguments: Any) -> Any:
     try:
         return getattr(task, method)(*arguments)
     except Exception as error:
-        raise _failure(task, method, error) from error
-
-
-def _failure(task: Task, method: str, error: Exception) -> TaskError:
-    """What to raise where a method has raised an error."""
-    return TaskError(
-        f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
-        + _meant(error)
-    )
+        raise TaskError(
+            f"{label(task)}.{method} failed, for all flights: {type(error).__name__}: {error}"
+            + _meant(error)
+        ) from error
 
 
 def _meant(error: Exception) -> str:
@@ -72,16 +69,13 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
     return found
 
 
-def reward(task: Task, view: View, count: int) -> NDArray[Any]:
+def reward(task: Task, view: "View", count: int) -> NDArray[Any]:
     """(n,) rewards that a task pays; they may still be NaN or infinite.
 
     Raises:
         TaskError: If it fails, or returns another shape, or no array of numbers.
     """
-    try:
-        value: Any = task.reward(view)
-    except Exception as error:
-        raise _failure(task, "reward", error) from error
+    value = ask(task, "reward", view)
     if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (count,):
         return value  # almost always
     found = numbers(task, "reward", value)
@@ -93,16 +87,13 @@ def reward(task: Task, view: View, count: int) -> NDArray[Any]:
     return found
 
 
-def truths(task: Task, method: str, view: View, count: int) -> Truths:
+def truths(task: Task, method: str, view: "View", count: int) -> Truths:
     """(n,) truth values that a method returns.
 
     Raises:
         TaskError: If it fails, or returns something else.
     """
-    try:
-        value: Any = getattr(task, method)(view)
-    except Exception as error:
-        raise _failure(task, method, error) from error
+    value = ask(task, method, view)
     if type(value) is np.ndarray and value.dtype is _TRUTH and value.shape == (count,):
         return value  # almost always
     found = numbers(task, method, value)

@@ -14,7 +14,7 @@ from quad_gym.params import checks as check
 from quad_gym.records import WIDTH, Autoreset, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
-from quad_gym.tasks.memory import ReadableBatch
+from quad_gym.tasks.memory import COMPARED_ERROR, COMPARED_GATES, ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.state import State
@@ -106,12 +106,13 @@ class TaskBatch(ReadableBatch):
         given: Start = {"position": position, "velocity": velocity, "yaw": yaw}
         chosen = checked_mask(self.count, mask)
         shipped = super().reset(seeds=seeds, keys=keys, mask=mask, **given)
-        others = None if self._failed is None else self._failed & ~chosen
-        self._failed = others if others is not None and others.any() else None
+        nobody = np.zeros(self.count, bool)
+        others = nobody if self._failed is None else self._failed & ~chosen
+        self._note_failed(others)
         try:
             return self._observed(self._begin(chosen, given, shipped))
         except BaseException:
-            self._failed = chosen.copy() if others is None else others | chosen
+            self._note_failed(others | chosen)
             raise
 
     def step(self, actions: NDArray[Any] | None = None) -> Singles:
@@ -135,24 +136,28 @@ class TaskBatch(ReadableBatch):
         try:
             return self._after_step(shipped)
         except BaseException:
-            self._failed = np.ones(self.count, bool)
+            self._note_failed(np.ones(self.count, bool))
             raise
+
+    def _note_failed(self, flights: Truths) -> None:
+        """Note which flights a method has failed for: they need a reset before the next step."""
+        self._failed = flights if flights.any() else None
 
     def _remember(self) -> None:
         """Keep what the next step is compared with."""
         self._before[:] = self.compared_shown
         if self._counts_gates:
-            self._before[1] = self.columns("gate_next")
+            self._before[COMPARED_GATES] = self.columns("gate_next")
 
     @property
     def error_before(self) -> Floats:
         """(n,) distance from the reference before the step [m]."""
-        return self._before[0]
+        return self._before[COMPARED_ERROR]
 
     @property
     def gates_before(self) -> Floats:
         """(n,) gates passed before the step."""
-        return self._before[1]
+        return self._before[COMPARED_GATES]
 
     def _after_step(self, shipped: Singles) -> Singles:
         """Ask the task about a step that has been flown; return what is observed."""
@@ -160,7 +165,8 @@ class TaskBatch(ReadableBatch):
         self._begun_again = False
         if self._in_kernel:
             np.logical_not(self.time_shown, out=self._began_in_step)
-            self.began_some = True in self._began_in_step.tobytes()  # any() takes ten times longer
+            # bytes of truth values are 0 or 1; any() takes ten times longer for few flights
+            self.began_some = 1 in self._began_in_step.tobytes()
         if self.began_some:
             shipped = self._begin(self._began_in_step, {}, shipped)
         if "update" in self.methods:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
 from quad_gym.rotations import dcm_to_quaternion
-from quad_gym.tasks.lazy import Group, Lazy, Place, Shown
+from quad_gym.tasks.lazy import Attribute, Group, Lazy, Shown
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
@@ -22,7 +22,7 @@ class Truth(Group):
 
     __slots__ = ("_view",)
 
-    def __init__(self, flights: Any, kept: list[Place], view: "View") -> None:
+    def __init__(self, flights: Any, kept: list[Attribute], view: "View") -> None:
         super().__init__(flights, kept)
         self._view = view
 

@@ -11,8 +11,8 @@ from quad_gym.records import SHOWN, SHOWN_KINDS, SHOWN_SHAPES
 
 T = TypeVar("T")
 
-Place = tuple[dict[str, Any], str]
-"""Where an array is kept: attributes of a group, and its name in them."""
+Attribute = tuple[dict[str, Any], str]
+"""An attribute that holds an array: the attributes of a group, and its name in them."""
 
 
 class Lazy(Generic[T]):
@@ -41,7 +41,8 @@ class Lazy(Generic[T]):
 class Shown:
     """An array of a `Group` that the kernels show, see `quad_gym.records.SHOWN`.
 
-    It looks into the memory of what is shown, and stays as long as that; a matrix is copied.
+    It is a NumPy view of the memory of what is shown, the same in each step until the memory
+    changes; a matrix is copied.
 
     Args:
         name: Which.
@@ -58,8 +59,8 @@ class Shown:
         self._kind = SHOWN_KINDS[name]
         self._is_matrix = len(self._shape) > 1 and part is None
 
-    def into(self, shown: NDArray[np.float64]) -> NDArray[Any]:
-        """(n, ...) looking into what is shown."""
+    def part_of(self, shown: NDArray[np.float64]) -> NDArray[Any]:
+        """(n, ...) a NumPy view of what is shown."""
         found = shown[self._rows].T
         if self._is_matrix:
             found = found.reshape(-1, *self._shape)
@@ -67,7 +68,7 @@ class Shown:
 
     def __set_name__(self, owner: type, name: str) -> None:
         """Learn what it is called."""
-        self._name, self._source = name, f"_shown_{name}"
+        self._name, self._uncopied = name, f"_{name}_uncopied"
 
     @overload
     def __get__(self, group: None, owner: type) -> "Shown": ...
@@ -80,12 +81,12 @@ class Shown:
         if group is None:
             return self
         if not self._is_matrix:
-            return group._flights.look(self, group.__dict__, self._name)
-        shown = group.__dict__.get(self._source)
-        if shown is None:
-            shown = group._flights.look(self, group.__dict__, self._source)
+            return group._flights.hand_out(self, group.__dict__, self._name)
+        uncopied = group.__dict__.get(self._uncopied)
+        if uncopied is None:
+            uncopied = group._flights.hand_out(self, group.__dict__, self._uncopied)
         # in memory as for a single flight, so that products with it have the same bits
-        return group._keep(self._name, shown.copy())
+        return group._keep(self._name, uncopied.copy())
 
 
 def frozen(value: Any) -> Any:
@@ -103,28 +104,32 @@ class Group:
 
     Args:
         flights: What it shows.
-        kept: Where to note the arrays that are dropped at the next step: their places by name.
+        kept: Where to note the arrays that are dropped at the next step.
     """
 
     __slots__ = ("__dict__", "_flights", "_kept")
 
-    def __init__(self, flights: Any, kept: "list[Place]") -> None:
+    def __init__(self, flights: Any, kept: "list[Attribute]") -> None:
         self._flights, self._kept = flights, kept
 
     def _keep(self, name: str, value: Any) -> Any:
         """Keep what cannot be written to any more until `forget`; return it."""
-        arrays = self.__dict__
-        arrays[name] = value = frozen(value)
-        self._kept.append((arrays, name))
+        arrays, value = self.__dict__, frozen(value)
+        self._kept.append((arrays, name))  # first, so that it is dropped whatever happens
+        arrays[name] = value
         return value
 
     def forget(self) -> None:
         """Drop the arrays that were kept, of all groups that note them in the same place."""
-        for arrays, name in self._kept:
-            del arrays[name]
-        self._kept.clear()
+        kept = self._kept.copy()  # another thread may still add to it
+        for arrays, name in kept:
+            arrays.pop(name, None)  # two threads may have noted the same one
+        del self._kept[: len(kept)]
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name[0] != "_":
             raise AttributeError(f"view.{name} is what it is: keep your own in view.state")
         super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"view.{name} is what it is: it cannot be deleted")

@@ -1,7 +1,15 @@
 """`ReadableBatch`: flights that show each instant to the views of a task.
 
-The compiled code writes what is shown; views look into that memory, without a copy. Rewards and
-endings of a task are written by `quad_gym.kernels.task.settle`.
+The compiled code writes what is shown to one block of memory, and arrays of views are NumPy views
+of it, without a copy. Rewards and endings of a task are written by `quad_gym.kernels.task.settle`.
+
+An array that a task keeps must not change in the next step. Before each step, counts of references
+tell whether somebody keeps one, and then the step writes to other memory. The invariant: while
+nobody keeps any, each array that was handed out is referred to by the list of these and by its
+attribute alone, and the memory by the batch, its calls and the arrays in that list alone. Any
+further reference, such as from a slice, which NumPy lets refer to the memory itself, makes a count
+larger. An array that is in no list counts as kept, so an interrupt or a second thread can cost
+memory, but never show an old instant. Weak references are not counted.
 """
 
 from sys import getrefcount
@@ -15,7 +23,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import SETTLE
 from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
-from quad_gym.tasks.lazy import Place, Shown
+from quad_gym.tasks.lazy import Attribute, Shown
 
 Floats = NDArray[np.float64]
 
@@ -24,26 +32,28 @@ _GAP = 8
 _TIME = SHOWN["time"].start
 _COMPARED = slice(SHOWN["position_error"].start, SHOWN["gate_next"].stop)
 """What a step is compared with the one before in."""
+COMPARED_ERROR = SHOWN["position_error"].start - _COMPARED.start
+"""The row of the position's error among what is compared."""
+COMPARED_GATES = SHOWN["gate_next"].start - _COMPARED.start
+"""The row of the gates passed."""
 
 
-def _references_of_one() -> int:
-    """References of one array of a view; measured, as interpreters differ."""
-    memory = np.zeros(1)
-    before = getrefcount(memory)
-    looking: list[Floats] = [memory[:]]
-    kept = (looking, {"": looking[0]})  # as `look` does
-    return getrefcount(memory) - before + sum(map(getrefcount, kept[0]))
+def _references_unless_kept() -> int:
+    """To an array that was handed out; measured, as interpreters count differently."""
+    attributes = {"": np.zeros(1)}
+    return max(map(getrefcount, [attributes[""]]))
 
 
-_REFERENCES_OF_ONE = _references_of_one()
+_UNLESS_KEPT = _references_unless_kept()
 
 
 class ReadableBatch(FlightBatch):
     """A `FlightBatch` with what the views of a task read.
 
     `shown` is memory that the next step overwrites, unless somebody keeps an array of it: then the
-    step writes to other memory. The arrays of views stay as long as their memory. Other fields are
-    read as new arrays.
+    step writes to other memory. Arrays of views are handed out once for each memory, as making
+    them in every step would take longer than the rest of a small task. Other fields are read as
+    new arrays.
     """
 
     def __init__(self, count: int, **keywords: Any) -> None:
@@ -52,59 +62,69 @@ class ReadableBatch(FlightBatch):
         self._stages |= {Stage.SHOW}
         self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
-        self._looking: list[NDArray[Any]] = []
-        self._places: list[Place] = []
-        self._bare_references = 0
+        self._handed_out: list[NDArray[Any]] = []
+        self._attributes: list[Attribute] = []
+        self._memory_references = 0
         # rows that lie a power of two apart would share a few lines of the cache
-        self._look_into(np.empty((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
+        self._use_memory(np.zeros((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
 
     shown: Floats
     """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` at the present instant; read-only"""
-    _own_references: int
-    """To what is shown, and to the arrays that look into it, where nobody else keeps any."""
+    _handed_out: list[NDArray[Any]]
+    """Arrays of the present memory, each of which is an attribute of a view."""
+    _attributes: list[Attribute]
+    """All attributes that may hold an array of the present memory."""
+    _memory_references: int
+    """To the memory, without those of arrays that were handed out."""
 
-    def _look_into(self, memory: Floats) -> None:
-        """Let `shown` be what other memory holds."""
-        for arrays, name in self._places:
-            del arrays[name]
-        self._places, self._looking = [], []
-        self._own_references = self._bare_references
-        self._shown, self.shown = memory, memory[:, : self.count]
-        self.shown.setflags(write=False)
+    def _use_memory(self, memory: Floats) -> None:
+        """Show what this memory holds from now on."""
+        for group, name in self._attributes:
+            group.pop(name, None)
+        self._attributes, self._handed_out = [], []
+        memory.setflags(write=False)  # no array of it can be made writable then
+        self._memory, self.shown = memory, memory[:, : self.count]
         self.time_shown, self.compared_shown = self.shown[_TIME], self.shown[_COMPARED]
 
-    def look(self, at: Shown, place: dict[str, Any], name: str) -> NDArray[Any]:
-        """An array (n, ...) that looks into what is shown, and stays as long as its memory.
+    def _change_memory(self, calls: Calls) -> None:
+        """Leave the present memory to those who keep it, and use a copy."""
+        self._memory_references = 0  # whatever interrupts this, the next step does it again
+        self._use_memory(self._memory.copy())
+        calls.show_into(self._memory)
+        self._memory_references = getrefcount(self._memory)
+
+    def hand_out(self, field: Shown, group: dict[str, Any], name: str) -> NDArray[Any]:
+        """Make an array (n, ...) of the present memory an attribute, until the memory changes.
 
         Args:
-            at: What it looks at.
-            place: Attributes that are to have it.
+            field: What it holds.
+            group: The attributes of a group.
             name: Its name in them.
         """
-        array = at.into(self.shown)
-        place[name] = array
-        self._looking.append(array)
-        self._places.append((place, name))
-        self._own_references += _REFERENCES_OF_ONE
+        self._attributes.append((group, name))  # first, so that it is dropped whatever happens
+        made = field.part_of(self.shown)
+        array = group.setdefault(name, made)
+        if array is made:  # no other thread was faster
+            self._handed_out.append(array)
         return array
 
-    def _references(self) -> int:
-        """How many references there are to what is shown, and to the arrays that look into it."""
-        return getrefcount(self._shown) + sum(map(getrefcount, self._looking))
+    def _is_kept(self) -> bool:
+        """Whether anybody keeps an array of the present memory."""
+        arrays = self._handed_out
+        return (
+            getrefcount(self._memory) - len(arrays) > self._memory_references
+            or max(map(getrefcount, arrays), default=0) > _UNLESS_KEPT
+        )
 
     def _run(self, command: Command) -> NDArray[np.float32]:
-        if self._crew is not None and self._references() > self._own_references:
-            # somebody keeps what was shown
+        if self._crew is not None and self._is_kept():
             self._crew.gather()  # nobody may still write to the memory that goes
-            self._look_into(np.empty_like(self._shown))
-            self._calls.show_into(self._shown)
+            self._change_memory(self._calls)
         return super()._run(command)
 
     def _calls_of_threads(self) -> Calls:
         calls = super()._calls_of_threads()
-        self._look_into(np.empty_like(self._shown))  # nobody else knows of it yet
-        calls.show_into(self._shown)
-        self._bare_references = self._own_references = self._references()
+        self._change_memory(calls)
         return calls
 
     def restore(self, snapshot: NDArray[Any]) -> None:
@@ -119,15 +139,15 @@ class ReadableBatch(FlightBatch):
         self._blocks[:] = snapshot  # what fills the last block has begun anew
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the arrays that look into its memory, which a copy makes anew."""
-        looking: dict[str, Any] = {"_fields": {}, "_places": [], "_looking": []}
-        looking |= {"shown": None, "time_shown": None, "compared_shown": None}
-        return super().__getstate__() | looking
+        """All but the arrays of its memory, which a copy makes anew."""
+        arrays: dict[str, Any] = {"_fields": {}, "_attributes": [], "_handed_out": []}
+        arrays |= {"shown": None, "time_shown": None, "compared_shown": None}
+        return super().__getstate__() | arrays
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Look into memory of its own."""
+        """Use memory of its own."""
         self.__dict__.update(state)
-        self._look_into(self._shown)
+        self._use_memory(self._memory)
 
     def _field(self, name: str) -> NDArray[Any]:
         """A field of the flights' records, (blocks, ..., lanes), found once."""
@@ -155,7 +175,7 @@ class ReadableBatch(FlightBatch):
         if values.ndim == 3:
             return self.columns(name).T
         last = values.ndim - 1
-        values = values.transpose(0, last, *range(1, last))
+        values = values.transpose(0, last, *range(1, last)).copy()
         return values.reshape(-1, *values.shape[2:])[: self.count]
 
     def counts(self, name: str) -> NDArray[np.int64]:

@@ -210,12 +210,13 @@ class Visibility(Piece):
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
-    """(n,) products of rows with at least three columns; `einsum` takes longer for few flights."""
-    first, second, *others = (a * b).T
-    total = second + others[0]
-    for column in others[1:]:
+    """(n,) products of rows, which have at least three columns."""
+    # whole columns, whose sums have the same bits however the arrays lie in memory; the first
+    # column comes last, as it always has: another order would change the last bits of rewards
+    first, second, third, *others = (a * b).T
+    total = second + third
+    for column in (*others, first):
         total += column
-    total += first
     return total
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.tasks.lazy import Group, Lazy, Place, frozen
+from quad_gym.tasks.lazy import Attribute, Group, Lazy, frozen
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -18,7 +18,7 @@ class Shipped(Group):
 
     __slots__ = ("_begun",)
 
-    def __init__(self, flights: Any, kept: list[Place]) -> None:
+    def __init__(self, flights: Any, kept: list[Attribute]) -> None:
         super().__init__(flights, kept)
         self._begun: Truths | None = None
 

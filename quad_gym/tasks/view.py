@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.records import SHOWN
 from quad_gym.tasks.groups import Estimate, Measured, Seen, Truth
-from quad_gym.tasks.lazy import Group, Lazy, Place, Shown
+from quad_gym.tasks.lazy import Attribute, Group, Lazy, Shown
 from quad_gym.tasks.shipped import Shipped
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
@@ -43,7 +43,7 @@ class View(Group):
     state: State
 
     def __init__(self, flights: "TaskBatch", state: State) -> None:
-        of_instant: list[Place] = []
+        of_instant: list[Attribute] = []
         super().__init__(flights, of_instant)
         self._hidden = False
         self._truth, self._shipped = Truth(flights, of_instant, self), Shipped(flights, [])

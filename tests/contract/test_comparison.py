@@ -9,6 +9,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +29,15 @@ ROOT = Path(__file__).resolve().parents[2]
 def read_csv(file):
     with file.open(encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
+
+
+def test_a_comparison_from_before_there_were_engines_goes_on(tmp_path):
+    described = {"steps": 100, "engine": "sb3"}
+    (tmp_path / "comparison.json").write_text('{"steps": 100}')
+    command._require_same(SimpleNamespace(folder=tmp_path, description=lambda: described))
+    described["engine"] = "compiled"
+    with pytest.raises(ValueError, match="different: engine"):
+        command._require_same(SimpleNamespace(folder=tmp_path, description=lambda: described))
 
 
 def test_evaluate_writes_what_it_prints(tmp_path):

@@ -166,6 +166,19 @@ def test_a_reset_of_the_flights_that_failed_is_needed():
     env.step(np.zeros((3, 4)))
 
 
+def test_no_flight_has_failed_where_none_was_reset():
+    def fail(view):
+        raise OSError("full")
+
+    env, switch = with_switch("observe", fail, "Disabled")
+    batch = env.flights.batch
+    switch.on = True
+    with pytest.raises(TaskError, match="observe failed"):
+        batch.reset(mask=np.zeros(FLIGHTS, bool))
+    switch.on = False
+    batch.step(np.zeros((FLIGHTS, 4)))
+
+
 def test_an_interruption_leaves_flights_that_need_a_reset():
     def stop(view):
         raise KeyboardInterrupt

@@ -3,6 +3,7 @@
 import copy
 import inspect
 import re
+import threading
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.tasks.fields import VIEW_FIELDS
+from quad_gym.tasks.lazy import Shown
 
 FLIGHTS = 5
 
@@ -331,7 +333,7 @@ def test_restoring_again_and_again_takes_no_more_memory():
         assert batch.view.R_BI.shape == (FLIGHTS, 3, 3)
         batch.step(np.full((FLIGHTS, 4), 0.1))
         assert (batch.view.position != positions).any()
-        memory.add((id(batch._shown), len(batch._looking)))
+        memory.add((id(batch._memory), len(batch._handed_out)))
         batch.restore(instant)
         np.testing.assert_array_equal(batch.view.position, positions)
     assert len(memory) == 1
@@ -380,3 +382,158 @@ def test_a_view_is_of_the_instant_that_has_been_restored(task, mode):
         np.testing.assert_array_equal(batch.view.truth.progress, np.zeros(FLIGHTS))
         np.testing.assert_array_equal(kept, while_away)
         assert batch.snapshot().tobytes() == instant.tobytes()
+
+
+@pytest.mark.parametrize("count", [1, 5, 8, 9])
+def test_no_array_of_a_view_is_memory_of_the_records(count):
+    env = QuadVectorEnv(
+        *(count, "waypoints"),
+        **{"custom": Nothing(), "sensors": "rtk"},
+        randomization={"mass": quad_gym.Uniform(0.7, 0.8)},
+    )
+    env.reset(seed=1)
+    batch, kept = env.flights.batch, []
+    for k in range(3):
+        env.step(np.full((count, 4), 0.1 * k))
+        for field in every_name():
+            value = value_of(batch.view, field.name)
+            arrays = value if field.shape.startswith("dict") else {"": value}
+            if field.shape:
+                kept += [(field.name, array, np.array(array)) for array in arrays.values()]
+    env.reset(seed=2)
+    for name, array, before in kept:
+        assert not np.may_share_memory(array, batch._blocks), name
+        np.testing.assert_array_equal(array, before, name)
+    for name in batch._blocks.dtype.names:  # with what no view of this configuration shows
+        for values in (batch.rows(name), batch.columns(name)):
+            assert not np.may_share_memory(values, batch._blocks), name
+        np.testing.assert_array_equal(batch.rows(name), batch.read(name), name)
+
+
+def test_the_covariance_has_the_same_bits_in_batches_of_any_size():
+    found = {}
+    for count in (1, 8, 16):
+        env = QuadVectorEnv(count, "circle", custom=Nothing())
+        env.reset(seed=list(range(count)))
+        for _ in range(5):
+            env.step(np.full((count, 4), 0.1))
+        view = env.flights.batch.view
+        estimate = view.estimate
+        found[count] = (estimate.factor, estimate.sigma, estimate.covariance, view.truth.nees)
+    for count in (1, 8):
+        for one, other in zip(found[count], found[16], strict=True):
+            np.testing.assert_array_equal(one, other[:count])
+
+
+def steps_with_right_views(env):
+    """Fly, and look whether the view is of each instant."""
+    batch = env.flights.batch
+    for _ in range(3):
+        env.step(np.full((FLIGHTS, 4), 0.2))
+        np.testing.assert_array_equal(batch.view.position, batch.read("r"))
+        np.testing.assert_array_equal(batch.view.R_BI[:, 0], batch.view.truth.forward)
+        np.testing.assert_array_equal(batch.view.truth.wind, batch.read("wind"))
+        np.testing.assert_array_equal(batch.view.step, batch.read("step"))
+
+
+def at_once(monkeypatch, owner, method, read):
+    """Read in two threads that meet in a method before either goes on."""
+    real, both = getattr(owner, method), threading.Barrier(2, timeout=30.0)
+
+    def meet(*arguments):
+        both.wait()
+        return real(*arguments)
+
+    found = []
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, method, meet)
+        threads = [threading.Thread(target=lambda: found.append(read())) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(found) == 2
+    return found
+
+
+def test_two_threads_may_read_the_same_array_at_once(monkeypatch):
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    batch = env.flights.batch
+    env.step(np.zeros((FLIGHTS, 4)))
+    one, other = at_once(monkeypatch, Shown, "part_of", lambda: batch.view.velocity)
+    assert one is other
+    at_once(monkeypatch, batch, "rows", lambda: batch.view.truth.wind)
+    del one, other
+    kept, before = batch.view.position, batch.view.position.copy()
+    steps_with_right_views(env)
+    np.testing.assert_array_equal(kept, before)
+
+
+def test_arrays_of_a_view_cannot_be_deleted_or_made_writable():
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    view = env.flights.batch.view
+    env.step(np.zeros((FLIGHTS, 4)))
+    for group, name in ((view, "gates"), (view.truth, "position"), (view.truth, "wind")):
+        getattr(group, name)
+        with pytest.raises(AttributeError, match=f"view.{name} .* cannot be deleted"):
+            delattr(group, name)
+    for array in (
+        view.position,
+        view.position[1:],
+        view.step,
+        copy.deepcopy(env).flights.batch.view.time,
+    ):
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            array.setflags(write=True)
+    kept, before = view.position, view.position.copy()
+    steps_with_right_views(env)
+    np.testing.assert_array_equal(kept, before)
+
+
+class Interrupted(list):
+    """Notes nothing, as somebody presses Ctrl-C."""
+
+    def append(self, item):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("where", ["_attributes", "_handed_out", "_kept"])
+def test_a_view_is_of_its_instant_after_an_interrupt_while_it_was_read(where):
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    batch = env.flights.batch
+    env.step(np.zeros((FLIGHTS, 4)))
+    group, name = (batch.view.truth, "wind") if where == "_kept" else (batch.view, "position")
+    owner = group if where == "_kept" else batch
+    noted = getattr(owner, where)
+    object.__setattr__(owner, where, Interrupted(noted))
+    with pytest.raises(KeyboardInterrupt):
+        getattr(group, name)
+    object.__setattr__(owner, where, noted)
+    array = getattr(group, name)
+    before = array.copy()
+    steps_with_right_views(env)
+    np.testing.assert_array_equal(array, before)
+    assert getattr(group, name) is not array
+
+
+def test_a_view_is_of_its_instant_after_an_interrupt_while_the_memory_changed(monkeypatch):
+    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env.reset(seed=1)
+    batch = env.flights.batch
+    env.step(np.zeros((FLIGHTS, 4)))
+    kept = batch.view.position
+    before = kept.copy()
+
+    def interrupt(shown):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch._calls, "show_into", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            env.step(np.zeros((FLIGHTS, 4)))
+    np.testing.assert_array_equal(batch.view.position, before)  # the step was not flown
+    steps_with_right_views(env)
+    np.testing.assert_array_equal(kept, before)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 COUNTS = (8, 1024)
 """Flights in the batches."""
 
-# Arrays of no axes: NumPy would make one of a Python number in every step, which takes a while.
+# arrays of no axes: NumPy would make one of a Python number in every step, which takes a while
 NEAR_RATE, FINE_RATE, FINE_WEIGHT = np.array(-2.0), np.array(-20.0), np.array(0.5)
 HEADING_WEIGHT, ACTION_COST, RATE_COST = np.array(0.1), np.array(0.02), np.array(0.002)
 FAR, LOW, MOST_STEPS = np.array(3.0), np.array(-0.5), np.array(500)
@@ -28,7 +28,11 @@ TIPPED = np.array(math.cos(math.radians(100.0)))
 
 
 class OwnCircle(Task):
-    """The circle's reward, endings and observation, as a user writes them."""
+    """The circle's reward, endings and observation in NumPy, written for few flights.
+
+    It makes as few calls as it can, of the functions that begin soonest: constants are arrays, and
+    `np.vecdot` takes the place of `np.einsum`, which is faster with a thousand flights only.
+    """
 
     replaces_observation = True
 
