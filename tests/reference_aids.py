@@ -104,7 +104,8 @@ class Aided:
         z = np.concatenate([z, *(value for value, _, _ in pending)])
         noise = block_diagonal(noise, *(block for _, block, _ in pending)) if pending else noise
         if self.hard_iron is not None:
-            self.field_before = self.R @ self.field
+            delta = self.d[self.declination - 15]
+            self.field_before = self.R @ (self.field + delta * self.field_turned)
         super()._condition(z, noise, models)
 
     def _turn(self, e):

@@ -68,10 +68,13 @@ def test_late_and_gated_flights_are_consistent_after_two_seconds(kind):
     assert (batch.read("rejections")[:, AID_BLOCKS:] <= 1).all()
 
 
-@pytest.mark.parametrize(("task", "start"), [("hover", "cold"), ("random_trajectory", "warm")])
-def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it(task, start):
-    """Mean square of 1,200 headings, of deviation 0.04: after a hard start it used to be 1.3."""
-    batch = fly(quad_gym.sensor_suite("consumer"), 1200, task=task, filter_start=start)
+def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it():
+    """Mean square of 1,200 headings, of deviation 0.04.
+
+    It is 1.3 where velocities tell nothing of the heading and hard iron does not follow it; the
+    unit tests notice either by itself.
+    """
+    batch = fly(quad_gym.sensor_suite("consumer"), 1200, task="hover", filter_start="cold")
     steps(batch, 1.5)
     vertical = batch.read("R_hat")[:, :, 2]
     error = np.einsum("ni,ni->n", vertical, state_errors(batch)[:, 6:9])

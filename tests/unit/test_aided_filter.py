@@ -9,6 +9,7 @@ import pytest
 import quad_gym
 from quad_gym import BarometerParams, MagnetometerParams
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.packing.aids import slow_states
 from quad_gym.records import AID_BLOCKS, Aid, Gate
 from tests.circle_flight import record_circle
 from tests.reference_aids import AidedEKF, AidedUKF
@@ -146,6 +147,53 @@ def test_a_velocity_tells_the_heading_of_a_vehicle_that_turns(kind):
     gap = (ours.covariance - expected) / np.outer(sigma, sigma)
     assert abs(gap).max() < tolerance
     assert ours.covariance[8, 8] < 0.8 * P[8, 8]
+
+
+def field_derivatives(ours, suite, delta):
+    """The derivatives of the expected field by attitude error and hard iron, numerically."""
+    g = np.cross(suite.magnetometer.field_I, (0.0, 0.0, 1.0))
+    field_I = suite.magnetometer.field_I + ours._engine.read("slow_hat")[0, delta] * g
+    R_BI = ours.R_BI
+
+    def field_B(x):
+        return rotation_312(x[np.newaxis, :3])[0] @ R_BI @ field_I + x[3:]
+
+    return np.array([(field_B(1e-5 * e) - field_B(-1e-5 * e)) / 2e-5 for e in np.eye(6)]).T
+
+
+def covariance_of_field(ours, H, first):
+    """H P H^T, P the joint covariance of attitude error and hard iron."""
+    rows = [ours._engine.read("L")[0, 6:9], ours._engine.read("L_slow")[0, first : first + 3]]
+    L = np.zeros((6, rows[1].shape[1]))
+    L[:3, :15], L[3:] = rows
+    return H @ L @ L.T @ H.T
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_a_rotated_attitude_leaves_what_is_known_of_the_field_unchanged(kind):
+    """Before and after an update that corrects the heading by eight degrees.
+
+    A filter whose covariance does not turn has the covariance of the errors as they are before the
+    rotation, and finds another covariance of the field after it.
+    """
+    magnetometer = MagnetometerParams(declination_sigma=1e-9)
+    plain = quad_gym.sensor_suite("consumer").simplified().replace(magnetometer=magnetometer)
+    places = slow_states(plain)
+    first, delta = places.vectors[Aid.MAGNETOMETER], places.scalars[Aid.MAGNETOMETER]
+    field_B = rotation_312(np.array([[0.0, 0.0, 0.15]]))[0] @ plain.magnetometer.field_I
+    found = {}
+    for reset in ("turn", "none"):
+        estimator = plain.estimator.replace(covariance_reset=reset, gate_false_alarm=0.0)
+        suite = plain.replace(estimator=estimator)
+        ours = kind(suite)
+        ours.initialize(np.zeros(3), heading=0.0, heading_sigma=0.1)
+        before = field_derivatives(ours, suite, delta)
+        ours.update(magnetometer=field_B)
+        after = field_derivatives(ours, suite, delta)
+        found[reset] = [covariance_of_field(ours, H, first) for H in (before, after)]
+    kept, scale = found["none"][0], abs(found["none"][0]).max()
+    assert abs(found["turn"][1] - kept).max() < 1e-6 * scale
+    assert abs(found["none"][1] - kept).max() > 0.05 * scale
 
 
 def test_what_is_beyond_the_gate_is_left_out_and_at_last_believed():

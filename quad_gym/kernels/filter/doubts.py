@@ -4,8 +4,9 @@ What may be wrong is not only what the sensor measures. An innovation that has g
 since the last acceptance may come from biases, so their deviations become: nu / T of an angle
 for the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g of
 that for the tilt. What each measurement doubts is in its file in `kernels/measurements/`. Variances
-are raised to the square of these, not increased by it, so that doubts that repeat do not add up:
-what is doubted is never larger than the largest innovation tells.
+are raised to the square of these, not increased by it, so that doubts that repeat do not add up.
+Where GNSS positions drift, position and drift are raised to the square of three times an innovation
+or a sum of corrections, as the drift may have followed the error in part.
 
 Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
 states is multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and
@@ -43,6 +44,7 @@ from quad_gym.kernels.filter.recovery import (
     MOST_TILT,
     MOST_VELOCITY,
     camera_fits,
+    enlarge,
     forget_corrections,
     one_way,
     suspect_group,
@@ -71,8 +73,7 @@ _FIRST_AID, _DOUBT = int(Stage[Aid(0).name]), int(Act.DOUBT)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _FACTOR, _BIAS_FACTOR = 16.0, 240.0
 """Of the covariance, and what is added of the biases' variances, where innovations drift."""
-_REMAINING = 9.0
-"""Square of how many times the sum of corrections may still be missing."""
+_BAROMETER_GROUP = AID_GROUPS + int(Aid.BAROMETER)
 
 
 @kernel
@@ -86,7 +87,7 @@ def _mean_variance(flight, row):
 def _doubt_biases(flight, P, row, drifting, going, square, most):
     """Add to the variances of three biases from a row on, up to `most`."""
     more = select(drifting, minimum(_BIAS_FACTOR * _mean_variance(flight, row), most * most), 0.0)
-    more = more + select(going, minimum(_REMAINING * square, most * most), 0.0)
+    more = more + select(going, enlarge(square, most), 0.0)
     for i in range(row, row + 3):
         P[i, i] = P[i, i] + minimum(more, maximum(most * most - P[i, i], 0.0))
 
@@ -188,7 +189,9 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
     moved = mask & (flight.tick < 0.0)  # nobody
     if slow is not None:
         if slow.estimates_drift:
-            moved = mask & drifts_suddenly(flight) & logical_not(camera_fits(flight, p))
+            climbed = work.doubted[_BAROMETER_GROUP] > 0.0
+            moved = mask & (drifts_suddenly(flight) | climbed)
+            moved = moved & logical_not(camera_fits(flight, p))
     doubtful = inflated | moved
     for group in range(SENSOR_GROUPS):
         doubtful = doubtful | (work.doubted[group] > 0.0)

@@ -5,15 +5,16 @@ GNSS has drifted, so that it takes any fix that is off for drift, however sudden
 the drift has followed, no innovation is left. But corrections of the drift are white in a right
 filter, each with the variance that its update takes away, as those of biases are (`recovery.py`).
 Their sum over about a second has the deviation by which GNSS drifts meanwhile, 0.1 m with
-`consumer`, and shows what drift does not do. Then the position is doubted as much as the drift.
+`consumer`, and shows what drift does not do. Then the position is doubted as much as the drift; so
+it is where a barometer is rejected for the last time, which sees the vertical share of a jump.
 
 Source: ours.
 """
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import D, R
-from quad_gym.kernels.filter.recovery import MOST_POSITION, variance_of
-from quad_gym.kernels.maths.elementary import maximum, minimum
+from quad_gym.kernels.filter.recovery import MOST_POSITION, enlarge, variance_of
+from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.simd.lanes import select
 
 _TIME = 1.5
@@ -23,8 +24,6 @@ _SUDDEN, _LIKELY = 24.0, 12.0
 """Normalized square of their sum, chi-square of three numbers, beyond which it is no drift. That of
 a right filter exceeds it with a probability of 2e-5. Less, 0.7 %, where the filter is lost anyway:
 a barometer may have seen the vertical share of the jump."""
-_REMAINING = 9.0
-"""Square of how many times the sum the jump may be."""
 
 
 @kernel
@@ -78,8 +77,7 @@ def doubt_position_and_drift(flight, P, doubted):
     for i in range(3):
         total = flight.drift_corrected[i]
         square = maximum(total * total, mean)
-        most = minimum(_REMAINING * square, MOST_POSITION * MOST_POSITION)
-        wanted = select(doubted, most, 0.0)
+        wanted = select(doubted, enlarge(square, MOST_POSITION), 0.0)
         P[R + i, R + i] = maximum(P[R + i, R + i], wanted)
         P[D + i, D + i] = maximum(P[D + i, D + i], wanted)
 

@@ -62,6 +62,9 @@ MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
 """Largest deviations that a doubt raises to [m/s^2], [rad/s], [rad]."""
 MOST_POSITION, MOST_VELOCITY = 100.0, 20.0
 """Likewise [m], [m/s]."""
+_REMAINING = 9.0
+"""Square of how many times as large an error may be as what shows of it: corrections or drift of
+GNSS may have followed in part."""
 MOST_ANGLE = math.pi / math.sqrt(3.0)
 """Largest deviation of an angle [rad]: of one that may be anything."""
 
@@ -207,6 +210,12 @@ def suspect_group(flight, p, work, group, free):
 def time_of(flight, p, group):
     """Seconds since a measurement of a group was last accepted."""
     return maximum(flight.tick - flight.accepted_tick[group], 1.0) * p.dt
+
+
+@kernel
+def enlarge(square, most):
+    """Variance of an error of which the `square` of a part shows, up to a deviation of `most`."""
+    return minimum(_REMAINING * square, most * most)
 
 
 @kernel

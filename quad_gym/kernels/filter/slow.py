@@ -27,6 +27,7 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.maths.linalg import (
+    add,
     apply,
     cross,
     load3,
@@ -147,12 +148,18 @@ def load_slow(flight, slow, columns):
 
 @kernel
 def turn_iron(flight, slow, p, L9, T, correction, columns):
-    """Let a magnetometer's hard iron go with the attitude as an update turns that, as in the field.
+    """Correct the covariance of hard iron when an update rotates the attitude.
 
-    The field tells the sum b + (R m_I) x e, with hard iron b and error angles e, much better than
-    either. The update took R m_I as it was estimated before; where it corrects the attitude by
-    degrees, the sum is another one from then on. Were that taken for known, the next field, from
-    another tilt, would seem to tell the heading. So b takes up the difference.
+    The field tells the sum b + f x e, with hard iron b, error angles e and the expected field f in
+    B, much better than either. An update that rotates the attitude by degrees rotates f, and
+    another sum takes the place of this one. If that one counted as known, the next field, from
+    another tilt, would seem to tell the heading. To keep the covariance of the sum unchanged, the
+    rows of b take up the difference.
+
+    The share of the declination's error, delta g with g = R_BI (m_I x e3), rotates as well; that is
+    neglected, as is the correction of delta in f: 0.35 degrees matter little. Hard iron that is
+    known much better than a field's noise becomes less certain by up to |f x m| times the deviation
+    of the attitude, m being the rotation.
 
     Args:
         flight: Record; R_hat is that before the update.
@@ -165,7 +172,10 @@ def turn_iron(flight, slow, p, L9, T, correction, columns):
     """
     first = slow.aid_vector[_MAGNETOMETER]
     if first >= 0:
-        before = apply(load33(flight.R_hat), load3(p.aid_numbers[_MAGNETOMETER]))
+        m, delta = load3(p.aid_numbers[_MAGNETOMETER]), slow.aid_scalar[_MAGNETOMETER]
+        turned = (m[1], -m[0], 0.0 * m[2])
+        field_I = add(m, scale(flight.slow_hat[delta], turned))
+        before = apply(load33(flight.R_hat), field_I)
         after = apply(euler_to_dcm(correction), before)
         for j in range(columns - 9, columns):
             e = load_column3(L9, E, j)

@@ -18,10 +18,11 @@ from quad_gym.kernels.filter.recovery import (
     camera_fits,
     doubt_acceleration,
     drifts,
+    enlarge,
     suspect_group,
     time_of,
 )
-from quad_gym.kernels.maths.elementary import exp, log, maximum, minimum
+from quad_gym.kernels.maths.elementary import exp, log, maximum
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
@@ -48,9 +49,6 @@ from quad_gym.records import DRAW_DRIFT, POSITION_BLOCK, SENSOR_GROUPS, FilterFo
 
 SENSOR = Sensor.GNSS
 _EKF = int(FilterForm.EKF)
-_REMAINING = 9.0
-"""Square of how many times an innovation a jump may be: the drift of GNSS has followed it in part,
-and what is left is shared among the position and the drift."""
 
 count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
     "position", POSITION_BLOCK
@@ -160,16 +158,21 @@ def suspect(flight, p, work, settings, slow, k):
 def doubt(flight, p, work, settings, slow, k):
     """Raise the variances of what may be wrong, where positions are doubted.
 
-    That is the position itself, or its slow error; accelerometer and tilt may have led there.
+    That is the position itself, or its slow error; accelerometer and tilt may have led there. Where
+    positions drift, a jump may be three times the innovation, as the drift has followed it in part;
+    but an innovation beyond `MOST_POSITION` counts in full, so that any jump is followed.
     """
     nu, doubted, P = load3(flight.innovation[POSITION_BLOCK]), work.doubted[POSITION_BLOCK], work.P
-    T = time_of(flight, p, POSITION_BLOCK)
+    T, elsewhere = time_of(flight, p, POSITION_BLOCK), doubted > 0.0
+    if slow is not None:
+        if slow.estimates_drift:
+            elsewhere = _is_elsewhere(flight, p, work)
     for i in range(3):
-        square = select(doubted > 0.0, nu[i] * nu[i], 0.0)
+        own = nu[i] * nu[i]
+        square = select(elsewhere, own, 0.0)
         if slow is not None:
             if slow.estimates_drift:
-                most = minimum(_REMAINING * nu[i] * nu[i], MOST_POSITION * MOST_POSITION)
-                square = select(_is_elsewhere(flight, work), most, 0.0)
+                square = select(elsewhere, maximum(enlarge(own, MOST_POSITION), own), 0.0)
                 P[D + i, D + i] = maximum(P[D + i, D + i], square)
         P[R + i, R + i] = maximum(P[R + i, R + i], square)
     doubt_acceleration(p, P, 2.0 * norm(nu) / (T * T), doubted)
@@ -177,14 +180,17 @@ def doubt(flight, p, work, settings, slow, k):
 
 
 @kernel
-def _is_elsewhere(flight, work):
+def _is_elsewhere(flight, p, work):
     """Where the vehicle, or GNSS, is likely to be elsewhere.
 
-    The filter doubts itself, for this sensor or another, while fixes are rejected; or fixes drift.
-    A jump shows in these as often as in the sum of the drift's corrections (`filter/jumps.py`).
+    Positions are doubted; or the filter doubts itself for another sensor while at least two fixes
+    in a row are rejected, as one may be an outlier; or innovations of fixes drift. A jump shows in
+    these as often as in the sum of the drift's corrections (`filter/jumps.py`). While the camera
+    fits, it speaks for the estimate.
     """
     doubted = work.drifting
     for group in range(SENSOR_GROUPS):
         doubted = maximum(doubted, work.doubted[group])
-    elsewhere = (doubted > 0.0) & (flight.rejected_in_row[POSITION_BLOCK] > 0.0)
-    return (work.taking > 0.0) & (elsewhere | drifts(flight, POSITION_BLOCK))
+    elsewhere = (doubted > 0.0) & (flight.rejected_in_row[POSITION_BLOCK] > 1.0)
+    elsewhere = (elsewhere | drifts(flight, POSITION_BLOCK)) & logical_not(camera_fits(flight, p))
+    return (work.taking > 0.0) & (elsewhere | (work.doubted[POSITION_BLOCK] > 0.0))
