@@ -77,7 +77,7 @@ def test_evaluate_flies_what_there_is(tmp_path, capsys):
     assert done.stdout.startswith(told)
     assert "pd on truth" in done.stdout
     for args, told, policies in (
-        (("QuadGym/OutageDash-v0",), "no policy ships for QuadGym/OutageDash-v0", ["pd"]),
+        (("QuadGym/OutageDash-v0",), "", ["pd", "pretrained"]),
         (("QuadGym/Circle-v0", {"action": "attitude"}), "trained with action ctbr", ["pd"]),
         (("QuadGym/Circle-v0",), "", ["pd", "pretrained"]),
     ):
