@@ -148,10 +148,10 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),
-    # Through an outage, half the speed saves few crashes, and waiting for its end most of them: a
-    # policy has to come upon pauses of seconds. Noise that is drawn ten times a second averages
-    # out, so that in training actions are held for 0.25 s. Of what comes after 7 s of waiting,
-    # 0.996^28 = 89 % are left.
+    # During an outage, halving the speed prevents few crashes, and waiting for its end prevents
+    # most: a policy has to discover pauses of seconds. Exploration noise drawn ten times a second
+    # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting still
+    # count 0.996^28 = 89 %.
     ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
         steps=1_200_000,
         reward_scale=0.02,

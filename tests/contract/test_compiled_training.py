@@ -14,7 +14,7 @@ from baselines.compiled_ppo import CompiledPPO
 from baselines.keeping import STATE
 from baselines.mlp import MlpPolicy
 from baselines.plans import Plan
-from baselines.policies import load_policy
+from baselines.policies import PRETRAINED, load_policy
 from baselines.recipes import recipe
 from baselines.training import export, train
 from tests import console_commands
@@ -190,3 +190,10 @@ def test_nothing_of_it_needs_torch():
         "import baselines.training, baselines.compiled_ppo.run"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+@pytest.mark.parametrize("file", sorted(PRETRAINED.glob("*.npz")), ids=lambda f: f.stem)
+def test_a_policy_that_ships_has_the_record_of_its_training(file):
+    record = MlpPolicy.load(file).record
+    assert record["finished"]
+    assert {"plan", "steps", "best", "versions"} <= set(record)
