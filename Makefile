@@ -59,6 +59,8 @@ study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
 	$(BIN)/quad-gym study --arms-file baselines/arms_misled.py --section misled --episodes 200 \
 		--page docs/where-it-matters.md
 	$(BIN)/quad-gym study stale_race --seeds 5 --episodes 400 --page docs/where-it-matters.md
+	$(BIN)/quad-gym study stale_race --arms-file baselines/arms_withheld.py --section withheld \
+		--episodes 400 --page docs/where-it-matters.md
 	$(BIN)/quad-gym study outage_dash --seeds 5 --episodes 400 \
 		--arms pd pd_slow pd_waiting truth sigma truth_on_truth \
 		--page docs/where-it-matters.md

@@ -47,6 +47,16 @@ _MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
 
 _WIDTHS = ("gap_width", "next_width")
 
+TOLD_IN_A_RACE = {
+    "position_sigma": ("m", "I", 0.008),
+    "velocity_sigma": ("m/s", "I", 0.042),
+    "attitude_sigma": ("rad", "B", 0.004),
+    "accel_bias_sigma": ("m/s^2", "B", 0.13),
+    "gyro_bias_sigma": ("rad/s", "B", 0.011),
+}
+"""Standard deviations in the observation of a race: unit, frame, and the median in 200 episodes of
+the policy that ships."""
+
 STEADY_CRASH_COST = 100.0
 """Of a crash in `Steady`."""
 
@@ -310,3 +320,41 @@ def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
         sigma = np.zeros(view.count)
     ratio = SIGMAS * sigma[:, np.newaxis] / (0.5 * widths - MARGIN)
     return np.asarray(0.5 * np.log2(np.maximum(ratio, 2.0**-8)))
+
+
+class Withholding(StaleRace):
+    """`StaleRace` with the 15 standard deviations in its observation, some of them withheld.
+
+    What is withheld is shown as the constant median of `TOLD_IN_A_RACE`, so that a policy that was
+    trained with `include_covariance=True` can be flown without that part.
+
+    Args:
+        withheld: Names of `TOLD_IN_A_RACE`.
+    """
+
+    observes: Mapping[str, Observed] = {
+        name: Observed(unit, frame, 0.0) for name, (unit, frame, _) in TOLD_IN_A_RACE.items()
+    }
+
+    def __init__(self, *withheld: str) -> None:
+        super().__init__()
+        for name in withheld:
+            check.choice("withheld", name, tuple(TOLD_IN_A_RACE))
+        self._withheld = withheld
+
+    def observe(self, view: "View") -> Parts:
+        """Each (n, 3)."""
+        shown = {name: getattr(view.estimate, name) for name in TOLD_IN_A_RACE}
+        medians = {name: TOLD_IN_A_RACE[name][2] for name in self._withheld}
+        return {**shown, **{k: np.full((view.count, 3), value) for k, value in medians.items()}}
+
+
+ALL_TOLD = Withholding()
+POSITION_WITHHELD, VELOCITY_WITHHELD, ATTITUDE_WITHHELD, ACCEL_BIAS_WITHHELD, GYRO_BIAS_WITHHELD = (
+    Withholding(name) for name in TOLD_IN_A_RACE
+)
+POSITION_TOLD, VELOCITY_TOLD, ATTITUDE_TOLD, ACCEL_BIAS_TOLD, GYRO_BIAS_TOLD = (
+    Withholding(*(other for other in TOLD_IN_A_RACE if other != name)) for name in TOLD_IN_A_RACE
+)
+NONE_TOLD = Withholding(*TOLD_IN_A_RACE)
+"""Which of the standard deviations a controller is told."""

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from baselines import PDPolicy
-from baselines.arm_tasks import STEADY_CRASH_COST
+from baselines.arm_tasks import STEADY_CRASH_COST, TOLD_IN_A_RACE
 from baselines.arms import OUTAGE_DASH
 from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
@@ -70,6 +70,23 @@ def test_a_controller_may_be_told_another_standard_deviation(name, told):
     (plain, a), (misled, b) = make("Doubting"), make(name)
     change = part(misled, b, "log_sigma") - part(plain, a, "log_sigma")
     np.testing.assert_allclose(change, np.log10(told), atol=1e-5)
+
+
+def test_a_race_tells_the_standard_deviations_but_those_withheld():
+    task, steps = "QuadGym/StaleRace-v0", 30
+    plain = gymnasium.make_vec(task, num_envs=6, autoreset_mode="Disabled", include_covariance=True)
+    told, some = make("ALL_TOLD", task=task), make("ATTITUDE_WITHHELD", task=task)
+    shown, _ = plain.reset(seed=3)
+    told, observed, some, partly = *told, *some
+    for _ in range(steps):
+        np.testing.assert_array_equal(observed, shown)
+        withheld = part(some, partly, "attitude_sigma")
+        np.testing.assert_array_equal(withheld, np.float32(TOLD_IN_A_RACE["attitude_sigma"][2]))
+        others = np.ones(shown.shape[1], bool)
+        others[-9:-6] = False  # the third of the five blocks
+        np.testing.assert_array_equal(partly[:, others], shown[:, others])
+        actions = np.full((6, 4), 0.01, np.float32)
+        (shown, *_), (observed, *_), (partly, *_) = (e.step(actions) for e in (plain, told, some))
 
 
 def test_what_is_recalled_in_a_race_is_every_fifth_observation_newest_first():
