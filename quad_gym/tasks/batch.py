@@ -72,7 +72,7 @@ class TaskBatch(ReadableBatch):
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self._state = State(self.count, custom.state)
         self._counts_gates = "gates_passed" in custom.state
-        self._failed: Truths | None = None  # of no flight
+        self._failed: Truths | None = None  # None: no flight has failed
         self._began_in_step: Truths = np.zeros(self.count, bool)
         self.began: Truths = self._began_in_step
         self.began_some = False

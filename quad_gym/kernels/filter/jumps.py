@@ -5,8 +5,9 @@ GNSS has drifted, so that it takes any fix that is off for drift, however sudden
 the drift has followed, no innovation is left. But corrections of the drift are white in a right
 filter, each with the variance that its update takes away, as those of biases are (`recovery.py`).
 Their sum over about a second has the deviation by which GNSS drifts meanwhile, 0.1 m with
-`consumer`, and shows what drift does not do. Then the position is doubted as much as the drift; so
-it is where a barometer is rejected for the last time, which sees the vertical share of a jump.
+`consumer`, and shows what drift does not do. Then the position is doubted as much as the drift. The
+same happens when a barometer is rejected `gate_patience` times in a row, as it sees the vertical
+part of a jump.
 
 Source: ours.
 """

@@ -61,7 +61,7 @@ _FIT_TIME = 1.0
 MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
 """Largest deviations that a doubt raises to [m/s^2], [rad/s], [rad]."""
 MOST_POSITION, MOST_VELOCITY = 100.0, 20.0
-"""Likewise [m], [m/s]."""
+"""Likewise [m], [m/s]. A rejected position counts in full, even beyond."""
 _REMAINING = 9.0
 """Square of how many times as large an error may be as what shows of it: corrections or drift of
 GNSS may have followed in part."""
