@@ -47,6 +47,9 @@ _MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
 
 _WIDTHS = ("gap_width", "next_width")
 
+_ACTUAL = "actual_"
+"""Before the names of parts that show the truth, scaled alike."""
+
 TOLD_IN_A_RACE = {
     "position_sigma": ("m", "I", 0.008),
     "velocity_sigma": ("m/s", "I", 0.042),
@@ -227,12 +230,17 @@ def _scaled(name: str, value: Any) -> Any:
     """What `Scaled` shows for a value of a part of `OutageDash`."""
     if name in _WIDTHS:
         return (value - _MIDDLE_WIDTH) / _HALF_RANGE
-    return value / _SCALES.get(name, 1.0)
+    return value / _SCALES.get(name.removeprefix(_ACTUAL), 1.0)
 
 
 def _shown_as(name: str) -> str:
     """The name that `Scaled` gives to a part of `OutageDash`."""
-    return f"{name}_scaled" if name in (*_SCALES, *_WIDTHS) else name
+    return f"{name}_scaled" if name.removeprefix(_ACTUAL) in (*_SCALES, *_WIDTHS) else name
+
+
+def scaled_parts(parts: Parts) -> Parts:
+    """Parts of an observation of `OutageDash`, by the names and in the units of `Scaled`."""
+    return {_shown_as(name): _scaled(name, part) for name, part in parts.items()}
 
 
 def _in_numbers(name: str, part: Observed) -> Observed:
@@ -258,9 +266,7 @@ class Scaled(OutageDash):
 
     def observe(self, view: "View") -> Parts:
         """As `OutageDash`, scaled."""
-        return {
-            _shown_as(name): _scaled(name, part) for name, part in super().observe(view).items()
-        }
+        return scaled_parts(super().observe(view))
 
 
 class Wary(Scaled):

@@ -98,6 +98,13 @@ ARMS = (
         environment=_DOUBTING,
         learning={"custom": "baselines.arm_tasks:Sure"},
     ),
+    Arm(
+        name="asymmetric",
+        label="estimate + standard deviation, paid for being sure, critic sees the truth",
+        environment=_DOUBTING,
+        learning={"custom": "baselines.arm_critics:SureForCritic"},
+        parameters={"critic_only": 15},
+    ),
 )
 """Those of `QuadGym/LookAround-v0`."""
 
@@ -167,6 +174,13 @@ OUTAGE_DASH = (
         label="estimate + doubt",
         environment=_WARY,
         learning={"custom": "baselines.arm_tasks:SteadyWary"},
+    ),
+    Arm(
+        name="asymmetric",
+        label="estimate + doubt, critic sees the truth",
+        environment=_WARY,
+        learning={"custom": "baselines.arm_critics:SteadyWaryForCritic"},
+        parameters={"critic_only": 16},
     ),
     Arm(
         name="truth_on_truth",

@@ -32,6 +32,11 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
         ValueError: If the algorithm does not know one of the recipe's parameters.
     """
     chosen = plan.recipe
+    if chosen.parameters.get("critic_only"):
+        raise ValueError(
+            "critic_only must be 0 with Stable-Baselines3, whose critics see what the actor sees, "
+            f'got {chosen.parameters["critic_only"]}: it needs engine="compiled"'
+        )
     first, last = chosen.learning_rate
     activations = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
     policy = {

@@ -81,6 +81,19 @@ def _through_activation(delta, y, activation):
 
 
 @routine
+def _seen_by(table, x, spare):
+    """What a network sees of samples x: as many of the first columns as it takes, in one piece."""
+    size = table[0, INPUTS]
+    if size == x.shape[1]:
+        return x
+    seen = spare.reshape(-1)[: len(x) * size].reshape((len(x), size))
+    for i in range(len(x)):
+        for j in range(size):
+            seen[i, j] = x[i, j]
+    return seen
+
+
+@routine
 def _forward(x, table, model, outputs):
     """Run samples x (rows, inputs) through a network; `outputs` keeps what every layer gives."""
     params, flipped, _, _, activation = model
@@ -159,18 +172,19 @@ def _differentiate_tile(chosen, advantages, share, model, samples, recipe, room,
     params, _, actor, critic, _ = model
     observations, _, _, returns = samples
     inputs, outputs, deltas, _ = room
-    x = inputs[: len(chosen)]
+    x = inputs[0, : len(chosen)]
     for i in range(len(chosen)):
         sample = chosen[i]
         for j in range(x.shape[1]):
             x[i, j] = observations[sample, j]
-    mean = _forward(x, actor, model, outputs)
+    seen = _seen_by(actor, x, inputs[1])
+    mean = _forward(seen, actor, model, outputs)
     first = actor[-1, BIASES] + actor[-1, OUTPUTS]
     log_std = params[first : first + mean.shape[1]]
     slope = gradient[first : first + mean.shape[1]]
     d = deltas[0, : mean.size].reshape(mean.shape)
     _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, slope, sums)
-    _backward(x, actor, model, room, gradient)
+    _backward(seen, actor, model, room, gradient)
     value = _forward(x, critic, model, outputs)
     for i in range(len(chosen)):
         error = value[i, 0] - returns[chosen[i]]
@@ -211,9 +225,10 @@ def differentiate(
         minibatch: (2,) where it begins and ends in the order of this epoch; that order (n,); the
             advantages (n,) in that order, normalized.
         model: Parameters (p,), flipped weights (p,), tables of actor and critic, activation.
-        samples: Observations (n, o), actions (n, a), log probabilities (n,), returns (n,).
+        samples: Observations (n, o), of which the actor sees the first columns; actions (n, a), log
+            probabilities (n,), returns (n,).
         recipe: (3,) clip range, weights of the entropy and of the value function's error.
-        rooms: For each part: inputs (TILE, o), outputs, deltas (2, ...), a product of matrices.
+        rooms: For each part: inputs (2, TILE, o), outputs, deltas (2, ...), a product of matrices.
         written: Of each part: its gradient (p,) and SUMS (4,).
 
     Returns:
@@ -270,10 +285,10 @@ def flip(model):
 
 
 @entry
-def evaluate(x, model, outputs, means, values):
+def evaluate(x, model, inputs, outputs, means, values):
     """What both networks say of observations x (n, o): means (n, a) and values (n,), written."""
     _, _, actor, critic, _ = model
     for a in range(0, len(x), TILE):
         b = min(a + TILE, len(x))
-        means[a:b] = _forward(x[a:b], actor, model, outputs)
+        means[a:b] = _forward(_seen_by(actor, x[a:b], inputs[1]), actor, model, outputs)
         values[a:b] = _forward(x[a:b], critic, model, outputs)[:, 0]

@@ -19,14 +19,22 @@ class Networks:
     deviations, and the critic's layers. First values are drawn as Stable-Baselines3 draws them.
 
     Args:
-        inputs: Numbers in an observation.
+        inputs: Numbers in an observation in training.
         outputs: Numbers in an action.
         recipe: Layers, activation and the first standard deviations.
         rng: Draws the first weights.
+        critic_only: How many of the inputs, the last ones, the critic sees and the actor does not.
     """
 
-    def __init__(self, inputs: int, outputs: int, recipe: Recipe, rng: np.random.Generator) -> None:
-        self.actor, first = _table((inputs, *recipe.layers, outputs), 0)
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        recipe: Recipe,
+        rng: np.random.Generator,
+        critic_only: int = 0,
+    ) -> None:
+        self.actor, first = _table((inputs - critic_only, *recipe.layers, outputs), 0)
         self.critic, count = _table((inputs, *recipe.critic_layers, 1), first + outputs)
         self.params = np.zeros(count, np.float32)
         self.log_std = self.params[first : first + outputs]
@@ -51,7 +59,7 @@ class Networks:
         """Memory that `kernels.differentiate` computes in."""
         tables = (self.actor, self.critic)
         sizes = (
-            (TILE, self.actor[0, INPUTS]),
+            (2, TILE, self.critic[0, INPUTS]),
             (TILE * max(t[-1, STORED] + t[-1, OUTPUTS] for t in tables),),
             (2, TILE * max(t[:, OUTPUTS].max() for t in tables)),
             (max((t[:, INPUTS] * t[:, OUTPUTS]).max() for t in tables),),

@@ -29,8 +29,10 @@ PARAMETERS = {
     "ent_coef": 0.0,
     "vf_coef": 0.5,
     "max_grad_norm": 0.5,
+    "critic_only": 0,
 }
-"""Parameters of a recipe, with the defaults of Stable-Baselines3."""
+"""Parameters of a recipe, with the defaults of Stable-Baselines3. It lacks `critic_only`: so many
+numbers at the end of an observation are for the critic alone, such as the true state."""
 
 _EPISODES = 100
 """Whose mean return is `training_return`: the latest."""
@@ -39,7 +41,8 @@ _EPISODES = 100
 class CompiledPPO:
     """PPO (Schulman et al. 2017) as `stable_baselines3.PPO` does it, but for the random numbers.
 
-    The same seed gives the same policy bit for bit, with any number of threads.
+    The same seed gives the same policy bit for bit, with any number of threads. With `critic_only`
+    among the recipe's parameters, the policy takes observations without that part.
 
     Args:
         env: Its observations are vectors, its actions vectors in [-1, 1], and it begins the next
@@ -63,12 +66,13 @@ class CompiledPPO:
         threads: int | None = None,
     ) -> None:
         inputs, outputs = _sizes(env)
-        self.parameters = _checked(recipe)
+        self.parameters = _checked(recipe, inputs)
         self.env, self.recipe, self.num_timesteps = env, recipe, 0
         self.losses: dict[str, float] = {}
         self._env_seed = seed if env_seed is None else env_seed
         self._rng = np.random.default_rng(seed)
-        self.networks = Networks(inputs, outputs, recipe, self._rng)
+        critic_only = self.parameters["critic_only"]
+        self.networks = Networks(inputs, outputs, recipe, self._rng, critic_only)
         shape = (self.parameters["n_steps"], env.num_envs)
         self._observations = np.zeros((*shape, inputs), np.float32)
         self._actions = np.zeros((*shape, outputs), np.float32)
@@ -84,7 +88,7 @@ class CompiledPPO:
             self.parameters,
             resolve_threads(threads),
         )
-        self._outputs = self.networks.rooms(1)[1][0]
+        self._room = tuple(room[0] for room in self.networks.rooms(1)[:2])
         self._seen: NDArray[np.float32] | None = None
         self._returns, self._finished = np.zeros(env.num_envs), deque[float](maxlen=_EPISODES)
 
@@ -116,8 +120,10 @@ class CompiledPPO:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Actions for observations (..., n); always deterministic."""
-        return self.policy().predict(observation)
+        """Actions for observations (..., n), with the critic's part or without; deterministic."""
+        policy, x = self.policy(), np.asarray(observation, np.float32)
+        whole = x.shape[-1:] == self._observations.shape[-1:]
+        return policy.predict(x[..., : policy.inputs] if whole else x)
 
     def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
         """A copy of the present policy, which needs NumPy alone."""
@@ -182,7 +188,7 @@ class CompiledPPO:
         """Means of actions (n, a) and values (n,) for observations (n, o)."""
         means = np.empty((len(x), self._actions.shape[-1]), np.float32)
         values = np.empty(len(x), np.float32)
-        kernels.evaluate(x, self.networks.model, self._outputs, means, values)
+        kernels.evaluate(x, self.networks.model, *self._room, means, values)
         return means, values
 
 
@@ -245,8 +251,8 @@ def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
     return sizes[0], sizes[1]
 
 
-def _checked(recipe: Recipe) -> dict[str, Any]:
-    """All parameters of a recipe, if the compiled PPO has what it asks for."""
+def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
+    """All parameters of a recipe for so many inputs, if the compiled PPO has what it asks for."""
     check.choice("algorithm of the compiled engine", recipe.algorithm, ("ppo",))
     check.keywords(recipe.parameters, tuple(PARAMETERS), "the compiled PPO")
     check.keywords(recipe.policy, ("log_std_init",), "the policy of the compiled PPO")
@@ -261,4 +267,10 @@ def _checked(recipe: Recipe) -> dict[str, Any]:
         check.number(name, found[name], least=0.0)
     check.flag("normalize_advantage", found["normalize_advantage"])
     check.number("log_std_init", recipe.policy.get("log_std_init", 0.0))
+    found["critic_only"] = check.whole("critic_only", found["critic_only"], least=0)
+    if found["critic_only"] >= inputs:
+        raise ValueError(
+            f"critic_only must leave the actor some of the {inputs} numbers of an observation, "
+            f"got {found['critic_only']}"
+        )
     return found

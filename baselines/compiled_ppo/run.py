@@ -47,13 +47,35 @@ def make_compiled(plan: Plan) -> CompiledPPO:
         ValueError: If the compiled PPO lacks what the plan asks for.
     """
     seed = first_seed("training", plan.seed, plan.recipe.n_envs)
+    flights = plan.make_vector_flights()
+    if plan.recipe.parameters.get("critic_only"):
+        _require_leaving(plan, flights)
     return CompiledPPO(
-        plan.make_vector_flights(),
+        flights,
         plan.recipe,
         seed=plan.seed,
         env_seed=seed,
         threads=plan.threads,
     )
+
+
+def _require_leaving(plan: Plan, flights: Any) -> None:
+    """Refuse a `critic_only` that does not leave the actor what the policy will observe.
+
+    Raises:
+        ValueError: If the flights in training show other numbers before those for the critic.
+    """
+    judge: Any = plan.make_judge()
+    learned, judged = (env.unwrapped.flights.table for env in (flights, judge))
+    judge.close()
+    more = learned[-1].slice.stop - judged[-1].slice.stop
+    given = plan.recipe.parameters["critic_only"]
+    if given != more or learned[: len(judged)] != judged:
+        raise ValueError(
+            "critic_only must count the numbers that end the observation in training alone: "
+            f"{max(more, 0)} of {learned[-1].slice.stop}, after those that the policy observes, "
+            f"got {given}"
+        )
 
 
 def run(

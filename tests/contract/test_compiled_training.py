@@ -77,6 +77,70 @@ def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollout
     assert timeless[0] == timeless[1]
 
 
+def asymmetric_plan(critic_only=15, **changes):
+    """A training whose critic sees the truth."""
+    plan = small_plan()
+    parameters = {**plan.recipe.parameters, "critic_only": critic_only}
+    return small_plan(
+        **{
+            "env_id": "QuadGym/LookAround-v0",
+            "environment": {"duration": 1.0, "custom": "baselines.arm_tasks:Doubting"},
+            "learning": {"custom": "baselines.arm_critics:SureForCritic"},
+            "recipe": plan.recipe.replace(parameters=parameters),
+            **changes,
+        }
+    )
+
+
+def test_a_policy_whose_critic_saw_the_truth_flies_without_it(tmp_path):
+    plan = asymmetric_plan()
+    done = run(plan, tmp_path / "whole")
+    env = plan.make_judge()
+    policy = load_policy(str(done.best_policy), env)
+    assert policy.inputs == env.observation_space.shape[1]
+    names = policy.record["interface"]["observation"]
+    assert names[-1] == "log_sigma"
+    assert not any("actual" in name for name in names)
+
+
+def test_a_training_with_such_a_critic_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch):
+    plan = asymmetric_plan()
+    run(plan, tmp_path / "whole")
+    calls = iter(range(10_000))
+    roll_out = CompiledPPO._roll_out
+
+    def die(self):
+        if next(calls) == 5:
+            raise RuntimeError("died")
+        roll_out(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CompiledPPO, "_roll_out", die)
+        with pytest.raises(RuntimeError, match="died"):
+            run(plan, tmp_path / "cut")
+    assert run(plan, tmp_path / "cut", resume=True).finished
+    assert_same_policy(tmp_path / "whole", tmp_path / "cut")
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (asymmetric_plan(critic_only=14), "15 of 47, after .* got 14"),
+        (asymmetric_plan(learning={}), "0 of 32, .* got 15"),
+        (asymmetric_plan(environment={"include_covariance": True}), "got 15"),
+    ],
+)
+def test_a_critic_sees_more_than_the_policy_by_so_many_numbers(tmp_path, plan, message):
+    with pytest.raises(ValueError, match="critic_only must count the numbers that .*" + message):
+        run(plan, tmp_path)
+
+
+def test_stable_baselines_has_no_critic_of_its_own_eyes(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    with pytest.raises(ValueError, match=r"critic_only must be 0 with .*, got 15"):
+        run(asymmetric_plan(engine="sb3"), tmp_path)
+
+
 def test_the_best_policy_flies_by_its_file_and_can_be_exported(tmp_path):
     done = run(small_plan(), tmp_path / "run")
     assert done.best_policy == tmp_path / "run" / "best.npz"

@@ -223,6 +223,90 @@ def test_rules_of_the_study_fly_the_plain_task_and_trained_arms_the_scaled_one()
             load_policy(arm.policy, env)
 
 
+def assert_shown(env, observations, want):
+    """That the last parts of an observation are these."""
+    names = [field.name for field in env.unwrapped.flights.table]
+    assert names[-len(want) :] == list(want)
+    for name, value in want.items():
+        found = part(env, observations, name)
+        np.testing.assert_allclose(found, value.reshape(found.shape), rtol=1e-5, atol=1e-5)
+
+
+def true_state(env, target):
+    """Of flights whose reference stands at targets: errors, vertical, rates; rotated by SciPy."""
+    batch = env.unwrapped.flights.batch
+    body = Rotation.from_quat(batch.read("q"), scalar_first=True)
+    into = body.inv().apply
+    return {
+        "position_error": into(target - batch.read("r")),
+        "up": into(np.tile([0.0, 0.0, 1.0], (len(target), 1))),
+        "body_rates": batch.read("w"),
+        "velocity_error": into(-batch.read("v")),
+    }
+
+
+def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_sees():
+    task = "baselines.arm_tasks:Sure"
+    plain = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", custom=task)
+    shipped = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", privileged=True)
+    both = [env.reset(seed=3)[0] for env in (plain, shipped)]
+    env = gymnasium.make_vec(
+        ID, num_envs=6, autoreset_mode="Disabled", custom="baselines.arm_critics:SureForCritic"
+    )
+    observations, _ = env.reset(seed=3)
+    for _ in range(20):
+        actions = np.full((6, 4), 0.1, np.float32)
+        steps = [e.step(actions) for e in (plain, shipped)]
+        both = [step[0] for step in steps]
+        observations, reward, *_ = env.step(actions)
+        np.testing.assert_array_equal(observations[:, :-15], both[0])
+        np.testing.assert_allclose(observations[:, -15:], both[1]["privileged"][:, :15], atol=1e-5)
+        np.testing.assert_array_equal(reward, steps[0][1])
+    seen = part(env, observations, "position_error")
+    assert abs(part(env, observations, "actual_position_error") - seen).max() > 0.01
+
+
+def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails():
+    task = "QuadGym/OutageDash-v0"
+    name = "baselines.arm_critics:SteadyWaryForCritic"
+    env = gymnasium.make_vec(task, num_envs=20, autoreset_mode="Disabled", custom=name)
+    plain = gymnasium.make_vec(
+        task, num_envs=20, autoreset_mode="Disabled", custom="baselines.arm_tasks:SteadyWary"
+    )
+    env.reset(seed=3)
+    plain.reset(seed=3)
+    batch = env.unwrapped.flights.batch
+    kinds = set()
+    for _ in range(80):
+        actions = np.tile(np.array([0.15, 0.0, 0.0, 0.0], np.float32), (20, 1))
+        observations, _, over, late, _ = env.step(actions)
+        seen = plain.step(actions)[0]
+        flying = ~(over | late)
+        np.testing.assert_array_equal(observations[flying, :-16], seen[flying])
+        fails = part(env, observations, "gnss_fails")[:, 0]
+        kinds |= set(fails[flying].tolist())
+        if over.any():
+            break
+        r = batch.read("r")
+        gap = np.full((20, 3), np.nan)
+        for i, middle in enumerate(batch.view.obstacles):
+            walls = [k for k in range(0, len(middle), 2) if middle[k, 0] - 0.7 <= r[i, 0]]
+            half = [w.half_size[1] for w in batch.view.world.obstacles[walls[0] : walls[0] + 2]]
+            north, south = middle[walls[0], 1] - half[0], middle[walls[0] + 1, 1] + half[1]
+            gap[i] = middle[walls[0], 0], 0.5 * (north + south), 4.0
+        true = true_state(env, gap)
+        want = {
+            "actual_position_error_scaled": true["position_error"] / 6.0,
+            "actual_velocity_error_scaled": true["velocity_error"] / 4.0,
+            "actual_up": true["up"],
+        }
+        for part_name, value in want.items():
+            np.testing.assert_allclose(part(env, observations, part_name), value, atol=1e-4)
+        rates = part(env, observations, "actual_body_rates_scaled")
+        np.testing.assert_allclose(rates, true["body_rates"] / 2.0, atol=1e-5)
+    assert kinds == {0.0, 1.0}
+
+
 def test_being_sure_is_paid_for():
     (plain, _), (paid, _) = make("Doubting"), make("Sure")
     for _ in range(40):

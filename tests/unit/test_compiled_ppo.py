@@ -56,7 +56,7 @@ def rng():
 # ---- against torch and Stable-Baselines3 ---------------------------------------------------------
 
 
-def models(activation, parameters, count=300):
+def models(activation, parameters, count=300, critic_only=0):
     """A model of each kind with the same weights, and the same samples to learn from."""
     torch = pytest.importorskip("torch")
     from stable_baselines3 import PPO
@@ -67,7 +67,8 @@ def models(activation, parameters, count=300):
         parameters={"n_steps": count, "batch_size": 128, **parameters},
         learning_rate=(3e-3, 3e-3),
     )
-    ours = CompiledPPO(sliders(1), recipe, seed=1)
+    asymmetric = {**recipe.parameters, "critic_only": critic_only}
+    ours = CompiledPPO(sliders(1), recipe.replace(parameters=asymmetric), seed=1)
     kinds = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
     theirs = PPO(
         "MlpPolicy",
@@ -82,6 +83,9 @@ def models(activation, parameters, count=300):
         **recipe.parameters,
     )
     draw = rng()
+    if critic_only:
+        actor = theirs.policy.mlp_extractor.policy_net
+        actor[0] = torch.nn.Linear(3 - critic_only, recipe.layers[0])
     layers = pairs_of(theirs, ours.networks.params, ours)
     for tensor, view in layers:  # biases too are to be something else than zero
         view[:] = draw.normal(0.0, 0.3, view.shape)
@@ -95,11 +99,10 @@ def models(activation, parameters, count=300):
     }
     samples = {k: v if v.dtype == bool else v.astype(np.float32) for k, v in samples.items()}
     with torch.no_grad():
-        found = theirs.policy.evaluate_actions(
-            torch.as_tensor(samples["observations"]), torch.as_tensor(samples["actions"])
-        )
+        normal, _ = outputs_of(theirs, torch.as_tensor(samples["observations"]))
+        found = normal.log_prob(torch.as_tensor(samples["actions"])).sum(dim=1).numpy()
     # some ratios beyond the clipping on either side
-    samples["log_probs"] = found[1].numpy() + draw.normal(0.0, 0.3, count).astype(np.float32)
+    samples["log_probs"] = found + draw.normal(0.0, 0.3, count).astype(np.float32)
     samples["advantages"] = draw.normal(2.0, 3.0, count).astype(np.float32)
     samples["returns"] = draw.normal(1.0, 2.0, count).astype(np.float32)
     ours._observations[:, 0], ours._actions[:, 0] = samples["observations"], samples["actions"]
@@ -107,6 +110,16 @@ def models(activation, parameters, count=300):
     ours._advantages[:, 0] = samples["advantages"]
     ours.prepare()
     return ours, theirs, samples
+
+
+def outputs_of(theirs, x):
+    """Distribution and values of a model of Stable-Baselines3, whose actor sees what it takes."""
+    import torch
+
+    policy, nets = theirs.policy, theirs.policy.mlp_extractor
+    means = policy.action_net(nets.policy_net(x[:, : nets.policy_net[0].in_features]))
+    values = policy.value_net(nets.value_net(x))
+    return torch.distributions.Normal(means, policy.log_std.exp()), values
 
 
 def pairs_of(theirs, vector, ours):
@@ -126,11 +139,13 @@ def pairs_of(theirs, vector, ours):
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh", "elu"])
-@pytest.mark.parametrize(("normalize", "size"), [(True, 173), (False, 751)])
-def test_gradients_are_those_of_torch(activation, normalize, size):
-    """Of parts smaller than a tile, and of such as take two."""
+@pytest.mark.parametrize(
+    ("normalize", "size", "critic_only"), [(True, 173, 0), (False, 751, 0), (True, 751, 2)]
+)
+def test_gradients_are_those_of_torch(activation, normalize, size, critic_only):
+    """Of parts smaller than a tile, and of such as take two; of an actor that sees less, too."""
     parameters = {"ent_coef": 0.02, "vf_coef": 0.7, "normalize_advantage": normalize}
-    ours, theirs, samples = models(activation, parameters, count=800)
+    ours, theirs, samples = models(activation, parameters, count=800, critic_only=critic_only)
     import torch
 
     chosen = rng().permutation(800)[:size]
@@ -144,10 +159,7 @@ def test_gradients_are_those_of_torch(activation, normalize, size):
 
     theirs.policy.double()
     tensors = {k: torch.as_tensor(v[chosen]).double() for k, v in samples.items() if k != "ended"}
-    nets, x = theirs.policy.mlp_extractor, tensors["observations"]  # its policy rounds to float32
-    values = theirs.policy.value_net(nets.value_net(x))
-    means = theirs.policy.action_net(nets.policy_net(x))
-    normal = torch.distributions.Normal(means, theirs.policy.log_std.exp())
+    normal, values = outputs_of(theirs, tensors["observations"])  # its policy rounds to float32
     log_prob = normal.log_prob(tensors["actions"]).sum(dim=1)
     entropy = normal.entropy().sum(dim=1)
     A = torch.as_tensor(advantage)
@@ -284,10 +296,11 @@ def test_actions_have_the_probability_that_is_kept_with_them():
 # ---- the whole -----------------------------------------------------------------------------------
 
 
-def test_same_seed_same_bits_with_any_number_of_threads():
-    found = []
+@pytest.mark.parametrize("critic_only", [0, 1])
+def test_same_seed_same_bits_with_any_number_of_threads(critic_only):
+    found, recipe = [], small_recipe(parameters={"critic_only": critic_only})
     for seed, threads in ((0, 1), (0, 2), (0, 4), (1, 1)):
-        model = CompiledPPO(sliders(), small_recipe(), seed=seed, threads=threads)
+        model = CompiledPPO(sliders(), recipe, seed=seed, threads=threads)
         model.learn(1000)
         found.append(model.networks.params)
     assert model.num_timesteps == 1024  # whole rollouts of 128
@@ -296,17 +309,18 @@ def test_same_seed_same_bits_with_any_number_of_threads():
     assert not np.array_equal(found[0], found[3])
 
 
-def test_a_kept_state_goes_on_bit_for_bit():
-    states = []
+@pytest.mark.parametrize("critic_only", [0, 1])
+def test_a_kept_state_goes_on_bit_for_bit(critic_only):
+    states, recipe = [], small_recipe(parameters={"critic_only": critic_only})
 
     def watch(model):
         states.append(model.state())
         return True
 
-    model = CompiledPPO(sliders(), small_recipe(), seed=0)
+    model = CompiledPPO(sliders(), recipe, seed=0)
     model.learn(1000, watch)
     for state in states[1::3]:
-        other = CompiledPPO(sliders(), small_recipe(), seed=9)
+        other = CompiledPPO(sliders(), recipe, seed=9)
         other.restore(state)
         other.learn(1000)
         np.testing.assert_array_equal(other.networks.params, model.networks.params)
@@ -334,6 +348,58 @@ def test_it_learns_an_environment_that_is_not_ours():
     assert action[1, 0] > 0.3
 
 
+def test_what_is_for_the_critic_alone_changes_values_and_no_action():
+    model = CompiledPPO(sliders(), small_recipe(parameters={"critic_only": 1}), seed=0)
+    model.learn(1000)
+    draw = rng()
+    x = draw.normal(size=(150, 3)).astype(np.float32)  # more than two tiles
+    other = x.copy()
+    other[:, 2] += 1.0
+    means, values = model._evaluate(x)
+    moved = model._evaluate(other)
+    np.testing.assert_array_equal(moved[0], means)
+    assert abs(moved[1] - values).min() > 1e-4
+
+    policy = model.policy()
+    assert policy.inputs == 2
+    want = policy.predict(x[:, :2])[0]
+    np.testing.assert_allclose(want, means.clip(-1.0, 1.0), atol=1e-6)
+    for seen in (x, x[:, :2]):
+        np.testing.assert_array_equal(model.predict(seen)[0], want)
+    with pytest.raises(ValueError, match=r"must be \(..., 2\), got shape \(150, 1\)"):
+        model.predict(x[:, :1])
+
+
+class Signs(gymnasium.Env):
+    """One step, rewarded by a hidden sign: nothing that is seen or done predicts the reward."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.sign = self.np_random.choice([-1.0, 1.0])
+        return np.array([1.0, self.sign], np.float32), {}
+
+    def step(self, action):
+        return np.array([1.0, self.sign], np.float32), self.sign, True, False, {}
+
+
+@pytest.mark.parametrize("critic_only", [0, 1])
+def test_a_critic_learns_from_what_the_actor_does_not_see(critic_only):
+    env = SyncVectorEnv([Signs] * 8, autoreset_mode=AutoresetMode.SAME_STEP)
+    recipe = small_recipe(
+        reward_scale=1.0,
+        learning_rate=(1e-2, 1e-2),
+        parameters={"n_steps": 32, "critic_only": critic_only},
+    )
+    model = CompiledPPO(env, recipe, seed=0)
+    model.learn(8000)
+    _, values = model._evaluate(np.array([[1.0, -1.0], [1.0, 1.0]], np.float32))
+    np.testing.assert_allclose(values, [-1.0, 1.0], atol=0.1)
+    assert model.policy().inputs == 2 - critic_only
+
+
 def test_a_diverged_training_says_so():
     model = CompiledPPO(sliders(), small_recipe(), seed=0)
     model.prepare()
@@ -353,6 +419,9 @@ def test_a_diverged_training_says_so():
         (sliders(), small_recipe(parameters={"batch_size": 0}), "batch_size must be at least 1"),
         (sliders(), small_recipe(parameters={"gamma": 1.5}), "gamma must be at most 1"),
         (sliders(), small_recipe(policy={"ortho_init": False}), "ortho_init is not a keyword"),
+        (sliders(), small_recipe(parameters={"critic_only": -1}), "critic_only must be at least 0"),
+        (sliders(), small_recipe(parameters={"critic_only": 0.5}), "critic_only must be a whole"),
+        (sliders(), small_recipe(parameters={"critic_only": 3}), "some of the 3 numbers .* got 3"),
     ],
 )
 def test_what_does_not_fit_is_refused(env, recipe, message):
