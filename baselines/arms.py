@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from baselines.recipes import ALGORITHMS
 from quad_gym import sensor_suite
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
@@ -34,10 +35,14 @@ class Arm(Checked):
     learning: Mapping[str, Any] = field(default_factory=dict)
     """keywords that hold in place of these while it is trained, but not where its best policy is
     chosen, such as a reward of its own"""
+    algorithm: str = "ppo"
+    """one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine, and the
+    others with Stable-Baselines3"""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """of the algorithm, in place of the recipe's"""
 
     def __post_init__(self) -> None:
+        self._check(check.choice, "algorithm", choices=ALGORITHMS)
         if not (isinstance(self.name, str) and self.name.isidentifier()):
             raise ValueError(f"Arm.name must be a word of letters and digits, got {self.name!r}")
         check.instance("Arm.label", self.label, str)
@@ -45,7 +50,8 @@ class Arm(Checked):
             check.instance(f"Arm.{name}", getattr(self, name), Mapping)
             self._set(name, MappingProxyType(dict(getattr(self, name))))
         given = self.policy if self.flies is None else f"that of {self.flies}"
-        if given is not None and (self.training or self.learning or self.parameters):
+        learns = self.training or self.learning or self.parameters or self.algorithm != "ppo"
+        if given is not None and learns:
             raise ValueError(f"Arm {self.name} must not be trained, as its policy is {given}")
         if self.policy is not None and self.flies is not None:
             raise ValueError(
@@ -56,6 +62,11 @@ class Arm(Checked):
     def trained(self) -> bool:
         """Whether it is trained."""
         return self.policy is None and self.flies is None
+
+    @property
+    def engine(self) -> str:
+        """What trains it, one of `baselines.plans.ENGINES`."""
+        return "compiled" if self.algorithm == "ppo" else "sb3"
 
 
 _FAR_SIGHTED = {"gamma": 0.995}
@@ -104,6 +115,13 @@ ARMS = (
         environment=_DOUBTING,
         learning={"custom": "baselines.arm_critics:SureForCritic"},
         parameters={"critic_only": 15},
+    ),
+    # paid for being sure as `paid` and `sure` are, so that these differ in what the policy knows
+    Arm(
+        name="recurrent",
+        label="estimate, LSTM, paid for being sure",
+        learning={"custom": "baselines.arm_tasks:Paid"},
+        algorithm="recurrent_ppo",
     ),
 )
 """Those of `QuadGym/LookAround-v0`."""

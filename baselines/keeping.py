@@ -32,7 +32,7 @@ _COLUMNS = (
 )
 
 
-_SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}
+SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}
 """Of files of policies, by engine."""
 
 
@@ -42,17 +42,17 @@ class RunError(ValueError):
 
 def last_file(plan: Plan, folder: Path) -> Path:
     """Where the policy of the last evaluation is kept, and what resuming needs."""
-    return folder / f"last{_SUFFIXES[plan.engine]}"
+    return folder / f"last{SUFFIXES[plan.engine]}"
 
 
 def best_file(plan: Plan, folder: Path) -> Path:
     """Where the policy of the best evaluation is kept."""
-    return folder / f"best{_SUFFIXES[plan.engine]}"
+    return folder / f"best{SUFFIXES[plan.engine]}"
 
 
 def has_checkpoint(folder: Path) -> bool:
     """Whether a run can be resumed from the folder."""
-    kept = any((folder / f"last{suffix}").exists() for suffix in _SUFFIXES.values())
+    kept = any((folder / f"last{suffix}").exists() for suffix in SUFFIXES.values())
     return kept and (folder / "training.json").exists()
 
 

@@ -148,6 +148,18 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),
+    # As PPO there; rollouts long enough to learn what to remember for a second, and large batches,
+    # as the time of a gradient step is that of the sequence. Slow: fewer steps than PPO has.
+    ("QuadGym/LookAround-v0", "recurrent_ppo"): _RECURRENT_PPO.replace(
+        steps=2_000_000,
+        parameters={
+            **_RECURRENT_PPO.parameters,
+            "gamma": 0.99,
+            "n_steps": 64,
+            "batch_size": 2048,
+        },
+        flights={"out_of_bounds": 3.0},
+    ),
     # During an outage, halving the speed prevents few crashes, and waiting for its end prevents
     # most: a policy has to discover pauses of seconds. Exploration noise drawn ten times a second
     # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting still

@@ -6,8 +6,9 @@
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
-Arms of baselines/arms.py (or of a file like it) are trained with the compiled PPO, and every policy
-flies the same test episodes on the estimate. Prints a table with interquartile means over
+Arms of baselines/arms.py (or of a file like it) are trained with the compiled PPO, or with another
+algorithm of Stable-Baselines3 where they name one, and every policy flies the same test episodes on
+the estimate. Prints a table with interquartile means over
 the seeds and bootstrap 95 % intervals, says what can be concluded from them, and writes figures,
 numbers and a report. Each training is a folder: an interrupted study continues where it
 stopped, and a training whose folder was deleted is repeated, but no other.
@@ -28,7 +29,7 @@ from tyro.conf import arg
 from baselines.arms import Arm
 from baselines.keeping import EVALUATIONS, RunError
 from baselines.plans import Plan
-from baselines.recipes import recipe
+from baselines.recipes import Recipe, recipe
 from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
@@ -137,7 +138,7 @@ def configure(args: Args) -> Study:
         OSError: If nothing can be written to the folder.
         ImportError: If matplotlib is missing.
     """
-    from baselines.compiled_ppo.run import make_compiled
+    from quad_gym.commands.train import require_model
 
     plots.require_matplotlib()
     args = with_full_id(args, STUDIED_IDS)
@@ -146,16 +147,14 @@ def configure(args: Args) -> Study:
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     leave(args.env, {"observation": "--arms", "threads": "--threads"})
-    chosen = recipe(args.env_id)
-    steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
-    chosen = chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
+    arms = arms_of(args)
     task = IDS[args.env_id]
     name = args.section or task
     study = Study(
         env_id=args.env_id,
-        arms=arms_of(args),
+        arms=arms,
         seeds=tuple(range(args.seed, args.seed + (QUICK_SEEDS if args.quick else args.seeds))),
-        recipe=chosen,
+        recipes={arm.algorithm: _recipe(args, arm.algorithm) for arm in arms if arm.trained},
         environment=dict(args.env),
         episodes=QUICK_EPISODES if args.quick else args.episodes,
         first_episode=first_seed("test", args.seed, args.episodes),
@@ -166,7 +165,7 @@ def configure(args: Args) -> Study:
     for arm in study.arms:
         if arm.trained:
             plan = plan_of(study, arm, study.seeds[0])
-            make_compiled(plan).env.close()
+            require_model(plan)
             plan.make_judge().close()
         test_flights(study, arm, 1).close()
     if args.page is not None:
@@ -175,15 +174,23 @@ def configure(args: Args) -> Study:
     return study
 
 
+def _recipe(args: Args, algorithm: str) -> Recipe:
+    """The recipe of an algorithm, with the options that change it."""
+    chosen = recipe(args.env_id, algorithm)
+    steps = args.steps or (QUICK_STEPS if args.quick else chosen.steps)
+    return chosen.replace(steps=steps, parameters={**chosen.parameters, **args.set})
+
+
 def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
     """How an arm is trained."""
+    chosen = study.recipes[arm.algorithm]
     return Plan(
         env_id=study.env_id,
         environment={**study.environment, **arm.environment, **arm.training},
         learning=arm.learning,
-        recipe=study.recipe.replace(parameters={**study.recipe.parameters, **arm.parameters}),
+        recipe=chosen.replace(parameters={**chosen.parameters, **arm.parameters}),
         seed=seed,
-        engine="compiled",
+        engine=arm.engine,
         threads=study.threads,
         evaluations=study.about.evaluations,
     )
@@ -256,7 +263,7 @@ def main(args: Args) -> None:
     with usage_errors():
         study = configure(args)
     trained = sum(arm.trained for arm in study.arms)
-    trainings = f"{trained * len(study.seeds)} trainings of {study.recipe.steps:,} steps, "
+    trainings = f"{trained * len(study.seeds)} trainings of {study.steps()}, "
     print(
         f"{study.env_id}: {len(study.arms)} arms, {trainings if trained else ''}"
         f"{study.episodes:,} episodes with each policy; into {study.folder}."

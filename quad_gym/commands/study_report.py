@@ -179,7 +179,7 @@ def _trainings(results: Results) -> str:
     study = results.study
     if not results.trained():
         return ""
-    return f"Training seeds: {len(study.seeds)}, of {study.recipe.steps:,} steps each; "
+    return f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
 
 
 def update_page(results: Results, page: Path, section: str | None = None) -> list[Path]:

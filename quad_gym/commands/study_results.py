@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.arms import Arm
+from baselines.keeping import SUFFIXES
 from baselines.recipes import Recipe
 from quad_gym.analysis.reports import as_json
 from quad_gym.analysis.robust import (
@@ -33,7 +34,8 @@ class Study:
     env_id: str
     arms: tuple[Arm, ...]
     seeds: tuple[int, ...]
-    recipe: Recipe
+    recipes: Mapping[str, Recipe]
+    """by algorithm, of those that train an arm"""
     environment: Mapping[str, Any]
     episodes: int
     first_episode: int
@@ -58,7 +60,8 @@ class Study:
 
     def policy_of(self, arm: Arm, seed: int | None) -> str:
         """The policy that an arm flies: a rule by name, or the file of a training."""
-        return arm.policy or str(self.policy_folder(arm, seed) / "best.npz")
+        engine = next(a.engine for a in self.arms if a.name == (arm.flies or arm.name))
+        return arm.policy or str(self.policy_folder(arm, seed) / f"best{SUFFIXES[engine]}")
 
     def test_digest(self, arm: Arm, seed: int | None) -> str:
         """Of what the test of an arm depends on: the policy, the episodes, the code that flies."""
@@ -69,9 +72,17 @@ class Study:
         given = as_json([*flight, self.about.traced, flights_digest()])
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
 
+    def steps(self) -> str:
+        """How many environment steps trainings have, for people."""
+        counts = {recipe.steps for recipe in self.recipes.values()}
+        if len(counts) < 2:
+            return f"{counts.pop():,} steps" if counts else ""
+        each = [f"{recipe.steps:,} ({name})" for name, recipe in self.recipes.items()]
+        return f"{' or '.join(each)} steps"
+
     def description(self) -> dict[str, Any]:
         """Everything that the results depend on, as JSON has it."""
-        names = ("env_id", "arms", "seeds", "recipe", "environment", "episodes")
+        names = ("env_id", "arms", "seeds", "recipes", "environment", "episodes")
         about = {name: getattr(self, name) for name in (*names, "first_episode")}
         about["success"] = self.about.meaning
         return as_json(about)  # type: ignore[no-any-return]

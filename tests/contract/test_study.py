@@ -75,6 +75,32 @@ def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, c
     assert (tmp_path / f"images/{task}_pace.png").stat().st_size > 1000
 
 
+def test_arms_of_either_engine_are_trained_and_flown_in_one_study(tmp_path, capsys):
+    pytest.importorskip("sb3_contrib")
+    words = [*QUICK, "--set", "n_steps=8", "batch_size=512", "n_epochs=1"]
+    words += ["--arms", "asymmetric", "recurrent", "--output", str(tmp_path / "out")]
+    assert main(words) == 0
+    assert "4 trainings of 4,096 steps" in capsys.readouterr().out
+    runs = tmp_path / "out" / "runs"
+    assert (runs / "asymmetric/seed_1/best.npz").exists()
+    assert (runs / "recurrent/seed_1/best.zip").exists()
+    plans = {
+        name: json.loads((runs / name / "seed_0/training.json").read_text())["plan"]
+        for name in ("asymmetric", "recurrent")
+    }
+    assert plans["recurrent"]["recipe"]["algorithm"] == "recurrent_ppo"
+    assert plans["recurrent"]["engine"] == "sb3"
+    assert plans["asymmetric"]["engine"] == "compiled"
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert set(summary["study"]["recipes"]) == {"ppo", "recurrent_ppo"}
+
+
+def test_steps_are_told_of_each_algorithm():
+    two = command.configure(command.Args(arms=("asymmetric", "recurrent")))
+    assert two.steps() == "4,000,000 (ppo) or 2,000,000 (recurrent_ppo) steps"
+    assert command.configure(command.Args(arms=("truth",))).steps() == "4,000,000 steps"
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -88,6 +114,8 @@ def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, c
         (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
         (["--env", "observation=truth"], "--env must leave observation to --arms"),
         (["--set", "gammma=0.9"], "gammma"),
+        (["--arms", "recurrent", "--set", "clip=0.1"], "recipe does not fit recurrent_ppo"),
+        (["--arms", "truth", "--set", "critic_only=3"], "critic_only must count the numbers"),
     ],
 )
 def test_wrong_options_end_the_study_before_it_begins(words, message, tmp_path, capsys):
@@ -107,6 +135,10 @@ def test_wrong_arms_are_refused():
         Arm(name="a", label="x", flies="truth", parameters={"gamma": 0.9})
     with pytest.raises(ValueError, match="have a policy, or fly that of another"):
         Arm(name="a", label="x", flies="truth", policy="pd")
+    with pytest.raises(ValueError, match="must not be trained, as its policy is pd"):
+        Arm(name="a", label="x", policy="pd", algorithm="sac")
+    with pytest.raises(ValueError, match=r"algorithm must be one of ppo, .*, got 'a2c'"):
+        Arm(name="a", label="x", algorithm="a2c")
     with pytest.raises(ValueError, match=r"Arm.environment must be a"):
         Arm(name="a", label="x", environment=3)
 
@@ -125,7 +157,7 @@ def test_a_reward_of_an_arm_holds_in_training_alone():
 def test_flights_are_flown_again_after_another_training_or_another_flight(tmp_path, monkeypatch):
     arms = tuple(arm for arm in ARMS if arm.name in ("truth", "truth_on_truth"))
     study = Study(
-        *("QuadGym/StaleRace-v0", arms, (0,), recipe("QuadGym/StaleRace-v0")),
+        *("QuadGym/StaleRace-v0", arms, (0,), {"ppo": recipe("QuadGym/StaleRace-v0")}),
         *({}, 40, 0, STUDIED["stale_race"], tmp_path, None),
     )
     policy = tmp_path / "runs" / "truth" / "seed_0" / "best.npz"
@@ -158,7 +190,7 @@ def flown(returns, crashed, error):
 def results(tmp_path, numbers):
     arms = tuple(arm for arm in ARMS if arm.name in numbers)
     study = Study(
-        *("QuadGym/LookAround-v0", arms, (0, 1, 2, 3, 4), recipe("QuadGym/LookAround-v0")),
+        *("QuadGym/LookAround-v0", arms, (0, 1, 2, 3, 4), {"ppo": recipe("QuadGym/LookAround-v0")}),
         *({}, 40, 0, STUDIED["look_around"], tmp_path, None),
     )
     rng = np.random.default_rng(0)

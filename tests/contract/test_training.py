@@ -22,6 +22,7 @@ from baselines.plans import Plan  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
 from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
 from baselines.training import train  # noqa: E402
+from quad_gym.evaluation import roll_out  # noqa: E402
 from tests import console_commands  # noqa: E402
 
 CIRCLE = "QuadGym/Circle-v0"
@@ -263,3 +264,27 @@ def test_every_algorithm_runs(tmp_path, algorithm):
     done = train(small_plan(algorithm), tmp_path, quiet=True, tensorboard=False)
     assert done.finished
     assert done.best_policy.exists()
+
+
+def test_a_policy_with_a_memory_begins_each_episode_without_one(tmp_path):
+    plan = small_plan("recurrent_ppo")
+    done = train(plan, tmp_path, quiet=True, tensorboard=False)
+    many, one = (gymnasium.make_vec(CIRCLE, num_envs=n, duration=1.0) for n in (4, 1))
+    policy = load_policy(str(done.best_policy), many)
+    together, again = (roll_out(policy, many, seed=7) for _ in range(2))
+    np.testing.assert_array_equal(together.returns, again.returns)
+    alone = [roll_out(policy, one, seed=7 + i).returns[0] for i in range(4)]
+    np.testing.assert_allclose(together.returns, alone, rtol=1e-4)
+
+    env = gymnasium.make_vec(CIRCLE, num_envs=1, duration=1.0)
+    observation, _ = env.reset(seed=7)
+    total, state, over = 0.0, None, False
+    while not over:  # what the memory is for: a state that is handed on
+        starts = np.array([state is None])
+        actions, state = policy.predict(observation, state, starts, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(actions)
+        total, over = total + reward[0], bool(terminated[0] or truncated[0])
+    assert total == pytest.approx(alone[0], rel=1e-4)
+    forgetful = policy.predict(observation, None, np.array([True]), deterministic=True)[0]
+    remembering = policy.predict(observation, state, np.array([False]), deterministic=True)[0]
+    assert abs(forgetful - remembering).max() > 1e-6

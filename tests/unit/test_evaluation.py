@@ -26,13 +26,25 @@ class Wobbly:
         return (self.size * turns).astype(np.float32), state
 
 
+class Wavering(Wobbly):
+    """The same by what it has observed since the episode began, which it remembers."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        seen = np.asarray(observation, float)[..., :4]
+        if state is None:
+            state = np.zeros_like(seen)
+        if episode_start is not None:
+            state = np.where(np.reshape(episode_start, (-1, 1)), 0.0, state)
+        return super().predict(state := 0.5 * state + seen, state)
+
+
 def plain_loop(task, policy, seed, **keywords):
     """One episode: return, length, mean, late and estimation error, crashed, gates, ending."""
     env = QuadEnv(task, **keywords)
     observation, _ = env.reset(seed=seed)
-    rewards, errors, estimation = [], [], []
+    rewards, errors, estimation, state = [], [], [], None
     while True:
-        action, _ = policy.predict(observation)
+        action, state = policy.predict(observation, state)
         observation, reward, terminated, truncated, info = env.step(action)
         rewards.append(reward)
         errors.append(info["position_error"])
@@ -53,11 +65,12 @@ def plain_loop(task, policy, seed, **keywords):
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("kind", [Wobbly, Wavering])
 @pytest.mark.parametrize(("task", "size"), [("hover", 0.8), ("circle", 0.3), ("waypoints", 0.6)])
-def test_it_measures_what_a_plain_loop_measures(task, size, mode):
+def test_it_measures_what_a_plain_loop_measures(task, size, kind, mode):
     keywords = {"max_episode_steps": LIMIT, "max_tilt": 0.9}
     env = QuadVectorEnv(24, task, autoreset_mode=mode, **keywords)
-    policy = Wobbly(size)
+    policy = kind(size)
     episodes = roll_out(policy, env, seed=100)
     expected = [plain_loop(task, policy, 100 + i, **keywords) for i in range(24)]
     for name in episodes._fields:
