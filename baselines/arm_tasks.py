@@ -127,14 +127,15 @@ class Remembering(Doubting):
 class Paid(LookAround):
     """`LookAround` that also pays for a sure filter, which the controller does not see.
 
-    -0.3 min(sigma / 0.5 m, 1) a step, sigma the largest standard deviation of the position: it
-    matters more than the heading from 0.25 m on.
+    0.3 (1 - min(sigma / 0.5 m, 1)) a step, sigma the largest standard deviation of the position:
+    what a doubt of 0.25 m costs is as much as the heading can bring. A payment, not a fine: where
+    the rewards of a vehicle that is lost add up to less than zero, a policy learns to crash at once.
     """
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) see the class."""
         sigma = view.estimate.position_sigma.max(axis=1)
-        return super().reward(view) - 0.3 * np.minimum(sigma / 0.5, 1.0)
+        return super().reward(view) + 0.3 * (1.0 - np.minimum(sigma / 0.5, 1.0))
 
 
 class Sure(Paid, Doubting):

@@ -144,7 +144,7 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
     ),
     # closer bounds than the task's: who has lost himself need not be watched for long
     ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
-        steps=4_000_000,
+        steps=8_000_000,
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),

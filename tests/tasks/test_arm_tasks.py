@@ -313,5 +313,5 @@ def test_being_sure_is_paid_for():
         actions = np.zeros((6, 4), np.float32)
         actions[:, 3] = 1.0  # turning, so that markers come and go
         reward, with_pay = plain.step(actions)[1], paid.step(actions)[1]
-        expected = reward - 0.3 * np.minimum(largest_sigma(paid) / 0.5, 1.0)
+        expected = reward + np.maximum(0.3 - 0.6 * largest_sigma(paid), 0.0)
         np.testing.assert_allclose(with_pay, expected, atol=1e-12)
