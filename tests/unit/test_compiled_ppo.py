@@ -3,50 +3,11 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from baselines.compiled_ppo import CompiledPPO
 from baselines.compiled_ppo.ppo import advantages
-from baselines.recipes import Recipe
-
-
-class Slider(gymnasium.Env):
-    """A point on a line that actions move; the reward is highest at 0, the episode 20 steps."""
-
-    observation_space = gymnasium.spaces.Box(-10.0, 10.0, (3,))
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x, self.steps = self.np_random.uniform(-2.0, 2.0), 0
-        return self.seen(), {}
-
-    def seen(self):
-        return np.array([self.x, 1.0, self.steps / 20.0], np.float32)
-
-    def step(self, action):
-        self.x += 0.3 * float(action[0])
-        self.steps += 1
-        fallen = abs(self.x) > 3.0
-        return self.seen(), 1.0 - self.x**2, fallen, self.steps >= 20, {}
-
-
-def sliders(count=8, mode=AutoresetMode.SAME_STEP):
-    return SyncVectorEnv([Slider] * count, autoreset_mode=mode)
-
-
-def small_recipe(policy=None, parameters=None, **changes):
-    options = {
-        "n_envs": 8,
-        "steps": 1000,
-        "reward_scale": 0.5,
-        "activation": "tanh",
-        "layers": (32, 17),
-        "critic_layers": (24,),
-        "parameters": {"n_steps": 16, "batch_size": 50, "n_epochs": 3, **(parameters or {})},
-        "policy": policy or {},
-    }
-    return Recipe(**{**options, **changes})
+from tests.unit.sliders import Slider, sliders, small_recipe
 
 
 def rng():
@@ -346,58 +307,6 @@ def test_it_learns_an_environment_that_is_not_ours():
     assert state is None
     assert action[0, 0] < -0.3
     assert action[1, 0] > 0.3
-
-
-def test_what_is_for_the_critic_alone_changes_values_and_no_action():
-    model = CompiledPPO(sliders(), small_recipe(parameters={"critic_only": 1}), seed=0)
-    model.learn(1000)
-    draw = rng()
-    x = draw.normal(size=(150, 3)).astype(np.float32)  # more than two tiles
-    other = x.copy()
-    other[:, 2] += 1.0
-    means, values = model._evaluate(x)
-    moved = model._evaluate(other)
-    np.testing.assert_array_equal(moved[0], means)
-    assert abs(moved[1] - values).min() > 1e-4
-
-    policy = model.policy()
-    assert policy.inputs == 2
-    want = policy.predict(x[:, :2])[0]
-    np.testing.assert_allclose(want, means.clip(-1.0, 1.0), atol=1e-6)
-    for seen in (x, x[:, :2]):
-        np.testing.assert_array_equal(model.predict(seen)[0], want)
-    with pytest.raises(ValueError, match=r"must be \(..., 2\), got shape \(150, 1\)"):
-        model.predict(x[:, :1])
-
-
-class Signs(gymnasium.Env):
-    """One step, rewarded by a hidden sign: nothing that is seen or done predicts the reward."""
-
-    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.sign = self.np_random.choice([-1.0, 1.0])
-        return np.array([1.0, self.sign], np.float32), {}
-
-    def step(self, action):
-        return np.array([1.0, self.sign], np.float32), self.sign, True, False, {}
-
-
-@pytest.mark.parametrize("critic_only", [0, 1])
-def test_a_critic_learns_from_what_the_actor_does_not_see(critic_only):
-    env = SyncVectorEnv([Signs] * 8, autoreset_mode=AutoresetMode.SAME_STEP)
-    recipe = small_recipe(
-        reward_scale=1.0,
-        learning_rate=(1e-2, 1e-2),
-        parameters={"n_steps": 32, "critic_only": critic_only},
-    )
-    model = CompiledPPO(env, recipe, seed=0)
-    model.learn(8000)
-    _, values = model._evaluate(np.array([[1.0, -1.0], [1.0, 1.0]], np.float32))
-    np.testing.assert_allclose(values, [-1.0, 1.0], atol=0.1)
-    assert model.policy().inputs == 2 - critic_only
 
 
 def test_a_diverged_training_says_so():
