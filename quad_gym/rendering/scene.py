@@ -89,10 +89,14 @@ class Scene:
         flight: The flight; its last row is the present.
         view: Where from.
         moving: Whether the view follows the vehicle, so that the ground must, too.
+        magnified: Whether a small ellipsoid is drawn larger than it is, see `ellipsoid_scale`.
     """
 
-    def __init__(self, canvas: Canvas, flight: Flight, view: View, moving: bool) -> None:
+    def __init__(
+        self, canvas: Canvas, flight: Flight, view: View, moving: bool, magnified: bool = True
+    ) -> None:
         self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
+        self._magnified = magnified
         self._stage, self._now = flight.stage, flight.rows[-1]
         self._R_BI = self._attitude("attitude")
         self.labels: list[Label] = []
@@ -299,7 +303,7 @@ class Scene:
             return
         view, canvas = self._view, self._canvas
         if self._flight.estimated:
-            scale = ellipsoid_scale(self._flight)
+            scale = ellipsoid_scale(self._flight) if self._magnified else 1.0
             axes = scale * ellipsoid_axes(self._now["covariance"][:3, :3], SIGMAS)
             outline = ellipsoid_outline(believed, axes, view)
             canvas.polygon(outline, VERMILLION, 0.16)
