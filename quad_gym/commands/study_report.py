@@ -137,7 +137,8 @@ def write_report(results: Results, film: Path | None = None) -> list[Path]:
         written += files
     shown = {CAPTIONS[name]: files[0] for name, files in figures.items()}
     if film is not None:
-        shown[CAPTIONS["film"]] = film
+        speed = results.study.about.film_speed
+        shown[CAPTIONS["film"] + ("" if speed == 1.0 else f" At {speed:g} times the speed.")] = film
         written.append(film)
     return [*written, _page(results, shown)]
 
