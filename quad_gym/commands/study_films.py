@@ -19,7 +19,7 @@ from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path
 
-RATE = 12.5
+RATE = 10.0
 """Pictures per second of a film."""
 SHOWN_ON_PAGES = ("webp", "gif")
 """Kinds of film that a page shows as it shows a picture."""

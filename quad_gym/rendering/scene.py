@@ -90,13 +90,20 @@ class Scene:
         view: Where from.
         moving: Whether the view follows the vehicle, so that the ground must, too.
         magnified: Whether a small ellipsoid is drawn larger than it is, see `ellipsoid_scale`.
+        spacing: Of the grid on the ground [m].
     """
 
     def __init__(
-        self, canvas: Canvas, flight: Flight, view: View, moving: bool, magnified: bool = True
+        self,
+        canvas: Canvas,
+        flight: Flight,
+        view: View,
+        moving: bool,
+        magnified: bool = True,
+        spacing: float = 1.0,
     ) -> None:
         self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
-        self._magnified = magnified
+        self._magnified, self._spacing = magnified, spacing
         self._stage, self._now = flight.stage, flight.rows[-1]
         self._R_BI = self._attitude("attitude")
         self.labels: list[Label] = []
@@ -134,7 +141,7 @@ class Scene:
         shift = np.zeros(3)
         wide = bool((np.abs(self._stage.obstacles[:, 1:3]) > n).any())
         if self._moving or wide:  # over a plane without an end, with the grid around the vehicle
-            shift[:2] = np.round(self._now["position"][:2])
+            shift[:2] = self._spacing * np.round(self._now["position"][:2] / self._spacing)
             canvas.clear(SKY, bottom=view.horizon)
             canvas.clear(GROUND, top=view.horizon)
         else:
@@ -142,7 +149,7 @@ class Scene:
             corners = n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
             border = view.segments(corners, np.roll(corners, -1, axis=0))
             canvas.polygon(border.reshape(-1, 2), GROUND)
-        starts, ends = _GRID + shift
+        starts, ends = self._spacing * _GRID + shift
         canvas.segments(view.segments(starts, ends), GRID)
         origin = np.zeros((2, 3))
         tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -38,6 +38,9 @@ SIDE = (480, 440)
 HOLD = 1.5
 """How long the last picture stays [s], so that one can read how both flights ended."""
 
+COURSE_GRID = 4.0
+"""Between the lines on the ground along a course [m]: closer ones, which pass, double a film."""
+
 _BAND, _PLOT = 50.0, 118.0
 """Heights above and below the scene [pixels]."""
 _TEXT, _SMALL = 19, 17
@@ -137,7 +140,11 @@ class _Half:
         view = self._view(flight)
         canvas.clear(WHITE)
         canvas.inside((box.left, box.top, box.width, box.height))
-        scene = Scene(canvas, flight, view, moving=self._moves, magnified=False)
+        scene = Scene(
+            *(canvas, flight, view, self._moves),
+            magnified=False,
+            spacing=COURSE_GRID if self._moves else 1.0,
+        )
         scene.draw_background()
         labels = scene.draw()
         self._mark(flight, view)
