@@ -48,6 +48,8 @@ _TINTS: tuple[Color, ...] = ((228, 230, 234), (214, 236, 229))
 """Grounds of the labels, in turn."""
 WEDGE = 2.5
 """How far the camera's field of view is drawn [m]."""
+_SHOWN = 9.0
+"""Positions farther from the start along an axis need not be seen by a fixed view [m]."""
 _FAR = 30.0
 """Vehicles with fewer pixels per meter are marked by a disc, as little is seen of them."""
 
@@ -115,10 +117,6 @@ class SideBySide:
         for part in parts[1:]:
             part[:, :2] = GREY
         return np.concatenate(parts, axis=1)
-
-
-_SHOWN = 9.0
-"""Positions farther from the start along an axis need not be seen by a fixed view [m]."""
 
 
 class _Half:
