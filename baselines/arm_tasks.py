@@ -129,7 +129,7 @@ class Paid(LookAround):
 
     0.3 (1 - min(sigma / 0.5 m, 1)) a step, sigma the largest standard deviation of the position:
     what a doubt of 0.25 m costs is as much as the heading can bring. A payment, not a fine: where
-    the rewards of a vehicle that is lost add up to less than zero, a policy learns to crash at once.
+    the rewards of a lost vehicle add up to less than zero, a policy learns to crash at once.
     """
 
     def reward(self, view: "View") -> NDArray[np.float64]:

@@ -80,7 +80,7 @@ class MlpPolicy:
             x = _ACTIVATIONS[activation](x @ W.T + b)
         return np.clip(x, -1.0, 1.0).astype(np.float32), None
 
-    def save(self, file: Path | IO[bytes]) -> None:
+    def save(self, file: str | Path | IO[bytes]) -> None:
         """Write the policy and its record to one file."""
         layers: dict[str, Any] = {f"W{i}": W for i, W in enumerate(self.weights)}
         layers |= {f"b{i}": b for i, b in enumerate(self.biases)}
@@ -88,12 +88,13 @@ class MlpPolicy:
         np.savez_compressed(file, about=np.array(json.dumps(about)), **layers)
 
     @classmethod
-    def load(cls, file: Path) -> "MlpPolicy":
+    def load(cls, file: str | Path) -> "MlpPolicy":
         """Read a policy.
 
         Raises:
             ValueError: If there is no such file, or it holds no policy of ours.
         """
+        file = Path(file)
         if not file.exists():
             raise ValueError(f"there is no policy {file}")
         try:

@@ -3,6 +3,7 @@
     quad-gym study                                   # LookAround, 5 seeds
     quad-gym study stale_race
     quad-gym study outage_dash --arms truth estimate sigma --seeds 10
+    quad-gym study --video webp                      # with a film of two policies side by side
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
@@ -20,7 +21,7 @@ import time
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -35,6 +36,7 @@ from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import EnvId, Keywords, leave, one_of, usage_errors, with_full_id
+from quad_gym.commands.study_films import require_film, write_film
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
@@ -75,9 +77,12 @@ class Args:
     in the second half is below this [m]; if not given, 0.5"""
     threads: int | None = None
     """of flights and learning; if not given, one per core; no result depends on them"""
+    video: Literal["none", "webp", "gif", "mp4"] = "none"
+    """also write a film of this kind: training on truth and on the estimate, side by side in the
+    same episode"""
     page: Path | None = None
-    """write table and conclusions into this page, too, between its marks for the section, and the
-    figures to the folder images beside it"""
+    """write table and conclusions into this page, too, between its marks for the section, and
+    figures and film to the folder images beside it"""
     section: str | None = None
     """of the page: the name in its marks, and in the figures' names; if not given, the task's"""
     output: Path | None = None
@@ -136,7 +141,7 @@ def configure(args: Args) -> Study:
     Raises:
         ValueError: If an option is invalid, or the folder holds another study.
         OSError: If nothing can be written to the folder.
-        ImportError: If matplotlib is missing.
+        ImportError: If matplotlib is missing, or what a film needs.
     """
     from quad_gym.commands.train import require_model
 
@@ -168,6 +173,8 @@ def configure(args: Args) -> Study:
             require_model(plan)
             plan.make_judge().close()
         test_flights(study, arm, 1).close()
+    if args.video != "none":
+        require_film(study, args.video, for_page=args.page is not None)
     if args.page is not None:
         marks_of(args.page, name)
     require_writable("--output", study.folder)
@@ -278,9 +285,12 @@ def main(args: Args) -> None:
     print(f"\n{table_text(results)}\n")
     for sentence in conclusions(results):
         print(sentence)
-    written = write_report(results)
+    film = None
+    if args.video != "none":
+        film = write_film(results, args.video, partial(test_flights, study))
+    written = write_report(results, film)
     if args.page is not None:
-        written = [*update_page(results, args.page, args.section), *written]
+        written = [*update_page(results, args.page, args.section, film), *written]
     print(
         f"\nWrote {len(written)} files to {study.folder} after "
         f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."

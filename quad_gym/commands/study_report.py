@@ -3,6 +3,7 @@
 import base64
 import html
 import math
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from quad_gym.analysis.study_plots import (
     returns_figure,
 )
 from quad_gym.commands.study_flights import Flown
+from quad_gym.commands.study_pair import CHOICES, label_of, pair_of
 from quad_gym.commands.study_results import Results
 from quad_gym.commands.study_tasks import ALWAYS, Column
 from quad_gym.commands.study_words import conclusions, number, share
@@ -27,9 +29,11 @@ CAPTIONS = {
     "learning": "Return of the evaluations while training, each arm on what it is trained on; "
     "thin lines are single seeds, bold ones their median.",
     "glance": "The same episode, flown on the estimate. Above, where the vehicle looks; below, "
-    "what the filter states and what is so.",
+    f"what the filter states and what is so. {CHOICES['glance']}",
     "pace": "The same episode, flown on the estimate. Above, how fast the vehicle flies; below, "
-    "what the filter states and what is so.",
+    f"what the filter states and what is so. {CHOICES['pace']}",
+    "film": "The policies and the episode of the figure: the truth, and the estimate on which both "
+    "fly.",
 }
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 64rem; margin: 2rem auto;
@@ -37,7 +41,7 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 64rem; marg
 table { border-collapse: collapse; margin: 1rem 0; font-size: 14px; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; }
-figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #666; }
+figure { margin: 1.5rem 0; } img, video { max-width: 100%; } figcaption { color: #666; }
 """
 
 
@@ -87,8 +91,13 @@ def table_markdown(results: Results) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def write_report(results: Results) -> list[Path]:
-    """Write figures, numbers and pages; the last file is the page to open."""
+def write_report(results: Results, film: Path | None = None) -> list[Path]:
+    """Write figures, numbers and pages; the last file is the page to open.
+
+    Args:
+        results: Of the study.
+        film: A film that is written already, for the page to show.
+    """
     folder, arms = results.study.folder, results.study.arms
     columns: dict[str, list[Any]] = {}
     for arm in arms:
@@ -126,7 +135,12 @@ def write_report(results: Results) -> list[Path]:
     figures = {name: plots.save_figure(f, folder / name) for name, f in _figures(results).items()}
     for files in figures.values():
         written += files
-    return [*written, _page(results, figures)]
+    shown = {CAPTIONS[name]: files[0] for name, files in figures.items()}
+    if film is not None:
+        speed = results.study.about.film_speed
+        shown[CAPTIONS["film"] + ("" if speed == 1.0 else f" At {speed:g} times the speed.")] = film
+        written.append(film)
+    return [*written, _page(results, shown)]
 
 
 def marks_of(page: Path, task: str) -> tuple[str, str, str]:
@@ -182,8 +196,10 @@ def _trainings(results: Results) -> str:
     return f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
 
 
-def update_page(results: Results, page: Path, section: str | None = None) -> list[Path]:
-    """Write a study into a page, and its figures beside it; return what was written."""
+def update_page(
+    results: Results, page: Path, section: str | None = None, film: Path | None = None
+) -> list[Path]:
+    """Write a study into a page, and its figures and film beside it; return what was written."""
     from quad_gym import IDS
 
     name_of_section = section or IDS[results.study.env_id]
@@ -195,6 +211,9 @@ def update_page(results: Results, page: Path, section: str | None = None) -> lis
     for name, figure in _figures(results).items():
         written.append(images / f"{name_of_section}_{name}.png")
         figure.savefig(written[-1], dpi=130)
+    if film is not None:
+        written.append(images / f"{name_of_section}_{film.name}")
+        shutil.copyfile(film, written[-1])
     return written
 
 
@@ -207,15 +226,16 @@ def _figures(results: Results) -> dict[str, Any]:
     levels = {results.arm(n).label: results.rows[n]["return"].value for n in results.fixed()}
     if curves:
         found["learning"] = returns_figure(curves, levels)
-    if "truth" in results.trained() and len(results.trained()) > 1:
-        best = results.best([name for name in results.trained() if name != "truth"])
-        pair = {
-            f"trained on {results.arm(name).label}".replace(", ", ",\n"): results.flown[
-                name, study.seeds[0]
-            ]
-            for name in ("truth", best)
+    pair = pair_of(results)
+    if pair is not None:
+        episodes = {
+            label_of(results, name).replace(", ", ",\n"): (
+                results.flown[name, seed].time,
+                _traces(results.flown[name, seed], pair.episode),
+            )
+            for name, seed in pair.trainings.items()
         }
-        found[study.about.figure] = _FIGURES[study.about.figure](study.env_id, pair)
+        found[study.about.figure] = _FIGURES[study.about.figure](study.env_id, episodes)
     return found
 
 
@@ -229,20 +249,13 @@ def half_view_of(env_id: str) -> float:
     return math.atan(0.5 * camera.image_size[0] / camera.focal_length)
 
 
-def _glances(env_id: str, pair: Mapping[str, Flown]) -> Any:
-    """Where two policies look, in the first episode that shows a difference."""
-    k = _telling(list(pair.values())[-1])
-    return glance_figure(
-        {label: Glance(run.time, **_traces(run, k)) for label, run in pair.items()},
-        half_view_of(env_id),
-    )
+def _glances(env_id: str, episodes: Mapping[str, tuple[Any, dict[str, Any]]]) -> Any:
+    glances = {label: Glance(time, **traces) for label, (time, traces) in episodes.items()}
+    return glance_figure(glances, half_view_of(env_id))
 
 
-def _paces(env_id: str, pair: Mapping[str, Flown]) -> Any:
-    """How fast two policies fly, in the first episode that the first ends with a crash."""
-    first = next(iter(pair.values()))
-    k = int(np.argmax(first.crashed[: first.traces["speed"].shape[1]]))
-    return pace_figure({label: Pace(run.time, **_traces(run, k)) for label, run in pair.items()})
+def _paces(env_id: str, episodes: Mapping[str, tuple[Any, dict[str, Any]]]) -> Any:
+    return pace_figure({label: Pace(time, **traces) for label, (time, traces) in episodes.items()})
 
 
 _FIGURES = {"glance": _glances, "pace": _paces}
@@ -252,18 +265,8 @@ def _traces(flown: Flown, k: int) -> dict[str, Any]:
     return {name: values[:, k] for name, values in flown.traces.items()}
 
 
-def _telling(flown: Flown) -> int:
-    """The first traced episode in which the rewarded heading is well away from the features.
-
-    Elsewhere there is nothing to see: a policy that looks where it is paid sees them anyway.
-    """
-    off_wall, off_reward = (flown.traces[name] for name in ("off_wall", "off_reward"))
-    off = np.abs(np.angle(np.exp(1j * (off_wall - off_reward))))
-    away = np.nanmean(off, axis=0)
-    return int(np.argmax(away > math.radians(100.0)))
-
-
-def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
+def _page(results: Results, shown: Mapping[str, Path]) -> Path:
+    """A page with table, conclusions, and pictures and films by their captions."""
     study = results.study
     rows = [f"<tr>{''.join(f'<th>{html.escape(h)}</th>' for h in headings(results))}</tr>"]
     rows += [
@@ -279,13 +282,13 @@ def _page(results: Results, figures: dict[str, list[Path]]) -> Path:
         *[f"<li>{html.escape(sentence)}</li>" for sentence in conclusions(results)],
         "</ul>",
     ]
-    for name, files in figures.items():
-        data = base64.b64encode(files[0].read_bytes()).decode()
-        caption = html.escape(CAPTIONS[name])
-        parts.append(
-            f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
-            f"<figcaption>{caption}</figcaption></figure>"
-        )
+    for caption, picture in shown.items():
+        words, kind = html.escape(caption), picture.suffix[1:]
+        data = base64.b64encode(picture.read_bytes()).decode()
+        tag = f'<img alt="{words}" src="data:image/{kind};base64,{data}">'
+        if kind == "mp4":
+            tag = f'<video controls loop src="data:video/mp4;base64,{data}"></video>'
+        parts.append(f"<figure>{tag}<figcaption>{words}</figcaption></figure>")
     file = study.folder / "report.html"
     file.write_text(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'

@@ -139,6 +139,10 @@ class Results:
         """The arm of the largest return."""
         return max(names, key=lambda name: self.rows[name]["return"].value)
 
+    def best_validated(self, name: str) -> int:
+        """The seed of the training of an arm whose evaluations reached the largest return."""
+        return max(self.study.seeds, key=lambda seed: float(self.curves[name, seed][1].max()))
+
     def description(self) -> dict[str, Any]:
         """For JSON."""
         trained = self.trained()

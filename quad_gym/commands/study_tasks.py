@@ -48,6 +48,10 @@ class StudiedTask:
     """how often a policy is evaluated over its training, to keep the best one"""
     figure: str
     """"glance": where policies look; "pace": how fast they fly, and how sure the filter is"""
+    course: tuple[str, int] | None = None
+    """what is passed on a course, and how many there are; None: there is no course"""
+    film_speed: float = 1.0
+    """seconds of flight per second of a film"""
 
 
 ALWAYS: Mapping[str, Column] = {
@@ -104,6 +108,7 @@ STUDIED: Mapping[str, StudiedTask] = {
         telling="gates",
         traced=("speed", "sigma", "estimation_error"),
         figure="pace",
+        course=("gates", 8),
     ),
     "outage_dash": StudiedTask(
         arms=ARMS_OF["outage_dash"],
@@ -120,6 +125,8 @@ STUDIED: Mapping[str, StudiedTask] = {
         telling="gates",
         traced=("speed", "sigma", "estimation_error", "outage"),
         figure="pace",
+        course=("gaps", 10),
+        film_speed=3.0,
     ),
 }
 """By task."""

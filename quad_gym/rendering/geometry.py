@@ -129,8 +129,15 @@ def fit_view(
     return View(eye @ axes, axes, focal, center)
 
 
-def fixed_view(flight: Flight, width: float, height: float) -> View:
-    """A view that shows the whole reference, the start and what the camera looks at."""
+def fixed_view(flight: Flight, width: float, height: float, also: Floats | None = None) -> View:
+    """A view that shows the whole reference, the start and what the camera looks at.
+
+    Args:
+        flight: The flight.
+        width: Of the picture [pixels].
+        height: Of the picture [pixels].
+        also: (n, 3) further points to show, in I [m].
+    """
     stage, start = flight.stage, flight["position"][0]
     times = np.linspace(0.0, stage.reference_period or 1.0, max(64, stage.pieces // 4))
     around = [stage.reference(times), start[np.newaxis], stage.gates_I, stage.features_I]
@@ -141,6 +148,8 @@ def fixed_view(flight: Flight, width: float, height: float) -> View:
         low, high = stage.geofence_I if len(stage.geofence_I) else (low, high)
         places = np.clip(stage.obstacles[:, 1:4], low, high)
         points = np.concatenate([points, places * (1.0, 1.0, 0.0), places])
+    if also is not None:
+        points = np.concatenate([points, also])
     pad = 0.45 * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (0, 1)])
     corners = (points[:, np.newaxis] + pad).reshape(-1, 3)
     low = np.array([0.03 * width, 0.24 * height])  # legend and inset fill the upper corners
@@ -162,6 +171,21 @@ def chase_view(flight: Flight, width: float, height: float) -> View:
     eye = here - 2.4 * behind + (0.0, 0.0, 1.15)
     eye[2] = max(eye[2], 0.25)
     target = here + 0.3 * behind + (0.0, 0.0, 0.12)
+    return look_at(eye, target, 1.15 * width, np.array([0.5 * width, 0.5 * height]))
+
+
+def course_view(flight: Flight, width: float, height: float) -> View:
+    """A view along a course of obstacles, from behind and above the vehicle, that keeps its line.
+
+    It moves with the true position along the course and does not turn, so that a vehicle that
+    leaves the course's line is seen to leave it.
+    """
+    start = np.array(flight["position"][0]) * (1.0, 1.0, 0.0)
+    ahead = flight.stage.obstacles[:, 1:4].mean(axis=0) * (1.0, 1.0, 0.0) - start
+    ahead = ahead / np.linalg.norm(ahead)
+    here = start + ((flight["position"][-1] - start) @ ahead) * ahead
+    eye = here - 15.0 * ahead + (0.0, 0.0, 25.0)
+    target = here + 4.5 * ahead + (0.0, 0.0, 3.0)
     return look_at(eye, target, 1.15 * width, np.array([0.5 * width, 0.5 * height]))
 
 

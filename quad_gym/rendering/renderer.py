@@ -166,8 +166,7 @@ class Renderer:
     @staticmethod
     def _warnings(flight: Flight) -> list[str]:
         rows, now = flight.rows, flight.rows[-1]
-        active = [kind for kind in FaultKind if int(now["faults"]) >> kind & 1]
-        found = [f"fault: {_spoken(kind)}" for kind in active]
+        found = [f"fault: {name}" for name in active_faults(flight)]
         if not flight.estimated:
             return found
         fixes = np.flatnonzero(np.isfinite(rows["gnss_position"][:, 0]))
@@ -178,6 +177,12 @@ class Renderer:
             names = [str(s.name).lower() for s in FilterStatus if s & int(now["filter_status"])]
             found.append("filter: " + ", ".join(names).replace("_", " "))
         return found
+
+
+def active_faults(flight: Flight) -> list[str]:
+    """Names, for people, of the faults at the last instant of a flight."""
+    active = int(flight.rows[-1]["faults"])
+    return [_spoken(kind) for kind in FaultKind if active >> kind & 1]
 
 
 def _spoken(fault: FaultKind) -> str:

@@ -89,10 +89,21 @@ class Scene:
         flight: The flight; its last row is the present.
         view: Where from.
         moving: Whether the view follows the vehicle, so that the ground must, too.
+        magnified: Whether a small ellipsoid is drawn larger than it is, see `ellipsoid_scale`.
+        spacing: Of the grid on the ground [m].
     """
 
-    def __init__(self, canvas: Canvas, flight: Flight, view: View, moving: bool) -> None:
+    def __init__(
+        self,
+        canvas: Canvas,
+        flight: Flight,
+        view: View,
+        moving: bool,
+        magnified: bool = True,
+        spacing: float = 1.0,
+    ) -> None:
         self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
+        self._magnified, self._spacing = magnified, spacing
         self._stage, self._now = flight.stage, flight.rows[-1]
         self._R_BI = self._attitude("attitude")
         self.labels: list[Label] = []
@@ -130,7 +141,7 @@ class Scene:
         shift = np.zeros(3)
         wide = bool((np.abs(self._stage.obstacles[:, 1:3]) > n).any())
         if self._moving or wide:  # over a plane without an end, with the grid around the vehicle
-            shift[:2] = np.round(self._now["position"][:2])
+            shift[:2] = self._spacing * np.round(self._now["position"][:2] / self._spacing)
             canvas.clear(SKY, bottom=view.horizon)
             canvas.clear(GROUND, top=view.horizon)
         else:
@@ -138,7 +149,7 @@ class Scene:
             corners = n * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
             border = view.segments(corners, np.roll(corners, -1, axis=0))
             canvas.polygon(border.reshape(-1, 2), GROUND)
-        starts, ends = _GRID + shift
+        starts, ends = self._spacing * _GRID + shift
         canvas.segments(view.segments(starts, ends), GRID)
         origin = np.zeros((2, 3))
         tips = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -299,7 +310,7 @@ class Scene:
             return
         view, canvas = self._view, self._canvas
         if self._flight.estimated:
-            scale = ellipsoid_scale(self._flight)
+            scale = ellipsoid_scale(self._flight) if self._magnified else 1.0
             axes = scale * ellipsoid_axes(self._now["covariance"][:3, :3], SIGMAS)
             outline = ellipsoid_outline(believed, axes, view)
             canvas.polygon(outline, VERMILLION, 0.16)

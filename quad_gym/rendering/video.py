@@ -76,8 +76,8 @@ def flight_of(
     return recorder.flight
 
 
-def _times(flight: Flight, fps: float, speed: float) -> NDArray[np.float64]:
-    end = float(flight["time"][-1])
+def times_of(end: float, fps: float, speed: float) -> NDArray[np.float64]:
+    """When the pictures of a video are taken [s], the end among them."""
     return np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
 
 
@@ -113,7 +113,7 @@ def save_video(
     check.positive("fps", fps)
     check.positive("speed", speed)
     renderer = Renderer(view, checked_size(size))
-    times: Iterable[float] = _times(flight, fps, speed)
+    times: Iterable[float] = times_of(float(flight["time"][-1]), fps, speed)
     frames = (renderer.draw(flight.until(t)) for t in (progress(times) if progress else times))
     write_frames(frames, target, fps=fps)
     return target
@@ -179,13 +179,22 @@ def checked_video_path(path: Path | str) -> Path:
     return target
 
 
-def write_frames(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> None:
-    """Write pictures (height, width, 3) of one size as a video, by the file's ending."""
+def write_frames(
+    frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, lossless: bool = False
+) -> None:
+    """Write pictures (height, width, 3) of one size as a video, by the file's ending.
+
+    Args:
+        frames: The pictures.
+        path: Of the file; missing folders are made.
+        fps: Pictures a second.
+        lossless: Of WebP: keep every pixel. Where most of the picture rests that takes less room.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".mp4":
         _write_mp4(iter(frames), path, fps)
     else:
-        _write_animation(frames, path, fps)
+        _write_animation(frames, path, fps, lossless)
 
 
 def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
@@ -210,12 +219,15 @@ def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> N
         writer.close()
 
 
-def _write_animation(frames: Iterable[NDArray[np.uint8]], path: Path, fps: float) -> None:
+def _write_animation(
+    frames: Iterable[NDArray[np.uint8]], path: Path, fps: float, lossless: bool
+) -> None:
     from PIL import Image
 
     pictures = [Image.fromarray(frame) for frame in frames]
     if path.suffix.lower() == ".webp":
         options: dict[str, Any] = {"quality": 70, "method": 4, "minimize_size": False}
+        options["lossless"] = lossless
     else:
         # one palette for all, so that colors do not flicker
         palette = pictures[len(pictures) // 2].quantize(128, dither=Image.Dither.NONE)

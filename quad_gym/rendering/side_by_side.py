@@ -1,0 +1,307 @@
+"""Flights side by side: the same episode, flown by different policies, as one film."""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.flights.record import Flight
+from quad_gym.params import checks as check
+from quad_gym.rendering.canvas import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT_BLUE,
+    PURPLE,
+    VERMILLION,
+    WHITE,
+    Canvas,
+    Color,
+)
+from quad_gym.rendering.geometry import View, course_view, fixed_view
+from quad_gym.rendering.history import History
+from quad_gym.rendering.inset import Inset, inset_box
+from quad_gym.rendering.renderer import active_faults
+from quad_gym.rendering.scene import Scene
+from quad_gym.rendering.strip import Box
+from quad_gym.rendering.video import Progress, checked_video_path, times_of, write_frames
+from quad_gym.rotations import quaternion_to_dcm
+
+Floats = NDArray[np.float64]
+
+SIDE = (480, 440)
+"""Width and height of one flight [pixels]."""
+HOLD = 1.5
+"""How long the last picture stays [s], so that one can read how both flights ended."""
+
+COURSE_GRID = 4.0
+"""Between the lines on the ground along a course [m]: closer ones, which pass, double a film."""
+
+_BAND, _PLOT = 50.0, 118.0
+"""Heights above and below the scene [pixels]."""
+_TEXT, _SMALL = 19, 17
+_TINTS: tuple[Color, ...] = ((228, 230, 234), (214, 236, 229))
+"""Grounds of the labels, in turn."""
+WEDGE = 2.5
+"""How far the camera's field of view is drawn [m]."""
+_SHOWN = 9.0
+"""Positions farther from the start along an axis need not be seen by a fixed view [m]."""
+_FAR = 30.0
+"""Vehicles with fewer pixels per meter are marked by a disc, as little is seen of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the flights.
+
+    Args:
+        flight: From its start to its ending.
+        label: Who flies, for people.
+        ending: How it ended, for people, such as "collision".
+        crashed: Whether that was a crash.
+        course: Of a course, what is passed and how many there are, such as ("gates", 8).
+    """
+
+    flight: Flight
+    label: str
+    ending: str
+    crashed: bool
+    course: tuple[str, int] | None = None
+
+    @property
+    def end(self) -> float:
+        """When it ended [s]."""
+        return float(self.flight["time"][-1])
+
+    def last_words(self) -> str:
+        """What is to be said once it is over."""
+        words = self.ending.replace("_", " ")
+        if self.crashed:
+            return f"crashed at {self.end:.1f} s: {words}"
+        return f"ended at {self.end:.1f} s: {words}"
+
+
+class SideBySide:
+    """Draws flights of one episode beside each other; those that are over stay as they ended.
+
+    Args:
+        sides: The flights, from left to right.
+
+    Raises:
+        ValueError: If there is none, or no filter ran.
+        ImportError: If pygame is not installed.
+    """
+
+    def __init__(self, sides: Sequence[Side]) -> None:
+        if not sides:
+            raise ValueError("sides must be at least one, got none")
+        for side in sides:
+            if not side.flight.estimated:
+                raise ValueError(f"sides must have an estimate, {side.label!r} has none")
+        self.sides = tuple(sides)
+        self.end = max(side.end for side in sides)
+        paths = [s.flight[c] for s in sides for c in ("position", "estimated_position")]
+        points = np.concatenate(paths)
+        near = points[np.abs(points - sides[0].flight["position"][0]).max(axis=1) < _SHOWN]
+        self._halves = [
+            _Half(side, self.end, near, _TINTS[k % len(_TINTS)]) for k, side in enumerate(sides)
+        ]
+
+    def draw(self, time: float) -> NDArray[np.uint8]:
+        """The picture at a time [s], (height, width, 3) red, green, blue."""
+        parts = [half.draw(time) for half in self._halves]
+        for part in parts[1:]:
+            part[:, :2] = GREY
+        return np.concatenate(parts, axis=1)
+
+
+class _Half:
+    """Draws one of the flights: who flies, the scene, and the errors over the whole episode."""
+
+    def __init__(self, side: Side, end: float, points: Floats, tint: Color) -> None:
+        self._side, self._points, self._tint = side, points, tint
+        width, height = SIDE
+        self._canvas = Canvas(width, height)
+        self._scene = Box(0.0, _BAND, width, height - _BAND - _PLOT)
+        plot = Box(0.0, height - _PLOT, width, _PLOT)
+        self._history = History(self._canvas, plot, side.flight, end, _SMALL, side.course)
+        self._fixed: View | None = None
+
+    def draw(self, time: float) -> NDArray[np.uint8]:
+        """The picture at a time [s]."""
+        canvas, box, width = self._canvas, self._scene, SIDE[0]
+        flight = self._side.flight.until(time)
+        view = self._view(flight)
+        canvas.clear(WHITE)
+        canvas.inside((box.left, box.top, box.width, box.height))
+        scene = Scene(
+            *(canvas, flight, view, self._moves),
+            magnified=False,
+            spacing=COURSE_GRID if self._moves else 1.0,
+        )
+        scene.draw_background()
+        labels = scene.draw()
+        self._mark(flight, view)
+        inset = None
+        if flight.stage.has_camera and self._side.course is None:
+            self._wedge(flight, view)
+            inset = Inset(canvas, inset_box(flight.stage, width - 8.0, box.top + 8.0, 118.0), 15)
+            inset.draw(flight)
+        canvas.inside(None)
+        canvas.box(0.0, 0.0, width, _BAND, self._tint)
+        self._history.draw(flight)
+        canvas.finish()
+        for words, at, color in labels:
+            inside = box.top < at[1] < box.top + box.height - canvas.line_height(15)
+            if np.isfinite(at).all() and inside:
+                canvas.text(words, at[0], at[1], 15, color, 0.5)
+        if inset is not None:
+            inset.write(flight)
+        self._write_label(flight)
+        self._write_legend(flight)
+        self._history.write(flight)
+        if time > self._side.end - 1e-9:
+            self._write_end()
+        return canvas.pixels()
+
+    @property
+    def _moves(self) -> bool:
+        """Whether the view goes along, as a course of obstacles is too long for one picture."""
+        return len(self._side.flight.stage.obstacles) > 0
+
+    def _view(self, flight: Flight) -> View:
+        box = self._scene
+        if self._moves:
+            view = course_view(flight, box.width, box.height)
+        elif self._fixed is None:
+            high = box.height - 34.0  # what ends the flight is written below
+            view = self._fixed = fixed_view(flight, box.width, high, self._points)
+        else:
+            view = self._fixed
+        return dataclasses.replace(view, center=view.center + np.array([0.0, box.top]))
+
+    def _mark(self, flight: Flight, view: View) -> None:
+        """Mark truth and estimate where they are small."""
+        now = flight.rows[-1]
+        if view.scale_at(np.array(now["position"])) < _FAR:
+            self._canvas.disc(view.project(now["estimated_position"])[0], 6.0, VERMILLION, 2.0)
+            self._canvas.disc(view.project(now["position"])[0], 4.0, BLUE)
+
+    def _wedge(self, flight: Flight, view: View) -> None:
+        """Draw the level slice of what the camera sees, as far as WEDGE."""
+        now = flight.rows[-1]
+        R_BI = quaternion_to_dcm(now["attitude"])
+        apex, a, b, c, d = flight.stage.frustum_corners(now["position"], R_BI, WEDGE)
+        outline = view.outline(np.stack([apex, (a + d) / 2, (b + c) / 2]))
+        self._canvas.polygon(outline, LIGHT_BLUE, 0.25)
+        self._canvas.line(outline, LIGHT_BLUE, 1.0, closed=True)
+
+    def _write_label(self, flight: Flight) -> None:
+        canvas, width = self._canvas, SIDE[0]
+        clock = f"{flight['time'][-1]:.1f} s"
+        room = width - 24.0 - canvas.width_of("00.0 s", _TEXT)
+        lines = _wrapped(canvas, self._side.label, _TEXT, room)
+        step = canvas.line_height(_TEXT) + 2
+        y = 0.5 * (_BAND - step * len(lines)) + 2.0
+        for line in lines:
+            canvas.text(line, 10.0, y, _TEXT)
+            y += step
+        canvas.text(clock, width - 10.0, 0.5 * (_BAND - step) + 2.0, _TEXT, INK, 1.0)
+
+    def _write_legend(self, flight: Flight) -> None:
+        """What the colors mean, and what is wrong, in the scene's upper left corner."""
+        canvas, stage = self._canvas, flight.stage
+        entries: list[tuple[str, Color]] = [("truth", BLUE), ("estimate, 3 sigma", VERMILLION)]
+        if not self._moves:
+            entries.append(("next gate" if len(stage.gates_I) else "reference", GREEN))
+        if stage.has_gnss:
+            entries.append(("GNSS fix", PURPLE))
+        step = canvas.line_height(_SMALL) + 2
+        top = _BAND + 6.0
+        faults = [f"fault: {name}" for name in active_faults(flight)]
+        widths = [canvas.width_of(words, _SMALL) for words in [w for w, _ in entries] + faults]
+        canvas.veil(6, top, max(widths) + 28, step * (len(entries) + len(faults)) + 4)
+        y = top + 3.0
+        for words, color in entries:
+            if color == PURPLE:
+                canvas.text("x", 14.0, y - 1.0, _SMALL, color)
+            else:
+                canvas.surface.fill(color, (12, round(y + 0.3 * step), 11, 5))
+            canvas.text(words, 28.0, y, _SMALL)
+            y += step
+        for words in faults:
+            canvas.text(words, 12.0, y, _SMALL, VERMILLION)
+            y += step
+
+    def _write_end(self) -> None:
+        """Say across the lower edge of the scene that the flight is over, and how it ended."""
+        canvas, box = self._canvas, self._scene
+        words, height = self._side.last_words(), canvas.line_height(_TEXT) + 8
+        width = canvas.width_of(words, _TEXT) + 24
+        left, top = 0.5 * (box.width - width), box.top + box.height - height - 8.0
+        color = VERMILLION if self._side.crashed else GREEN
+        canvas.surface.fill(color, (round(left), round(top), width, height))
+        canvas.text(words, 0.5 * box.width, top + 4.0, _TEXT, WHITE, 0.5)
+
+
+def _wrapped(canvas: Canvas, words: str, size: int, width: float) -> list[str]:
+    """Words in lines no wider than `width` [pixels]: after commas, or else between any words."""
+    if canvas.width_of(words, size) <= width:
+        return [words]
+    parts = [part + "," for part in words.split(", ")]
+    parts[-1] = parts[-1][:-1]
+    if max(canvas.width_of(part, size) for part in parts) > width:
+        parts = words.split()
+    lines = parts[:1]
+    for part in parts[1:]:
+        longer = f"{lines[-1]} {part}"
+        if canvas.width_of(longer, size) > width:
+            lines.append(part)
+        else:
+            lines[-1] = longer
+    return lines
+
+
+def save_side_by_side(
+    sides: Sequence[Side],
+    path: Path | str,
+    *,
+    fps: float = 12.5,
+    speed: float = 1.0,
+    progress: Progress | None = None,
+) -> Path:
+    """Write flights of one episode as a film, side by side; it ends with the last of them.
+
+    Args:
+        sides: The flights, from left to right.
+        path: Of the file, as `save_video` takes it.
+        fps: Pictures a second.
+        speed: Seconds of flight per second of the film.
+        progress: Wraps the times of the pictures, as `tqdm.tqdm` does.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If an argument is invalid.
+        ImportError: If a library that draws or writes is not installed.
+    """
+    target = checked_video_path(path)
+    check.positive("fps", fps)
+    check.positive("speed", speed)
+    film = SideBySide(sides)
+    times: Iterable[float] = times_of(film.end, fps, speed)
+
+    def frames() -> Iterator[NDArray[np.uint8]]:
+        for time in progress(times) if progress else times:
+            last = film.draw(time)
+            yield last
+        for _ in range(round(HOLD * fps)):
+            yield last
+
+    write_frames(frames(), target, fps=fps, lossless=True)
+    return target
