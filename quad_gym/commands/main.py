@@ -37,7 +37,7 @@ def usage() -> str:
     return (
         f"usage: {PROGRAM} COMMAND [options]\n\ncommands:\n{lines}\n\n"
         f"{PROGRAM} COMMAND --help explains a command.\n"
-        f"{PROGRAM} COMMAND --tyro-print-completion bash|zsh|tcsh prints its completion.\n"
+        f"{PROGRAM} COMMAND --tyro-print-completion bash|zsh prints its completion.\n"
     )
 
 

@@ -44,6 +44,11 @@ REFUSED = [
     ("replay folder", "folder: Is a directory"),
     ("replay binary.npz", "binary.npz must be a table of text (.csv)"),
     ("export text.toml", "policy must be pretrained, or a .npz or .zip file, got 'text.toml'"),
+    (
+        "train --tyro-print-completion fishy",
+        "--tyro-print-completion must be one of bash, zsh, got 'fishy'",
+    ),
+    ("train --tyro-print-completion", "--tyro-print-completion must be one of bash, zsh"),
     ("version extra", "unrecognized options: extra"),
 ]
 
@@ -73,6 +78,13 @@ def test_every_command_refuses_an_unknown_option(command):
     assert done.returncode == 2
     assert done.stderr.startswith("error: unrecognized options: --colour red")
     assert f"(quad-gym {command} --help explains the options)" in done.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completions_are_printed(shell):
+    done = console_commands.run("train", "--tyro-print-completion", shell)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "algorithm" in done.stdout
 
 
 def test_tasks_of_other_commands_are_not_taken_for_misspelt():
