@@ -54,6 +54,8 @@ def told_in_one_line(program: str) -> Iterator[None]:
             raise
         err.seek(0)
         raise refuse(sentence(err.read()), program) from None
+    except ValueError as error:  # of the dataclass, which former versions of tyro let pass
+        raise refuse(str(error), program) from None
     finally:
         os.environ.pop("COLUMNS")
         if columns is not None:
@@ -89,6 +91,7 @@ def sentence(framed: str) -> str:
         return f"{option} must be one of {known}, got {got!r}{did_you_mean(got, choices)}"
     if match := re.fullmatch(r"Missing value for argument '(.*)'. Expected (\d+) values.", told):
         option, count = match.groups()
+        option = option.strip("()',")  # of former versions of tyro
         if not option.startswith("-"):
             return f"{option.upper()} must be given"
         return f"{option} must have {count} value{'s' if count != '1' else ''}, got fewer"

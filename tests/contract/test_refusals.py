@@ -103,6 +103,13 @@ def test_a_width_of_the_terminal_breaks_no_message(monkeypatch):
     assert os.environ["COLUMNS"] == "40"
 
 
+def test_former_versions_of_the_parser_are_understood():
+    told = (
+        "╭─ Missing argument ─╮\n│ Missing value for argument '('--size',)'. Expected 2 values. │"
+    )
+    assert sentence(told) == "--size must have 2 values, got fewer"
+
+
 def test_what_has_no_frame_is_told_as_it_is():
     assert sentence("Something else\n") == "Something else"
 
