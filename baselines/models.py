@@ -1,5 +1,7 @@
 """The untrained models of Stable-Baselines3 that belong to a plan."""
 
+import inspect
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from baselines.plans import Linear, Plan
 from baselines.recipes import Recipe
 from baselines.seeds import first_seed
+from quad_gym.params import checks as check
+
+_OURS = {"self", "policy", "env", "learning_rate", "policy_kwargs", "action_noise"}
+_OURS |= {"seed", "device", "tensorboard_log", "_init_setup_model"}
+"""What `make_model` itself gives to an algorithm, or no recipe may."""
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
@@ -29,7 +36,8 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
     """An untrained model as the plan's recipe has it.
 
     Raises:
-        ValueError: If the algorithm does not know one of the recipe's parameters.
+        ValueError: If the algorithm does not know one of the recipe's parameters, or cannot have
+            its value.
     """
     chosen = plan.recipe
     if chosen.parameters.get("critic_only"):
@@ -37,6 +45,7 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
             "critic_only must be 0 with Stable-Baselines3, whose critics see what the actor sees, "
             f'got {chosen.parameters["critic_only"]}: it needs engine="compiled"'
         )
+    parameters = _checked_parameters(chosen)
     first, last = chosen.learning_rate
     activations = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh, "elu": torch.nn.ELU}
     policy = {
@@ -59,13 +68,40 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
             seed=plan.seed,
             device="cpu",
             tensorboard_log=None if tensorboard is None else str(tensorboard),
-            **chosen.parameters,
+            **parameters,
         )
     except (TypeError, AssertionError) as error:
         raise ValueError(f"recipe does not fit {chosen.algorithm}: {error}") from None
     # the algorithm has seeded the flights with its own seed, and so with those of a test
     env.seed(first_seed("training", plan.seed, chosen.n_envs))
     return model
+
+
+def _checked_parameters(chosen: Recipe) -> dict[str, Any]:
+    """The parameters of a recipe, each a number where the algorithm's default is one.
+
+    Stable-Baselines3 checks few of them, and fails while training.
+    """
+    kind = algorithm_class(chosen.algorithm)
+    known = {k: v for k, v in inspect.signature(kind).parameters.items() if k not in _OURS}
+    check.keywords(chosen.parameters, tuple(known), kind.__name__)
+    found = dict(chosen.parameters)
+    for name, value in found.items():
+        default = known[name].default
+        if callable(value) or isinstance(value, tuple):  # a schedule; a frequency of training
+            continue
+        if isinstance(default, bool):
+            check.flag(name, value)
+        elif name in ("n_steps", "batch_size", "n_epochs", "buffer_size"):
+            found[name] = check.whole(name, value)
+        elif isinstance(default, int):
+            found[name] = check.whole(name, value, least=-1)  # of gradient_steps: as many as steps
+        elif isinstance(default, float):
+            share = name in ("gamma", "gae_lambda", "tau")
+            check.number(name, value, least=0.0 if share else -math.inf)
+            if share and value > 1.0:
+                raise ValueError(f"{name} must be at most 1, got {value!r}")
+    return found
 
 
 def _exploration(chosen: Recipe, env: VecEnv) -> dict[str, Any]:

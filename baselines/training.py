@@ -76,28 +76,48 @@ def train(
         return _train(plan, folder, resume=resume, tensorboard=tensorboard, quiet=quiet)
 
 
+def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
+    """The record of the run that the folder holds, which goes on; None: one begins.
+
+    Args:
+        folder: Where the run is, or will be.
+        plan: What to train.
+        resume: Whether to go on from the folder's last checkpoint.
+
+    Raises:
+        RunError: If it holds a run and `resume` is not set, or holds the run of another plan.
+    """
+    if not has_checkpoint(folder):
+        return None
+    if not resume:
+        raise RunError(
+            f"folder {folder} holds a run already: resume it (--resume), or choose "
+            "another (--output)"
+        )
+    before: dict[str, Any] = json.loads((folder / "training.json").read_text(encoding="utf-8"))
+    described = description(plan)
+    if before["plan"] != described:
+        differing = [k for k in described if before["plan"].get(k) != described[k]]
+        raise RunError(
+            f"folder {folder} holds the run of another plan (different: {', '.join(differing)})"
+        )
+    return before
+
+
 def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: bool) -> Training:
     described = description(plan)
-    if has_checkpoint(folder):
-        if not resume:
-            raise RunError(f"folder {folder} holds a run already: resume it, or choose another")
-        before = json.loads((folder / "training.json").read_text(encoding="utf-8"))
-        if before["plan"] != described:
-            differing = [k for k in described if before["plan"].get(k) != described[k]]
-            raise RunError(
-                f"folder {folder} holds the run of another plan (different: {', '.join(differing)})"
-            )
-        if before["finished"]:
-            return Training(
-                folder,
-                before["steps"],
-                before["training_seconds"],
-                True,
-                before["best"],
-                best_file(plan, folder),
-            )
+    before = run_in(folder, plan, resume=resume)
+    if before is not None and before["finished"]:
+        return Training(
+            folder,
+            before["steps"],
+            before["training_seconds"],
+            True,
+            before["best"],
+            best_file(plan, folder),
+        )
     judge = plan.make_judge()
-    if not has_checkpoint(folder):
+    if before is None:
         begun = {"plan": described, "interface": interface_of(judge), "finished": False}
         _write_record(folder, begun)
     if plan.engine == "compiled":

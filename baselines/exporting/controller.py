@@ -94,6 +94,8 @@ def controller_of(
     if not file.exists():
         meant = check.did_you_mean(policy, ("pretrained", "filter"))
         raise ValueError(f"there is no policy {file}{meant}")
+    if file.suffix not in (".npz", ".zip"):
+        raise ValueError(f"policy must be pretrained, or a .npz or .zip file, got {policy!r}")
     record = _record_of(file)
     plan = record.get("plan", {})
     if env_id is None:

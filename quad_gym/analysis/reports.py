@@ -7,6 +7,7 @@ import math
 import platform
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,10 @@ def short_name(policy: str) -> str:
     return f"{path.parent.name}/{path.stem}".lstrip("/") if path.suffix else policy
 
 
+_made: list[Path] = []
+"""Folders that were made for files to come, each before those in which it is."""
+
+
 def require_writable(option: str, folder: Path) -> None:
     """Make a folder if it is missing, and see that files can be written there.
 
@@ -44,11 +49,20 @@ def require_writable(option: str, folder: Path) -> None:
     Raises:
         OSError: If nothing can be written there.
     """
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _made[:0] = [path.absolute() for path in missing]
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise OSError(f"cannot write to {option} {folder}: {error.strerror}") from None
+
+
+def remove_unused_folders() -> None:
+    """Remove the folders that `require_writable` has made and nothing was written to."""
+    while _made:
+        with suppress(OSError):  # not empty, or gone
+            _made.pop(0).rmdir()
 
 
 def as_json(value: Any) -> Any:

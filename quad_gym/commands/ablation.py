@@ -23,7 +23,7 @@ from tyro.conf import Positional
 from quad_gym import SensorSuite, VehicleParams, WorldParams, sensor_suite, vehicle_params
 from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, measure_consistency
-from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import Episodes, FilterStart, Seed, SuiteName, usage_errors
 from quad_gym.envs.configuration import TASK_DEFAULTS
@@ -272,7 +272,7 @@ def main(args: Args) -> None:
         suite = sensor_suite(args.sensors)
         cases = model_cases(suite) if args.table == "models" else filter_cases(suite)
         batches = [batch_of(case, args, 8, 1) for case in cases]
-        args.output.mkdir(parents=True, exist_ok=True)
+        require_writable("--output", args.output)
     del batches  # they were made to refuse an invalid case before flying any
     rows: dict[str, dict[str, float]] = {}
     for number, case in enumerate(cases, 1):

@@ -344,7 +344,7 @@ def main(args: Args) -> None:
     with usage_errors():
         require_matplotlib()
         batch = batch_of(args)
-        args.folder.mkdir(parents=True, exist_ok=True)
+        require_writable("--output", args.folder)
     began, title = time.monotonic(), title_of(batch, args)
     print(f"{title}; {args.count:,} flights of {args.duration:g} s, {args.task}.\n")
     whole = fly(args, batch)

@@ -21,6 +21,13 @@ from quad_gym.commands.options import Keywords, SuiteName, full_id, refuse_overw
 
 _SUFFIXES = {"c": ".c", "onnx": ".onnx", "json": ".json", "header": ".h"}
 
+_C_KEYWORDS = re.compile(
+    "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|"
+    "inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef|"
+    "union|unsigned|void|volatile|while"
+)
+"""Those of C99 that begin with a letter; no function can have them as its name."""
+
 
 @dataclass(frozen=True)
 class Args:
@@ -104,7 +111,7 @@ def _name(args: Args) -> str:
 def function_name(file: Path) -> str:
     """The name of the C function in a file: its stem, as an identifier."""
     name = re.sub(r"\W", "_", file.stem, flags=re.ASCII)
-    return name if name[:1].isalpha() else f"policy_{name}"
+    return name if name[:1].isalpha() and not _C_KEYWORDS.fullmatch(name) else f"policy_{name}"
 
 
 def export_policy(args: Args, kind: str, file: Path) -> str:

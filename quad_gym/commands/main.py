@@ -4,7 +4,8 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from quad_gym.commands.options import USAGE_ERROR, parse
+from quad_gym.commands.options import parse
+from quad_gym.commands.refusals import INTERRUPTED, USAGE_ERROR
 from quad_gym.params.checks import did_you_mean
 
 COMMANDS = {
@@ -36,7 +37,7 @@ def usage() -> str:
     return (
         f"usage: {PROGRAM} COMMAND [options]\n\ncommands:\n{lines}\n\n"
         f"{PROGRAM} COMMAND --help explains a command.\n"
-        f"{PROGRAM} COMMAND --tyro-print-completion bash|zsh|tcsh prints its completion.\n"
+        f"{PROGRAM} COMMAND --tyro-print-completion bash|zsh prints its completion.\n"
     )
 
 
@@ -66,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(command: str, argv: Sequence[str] | None = None, *, program: str | None = None) -> int:
-    """Parse the options of one command and run it.
+    """Parse the options of one command and run it; Ctrl-C ends it with a word, and code 130.
 
     Args:
         command: One of COMMANDS.
@@ -77,5 +78,22 @@ def run(command: str, argv: Sequence[str] | None = None, *, program: str | None 
         The exit code.
     """
     name = "benchmark.main" if command == "benchmark" else command
-    module = importlib.import_module(f"quad_gym.commands.{name}")
-    return module.main(parse(module.Args, argv, description=module.__doc__, program=program)) or 0
+    try:
+        module = importlib.import_module(f"quad_gym.commands.{name}")
+        args = parse(module.Args, argv, description=module.__doc__, program=program)
+        return module.main(args) or 0
+    except (KeyboardInterrupt, Exception) as error:
+        if not _interrupted(error):
+            raise
+        print("\nStopped by Ctrl-C.", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        if reports := sys.modules.get("quad_gym.analysis.reports"):  # else it has made none
+            reports.remove_unused_folders()
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether an error comes of Ctrl-C: one in a compilation becomes another error."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None

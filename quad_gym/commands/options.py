@@ -6,11 +6,12 @@ custom on Unix.
 """
 
 import ast
+import dataclasses
 import os
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -18,14 +19,15 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from quad_gym.commands.help_texts import registry, wrapped
+from quad_gym.commands.refusals import refuse, told_in_one_line
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
-USAGE_ERROR = 2
-"""Exit code of a program that was called with invalid arguments."""
+SHELLS = ("bash", "zsh")
+"""Those for which tyro makes a completion by itself."""
 
 _Args = TypeVar("_Args")
 
@@ -59,18 +61,48 @@ def parse(
         elif equals or given:
             unnamed.append(value if equals else given.pop(0))
     words = unnamed + words  # first, as an option before them may take any number of words
+    program = program or Path(sys.argv[0]).name
+    asked = bool({"-h", "--help"} & set(words))
     try:
-        if {"-h", "--help"} & set(words):
+        if asked:
             words = ["--help"]  # with others, tyro leaves out what they give
             if description:  # of which it would join the lines, and wrap none
                 print(wrapped(description))
                 description = ""
-        return tyro.cli(
-            kind, args=words, description=description, prog=program, registry=registry()
-        )
+        asked = asked or _completion_asked(words, program)
+        with nullcontext() if asked else told_in_one_line(program):
+            args = tyro.cli(
+                kind, args=words, description=description, prog=program, registry=registry()
+            )
     except BrokenPipeError:  # nobody reads the help to its end, as of `--help | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
+    _require_sound(args, words, program)
+    return args
+
+
+def _completion_asked(words: Sequence[str], program: str) -> bool:
+    """Whether the words ask for a completion; end the program if it is of an unknown shell."""
+    for number, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if option == "--tyro-print-completion":
+            shell = value if equals else "".join(words[number + 1 : number + 2])
+            if shell not in SHELLS:
+                raise refuse(f"{option} must be one of {', '.join(SHELLS)}, got {shell!r}", program)
+            return True
+    return any(word.startswith("--tyro-") for word in words)
+
+
+def _require_sound(args: Any, words: Sequence[str], program: str) -> None:
+    """End the program if an option has what no command takes: nothing, or a negative seed."""
+    former: Mapping[str, str] = getattr(args, "FORMER_NAMES", {})
+    for option in dataclasses.fields(args):
+        name, value = f"--{option.name.replace('_', '-')}", getattr(args, option.name)
+        name = former.get(name) or name
+        if name in words and value in ((), {}):
+            raise refuse(f"{name} must name at least one, got none", program)
+        if name == "--seed" and value < 0:
+            raise refuse(f"{name} must be at least 0, got {value}", program)
 
 
 @contextmanager
@@ -85,9 +117,12 @@ def usage_errors(
     try:
         yield
     except kinds as error:
-        missing = isinstance(error, FileNotFoundError) and error.filename
-        print(f"error: {f'there is no {missing}' if missing else error}", file=sys.stderr)
-        raise SystemExit(USAGE_ERROR) from None
+        told = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            told = f"{error.filename}: {error.strerror}"
+            if isinstance(error, FileNotFoundError):
+                told = f"there is no {error.filename}"
+        raise refuse(told) from None
 
 
 def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[str, Any]:
@@ -156,7 +191,7 @@ def value_of(word: str) -> Any:
     """A value as Python writes numbers, tuples, True and None; else the word itself."""
     try:
         return ast.literal_eval(_WORDS.get(word, word))
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return word
 
 
@@ -170,7 +205,7 @@ def _pairs(words: Sequence[str]) -> dict[str, Any]:
     for word in words:
         key, equals, value = word.partition("=")
         if not (equals and key.isidentifier()):
-            raise ValueError(f"expected KEY=VALUE, got {word!r}")
+            raise ValueError(f"must be KEY=VALUE, got {word!r}")
         found[key] = value_of(value)
     return found
 
@@ -219,9 +254,10 @@ def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
     """
     found, ids = full_id(given), tuple(ids)
     if found not in ids:
+        # a task that is another command's is not misspelt
+        near = () if found in IDS else (*ids, *(IDS[env_id] for env_id in ids))
         raise ValueError(
-            f"{name} must be one of {', '.join(ids)}, got {given!r}"
-            + did_you_mean(given, (*ids, *(IDS[env_id] for env_id in ids)))
+            f"{name} must be one of {', '.join(ids)}, got {given!r}{did_you_mean(given, near)}"
         )
     return found
 

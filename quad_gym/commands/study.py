@@ -118,7 +118,12 @@ def arms_of(args: Args) -> tuple[Arm, ...]:
     if args.arms_file is not None:
         if not args.arms_file.is_file():
             raise ValueError(f"--arms-file must be a Python file, got {args.arms_file}")
-        known = runpy.run_path(str(args.arms_file)).get("ARMS")
+        try:
+            known = runpy.run_path(str(args.arms_file)).get("ARMS")
+        except (SyntaxError, ValueError) as error:
+            raise ValueError(
+                f"--arms-file must be a Python file, got {args.arms_file}: {error}"
+            ) from None
         if not (isinstance(known, tuple) and all(isinstance(arm, Arm) for arm in known)):
             raise ValueError(f"--arms-file {args.arms_file} must have a tuple ARMS of Arm")
         wanted = args.arms or tuple(arm.name for arm in known)

@@ -50,7 +50,7 @@ class Args:
     """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; compiled_ppo is the
     ALGORITHM of the compiled engine"""
     resume: bool = False
-    """go on with the run in the folder"""
+    """go on with the run in the folder, or begin one where there is none"""
     evaluations: int = 20
     """evaluations, and checkpoints, over the run"""
     episodes: int = 100
@@ -75,6 +75,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     """
     from baselines.plans import Plan
     from baselines.recipes import recipe
+    from baselines.training import run_in
     from quad_gym.analysis.reports import require_writable
 
     args = with_full_id(args)
@@ -92,16 +93,17 @@ def configure(args: Args) -> tuple[Any, Path]:
         evaluations=args.evaluations,
         episodes=args.episodes,
     )
-    require_model(plan)
-    plan.make_judge().close()
-    task = IDS[args.env_id]
-    name = "compiled_ppo" if args.engine == "compiled" else args.algorithm
-    folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
-    require_writable("--output", folder)
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
     if args.export is not None and args.algorithm == "recurrent_ppo":
         raise ValueError("--export takes no recurrent_ppo, whose policies have a memory")
+    task = IDS[args.env_id]
+    name = "compiled_ppo" if args.engine == "compiled" else args.algorithm
+    folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
+    run_in(folder, plan, resume=args.resume)
+    plan.make_judge().close()
+    require_model(plan)
+    require_writable("--output", folder)
     return plan, folder
 
 
@@ -124,9 +126,11 @@ def main(args: Args) -> None:
     from_start = time.perf_counter()
     with usage_errors():
         plan, folder = configure(args)
-    from baselines.keeping import RunError
+    from baselines.keeping import RunError, has_checkpoint
     from baselines.training import export, train
 
+    if args.resume and not has_checkpoint(folder):
+        print(f"There is no run to resume in {folder}: one begins.")
     print(
         f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
         f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."

@@ -59,8 +59,11 @@ def _csv_columns(path: Path) -> dict[str, Floats]:
     """The columns of a file; an empty cell is NaN."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.reader(file)
-        names = [name.strip() for name in next(rows, [])]
-        cells = [row for row in rows if row]
+        try:
+            names = [name.strip() for name in next(rows, [])]
+            cells = [row for row in rows if row]
+        except (UnicodeDecodeError, csv.Error):
+            raise ValueError(f"{path.name} must be a table of text (.csv)") from None
     if len(set(names)) < len(names):
         raise ValueError(f"{path.name} must have a name for each column once, got {names}")
     table = np.empty((len(cells), len(names)))

@@ -72,7 +72,7 @@ def test_a_filter_becomes_json_or_a_header(tmp_path, kind, suffix):
         ("export pd QuadGym/Hover-v0", "must be a trained network"),
         ("export pretrained QuadGym/Hover-v1", "must be one of"),
         ("export pretrained QuadGym/Hover-v0 --to json", "--to must be c or onnx for a policy"),
-        ("export pretrained QuadGym/Hover-v0 --to ros", "invalid choice"),
+        ("export pretrained QuadGym/Hover-v0 --to ros", "must be one of"),
         ("export pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
         ("export pretrained QuadGym/Hover-v0 --sensors rtk", "give --env sensors=rtk"),
         ("export pretrained QuadGym/Hover-v0 --env action=motor", "trained with action ctbr"),

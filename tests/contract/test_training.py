@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import quad_gym
+from quad_gym import IDS
 from tests.console import plain
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 
 from baselines.mlp import MlpPolicy, mlp_of  # noqa: E402
-from baselines.models import algorithm_class, make_model  # noqa: E402
+from baselines.models import _checked_parameters, algorithm_class, make_model  # noqa: E402
 from baselines.plans import Plan  # noqa: E402
 from baselines.policies import load_policy  # noqa: E402
 from baselines.recipes import ALGORITHMS, Recipe, recipe  # noqa: E402
@@ -184,10 +185,15 @@ def train_again(folder, steps, where):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--algorithm", "alphago"], "invalid choice"),
+        (["--algorithm", "alphago"], "must be one of"),
         (["--env", "radius=-1"], "radius must be greater than 0"),
         (["--env", "colour=red"], "colour is not a keyword"),
-        (["--set", "momentum=1"], "momentum"),
+        (["--set", "gama=0.9"], "gama is not a keyword of PPO"),
+        (["--set", "gama=0.9"], "did you mean gamma?"),
+        (["--set", "gamma=abc"], "gamma must be a number, got 'abc'"),
+        (["--set", "gamma=1.1"], "gamma must be at most 1, got 1.1"),
+        (["--set", "n_steps=2.5"], "n_steps must be a whole number, got 2.5"),
+        (["--set", "normalize_advantage=3"], "normalize_advantage must be True or False, got 3"),
         (["--steps", "0"], "steps must be at least 1"),
         (["--evaluations", "0"], "evaluations must be at least 1"),
         (["--export", "policy.txt"], "must end in .npz"),
@@ -199,7 +205,24 @@ def test_nonsense_is_refused_before_anything_is_trained(tmp_path, more, message)
     assert done.returncode == 2
     assert message in plain(done.stderr)
     assert "Traceback" not in done.stderr
-    assert not (tmp_path / "run" / "last.zip").exists()
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_parameters_of_every_recipe_pass():
+    for env_id in IDS:
+        for algorithm in ALGORITHMS:
+            chosen = recipe(env_id, algorithm)
+            assert _checked_parameters(chosen) == dict(chosen.parameters)
+
+
+def test_a_run_that_is_not_there_begins_and_says_so(tmp_path):
+    few = ("--steps", 400, "--evaluations", 2, "--no-tensorboard", "--resume")
+    done = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"There is no run to resume in {tmp_path / 'run'}: one begins.\n")
+    again = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
+    assert again.returncode == 0
+    assert "no run to resume" not in again.stdout
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):

@@ -139,7 +139,7 @@ def test_a_file_that_is_not_there_is_named(capsys, tmp_path):
 
 
 def test_what_may_be_left_out_has_the_errors_of_what_it_is(capsys):
-    for line, told in (("--rate x", "--rate: must be a number, got 'x'"), ("--seeds 1.5", "whole")):
+    for line, told in (("--rate x", "--rate must be a number, got 'x'"), ("--seeds 1.5", "whole")):
         with pytest.raises(SystemExit):
             parse(Args, line.split(), program="it")
         message = plain(capsys.readouterr().err)

@@ -29,7 +29,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import arg
 
-from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.benchmark.against import against_table, time_against
 from quad_gym.commands.benchmark.compiling import compile_table, time_compile
@@ -234,7 +234,7 @@ def compare(args: Args) -> list[Row]:
 def main(args: Args) -> None:
     """Run the chosen sections."""
     with usage_errors():
-        args.output.mkdir(parents=True, exist_ok=True)
+        require_writable("--output", args.output)
     cpu = processor()
     print(f"{cpu['model']}, {cpu['cores']} cores for this process.\n")
     sections: dict[str, list[Row]] = {}
