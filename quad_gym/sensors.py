@@ -53,7 +53,7 @@ class GnssReceiver(_Sensor):
         imu = ImuParams(rate=params.rate)
         super().__init__(SensorSuite(imu=imu, gnss=params, camera=None), rng)
         self._drifts, self._paired = params.drifts, params.has_baseline
-        self._turns = self._paired and params.heading_error_sigma > 0.0
+        self._turns = params.heading_errs
         if self._turns:
             single.draw_sensor_errors(self._flight, self._params)
 

@@ -8,7 +8,7 @@ bands at 95 % of the instants, and innovations are white. The truth is the simul
 Prints tables and a verdict, and writes figures (PNG and SVG) and all numbers with the whole
 configuration and the seeds (consistency.json). For example:
 
-  quad-gym consistency                             the suite "rtk"
+  quad-gym consistency                             the suite "standard"
   quad-gym consistency circle --sensors indoor --filter-start warm
   quad-gym consistency --sensors lab                 the report's filter
   quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
@@ -115,7 +115,7 @@ class Args:
     threads: int | None = None
     """threads; if not given, as many as there are cores; results do not depend on it"""
 
-    sensors: SuiteName = "rtk"
+    sensors: SuiteName = "standard"
     form: Literal["suite", "report", "corrected", "mended"] = "suite"
     """form of filter and IMU: as the suite has it, the report's, or with all corrections
     (formerly mended)"""

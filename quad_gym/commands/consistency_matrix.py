@@ -75,7 +75,7 @@ class Cell:
         if self.wrong:
             return {"": self.wrong}
         found, gnss = {}, self.flown.gnss
-        if gnss is not None and gnss.has_baseline and gnss.heading_error_sigma > 0.0:
+        if gnss is not None and gnss.heading_errs:
             found["nis_baseline"] = "counts constant heading errors as noise"
         if self.flown.imu.believed_accel_error > 0.0 and (
             self.task == "waypoints" or "world" in self.keywords

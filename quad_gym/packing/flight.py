@@ -223,8 +223,7 @@ def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
     """Fill the settings' fields of what sensors as they are (`measures`) do wrong."""
     imu, gnss, camera = measures.imu, measures.gnss, measures.camera
     settings["imu_errs"], settings["imu_vibrates"] = imu.errs, imu.vibrates
-    paired = gnss is not None and gnss.has_baseline
-    settings["heading_errs"] = paired and gnss is not None and gnss.heading_error_sigma > 0.0
+    settings["heading_errs"] = gnss is not None and gnss.heading_errs
     if camera is not None:
         settings["camera_limited"] = camera.limited
         settings["camera_blurs"] = camera.exposure > 0.0

@@ -121,6 +121,11 @@ class GnssParams(Checked):
         return any(self.drift_sigma_I)
 
     @property
+    def heading_errs(self) -> bool:
+        """Whether baselines have a constant error, which the filter counts as white noise."""
+        return self.has_baseline and self.heading_error_sigma > 0.0
+
+    @property
     def first_baseline_sigma(self) -> float:
         """Standard deviation of the direction of one baseline [rad]."""
         return math.hypot(self.baseline_sigma, self.heading_error_sigma)

@@ -1,8 +1,15 @@
 """The consistency script: what it writes, and that it finds fault where there is fault."""
 
 import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
 
 import quad_gym
+from quad_gym.analysis.consistency import MeanSquare
+from quad_gym.analysis.consistency_flights import Findings
 from quad_gym.commands import consistency as script
 from quad_gym.commands.options import parse
 from tests import console_commands
@@ -66,3 +73,24 @@ def test_the_former_name_of_the_corrected_form_is_accepted():
         for form in ("corrected", "mended")
     ]
     assert forms[0] == forms[1] != quad_gym.sensor_suite("lab")
+
+
+def test_small_innovations_of_a_constant_error_that_counts_as_noise_are_expected(tmp_path):
+    line = ["--flights", "100", "--duration", "2", "--output", str(tmp_path)]
+    assert console_commands.run("consistency", "--sensors", "rtk", *line).returncode == 0
+    found = json.loads((tmp_path / "consistency.json").read_text())
+    verdicts = found["verdicts"]
+    assert found["overall"]["nis_baseline"] < 0.5
+    expected = {name for name, sentence in verdicts.items() if "Expected" in sentence}
+    assert expected == {"nis_baseline", "innovations_baseline"} & verdicts.keys()
+
+
+@pytest.mark.parametrize(("mean", "consistent"), [(0.1, True), (2.0, True), (2.1, False)])
+def test_innovations_of_a_constant_error_must_not_be_larger_than_claimed(mean, consistent):
+    one = np.ones(4)
+    nees = {"state": MeanSquare("state", 15, one, 15.0 * one, 14.0 * one, 16.0 * one)}
+    nis = {"baseline": MeanSquare("baseline", 2, one, mean * one, 1.9 * one, 2.1 * one)}
+    some: Any = None
+    findings = Findings(nees, nis, {}, one, one, some, one > 2.0, 0, frozenset({"baseline"}))
+    assert findings.consistent == consistent
+    assert not replace(findings, nis={}, failed=1).consistent
