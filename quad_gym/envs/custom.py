@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.envs.spaces import ObservationField, policy_size
+from quad_gym.envs.spaces import PRIVILEGED_NAMES, ObservationField, policy_size
 from quad_gym.tasks.batch import TaskBatch
 from quad_gym.tasks.observing import Part
 from quad_gym.tasks.task import Observed, resolve_task
@@ -48,9 +48,9 @@ def with_task(
         if field.slice.stop <= split and (not task.replaces_observation or field.name in task.keeps)
     )
     rest = tuple(f for f in table if f.slice.start >= split)
-    taken = {field.name for field in (*kept, *rest)} & set(sizes)
+    taken = ({field.name for field in (*kept, *rest)} | PRIVILEGED_NAMES) & set(sizes)
     if taken:
-        raise ValueError(f"observe must not return {taken.pop()!r}, which is the shipped one's")
+        raise ValueError(f"observe must not return {min(taken)!r}, which is the shipped one's")
     described = {name: task.observes.get(name, Observed()) for name in sizes}
     own = [ObservationField(name, slice(0, sizes[name]), *described[name]) for name in sizes]
     parts = {n: Part(sizes[n], described[n].low, described[n].high) for n in sizes}

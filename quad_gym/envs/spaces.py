@@ -82,6 +82,8 @@ _PRIVILEGED: tuple[Part, ...] = (
     ("true_gyro_bias", 3, "rad/s", "B", 10.0),
     ("rotor_speeds", 4, "of hover", "-", 20.0),
 )
+PRIVILEGED_NAMES = frozenset(name for name, *_ in _PRIVILEGED)
+"""By these a table tells its privileged part: no part of a user's task has them."""
 _LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
 _FLAG = 0.0
 """A bound of zero marks a flag, in [0, 1]."""

@@ -249,6 +249,10 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
             "observes has 'b', which observe does not return",
         ),
         ({"observe": lambda v: {"up": v.time}}, "must not return 'up'"),
+        (
+            {"observe": lambda v: {"true_position_error": v.seen.position}},
+            "must not return 'true_position_error'",
+        ),
         ({"observe": lambda v: {}, "replaces_observation": True}, "must return something"),
         ({"replaces_observation": 1}, "replaces_observation of Task must be True or False"),
     ],
