@@ -3,6 +3,7 @@
 import importlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from quad_gym.commands.options import parse
 from quad_gym.commands.refusals import INTERRUPTED, USAGE_ERROR
@@ -23,6 +24,7 @@ COMMANDS = {
     "benchmark": "measure the speed of everything",
     "export": "take a trained policy, or a filter's parameters, to an autopilot: C or ONNX",
     "compile": "compile the kernels ahead of their first use, into the cache",
+    "completion": "print a script that completes commands and options with the Tab key",
     "version": "print the version",
 }
 """Names of commands, with what each does."""
@@ -37,7 +39,6 @@ def usage() -> str:
     return (
         f"usage: {PROGRAM} COMMAND [options]\n\ncommands:\n{lines}\n\n"
         f"{PROGRAM} COMMAND --help explains a command.\n"
-        f"{PROGRAM} COMMAND --tyro-print-completion bash|zsh prints its completion.\n"
     )
 
 
@@ -77,9 +78,8 @@ def run(command: str, argv: Sequence[str] | None = None, *, program: str | None 
     Returns:
         The exit code.
     """
-    name = "benchmark.main" if command == "benchmark" else command
     try:
-        module = importlib.import_module(f"quad_gym.commands.{name}")
+        module = module_of(command)
         args = parse(module.Args, argv, description=module.__doc__, program=program)
         return module.main(args) or 0
     except (KeyboardInterrupt, Exception) as error:
@@ -90,6 +90,12 @@ def run(command: str, argv: Sequence[str] | None = None, *, program: str | None 
     finally:
         if reports := sys.modules.get("quad_gym.analysis.reports"):  # else it has made none
             reports.remove_unused_folders()
+
+
+def module_of(command: str) -> Any:
+    """The module of one of COMMANDS, with its `Args` and its `main`."""
+    name = "benchmark.main" if command == "benchmark" else command
+    return importlib.import_module(f"quad_gym.commands.{name}")
 
 
 def _interrupted(error: BaseException | None) -> bool:

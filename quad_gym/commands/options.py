@@ -26,9 +26,6 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
-SHELLS = ("bash", "zsh")
-"""Those for which tyro makes a completion by itself."""
-
 _Args = TypeVar("_Args")
 
 
@@ -69,7 +66,8 @@ def parse(
             if description:  # of which it would join the lines, and wrap none
                 print(wrapped(description))
                 description = ""
-        asked = asked or _completion_asked(words, program)
+        if any(word.startswith("--tyro-") for word in words):
+            raise refuse("completions of all commands are printed by quad-gym completion", program)
         with nullcontext() if asked else told_in_one_line(program):
             args = tyro.cli(
                 kind, args=words, description=description, prog=program, registry=registry()
@@ -79,18 +77,6 @@ def parse(
         raise SystemExit(1) from None
     _require_sound(args, words, program)
     return args
-
-
-def _completion_asked(words: Sequence[str], program: str) -> bool:
-    """Whether the words ask for a completion; end the program if it is of an unknown shell."""
-    for number, word in enumerate(words):
-        option, equals, value = word.partition("=")
-        if option == "--tyro-print-completion":
-            shell = value if equals else "".join(words[number + 1 : number + 2])
-            if shell not in SHELLS:
-                raise refuse(f"{option} must be one of {', '.join(SHELLS)}, got {shell!r}", program)
-            return True
-    return any(word.startswith("--tyro-") for word in words)
 
 
 def _require_sound(args: Any, words: Sequence[str], program: str) -> None:

@@ -47,11 +47,8 @@ REFUSED = [
     ("replay folder", "folder: Is a directory"),
     ("replay binary.npz", "binary.npz must be a table of text (.csv)"),
     ("export text.toml", "policy must be pretrained, or a .npz or .zip file, got 'text.toml'"),
-    (
-        "train --tyro-print-completion fishy",
-        "--tyro-print-completion must be one of bash, zsh, got 'fishy'",
-    ),
-    ("train --tyro-print-completion", "--tyro-print-completion must be one of bash, zsh"),
+    ("train --tyro-print-completion bash", "are printed by quad-gym completion"),
+    ("completion fish", "must be one of bash, zsh, got 'fish'"),
     ("version extra", "unrecognized options: extra"),
 ]
 
@@ -76,7 +73,7 @@ def test_wrong_options_are_told_in_one_line(line, told, tmp_path):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_refuses_an_unknown_option(command):
-    needed = ["it"] if command in ("export", "replay") else []
+    needed = {"export": ["it"], "replay": ["it"], "completion": ["bash"]}.get(command, [])
     done = console_commands.run(command, *needed, "--colour", "red")
     assert done.returncode == 2
     assert done.stderr.startswith("error: unrecognized options: --colour red")
@@ -85,9 +82,33 @@ def test_every_command_refuses_an_unknown_option(command):
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completions_are_printed(shell):
-    done = console_commands.run("train", "--tyro-print-completion", shell)
+    done = console_commands.run("completion", shell)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "algorithm" in done.stdout
+    assert all(command in done.stdout for command in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("ev", {"evaluate"}),
+        ("fly --pol", {"--policy"}),
+        ("train --algor", {"--algorithm"}),
+        ("fly --algor", set()),
+    ],
+)
+def test_bash_completes_the_options_of_the_command_that_is_typed(typed, meant, tmp_path):
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("there is no bash")
+    (tmp_path / "complete").write_text(console_commands.run("completion", "bash").stdout)
+    words = ["quad-gym", *typed.split()]
+    script = (
+        "source ./complete; "
+        f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; "
+        "$(complete -p quad-gym | sed 's/.*-F \\([^ ]*\\).*/\\1/'); echo ${COMPREPLY[@]}"
+    )
+    done = subprocess.run([bash, "-c", script], capture_output=True, text=True, cwd=tmp_path)
+    assert set(done.stdout.split()) == meant, done.stderr
 
 
 def test_tasks_of_other_commands_are_not_taken_for_misspelt():
