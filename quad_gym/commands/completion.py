@@ -1,9 +1,7 @@
 """Print a script that completes commands and options with the Tab key.
 
-For bash, in ~/.bashrc; for zsh, into a folder of its fpath:
-
-    source <(quad-gym completion bash)
-    quad-gym completion zsh > ~/.zfunc/_quad-gym
+    source <(quad-gym completion bash)   # in ~/.bashrc
+    quad-gym completion zsh              # to be written to _quad-gym in a folder of fpath
 """
 
 from dataclasses import dataclass
