@@ -55,7 +55,8 @@ compare: $(VENV)/.user  ## the comparison of docs/results.md: two sensor suites,
 	$(BIN)/quad-gym compare --engine compiled --sensors standard rtk
 
 study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
-	$(BIN)/quad-gym study look_around --video webp --page docs/where-it-matters.md
+	$(BIN)/quad-gym study look_around --video webp --page docs/where-it-matters.md \
+		--arms pd_reference pd_features pd_unsure truth noisy paid sigma sure asymmetric
 	$(BIN)/quad-gym study --arms-file baselines/arms_misled.py --section misled --episodes 200 \
 		--page docs/where-it-matters.md
 	$(BIN)/quad-gym study stale_race --seeds 5 --episodes 400 --video webp \
@@ -63,7 +64,7 @@ study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
 	$(BIN)/quad-gym study stale_race --arms-file baselines/arms_withheld.py --section withheld \
 		--episodes 400 --page docs/where-it-matters.md
 	$(BIN)/quad-gym study outage_dash --seeds 5 --episodes 400 \
-		--arms pd pd_slow pd_waiting truth sigma truth_on_truth \
+		--arms pd pd_slow pd_waiting truth sigma asymmetric truth_on_truth \
 		--video webp --page docs/where-it-matters.md
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
