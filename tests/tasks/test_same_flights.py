@@ -178,7 +178,9 @@ def test_the_endings_say_why():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize("count", [3, 256])  # NumPy unpickles small arrays and large ones differently
+@pytest.mark.parametrize(
+    "count", [3, 256]
+)  # NumPy unpickles small arrays and large ones differently
 def test_a_copy_flies_on_as_the_original(count, copied):
     env = QuadVectorEnv(count, "hover", custom=Chase(), **SHORT)
     env.reset(seed=4)
