@@ -63,7 +63,8 @@ class State:
         return self._arrays, self._start
 
     def __setstate__(self, state: Any) -> None:
-        super().__setattr__("_arrays", state[0])
+        # larger arrays come out of a pickle as views of its bytes, which cannot be unlocked again
+        super().__setattr__("_arrays", {name: array.copy() for name, array in state[0].items()})
         super().__setattr__("_start", state[1])
         self.lock(True)
 

@@ -178,13 +178,16 @@ def test_the_endings_say_why():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_flies_on_as_the_original(copied):
-    env = QuadVectorEnv(3, "hover", custom=Chase(), **SHORT)
+@pytest.mark.parametrize(
+    "count", [3, 256]
+)  # NumPy unpickles small arrays and large ones differently
+def test_a_copy_flies_on_as_the_original(count, copied):
+    env = QuadVectorEnv(count, "hover", custom=Chase(), **SHORT)
     env.reset(seed=4)
-    for action in actions(3)[:15]:
+    for action in actions(count)[:15]:
         env.step(action)
     other = copied(env)
-    for action in actions(3)[15:]:
+    for action in actions(count)[15:]:
         assert_same(env.step(action), other.step(action))
 
 
