@@ -60,7 +60,7 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
         axes.set_xlim(0.0, max(time[-1] for time, _ in curves.values()))
         axes.set_xlabel("time [s]")
         axes.set_ylabel("position error [m]\nmedian, 5 to 95 % of episodes")
-        _legend_below(figure, axes)
+        legend_below(figure, axes)
     return figure
 
 
@@ -112,7 +112,7 @@ def learning_figure(
         axes.set_xlim(left=0.0)
         axes.set_xlabel(f"training [{unit}]")
         axes.set_ylabel("mean position error [m]")
-        _legend_below(figure, axes)
+        legend_below(figure, axes)
     return figure
 
 
@@ -193,11 +193,17 @@ def _figure(size: tuple[float, float], title: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def _legend_below(figure: Any, axes: Any) -> None:
-    """The legend of a picture under it, where no curve can be."""
+def legend_below(figure: Any, axes: Any) -> None:
+    """The legend of a picture under it, where no curve can be, in as many columns as fit."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     handles, labels = axes.get_legend_handles_labels()
-    ncols = 2 if len(labels) == 4 or max(map(len, labels)) > 30 else min(len(labels), 3)
-    figure.legend(handles, labels, loc="outside lower center", ncols=ncols)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for ncols in (2, 1) if len(labels) == 4 else (3, 2, 1):
+        legend = figure.legend(handles, labels, loc="outside lower center", ncols=ncols)
+        if ncols == 1 or legend.get_window_extent(renderer).width < figure.bbox.width:
+            return
+        legend.remove()
 
 
 def line_styles(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:

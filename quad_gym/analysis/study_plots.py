@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.comparison_plots import draw_seeds, line_styles
+from quad_gym.analysis.comparison_plots import draw_seeds, legend_below, line_styles
 from quad_gym.analysis.plots import (
     BLUE,
     GREEN,
@@ -81,7 +81,7 @@ def returns_figure(
         axes.set_xlim(left=0.0)
         axes.set_xlabel("training [million steps]")
         axes.set_ylabel("return of an episode")
-        figure.legend(loc="outside lower center", ncols=2)
+        legend_below(figure, axes)
     return figure
 
 

@@ -1,7 +1,7 @@
 """Print a script that completes commands and options with the Tab key.
 
-    source <(quad-gym completion bash)   # in ~/.bashrc
-    quad-gym completion zsh              # to be written to _quad-gym in a folder of fpath
+source <(quad-gym completion bash)   # in ~/.bashrc
+quad-gym completion zsh              # to be written to _quad-gym in a folder of fpath
 """
 
 from dataclasses import dataclass

@@ -105,6 +105,26 @@ def test_tune_flies_as_many_candidates_as_it_says(candidates, tmp_path, monkeypa
     assert best == found.flown[int(np.argmin(errors))]
 
 
+@pytest.mark.parametrize("length", [3, 20, 45, 75])
+@pytest.mark.parametrize("count", [2, 4, 9])
+def test_a_legend_is_within_its_figure_and_no_higher_than_needed(count, length):
+    pytest.importorskip("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from quad_gym.analysis.study_plots import returns_figure
+
+    curve = [(np.linspace(0.0, 1.0, 5), np.linspace(0.0, 9.0, 5))]
+    figure = returns_figure({f"{k}".rjust(length, "n"): curve for k in range(count)}, {})
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    (legend,) = figure.legends
+    box = legend.get_window_extent(canvas.get_renderer())
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+    rows = {text.get_window_extent().y0 for text in legend.get_texts()}
+    assert (len(rows) < count) == (length < 45)
+
+
 @pytest.mark.parametrize("points", ["at rest", "moving"])
 def test_no_legend_covers_paths(points):
     """It stands below the pictures; all pictures have one scale; a reference at rest has a mark."""
