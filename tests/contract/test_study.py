@@ -116,7 +116,7 @@ def test_steps_are_told_of_each_algorithm():
         (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
         (["--env", "observation=truth"], "--env must leave observation to --arms"),
         (["--set", "gammma=0.9"], "gammma"),
-        (["--arms", "recurrent", "--set", "clip=0.1"], "recipe does not fit recurrent_ppo"),
+        (["--arms", "recurrent", "--set", "clip=0.1"], "clip is not a keyword of RecurrentPPO"),
         (["--arms", "truth", "--set", "critic_only=3"], "critic_only must count the numbers"),
     ],
 )
