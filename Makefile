@@ -60,7 +60,8 @@ study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
 	$(BIN)/quad-gym study --arms-file baselines/arms_misled.py --section misled --episodes 200 \
 		--page docs/where-it-matters.md
 	$(BIN)/quad-gym study stale_race --seeds 5 --episodes 400 --video webp \
-		--page docs/where-it-matters.md
+		--arms pd truth residual covariance recalling truth_on_truth truth_stamped \
+		covariance_stamped --page docs/where-it-matters.md
 	$(BIN)/quad-gym study stale_race --arms-file baselines/arms_withheld.py --section withheld \
 		--episodes 400 --page docs/where-it-matters.md
 	$(BIN)/quad-gym study outage_dash --seeds 5 --episodes 400 \
