@@ -54,10 +54,8 @@ def test_the_same_seed_gives_the_same_policy_with_any_number_of_threads(tmp_path
     assert_same_policy(tmp_path / "a", tmp_path / "b")
 
 
-@pytest.mark.parametrize("rollouts", [3, 8])
-def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollouts):
-    plan = small_plan()
-    run(plan, tmp_path / "whole")
+def die_after(rollouts, plan, folder, monkeypatch):
+    """Train until a rollout fails."""
     calls = iter(range(10_000))
     roll_out = CompiledPPO._roll_out
 
@@ -69,7 +67,14 @@ def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollout
     with monkeypatch.context() as patch:
         patch.setattr(CompiledPPO, "_roll_out", die)
         with pytest.raises(RuntimeError, match="died"):
-            run(plan, tmp_path / "cut")
+            run(plan, folder)
+
+
+@pytest.mark.parametrize("rollouts", [3, 8])
+def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollouts):
+    plan = small_plan()
+    run(plan, tmp_path / "whole")
+    die_after(rollouts, plan, tmp_path / "cut", monkeypatch)
     assert run(plan, tmp_path / "cut", resume=True).finished
     assert_same_policy(tmp_path / "whole", tmp_path / "cut")
     rows = [(tmp_path / name / "evaluations.csv").read_text() for name in ("whole", "cut")]
@@ -106,18 +111,7 @@ def test_a_policy_whose_critic_saw_the_truth_flies_without_it(tmp_path):
 def test_a_training_with_such_a_critic_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch):
     plan = asymmetric_plan()
     run(plan, tmp_path / "whole")
-    calls = iter(range(10_000))
-    roll_out = CompiledPPO._roll_out
-
-    def die(self):
-        if next(calls) == 5:
-            raise RuntimeError("died")
-        roll_out(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(CompiledPPO, "_roll_out", die)
-        with pytest.raises(RuntimeError, match="died"):
-            run(plan, tmp_path / "cut")
+    die_after(5, plan, tmp_path / "cut", monkeypatch)
     assert run(plan, tmp_path / "cut", resume=True).finished
     assert_same_policy(tmp_path / "whole", tmp_path / "cut")
 

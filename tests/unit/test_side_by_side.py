@@ -48,14 +48,18 @@ def test_a_flight_that_is_over_stays_as_it_ended(sides):
     assert film.draw(film.end).shape == (SIDE[1], 2 * width, 3)
 
 
-def test_words_say_how_a_flight_ended_once_it_is_over(sides, monkeypatch):
-    written = []
+@pytest.fixture
+def written(monkeypatch):
+    """All words that are drawn."""
+    words = []
     write = Canvas.text
     monkeypatch.setattr(
-        Canvas,
-        "text",
-        lambda self, words, *more: written.append(words) or write(self, words, *more),
+        Canvas, "text", lambda self, text, *more: words.append(text) or write(self, text, *more)
     )
+    return words
+
+
+def test_words_say_how_a_flight_ended_once_it_is_over(sides, written):
     film = SideBySide(sides)
     film.draw(sides[0].end - 0.02)
     assert not any("crashed" in words for words in written)
@@ -77,14 +81,7 @@ def test_truth_and_estimate_have_their_colors(sides):
         assert has(half, colors.VERMILLION)
 
 
-def test_a_course_shows_progress_in_place_of_the_error_and_when_gnss_fails(monkeypatch):
-    written = []
-    write = Canvas.text
-    monkeypatch.setattr(
-        Canvas,
-        "text",
-        lambda self, words, *more: written.append(words) or write(self, words, *more),
-    )
+def test_a_course_shows_progress_in_place_of_the_error_and_when_gnss_fails(written):
     side = side_of("OutageDash", 100, course=("gaps", 10))
     failing = side.flight["faults"] > 0
     assert failing.any()  # from a time within 2 to 8 s on
