@@ -73,15 +73,16 @@ class Findings:
 
     def sentences(self) -> dict[str, str]:
         """Verdicts in plain English, by what they are on."""
+        why = " Expected: the filter counts a constant error as noise."
+        known = dict.fromkeys(self.counted_as_noise, why)
         said = {f"nees_{name}": f"NEES of the {verdict(part)}" for name, part in self.nees.items()}
-        said |= {f"nis_{name}": f"NIS of the {verdict(part)}" for name, part in self.nis.items()}
+        for name, part in self.nis.items():
+            said[f"nis_{name}"] = f"NIS of the {verdict(part)}{known.get(name, '')}"
         for name, white in self.whiteness.items():
             largest = f"autocorrelation at most {white.largest:+.3f}"
             judged = "white" if white.white else "not white"
-            said[f"innovations_{name}"] = f"Innovations of the {name}: {largest}: {judged}."
-        for key in said:
-            if key.removeprefix("nis_").removeprefix("innovations_") in self.counted_as_noise:
-                said[key] += " Expected: the filter counts a constant error as noise."
+            told = f"Innovations of the {name}: {largest}: {judged}."
+            said[f"innovations_{name}"] = told + known.get(name, "")
         return said
 
 

@@ -1,7 +1,10 @@
 """Print a script that completes commands and options with the Tab key.
 
-source <(quad-gym completion bash)   # in ~/.bashrc
-quad-gym completion zsh              # to be written to _quad-gym in a folder of fpath
+Put the first line into ~/.bashrc; for zsh, write what the second prints to a file _quad-gym in a
+folder of fpath:
+
+  source <(quad-gym completion bash)
+  quad-gym completion zsh
 """
 
 from dataclasses import dataclass

@@ -36,7 +36,6 @@ from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import EnvId, Keywords, leave, one_of, usage_errors, with_full_id
-from quad_gym.commands.study_films import require_film, write_film
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
@@ -179,6 +178,8 @@ def configure(args: Args) -> Study:
             plan.make_judge().close()
         test_flights(study, arm, 1).close()
     if args.video != "none":
+        from quad_gym.commands.study_films import require_film
+
         require_film(study, args.video, for_page=args.page is not None)
     if args.page is not None:
         marks_of(args.page, name)
@@ -292,6 +293,8 @@ def main(args: Args) -> None:
         print(sentence)
     film = None
     if args.video != "none":
+        from quad_gym.commands.study_films import write_film
+
         film = write_film(results, args.video, partial(test_flights, study))
     written = write_report(results, film)
     if args.page is not None:

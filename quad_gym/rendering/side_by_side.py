@@ -1,7 +1,7 @@
 """Flights side by side: the same episode, flown by different policies, as one film."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.flights.record import Flight
-from quad_gym.params import checks as check
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,
@@ -291,13 +290,11 @@ def save_side_by_side(
         ImportError: If a library that draws or writes is not installed.
     """
     target = checked_video_path(path)
-    check.positive("fps", fps)
-    check.positive("speed", speed)
     film = SideBySide(sides)
-    times: Iterable[float] = times_of(film.end, fps, speed)
+    times = times_of(film.end, fps, speed, progress)
 
     def frames() -> Iterator[NDArray[np.uint8]]:
-        for time in progress(times) if progress else times:
+        for time in times:
             last = film.draw(time)
             yield last
         for _ in range(round(HOLD * fps)):

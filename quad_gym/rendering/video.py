@@ -76,9 +76,18 @@ def flight_of(
     return recorder.flight
 
 
-def times_of(end: float, fps: float, speed: float) -> NDArray[np.float64]:
-    """When the pictures of a video are taken [s], the end among them."""
-    return np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
+def times_of(
+    end: float, fps: float, speed: float, progress: Progress | None = None
+) -> Iterable[float]:
+    """When the pictures of a video are taken [s], the end among them.
+
+    Raises:
+        ValueError: If `fps` or `speed` is not positive.
+    """
+    check.positive("fps", fps)
+    check.positive("speed", speed)
+    times = np.append(np.arange(0.0, end - 1e-9, speed / fps), end)
+    return progress(times) if progress else times
 
 
 def save_video(
@@ -110,11 +119,9 @@ def save_video(
         ImportError: If a library that writes the file is not installed.
     """
     target = checked_video_path(path)
-    check.positive("fps", fps)
-    check.positive("speed", speed)
+    times = times_of(float(flight["time"][-1]), fps, speed, progress)
     renderer = Renderer(view, checked_size(size))
-    times: Iterable[float] = times_of(float(flight["time"][-1]), fps, speed)
-    frames = (renderer.draw(flight.until(t)) for t in (progress(times) if progress else times))
+    frames = (renderer.draw(flight.until(t)) for t in times)
     write_frames(frames, target, fps=fps)
     return target
 

@@ -7,7 +7,7 @@ from collections import defaultdict
 import pytest
 
 from quad_gym.commands import compare, consistency, evaluate, fly, study, train
-from quad_gym.commands.main import COMMANDS, main
+from quad_gym.commands.main import COMMANDS, main, module_of
 from quad_gym.commands.options import parse
 
 FORMER = {
@@ -101,3 +101,16 @@ def test_ids_may_be_short():
         assert parse(args_of(command), ["hover"]).env_id == "QuadGym/Hover-v0"
         assert parse(args_of(command), ["QuadGym/Hover-v0"]).env_id == "QuadGym/Hover-v0"
         assert parse(args_of(command), ["Mine/Task-v0"]).env_id == "Mine/Task-v0"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_examples_as_they_are_written(command, capsys):
+    examples = [
+        line.strip()
+        for line in (module_of(command).__doc__ or "").splitlines()
+        if line.strip().startswith(("quad-gym ", "source "))
+    ]
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    shown = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert [line for line in examples if line not in shown] == []
