@@ -25,7 +25,14 @@ from quad_gym.analysis.consistency import PARTS
 from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, measure_consistency
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import Episodes, FilterStart, Seed, SuiteName, usage_errors
+from quad_gym.commands.options import (
+    Episodes,
+    FilterStart,
+    Seed,
+    SuiteName,
+    require_at_least,
+    usage_errors,
+)
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.params.checks import Vector
 from quad_gym.params.world import world_params
@@ -62,8 +69,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.flights < 2:
-            raise ValueError(f"--episodes must be at least 2, got {self.flights}")
+        require_at_least(self, flights=2, threads=1)
         least = SETTLED + 0.1
         if not (math.isfinite(self.duration) and self.duration >= least):
             raise ValueError(f"--duration must be at least {least:g} s, got {self.duration:g}")

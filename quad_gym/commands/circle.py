@@ -37,7 +37,7 @@ from quad_gym.analysis.metrics import (
 from quad_gym.analysis.recording import Recording, record_flights
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import Episodes, Seed, usage_errors
+from quad_gym.commands.options import Episodes, Seed, require_at_least, usage_errors
 from quad_gym.records import Source
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
@@ -114,10 +114,7 @@ def configure(args: Args) -> Setup:
         OSError: If nothing can be written to the output folder.
         ImportError: If matplotlib or tqdm is missing.
     """
-    checked = (("episodes", args.seeds, 1), ("seed", args.first_seed, 0))
-    for name, value, least in (*checked, ("threads", args.threads, 1)):
-        if value is not None and value < least:
-            raise ValueError(f"--{name} must be at least {least}, got {value}")
+    require_at_least(args, seeds=1, first_seed=0, threads=1)
     if args.camera_rate is not None and not args.camera:
         raise ValueError("--camera-rate has no meaning with --no-camera")
     task = TaskParams(

@@ -47,6 +47,7 @@ from quad_gym.commands.options import (
     SuiteNames,
     TrackingId,
     leave,
+    require_at_least,
     usage_errors,
     with_full_id,
 )
@@ -111,11 +112,7 @@ def configure(args: Args) -> Setting:
 
     plots.require_matplotlib()
     args = with_full_id(args, TRACKING)
-    for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    if args.jobs is not None and args.jobs < 1:
-        raise ValueError(f"--jobs must be at least 1, got {args.jobs}")
+    require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)
     for source in args.train_on:
         check.choice("--train-on", source, SOURCES)
     leave(args.env, {"observation": "--train-on", "sensors": "--sensors", "threads": "--jobs"})

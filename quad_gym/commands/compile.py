@@ -22,6 +22,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import arg
 
+from quad_gym.commands.options import require_at_least
+
 Kind = Literal["plain", "truth", "single", "all"]
 
 
@@ -42,8 +44,7 @@ class Args:
         """Check that there is something to compile, and someone who does it."""
         if not self.stages:
             raise ValueError("--stages must name at least one, got none")
-        if self.processes is not None and self.processes < 1:
-            raise ValueError(f"--jobs must be at least 1, got {self.processes}")
+        require_at_least(self, processes=1)
 
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:

@@ -61,6 +61,7 @@ from quad_gym.commands.options import (
     SuiteName,
     TrackingId,
     known_id,
+    require_at_least,
     usage_errors,
 )
 from quad_gym.envs import IDS
@@ -158,8 +159,7 @@ class Args:
             folder = "consistency_matrix" if self.matrix else "consistency"
             folder = "consistency_recovery" if self.recovery else folder
             object.__setattr__(self, "output", Path("results") / folder)
-        if self.count < 2:
-            raise ValueError(f"--episodes must be at least 2, got {self.flights}")
+        require_at_least(self, flights=2, threads=1)
         object.__setattr__(self, "env_id", known_id("ENV_ID", self.env_id, TRACKING))
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")

@@ -37,6 +37,7 @@ from quad_gym.commands.options import (
     free_folder,
     leave,
     refuse_overwriting,
+    require_at_least,
     sensors_of,
     usage_errors,
     with_full_id,
@@ -90,9 +91,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
         ImportError: If a package is missing.
     """
     args = with_full_id(args)
-    for name, least in (("episodes", 1), ("seed", 0)):
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    require_at_least(args, episodes=1, seed=0, threads=1)
     if not args.observation:
         raise ValueError("--observation must name at least one, got none")
     if args.policy == ():

@@ -81,14 +81,34 @@ def parse(
 
 def _require_sound(args: Any, words: Sequence[str], program: str) -> None:
     """End the program if an option has what no command takes: nothing, or a negative seed."""
-    former: Mapping[str, str] = getattr(args, "FORMER_NAMES", {})
     for option in dataclasses.fields(args):
-        name, value = f"--{option.name.replace('_', '-')}", getattr(args, option.name)
-        name = former.get(name) or name
+        name, value = option_name(args, option.name), getattr(args, option.name)
         if name in words and value in ((), {}):
             raise refuse(f"{name} must name at least one, got none", program)
         if name == "--seed" and value < 0:
             raise refuse(f"{name} must be at least 0, got {value}", program)
+
+
+def option_name(args: Any, field: str) -> str:
+    """How the option is written that a field of a dataclass declares."""
+    name = f"--{field.replace('_', '-')}"
+    return getattr(args, "FORMER_NAMES", {}).get(name) or name
+
+
+def require_at_least(args: Any, **least: int) -> None:
+    """Refuse numbers that are too small; options that were not given, None, pass.
+
+    Args:
+        args: The dataclass of options.
+        least: The smallest number that each of these fields may have.
+
+    Raises:
+        ValueError: If one is smaller.
+    """
+    for field, limit in least.items():
+        value = getattr(args, field)
+        if value is not None and value < limit:
+            raise ValueError(f"{option_name(args, field)} must be at least {limit}, got {value}")
 
 
 @contextmanager

@@ -35,7 +35,15 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import require_writable
-from quad_gym.commands.options import EnvId, Keywords, leave, one_of, usage_errors, with_full_id
+from quad_gym.commands.options import (
+    EnvId,
+    Keywords,
+    leave,
+    one_of,
+    require_at_least,
+    usage_errors,
+    with_full_id,
+)
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
 from quad_gym.commands.study_results import Study
@@ -152,9 +160,7 @@ def configure(args: Args) -> Study:
     plots.require_matplotlib()
     args = with_full_id(args, STUDIED_IDS)
     about = studied(args)
-    for name, least in (("seeds", 1), ("episodes", 2), ("seed", 0)):
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
+    require_at_least(args, seeds=1, episodes=2, seed=0, threads=1)
     leave(args.env, {"observation": "--arms", "threads": "--threads"})
     arms = arms_of(args)
     task = IDS[args.env_id]

@@ -20,8 +20,14 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from quad_gym import IDS
-from quad_gym.commands.options import Keywords, full_id, leave, usage_errors, value_of
-from quad_gym.params import checks as check
+from quad_gym.commands.options import (
+    Keywords,
+    full_id,
+    leave,
+    require_at_least,
+    usage_errors,
+    value_of,
+)
 
 
 @dataclass(frozen=True)
@@ -80,13 +86,9 @@ def configure(args: Args) -> tuple[list[Any], Path]:
         OSError: If the file cannot be read.
         ImportError: If a package is missing.
     """
-    from quad_gym.batch.threads import resolve_threads
     from quad_gym.commands.sweep_plan import expand, read
 
-    check.whole("--retries", args.retries, least=0)
-    resolve_threads(args.threads)
-    if args.jobs is not None:
-        check.whole("--jobs", args.jobs)
+    require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1, retries=0)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], {"threads": "--threads"})
     name = IDS.get(full_id(given["env_ids"][0]), "") if given.get("env_ids") else "circle"

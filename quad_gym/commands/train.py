@@ -21,7 +21,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import IDS
-from quad_gym.commands.options import EnvId, Keywords, flying_options, usage_errors, with_full_id
+from quad_gym.commands.options import (
+    EnvId,
+    Keywords,
+    flying_options,
+    require_at_least,
+    usage_errors,
+    with_full_id,
+)
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     from quad_gym.analysis.reports import require_writable
 
     args = with_full_id(args)
+    require_at_least(args, steps=1, n_envs=1, evaluations=1, episodes=1, threads=1, seed=0)
     chosen = recipe(args.env_id, args.algorithm)
     given = {"steps": args.steps, "n_envs": args.n_envs}
     chosen = chosen.replace(**{k: v for k, v in given.items() if v is not None})

@@ -39,6 +39,7 @@ from quad_gym.commands.options import (
     leave,
     one_of,
     refuse_overwriting,
+    require_at_least,
     usage_errors,
 )
 from quad_gym.evaluation import roll_out
@@ -199,10 +200,7 @@ def configure(args: Args) -> Search:
     """
     for env_id in args.env_ids:
         known_id("--env-ids", env_id, TRACKING)
-    for name, least in (("candidates", 1), ("episodes", 1), ("fresh_episodes", 2), ("seed", 0)):
-        if getattr(args, name) < least:
-            option_name = name.replace("_", "-")
-            raise ValueError(f"--{option_name} must be at least {least}, got {getattr(args, name)}")
+    require_at_least(args, candidates=1, episodes=1, fresh_episodes=2, seed=0, threads=1)
     names = ("observation", "sensors", "threads")
     leave(args.env, {name: f"--{name}" for name in names})
     refuse_overwriting(args.output / "gains.json", args.overwrite)

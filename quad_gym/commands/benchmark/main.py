@@ -41,7 +41,7 @@ from quad_gym.commands.benchmark.own_task import own_task_table, time_own_task
 from quad_gym.commands.benchmark.rendering import rendering_table, time_rendering
 from quad_gym.commands.benchmark.stages import tick_table, time_tick
 from quad_gym.commands.benchmark.timing import Effort, Row
-from quad_gym.commands.options import usage_errors
+from quad_gym.commands.options import require_at_least, usage_errors
 from quad_gym.envs.spaces import layout_bounds, observation_layout
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.records import WIDTH
@@ -93,11 +93,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        for name in ("batch", "envs", "repeats", "seeds", "steps", "threads"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                option = {"envs": "n-envs"}.get(name, name)
-                raise ValueError(f"--{option} must be at least 1, got {value}")
+        require_at_least(self, batch=1, envs=1, repeats=1, seeds=1, steps=1, threads=1)
         if self.batch % WIDTH:
             raise ValueError(f"--batch must be a multiple of {WIDTH}, got {self.batch}")
         if self.against is not None and not (self.against / "quad_gym" / "__init__.py").is_file():
