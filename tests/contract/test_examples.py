@@ -1,0 +1,52 @@
+"""Scripts of the documentation that need no package beyond those for training."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+from quad_gym.evaluation import roll_out
+
+SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "sb3_defaults.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    pytest.importorskip("stable_baselines3")
+    spec = importlib.util.spec_from_file_location("sb3_defaults", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["sb3_defaults"] = module  # where dataclasses look for it
+    spec.loader.exec_module(module)
+    return module
+
+
+def evaluations(text):
+    """Steps and errors, of the lines that the script prints."""
+    found = re.findall(r"^([\d,]+) steps: mean error ([\d.]+) m, [\d.]+% of 4", text, re.MULTILINE)
+    return {int(steps.replace(",", "")): error for steps, error in found}
+
+
+@pytest.mark.parametrize(("algorithm", "steps"), [("sac", 130), ("ppo", 2048)])
+def test_the_defaults_of_stable_baselines_are_evaluated_as_they_learn(
+    script, algorithm, steps, tmp_path, capsys
+):
+    file = tmp_path / "policy.zip"
+    args = script.Args(algorithm=algorithm, total_timesteps=130, num_envs=1, every=100, evaluate=4)
+    args.save = file
+    script.main(args)
+    found = evaluations(capsys.readouterr().out)
+    assert found.keys() >= {100, steps}
+    kept = script.CLASSES[algorithm].load(file)
+    flown = roll_out(kept, gymnasium.make_vec(args.env_id, num_envs=4), seed=0)
+    assert found[steps] == f"{flown.mean_error.mean():.4f}"
+
+
+def test_evaluations_change_nothing_that_is_learned(script, capsys):
+    options = {"algorithm": "sac", "total_timesteps": 160, "evaluate": 4}
+    for every in (20, 160):
+        script.main(script.Args(**options, every=every))
+    often, once = capsys.readouterr().out.split("160 steps:")[1:]
+    assert often.splitlines()[0] == once.splitlines()[0]
