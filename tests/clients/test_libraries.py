@@ -3,9 +3,7 @@
 Most need the packages of the extra `clients`, and are skipped without: `make test-clients`.
 """
 
-import importlib.util
-import sys
-from pathlib import Path
+import importlib
 
 import gymnasium
 import numpy as np
@@ -14,8 +12,8 @@ import pytest
 import quad_gym
 from baselines import PDPolicy
 from quad_gym.envs.vector import QuadVectorEnv
+from tests.examples import example
 
-SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "cleanrl_ppo.py"
 SHORT = {"max_episode_steps": 20}
 
 
@@ -23,11 +21,7 @@ SHORT = {"max_episode_steps": 20}
 def cleanrl():
     """The script in the style of CleanRL, as a module."""
     pytest.importorskip("torch")
-    spec = importlib.util.spec_from_file_location("cleanrl_ppo", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["cleanrl_ppo"] = module  # where dataclasses look for it
-    spec.loader.exec_module(module)
-    return module
+    return example("cleanrl_ppo")
 
 
 def test_the_script_of_cleanrl_trains_evaluates_and_saves(cleanrl, tmp_path, capsys):

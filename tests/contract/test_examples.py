@@ -1,26 +1,18 @@
 """Scripts of the documentation that need no package beyond those for training."""
 
-import importlib.util
 import re
-import sys
-from pathlib import Path
 
 import gymnasium
 import pytest
 
 from quad_gym.evaluation import roll_out
-
-SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "sb3_defaults.py"
+from tests.examples import example
 
 
 @pytest.fixture(scope="module")
 def script():
     pytest.importorskip("stable_baselines3")
-    spec = importlib.util.spec_from_file_location("sb3_defaults", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["sb3_defaults"] = module  # where dataclasses look for it
-    spec.loader.exec_module(module)
-    return module
+    return example("sb3_defaults")
 
 
 def evaluations(text):
