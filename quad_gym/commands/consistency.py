@@ -61,6 +61,7 @@ from quad_gym.commands.options import (
     SuiteName,
     TrackingId,
     known_id,
+    option_name,
     require_at_least,
     usage_errors,
 )
@@ -170,7 +171,7 @@ class Args:
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"--{name.replace('_', '-')} must be above 0, got {value}")
+                raise ValueError(f"{option_name(self, name)} must be above 0, got {value}")
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
 
