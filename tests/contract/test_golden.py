@@ -48,3 +48,17 @@ def test_they_do_not_depend_on_the_number_of_lanes(lanes):
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_they_do_not_depend_on_the_processor_that_numpy_computes_for():
+    """NumPy's linear algebra rounds as its code for the processor does; flights must not."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.golden.flights"],
+        cwd=Path(__file__).parents[2],
+        env=os.environ | {"OPENBLAS_CORETYPE": "Prescott"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

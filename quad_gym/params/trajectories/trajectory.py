@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
+from quad_gym.params import portable
 from quad_gym.params.checks import Checked, Vector
 from quad_gym.params.vehicle import VehicleParams
 
@@ -329,7 +330,7 @@ class Trajectory(Checked):
             # the end's own, unless it is at rest there but for rounding
             for time, least in ((inner, 1e-10), (end, 1e-4)):
                 velocity = self._polynomials(0, 2)(time, 1)
-                speed = float(np.linalg.norm(velocity))
+                speed = portable.norm(velocity)  # BLAS would round it by the processor
                 if speed > least:
                     found[row] = velocity / speed
         return found
