@@ -39,8 +39,8 @@ def check_standing(
     lower, upper = (max(float(ends[column]), 0.0) for ends in (draws.low, draws.high))
     for low, high in _reference_heights(task):
         above, below = standing + lower - high, low - (standing + upper)
-        # a hovering start is near the reference, unless the ground lifts it
-        distance = above if task.start == "hover" else max(above, below)
+        # a start in the air is near the reference, unless the ground lifts it
+        distance = max(above, below) if task.may_start_on_ground else above
         if distance > task.out_of_bounds:
             begins = f"{low:g}" if low == high else f"{low:g} to {high:g}"
             raise ValueError(

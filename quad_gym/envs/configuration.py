@@ -113,8 +113,10 @@ class Flights:
             if name in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ()):
                 raise ValueError(f"{name} means nothing to the task {task}, and must not be given")
         self.task: TaskParams = defaults.replace(**given)
-        if "pad" in given and self.task.start == "hover":
-            raise ValueError('pad means nothing with start="hover", and must not be given')
+        if "pad" in given and not self.task.may_start_on_ground:
+            raise ValueError(
+                f'pad means nothing with start="{self.task.start}", and must not be given'
+            )
         if "trajectory" in given and "duration" not in given:  # all of it, or a round
             longest = max(path.duration for path in self.task.trajectories)
             self.task = self.task.replace(duration=longest)

@@ -116,10 +116,11 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     as wanted. A launch pad carries the vehicle until its thrust lifts it; with `pad=False`, as in
     the report, it sinks while its rotors spin up. "hover": hovering, with standard deviations of
     0.3 m, 0.03 m/s, 0.2 rad in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5: a
-    policy that has learned to hover learns to take off. The filter starts from its first fix in
-    each, or with `filter_start="warm"` as if it had been running for 10 s, as before any real
-    take-off. `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of these
-    for one episode.
+    policy that has learned to hover learns to take off. "moving": as "hover", with a velocity of up
+    to 1.5 m/s and body rates of up to 2 rad/s on each axis, uniform. The filter starts from its
+    first fix in each, or with `filter_start="warm"` as if it had been running for 10 s, as before
+    any real take-off. `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of
+    these for one episode.
 
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;

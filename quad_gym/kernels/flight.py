@@ -14,7 +14,7 @@ from quad_gym.kernels.maths.linalg import load3, load4, norm, sub
 from quad_gym.kernels.measurements.aid import ACTS, align_by_aid, call_aids
 from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import FOLLOWED, Act, Control, Layout, Start, Supply
+from quad_gym.records import FOLLOWED, Act, Control, Layout, Supply
 
 _DISTURB_IMU, _BEGIN_IMPERFECT = int(Stage.DISTURB_IMU), int(Stage.BEGIN_IMPERFECT)
 _DELAY_ACTION = int(Stage.DELAY_ACTION)
@@ -108,7 +108,7 @@ def tick(flight, world, model, settings, work, stages, last):
     if settings.supply != Supply.NOMINAL:
         call_stage(stages, _SUPPLY, flight, world, model, settings, work, 0)
     flight.instant = flight.instant + _ONE
-    resting = settings.pad > 0 and settings.start != Start.HOVER and any_of(flight.on_pad > 0.0)
+    resting = settings.pad > 0 and any_of(flight.on_pad > 0.0)
     if settings.imu_averages or resting or settings.grounded:
         _store_start(flight, work)
     if settings.air:

@@ -275,7 +275,7 @@ def settings_record(
     s["include_covariance"], s["privileged"] = include_covariance, privileged
     s["autoreset"], s["run_filter"] = autoreset, run_filter
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
-    s["pad"], s["randomize"] = task.pad, task.randomize
+    s["pad"], s["randomize"] = task.pad and task.may_start_on_ground, task.randomize
     s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
     s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], MAX_HARMONICS)
     s["max_steps"] = round(task.duration * clocks.control_rate)

@@ -11,7 +11,7 @@ from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomiza
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import BatteryParams, WorldParams
-from quad_gym.records import COLUMNS, SETTINGS, Supply
+from quad_gym.records import COLUMNS, MAX_START_VELOCITY, SETTINGS, Start, Supply
 
 FALLEN_THROUGH = 0.5
 """Below ground that carries vehicles, nothing flies at this depth [m]."""
@@ -62,16 +62,28 @@ def pack_options(
     if world.battery is not None:
         s["supply"] = Supply.BATTERY
     s["observe_world"] = s["privileged"] and (world != WorldParams() or bool(draws.names))
-    if "start_velocity_I" in draws.names:
-        s["start_velocity_variance"] = draws.mean_square("start_velocity_I")
-    for i, name in enumerate(("start_roll", "start_pitch")):
-        if name in draws.names:
-            # no angle is less known than one that may be any
-            s["start_tilt_variance"][i] = min(draws.mean_square(name)[0], math.pi**2 / 3.0)
+    pack_start(s, draws)
     s["randomized"], s["known"] = bool(draws.names), known
     pack_obstacles(s, world)
     for name in ("kind", "a", "b", "c", "d", "low", "high", "center", "spread"):
         s[f"draw_{name}"] = np.asarray(getattr(draws, name))
+
+
+def pack_start(s: Any, draws: DrawingTable) -> None:
+    """Write into a settings record how much the velocity and the tilt of starts vary.
+
+    Args:
+        s: The settings, which say already how episodes begin.
+        draws: What is drawn on top.
+    """
+    if s["start"] == Start.MOVING:  # uniform on [-most, most]
+        s["start_velocity_variance"] = MAX_START_VELOCITY**2 / 3.0
+    if "start_velocity_I" in draws.names:
+        s["start_velocity_variance"] += draws.mean_square("start_velocity_I")
+    for i, name in enumerate(("start_roll", "start_pitch")):
+        if name in draws.names:
+            # no angle is less known than one that may be any
+            s["start_tilt_variance"][i] = min(draws.mean_square(name)[0], math.pi**2 / 3.0)
 
 
 def pack_places(

@@ -40,7 +40,8 @@ class TaskParams(Checked):
     start: str = "ground"
     """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
     "hover": hovering at rest within some decimeters of the reference; "mixed": either, with
-    probability 0.5"""
+    probability 0.5; "moving": as "hover", with up to 1.5 m/s and 2 rad/s on each axis, uniform, as
+    after a disturbance"""
     pad: bool = True
     """whether a launch pad carries a vehicle that starts on the ground until its thrust lifts it;
     without one it sinks while its rotors spin up, as in the report. Ground that carries vehicles
@@ -106,6 +107,11 @@ class TaskParams(Checked):
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
         if min(self.preview) < 0.0:
             raise ValueError(f"TaskParams.preview must be at least 0, got {self.preview}")
+
+    @property
+    def may_start_on_ground(self) -> bool:
+        """Whether any episode begins on the ground."""
+        return self.start in ("ground", "mixed")
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:

@@ -143,6 +143,8 @@ class Start(IntEnum):
     """Hovering, at rest, within some decimeters of the reference."""
     MIXED = 2
     """Either, with probability 0.5: for training, as a policy that has learned to hover learns to take off."""
+    MOVING = 3
+    """As HOVER, with a velocity and body rates, as after a disturbance."""
 
 
 class Layout(IntEnum):

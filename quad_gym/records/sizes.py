@@ -15,6 +15,8 @@ HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY, HEADING_GIVEN = 0.0, 1.0, 2.0, 
 """Rules of a reference's heading: toward a point, along a direction, along the velocity, a yaw."""
 MAX_GATES = 8
 """Gates of a course."""
+MAX_START_VELOCITY, MAX_START_RATE = 1.5, 2.0
+"""A moving start has at most so much on each axis: [m/s], [rad/s]."""
 MAX_FEATURES = 16
 """Features of a camera."""
 MAX_OBSTACLES = 32

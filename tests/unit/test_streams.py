@@ -57,7 +57,13 @@ def test_a_draw_that_is_taken_is_refused(end):
 
 # ---- what the kernels draw -------------------------------------------------------------------
 
-DRAWS_OF = {"uniform_pair": 1, "normal_pair": 1, "six_normals": 3, "_any_direction": 1}
+DRAWS_OF = {
+    "uniform_pair": 1,
+    "normal_pair": 1,
+    "six_normals": 3,
+    "_any_direction": 1,
+    "_signed_pair": 1,
+}
 """How many draws a function takes from the one on that is its second argument."""
 LARGEST = {
     "feature_count": MAX_FEATURES,

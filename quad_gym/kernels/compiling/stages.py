@@ -31,7 +31,6 @@ from quad_gym.records import (
     Aid,
     FilterForm,
     Layout,
-    Start,
     Supply,
 )
 
@@ -156,7 +155,7 @@ def _raw(s: Any) -> bool:
 
 
 def _pad(s: Any) -> bool:
-    return bool(s["pad"] and s["start"] != Start.HOVER and not s["grounded"])
+    return bool(s["pad"] and not s["grounded"])
 
 
 def _grounded(s: Any) -> bool:

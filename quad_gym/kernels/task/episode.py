@@ -1,45 +1,32 @@
-"""How an episode begins: its reference, its gates, its start."""
+"""How an episode begins: its reference, its gates, its clocks and counters."""
 
 import math
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
-from quad_gym.kernels.maths.elementary import atan2, clip, maximum, minimum, sin_cos
-from quad_gym.kernels.maths.linalg import add, dot, keep3, load3, multiply, scale
-from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, uniform_pair
-from quad_gym.kernels.maths.rotation import dcm_to_quaternion, euler_to_dcm
+from quad_gym.kernels.maths.elementary import minimum, sin_cos
+from quad_gym.kernels.maths.linalg import keep3, load3
+from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
 from quad_gym.kernels.measurements.clock import first_wait
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.follow import draw_path
 from quad_gym.kernels.task.heights import GATE_SPREAD, LOWEST_GATE, RANDOM_RISE
-from quad_gym.kernels.task.reference import evaluate_reference
+from quad_gym.kernels.task.start import draw_start
 from quad_gym.records import (
-    COLUMNS,
     DRAW_COURSE,
-    DRAW_FIRST_BIASES,
     DRAW_GATES,
-    DRAW_GROUND,
     DRAW_PHASE,
     DRAW_SERIES,
-    DRAW_START,
     FOLLOWED,
     HEADING_ALONG,
     HEADING_TOWARD,
     HEADING_VELOCITY,
     MAX_GATES,
     MAX_HARMONICS,
-    Start,
     Task,
 )
 
-START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
-"""Spread of a hovering start: [m], [rad], [rad], [m/s]."""
-GROUND_SHARE = 0.5
-"""Share of the mixed starts that are on the ground."""
 _FOLLOW = int(Stage.FOLLOW)
-_POSITION, _VELOCITY = COLUMNS["start_position_I"].start, COLUMNS["start_velocity_I"].start
-_RATES, _YAW = COLUMNS["start_body_rates"].start, COLUMNS["start_yaw"].start
-_ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start
 
 
 @kernel
@@ -152,80 +139,6 @@ def draw_reference(flight, settings, stream, mask):
         # a fixed heading: one that follows the gates would turn about from one to the next
         _clear_reference(flight, mask, over_origin, zero, HEADING_ALONG, ahead)
         _draw_gates(flight, settings, stream, mask)
-
-
-@kernel
-def _given_or(given, drawn):
-    """A start value that the caller gave, or the drawn one where it is NaN."""
-    return select(given == given, given, drawn)
-
-
-@kernel
-def draw_start(flight, p, model, settings, work, stream, mask):
-    """Set the true state at the start of an episode, where `mask`; keep who is on the ground."""
-    (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
-    yaw = atan2(x_ref[1], x_ref[0])
-    zero = 0.0 * yaw
-    v_I = (zero, zero, zero)
-    roll, pitch, rotor_speed = zero, zero, zero
-    on_ground = mask
-    if settings.start != Start.GROUND:
-        n_r, n_v = six_normals(stream, DRAW_START)
-        n_roll, n_pitch = normal_pair(stream, DRAW_START + 3)
-        n_yaw, _ = normal_pair(stream, DRAW_START + 4)
-        u_ground, _ = uniform_pair(stream, DRAW_GROUND)
-        share = GROUND_SHARE if settings.start == Start.MIXED else 0.0
-        on_ground = u_ground < share
-        if settings.task == Task.WAYPOINTS:
-            x, y, z = load3(flight.gates[0])
-            x, y, z = 0.25 * x, 0.25 * y, zero + settings.height
-        r_I = (
-            x + START_POSITION_SIGMA * clip(n_r[0], -3.0, 3.0),
-            y + START_POSITION_SIGMA * clip(n_r[1], -3.0, 3.0),
-            maximum(z + START_POSITION_SIGMA * clip(n_r[2], -3.0, 3.0), 0.1),
-        )
-        x, y = select(on_ground, x, r_I[0]), select(on_ground, y, r_I[1])
-        z = r_I[2]
-        hovering = select(on_ground, 0.0, 1.0)
-        v_I = scale(hovering * START_VELOCITY_SIGMA, n_v)
-        roll = hovering * START_TILT_SIGMA * n_roll
-        pitch = hovering * START_TILT_SIGMA * n_pitch
-        yaw = yaw + hovering * START_YAW_SIGMA * n_yaw
-        rotor_speed = hovering * model.motor_gain * model.hover_voltage
-    z = select(on_ground, 0.0, z)
-    w_B = (zero, zero, zero)
-    if settings.randomized:
-        drawn = flight.drawn
-        x, y, z = x + drawn[_POSITION], y + drawn[_POSITION + 1], z + drawn[_POSITION + 2]
-        v_I = add(v_I, (drawn[_VELOCITY], drawn[_VELOCITY + 1], drawn[_VELOCITY + 2]))
-        w_B = (drawn[_RATES], drawn[_RATES + 1], drawn[_RATES + 2])
-        roll, pitch, yaw = roll + drawn[_ROLL], pitch + drawn[_PITCH], yaw + drawn[_YAW]
-    given = flight.start_given
-    x, y, z = _given_or(given[0], x), _given_or(given[1], y), _given_or(given[2], z)
-    v_I = (_given_or(given[3], v_I[0]), _given_or(given[4], v_I[1]), _given_or(given[5], v_I[2]))
-    yaw = _given_or(given[6], yaw)
-    still = dot(v_I, v_I) + dot(w_B, w_B) <= 0.0
-    work.on_ground = select(on_ground, 1.0, 0.0)
-    on_pad = select(on_ground & still, 1.0 * settings.pad, 0.0)
-    flight.on_pad = select(mask, on_pad, flight.on_pad)
-    keep3(flight.r, mask, (x, y, z))
-    keep3(flight.v, mask, v_I)
-    keep3(flight.w, mask, w_B)
-    keep3(flight.disturbance, mask, (zero, zero, zero))
-    q = dcm_to_quaternion(
-        multiply(euler_to_dcm((roll, pitch, zero)), euler_to_dcm((zero, zero, yaw)))
-    )
-    for i in range(4):
-        flight.q[i] = select(mask, q[i], flight.q[i])
-        flight.rotor_speeds[i] = select(mask, rotor_speed, flight.rotor_speeds[i])
-        flight.voltages[i] = select(mask, 0.0, flight.voltages[i])
-        flight.action[i] = select(mask, 0.0, flight.action[i])
-        flight.last_action[i] = select(mask, 0.0, flight.last_action[i])
-
-    n_a, n_g = six_normals(stream, DRAW_FIRST_BIASES)
-    for i in range(3):
-        flight.b_a[i] = select(mask, p.accel_bias_sigma * n_a[i], flight.b_a[i])
-        flight.b_g[i] = select(mask, p.gyro_bias_sigma * n_g[i], flight.b_g[i])
 
 
 @kernel
