@@ -5,6 +5,7 @@ import re
 import gymnasium
 import pytest
 
+import quad_gym
 from quad_gym.evaluation import roll_out
 from tests.examples import example
 
@@ -34,6 +35,17 @@ def test_the_defaults_of_stable_baselines_are_evaluated_as_they_learn(
     kept = script.CLASSES[algorithm].load(file)
     flown = roll_out(kept, gymnasium.make_vec(args.env_id, num_envs=4), seed=0)
     assert found[steps] == f"{flown.mean_error.mean():.4f}"
+
+
+def test_training_and_evaluation_start_as_the_option_says(script, monkeypatch):
+    made = []
+    for module, name in ((quad_gym, "make_sb3_vec_env"), (gymnasium, "make_vec")):
+        make = getattr(module, name)
+        kept = lambda *args, make=make, **given: made.append(make(*args, **given)) or made[-1]  # noqa: E731
+        monkeypatch.setattr(module, name, kept)
+    script.main(script.Args(algorithm="sac", total_timesteps=120, evaluate=4, start="moving"))
+    assert [type(env).__name__ for env in made] == ["QuadVecEnv", "QuadVectorEnv"]
+    assert all(env.unwrapped.flights.task.start == "moving" for env in made)
 
 
 def test_evaluations_change_nothing_that_is_learned(script, capsys):
