@@ -32,6 +32,8 @@ class Args:
     env_id: str = "QuadGym/Circle-v0"
     start: Literal["ground", "hover", "mixed", "moving"] | None = None
     """how episodes start, in training and evaluation; if not given, as the task's do"""
+    out_of_bounds: float | None = None
+    """distance from the reference at which episodes end [m], likewise"""
     seed: int = 0
     total_timesteps: int | None = None
     """if not given, 1,000,000 of PPO and 300,000 of SAC"""
@@ -43,6 +45,11 @@ class Args:
     """episodes of each"""
     save: Path | None = None
     """file for the policy, as it is at the last evaluation"""
+
+
+def keywords_of(args):
+    """Keywords of the environment, in training and evaluation; None is the task's own."""
+    return {"start": args.start, "out_of_bounds": args.out_of_bounds}
 
 
 class Evaluation(BaseCallback):
@@ -65,8 +72,9 @@ class Evaluation(BaseCallback):
         """Say how well the policy flies, and save it."""
         self.flown = self.num_timesteps
         self.due = self.flown + self.args.every
-        count, start = self.args.evaluate, self.args.start
-        test = gymnasium.make_vec(self.args.env_id, num_envs=count, start=start)
+        test = gymnasium.make_vec(
+            self.args.env_id, num_envs=self.args.evaluate, **keywords_of(self.args)
+        )
         found = roll_out(self.model, test, seed=0).summary()
         print(
             f"{self.flown:,} steps: mean error {found['mean_error']:.4f} m, "
@@ -83,7 +91,9 @@ def main(args):
     torch.set_num_threads(1)  # the networks are small, and more threads round differently
     count = args.num_envs or FLIGHTS[args.algorithm]
     first_flight = 10**9 + 1000 * args.seed  # seeds below 10^9 are for tests
-    env = quad_gym.make_sb3_vec_env(args.env_id, n_envs=count, seed=first_flight, start=args.start)
+    env = quad_gym.make_sb3_vec_env(
+        args.env_id, n_envs=count, seed=first_flight, **keywords_of(args)
+    )
     model = CLASSES[args.algorithm]("MlpPolicy", env, seed=args.seed)
     model.learn(args.total_timesteps or STEPS[args.algorithm], callback=Evaluation(args))
 

@@ -37,15 +37,17 @@ def test_the_defaults_of_stable_baselines_are_evaluated_as_they_learn(
     assert found[steps] == f"{flown.mean_error.mean():.4f}"
 
 
-def test_training_and_evaluation_start_as_the_option_says(script, monkeypatch):
+def test_training_and_evaluation_fly_as_the_options_say(script, monkeypatch):
     made = []
     for module, name in ((quad_gym, "make_sb3_vec_env"), (gymnasium, "make_vec")):
         make = getattr(module, name)
         kept = lambda *args, make=make, **given: made.append(make(*args, **given)) or made[-1]  # noqa: E731
         monkeypatch.setattr(module, name, kept)
-    script.main(script.Args(algorithm="sac", total_timesteps=120, evaluate=4, start="moving"))
+    options = {"start": "moving", "out_of_bounds": 1.5}
+    script.main(script.Args(algorithm="sac", total_timesteps=120, evaluate=4, **options))
     assert [type(env).__name__ for env in made] == ["QuadVecEnv", "QuadVectorEnv"]
-    assert all(env.unwrapped.flights.task.start == "moving" for env in made)
+    for task in (env.unwrapped.flights.task for env in made):
+        assert (task.start, task.out_of_bounds) == ("moving", 1.5)
 
 
 def test_evaluations_change_nothing_that_is_learned(script, capsys):
