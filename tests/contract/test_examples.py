@@ -39,10 +39,16 @@ def test_the_defaults_of_stable_baselines_are_evaluated_as_they_learn(
 
 def test_training_and_evaluation_fly_as_the_options_say(script, monkeypatch):
     made = []
+
+    def keeping(make):
+        def make_and_keep(*args, **keywords):
+            made.append(make(*args, **keywords))
+            return made[-1]
+
+        return make_and_keep
+
     for module, name in ((quad_gym, "make_sb3_vec_env"), (gymnasium, "make_vec")):
-        make = getattr(module, name)
-        kept = lambda *args, make=make, **given: made.append(make(*args, **given)) or made[-1]  # noqa: E731
-        monkeypatch.setattr(module, name, kept)
+        monkeypatch.setattr(module, name, keeping(getattr(module, name)))
     options = {"start": "moving", "out_of_bounds": 1.5}
     script.main(script.Args(algorithm="sac", total_timesteps=120, evaluate=4, **options))
     assert [type(env).__name__ for env in made] == ["QuadVecEnv", "QuadVectorEnv"]

@@ -36,29 +36,26 @@ def test_they_do_not_depend_on_the_other_flights(name, flights, threads):
     assert fly(CASES[name], flights=flights, threads=threads) == GOLDEN[name]
 
 
-@pytest.mark.slow  # each compiles everything anew
-@pytest.mark.parametrize("lanes", WIDTHS)
-def test_they_do_not_depend_on_the_number_of_lanes(lanes):
+def assert_the_same_with(**environment):
+    """Fly all of them in a process with other environment variables."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.golden.flights"],
         cwd=Path(__file__).parents[2],
-        env=os.environ | {"QUAD_GYM_LANES": str(lanes)},
+        env=os.environ | environment,
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow  # each compiles everything anew
+@pytest.mark.parametrize("lanes", WIDTHS)
+def test_they_do_not_depend_on_the_number_of_lanes(lanes):
+    assert_the_same_with(QUAD_GYM_LANES=str(lanes))
 
 
 @pytest.mark.slow
 def test_they_do_not_depend_on_the_processor_that_numpy_computes_for():
     """NumPy's linear algebra rounds as its code for the processor does; flights must not."""
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.golden.flights"],
-        cwd=Path(__file__).parents[2],
-        env=os.environ | {"OPENBLAS_CORETYPE": "Prescott"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    assert_the_same_with(OPENBLAS_CORETYPE="Prescott")
