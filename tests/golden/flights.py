@@ -82,6 +82,7 @@ def cases():
         for suite in SUITES:
             found[f"{task}, {suite}"] = {"id": task, "sensors": suite, "randomize": True}
     found["Circle, mixed"] = {"start": "mixed"}
+    found["Hover, moving"] = {"id": "Hover", "start": "moving"}
     for observation in ("truth", "noisy", "sensors"):
         found[f"observation {observation}"] = {"observation": observation}
     for suite in SUITES:

@@ -48,7 +48,7 @@ def test_no_episode_ends_because_of_where_the_ground_is(kind, height, reference)
     assert (flights.read("footing") == 4.0).all()
 
 
-@pytest.mark.parametrize("start", ["ground", "mixed", "hover"])
+@pytest.mark.parametrize("start", ["ground", "mixed", "hover", "moving"])
 def test_ground_out_of_bounds_of_the_reference_is_refused(start):
     task = {"start": start, "height": 1.0, "out_of_bounds": 3.0}
     for height in (-2.0, 3.8):
@@ -57,7 +57,7 @@ def test_ground_out_of_bounds_of_the_reference_is_refused(start):
         assert (stand(flights, steps=1) == 0.0).all()
     with pytest.raises(ValueError, match=r"WorldParams\.ground_height .* out_of_bounds=3 .* got 4"):
         batch(height=4.0, task=task)
-    if start == "hover":
+    if start in ("hover", "moving"):
         batch(height=-2.2, task=task)
     else:
         with pytest.raises(ValueError, match=r"WorldParams\.ground_height .* got -2.2"):
