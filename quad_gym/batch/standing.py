@@ -23,18 +23,39 @@ def check_standing(
 
     Raises:
         ValueError: If a foot is not below all rotor hubs, on which the vehicle would stand, which
-            is a crash; or if a start on the ground is farther from the reference than
-            `TaskParams.out_of_bounds`, so that the episode ends with its first step.
+            is a crash; or if a start on the ground or on the launch pad is farther from the
+            reference than `TaskParams.out_of_bounds`, so that the episode ends with its first step.
     """
-    if world.ground is None:
+    ground = world.ground
+    if ground is None:
+        if task.may_start_on_ground:
+            begins = _begins_out_of_bounds(task, 0.0, draws)
+            if begins is not None:
+                raise ValueError(
+                    f"TaskParams.start={task.start!r} begins at a height of 0 m, which must be "
+                    f"within out_of_bounds={task.out_of_bounds:g} m of the reference, got a "
+                    f"reference that begins at a height of {begins} m"
+                )
         return
-    feet, hubs = (np.array(p)[:, 2] for p in (world.ground.feet_B, vehicle.rotor_positions_B))
+    feet, hubs = (np.array(p)[:, 2] for p in (ground.feet_B, vehicle.rotor_positions_B))
     if feet.max() >= hubs.min():
         raise ValueError(
             "GroundParams.feet_B must be below the vehicle's lowest rotor hub, at "
             f"{hubs.min():g} m, got {feet.max():g} m"
         )
-    standing = world.ground_height - world.ground.feet_B[0][2]
+    standing = world.ground_height - ground.feet_B[0][2]
+    begins = _begins_out_of_bounds(task, standing, draws)
+    if begins is not None:
+        raise ValueError(
+            "WorldParams.ground_height must let a vehicle stand within "
+            f"out_of_bounds={task.out_of_bounds:g} m of the reference, which begins at a "
+            f"height of {begins} m, got {world.ground_height:g}, where it stands at "
+            f"{standing:g} m"
+        )
+
+
+def _begins_out_of_bounds(task: TaskParams, standing: float, draws: DrawingTable) -> str | None:
+    """Height [m] of a reference that is out of bounds from a height on the ground [m], if any is."""
     column = COLUMNS["start_position_I"].stop - 1
     lower, upper = (max(float(ends[column]), 0.0) for ends in (draws.low, draws.high))
     for low, high in _reference_heights(task):
@@ -42,13 +63,8 @@ def check_standing(
         # a start in the air is near the reference, unless the ground lifts it
         distance = max(above, below) if task.may_start_on_ground else above
         if distance > task.out_of_bounds:
-            begins = f"{low:g}" if low == high else f"{low:g} to {high:g}"
-            raise ValueError(
-                "WorldParams.ground_height must let a vehicle stand within "
-                f"out_of_bounds={task.out_of_bounds:g} m of the reference, which begins at a "
-                f"height of {begins} m, got {world.ground_height:g}, where it stands at "
-                f"{standing:g} m"
-            )
+            return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return None
 
 
 def _reference_heights(task: TaskParams) -> list[tuple[float, float]]:
