@@ -48,9 +48,15 @@ class MovingTarget(quad_gym.Task):
 
 # %%
 # PPO learns to follow. The actions are velocities; a million steps take about a minute on two
-# cores, and the policy that they lead to is kept beside this file.
+# cores, and the policy that they lead to is kept beside this file. The bounds are wider than those
+# of ``Hover``, as the target wanders more than 1.6 m away.
 
-KEYWORDS = {"custom": MovingTarget(), "action": "velocity", "max_episode_steps": 400}
+KEYWORDS = {
+    "custom": MovingTarget(),
+    "action": "velocity",
+    "out_of_bounds": 3.0,
+    "max_episode_steps": 400,
+}
 RECIPE = Recipe(
     steps=1_000_000,
     n_envs=128,

@@ -105,11 +105,11 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     depend on the control rate: 16 for a perfect circle.
 
     ## Episode end
-    Terminated: farther than 3 m from the reference (`Waypoints`: 12 m, `LookAround`: 8 m), tipped
-    by more than 100 degrees, below -0.5 m (`LookAround`: -5 m), through the last gate, or, in a
-    world that has any, where the vehicle touches an obstacle or leaves the geofence. Truncated: at
-    the time limit, when the filter has failed (`info["filter_status"]`), or with
-    `end_when_lost=True` when it finds that it is lost. `info["ending"]` says which.
+    Terminated: farther than 3 m from the reference (`Hover`: 1.6 m, `LookAround`: 8 m,
+    `Waypoints`: 12 m), tipped by more than 100 degrees, below -0.5 m (`LookAround`: -5 m), through
+    the last gate, or, in a world that has any, where the vehicle touches an obstacle or leaves the
+    geofence. Truncated: at the time limit, when the filter has failed (`info["filter_status"]`), or
+    with `end_when_lost=True` when it finds that it is lost. `info["ending"]` says which.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking

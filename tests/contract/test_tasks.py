@@ -1,12 +1,16 @@
 """Rewards, endings and starts of the tasks, recomputed in NumPy from the true state."""
 
+import math
+
 import gymnasium
 import numpy as np
 import pytest
 
 from baselines import PDPolicy
+from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.kernels.task.start import START_POSITION_SIGMA
 from quad_gym.records import Ending
 from tests.contract.comparing import actions_of
 
@@ -158,12 +162,15 @@ def last_step(env, action, *, start=None, seed=1):
 STILL = np.zeros(4)
 
 
-@pytest.mark.parametrize("task", ["hover", "circle", "lemniscate", "random_trajectory"])
-def test_farther_than_three_meters_from_the_reference_is_out_of_bounds(task):
+BOUNDS = {"hover": 1.6, "circle": 3.0, "lemniscate": 3.0, "random_trajectory": 3.0}
+
+
+@pytest.mark.parametrize("task", BOUNDS)
+def test_farther_from_the_reference_than_its_bound_is_out_of_bounds(task):
     start = QuadEnv(task)
     start.reset(seed=1)
     r_ref, _ = reference_of(task, 0.0, start.flights.batch)
-    for away, over in ((2.8, False), (3.2, True)):
+    for away, over in ((BOUNDS[task] - 0.2, False), (BOUNDS[task] + 0.2, True)):
         env = QuadEnv(task)
         options = {"position": r_ref[0] + [0, 0, away], "velocity": [0, 0, 0]}
         env.reset(seed=1, options=options)
@@ -171,6 +178,12 @@ def test_farther_than_three_meters_from_the_reference_is_out_of_bounds(task):
         assert (terminated, truncated) == (over, False)
         assert info["ending"] == ("out_of_bounds" if over else "none")
         assert info["ending_code"] == (Ending.OUT_OF_BOUNDS if over else Ending.NONE)
+
+
+def test_no_hovering_start_is_out_of_bounds():
+    farthest = math.sqrt(3.0) * 3.0 * START_POSITION_SIGMA  # all three axes at their limits
+    for name, task in TASK_DEFAULTS.items():
+        assert farthest < task.out_of_bounds, name
 
 
 def test_a_course_has_wider_bounds():
@@ -189,9 +202,12 @@ def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
     assert up < np.cos(np.radians(100.0))
 
 
-@pytest.mark.parametrize("task", ["hover", "circle", "waypoints"])
-def test_half_a_meter_below_the_origin_is_on_the_ground(task):
-    env = QuadEnv(task, **({"pad": False} if task == "circle" else {}))
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [("hover", {"out_of_bounds": 3.0}), ("circle", {"pad": False}), ("waypoints", {})],
+)
+def test_half_a_meter_below_the_origin_is_on_the_ground(task, options):
+    env = QuadEnv(task, **options)
     *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
     assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")
     assert -1.0 < env.flights.batch.read("r")[0, 2] < -0.5

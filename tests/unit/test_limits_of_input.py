@@ -183,8 +183,8 @@ def test_a_start_that_is_out_of_all_bounds_is_refused_and_changes_nothing():
         one.reset(seed=1)
         before = one.flights.batch.snapshot(), one.np_random.bit_generator.state
         for options, message in (
-            ({"position": [1e12, 0.0, 0.0]}, "position must be .* out_of_bounds=3 m"),
-            ({"position": [1e300, 0.0, 0.0]}, "position must be .* out_of_bounds=3 m"),
+            ({"position": [1e12, 0.0, 0.0]}, "position must be .* out_of_bounds=1.6 m"),
+            ({"position": [1e300, 0.0, 0.0]}, "position must be .* out_of_bounds=1.6 m"),
             ({"velocity": [0.0, 1e9, 0.0]}, "velocity must be at most"),
             ({"yaw": 1e300}, "yaw must be at most"),
             ({"position": ["1", "2", "3"]}, "position must be numbers"),

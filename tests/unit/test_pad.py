@@ -137,3 +137,36 @@ def test_reward_per_step_is_that_per_second_times_the_control_rate():
         env.reset(seed=0)
         rewards[per] = np.array([env.step(np.full((4, 4), 0.1))[1] for _ in range(30)])
     np.testing.assert_allclose(rewards["step"], 100.0 * rewards["second"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("start", ["ground", "mixed"])
+@pytest.mark.parametrize("kind", ["hover", "circle", "lemniscate"])
+def test_a_reference_out_of_bounds_of_the_pad_is_refused(kind, start):
+    task = {"kind": kind, "start": start, "out_of_bounds": 1.6}
+    flights = batch(16, task=task | {"height": 1.6})
+    flights.reset(seeds=range(16))
+    if kind == "hover":  # elsewhere the reference moves away from the limit
+        flights.step(stopped(16))
+        assert (flights.result("ending") == 0.0).all()
+    message = rf"TaskParams\.start='{start}' .* out_of_bounds=1.6 m .* at a height of 1.61 m"
+    with pytest.raises(ValueError, match=message):
+        batch(task=task | {"height": 1.61})
+    with pytest.raises(ValueError, match=message):
+        batch(task=task | {"height": 1.61, "pad": False})
+
+
+def test_only_pads_from_which_no_episode_can_begin_are_refused():
+    high = {"kind": "hover", "height": 2.0, "out_of_bounds": 1.6}
+    for start in ("hover", "moving"):
+        batch(task=high | {"start": start})
+    lifted = {"start_position_I": (None, None, quad_gym.Uniform(0.0, 0.5))}
+    batch(task=high, randomization=lifted)
+    batch(task={"kind": "waypoints", "height": 2.2, "out_of_bounds": 1.6})  # gates from 1.54 m on
+    with pytest.raises(ValueError, match=r"at a height of 1\.61 to 2\.99 m"):
+        batch(task={"kind": "waypoints", "height": 2.3, "out_of_bounds": 1.6})
+
+
+def test_an_environment_refuses_a_pad_out_of_its_bounds():
+    with pytest.raises(ValueError, match=r"start='ground' .* out_of_bounds=1.6 m"):
+        gymnasium.make("QuadGym/Hover-v0", start="ground", height=2.0)
+    gymnasium.make("QuadGym/Hover-v0", start="ground", height=2.0, out_of_bounds=3.0).close()
