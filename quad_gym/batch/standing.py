@@ -32,9 +32,9 @@ def check_standing(
             begins = _begins_out_of_bounds(task, 0.0, draws)
             if begins is not None:
                 raise ValueError(
-                    f"TaskParams.start={task.start!r} begins at a height of 0 m, which must be "
-                    f"within out_of_bounds={task.out_of_bounds:g} m of the reference, got a "
-                    f"reference that begins at a height of {begins} m"
+                    "TaskParams.start must be 'hover' or 'moving', or out_of_bounds at least the "
+                    f"height at which the reference begins, {begins} m: got "
+                    f"start={task.start!r} and out_of_bounds={task.out_of_bounds:g} m"
                 )
         return
     feet, hubs = (np.array(p)[:, 2] for p in (ground.feet_B, vehicle.rotor_positions_B))
@@ -55,7 +55,7 @@ def check_standing(
 
 
 def _begins_out_of_bounds(task: TaskParams, standing: float, draws: DrawingTable) -> str | None:
-    """Height [m] of a reference that is out of bounds from a height on the ground [m], if any is."""
+    """Where a reference begins that is out of bounds from height `standing` [m], or None."""
     column = COLUMNS["start_position_I"].stop - 1
     lower, upper = (max(float(ends[column]), 0.0) for ends in (draws.low, draws.high))
     for low, high in _reference_heights(task):
