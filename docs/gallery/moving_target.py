@@ -49,7 +49,7 @@ class MovingTarget(quad_gym.Task):
 # %%
 # PPO learns to follow. The actions are velocities; a million steps take about a minute on two
 # cores, and the policy that they lead to is kept beside this file. The bounds are wider than those
-# of ``Hover``, as the target wanders more than 1.6 m away.
+# of ``Hover``, because the target wanders more than 1.6 m away.
 
 KEYWORDS = {
     "custom": MovingTarget(),

@@ -1,4 +1,4 @@
-"""Whether vehicles can stand on the ground of a world, and begin there."""
+"""Whether vehicles can stand on the ground of a world, or on the launch pad, and begin there."""
 
 import numpy as np
 
@@ -23,39 +23,18 @@ def check_standing(
 
     Raises:
         ValueError: If a foot is not below all rotor hubs, on which the vehicle would stand, which
-            is a crash; or if a start on the ground or on the launch pad is farther from the
-            reference than `TaskParams.out_of_bounds`, so that the episode ends with its first step.
+            is a crash; or if a start on the ground is farther from the reference than
+            `TaskParams.out_of_bounds`, so that the episode ends with its first step.
     """
-    ground = world.ground
-    if ground is None:
-        if task.may_start_on_ground:
-            begins = _begins_out_of_bounds(task, 0.0, draws)
-            if begins is not None:
-                raise ValueError(
-                    "TaskParams.start must be 'hover' or 'moving', or out_of_bounds at least the "
-                    f"height at which the reference begins, {begins} m: got "
-                    f"start={task.start!r} and out_of_bounds={task.out_of_bounds:g} m"
-                )
+    if world.ground is None:
         return
-    feet, hubs = (np.array(p)[:, 2] for p in (ground.feet_B, vehicle.rotor_positions_B))
+    feet, hubs = (np.array(p)[:, 2] for p in (world.ground.feet_B, vehicle.rotor_positions_B))
     if feet.max() >= hubs.min():
         raise ValueError(
             "GroundParams.feet_B must be below the vehicle's lowest rotor hub, at "
             f"{hubs.min():g} m, got {feet.max():g} m"
         )
-    standing = world.ground_height - ground.feet_B[0][2]
-    begins = _begins_out_of_bounds(task, standing, draws)
-    if begins is not None:
-        raise ValueError(
-            "WorldParams.ground_height must let a vehicle stand within "
-            f"out_of_bounds={task.out_of_bounds:g} m of the reference, which begins at a "
-            f"height of {begins} m, got {world.ground_height:g}, where it stands at "
-            f"{standing:g} m"
-        )
-
-
-def _begins_out_of_bounds(task: TaskParams, standing: float, draws: DrawingTable) -> str | None:
-    """Where a reference begins that is out of bounds from height `standing` [m], or None."""
+    standing = world.ground_height - world.ground.feet_B[0][2]
     column = COLUMNS["start_position_I"].stop - 1
     lower, upper = (max(float(ends[column]), 0.0) for ends in (draws.low, draws.high))
     for low, high in _reference_heights(task):
@@ -63,8 +42,30 @@ def _begins_out_of_bounds(task: TaskParams, standing: float, draws: DrawingTable
         # a start in the air is near the reference, unless the ground lifts it
         distance = max(above, below) if task.may_start_on_ground else above
         if distance > task.out_of_bounds:
-            return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-    return None
+            begins = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+            raise ValueError(
+                "WorldParams.ground_height must let a vehicle stand within "
+                f"out_of_bounds={task.out_of_bounds:g} m of the reference, which begins at a "
+                f"height of {begins} m, got {world.ground_height:g}, where it stands at "
+                f"{standing:g} m"
+            )
+
+
+def check_pad(task: TaskParams) -> None:
+    """Refuse a task whose launch pad, at height 0, is out of bounds wherever its reference begins.
+
+    Raises:
+        ValueError: If the episodes that start there would end with their first step.
+    """
+    if not task.may_start_on_ground:
+        return
+    distance = max(max(low, -high, 0.0) for low, high in _reference_heights(task))
+    if distance > task.out_of_bounds:
+        raise ValueError(
+            f"out_of_bounds must be at least {distance:g} m, or start 'hover' or 'moving': with "
+            f"start={task.start!r} episodes begin on the launch pad, {distance:g} m from the "
+            f"reference, got out_of_bounds={task.out_of_bounds:g} m"
+        )
 
 
 def _reference_heights(task: TaskParams) -> list[tuple[float, float]]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.standing import check_pad
 from quad_gym.batch.starts import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.spaces import (
@@ -37,8 +38,8 @@ if TYPE_CHECKING:
     from quad_gym.tasks import Task
 
 TASK_DEFAULTS: dict[str, TaskParams] = {
-    # within 3 m, SAC overestimates places that it no longer visits, and drifts there; starts are
-    # within 1.56 m
+    # with bounds of 3 m, SAC overestimates the value of places that it no longer visits, and drifts
+    # there; hovering starts are within 1.56 m
     "hover": TaskParams(kind="hover", start="hover", out_of_bounds=1.6),
     # plain PPO learns from "mixed"; from "ground" alone, the report's, no episode gets anywhere
     "circle": TaskParams(kind="circle", start="mixed"),
@@ -209,6 +210,8 @@ class Flights:
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world
         check.instance("world", place, WorldParams)
+        if place.ground is None and custom is None and "start_position_I" not in drawn.names:
+            check_pad(self.task)  # a task of one's own may say where vehicles start
         features = 0 if suite.camera is None else len(suite.camera.features_I)
         self.table: tuple[ObservationField, ...] = observation_layout(
             observation,

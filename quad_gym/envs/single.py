@@ -105,11 +105,12 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     depend on the control rate: 16 for a perfect circle.
 
     ## Episode end
-    Terminated: farther than 3 m from the reference (`Hover`: 1.6 m, `LookAround`: 8 m,
-    `Waypoints`: 12 m), tipped by more than 100 degrees, below -0.5 m (`LookAround`: -5 m), through
-    the last gate, or, in a world that has any, where the vehicle touches an obstacle or leaves the
-    geofence. Truncated: at the time limit, when the filter has failed (`info["filter_status"]`), or
-    with `end_when_lost=True` when it finds that it is lost. `info["ending"]` says which.
+    Terminated: farther than 3 m from the reference (`Hover`: 1.6 m, `LookAround`: 8 m, `Waypoints`
+    and `StaleRace`: 12 m, `OutageDash`: 300 m), tipped by more than 100 degrees, below -0.5 m
+    (`LookAround`: -5 m), through the last gate, or, in a world that has any, where the vehicle
+    touches an obstacle or leaves the geofence. Truncated: at the time limit, when the filter has
+    failed (`info["filter_status"]`), or with `end_when_lost=True` when it finds that it is lost.
+    `info["ending"]` says which.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking
@@ -199,9 +200,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     ## Version history
     - v0: before the first release, rewards became sums over steps of the order of one each (they
       were times the control period: `reward_per="second"`), vehicles that start on the ground stand
-      on a launch pad (they fell while their rotors spun up: `pad=False`), and half of the episodes
-      of the circle start hovering (all did on the ground: `start="ground"`). Stable-Baselines3's
-      default settings did not learn the circle before.
+      on a launch pad (they fell while their rotors spun up: `pad=False`), half of the episodes of
+      the circle start hovering (all did on the ground: `start="ground"`), and those of `Hover` end
+      1.6 m from the point (they ended at 3 m: `out_of_bounds=3.0`). Stable-Baselines3's default
+      settings did not learn the circle before, and its SAC was not stable on `Hover`.
     """
 
     metadata: dict[str, Any] = RENDERING_METADATA

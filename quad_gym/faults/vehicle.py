@@ -16,8 +16,8 @@ class PositionJump(DirectedFault):
 
     No real vehicle jumps, but its filter may find that the world is not where it was: a reference
     station or a map that was moved, a vehicle carried while its IMU was off. It is the trial of a
-    filter's way back. A jump of the measurements alone is `GnssJump`. Sizes reach beyond the bounds
-    of `Hover`; give it `out_of_bounds=3.0`.
+    filter's way back. A jump of the measurements alone is `GnssJump`. The default sizes
+    reach beyond the bounds of `Hover`, 1.6 m; give that environment `out_of_bounds=3.0`.
     """
 
     size: Span = (1.0, 2.0)

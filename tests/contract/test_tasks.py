@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from baselines import PDPolicy
-from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.kernels.task.start import START_POSITION_SIGMA
 from quad_gym.records import Ending
 from tests.contract.comparing import actions_of
 
@@ -181,9 +179,12 @@ def test_farther_from_the_reference_than_its_bound_is_out_of_bounds(task):
 
 
 def test_no_hovering_start_is_out_of_bounds():
-    farthest = math.sqrt(3.0) * 3.0 * START_POSITION_SIGMA  # all three axes at their limits
-    for name, task in TASK_DEFAULTS.items():
-        assert farthest < task.out_of_bounds, name
+    flights = QuadVectorEnv(20_000, "hover", observation="truth").flights.batch
+    flights.reset(seeds=range(20_000))
+    away = np.abs(flights.read("r") - reference_of("hover", 0.0, flights)[0])
+    farthest = np.linalg.norm(away.max(axis=0))  # each axis reaches its limit
+    np.testing.assert_allclose(farthest, 0.9 * math.sqrt(3.0), rtol=1e-12)
+    assert farthest < flights.task.out_of_bounds
 
 
 def test_a_course_has_wider_bounds():

@@ -187,6 +187,7 @@ def train_again(folder, steps, where):
     [
         (["--algorithm", "alphago"], "must be one of"),
         (["--env", "radius=-1"], "radius must be greater than 0"),
+        (["--env", "height=4"], "out_of_bounds must be at least 4 m"),  # half start on the pad
         (["--env", "colour=red"], "colour is not a keyword"),
         (["--set", "gama=0.9"], "gama is not a keyword of PPO"),
         (["--set", "gama=0.9"], "did you mean gamma?"),

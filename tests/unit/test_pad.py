@@ -1,11 +1,15 @@
 """The launch pad: a vehicle on the ground stands still until its thrust lifts it."""
 
+from contextlib import nullcontext
+
 import gymnasium
 import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import FlightBatch, TaskParams, vehicle_params
+from quad_gym import FlightBatch, TaskParams, Trajectory, Uniform, vehicle_params
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Control, Source
 
 LAB = vehicle_params("lab")
@@ -140,33 +144,59 @@ def test_reward_per_step_is_that_per_second_times_the_control_rate():
 
 
 @pytest.mark.parametrize("start", ["ground", "mixed"])
-@pytest.mark.parametrize("kind", ["hover", "circle", "lemniscate"])
-def test_a_reference_out_of_bounds_of_the_pad_is_refused(kind, start):
-    task = {"kind": kind, "start": start, "out_of_bounds": 1.6}
-    flights = batch(16, task=task | {"height": 1.6})
-    flights.reset(seeds=range(16))
-    if kind == "hover":  # elsewhere the reference moves away from the limit
-        flights.step(stopped(16))
-        assert (flights.result("ending") == 0.0).all()
-    message = rf"begins, 1\.61 m: got start='{start}' and out_of_bounds=1\.6 m"
-    with pytest.raises(ValueError, match=message):
-        batch(task=task | {"height": 1.61})
-    with pytest.raises(ValueError, match=message):
-        batch(task=task | {"height": 1.61, "pad": False})
+@pytest.mark.parametrize("task", ["hover", "circle", "lemniscate"])
+def test_a_reference_out_of_bounds_of_the_pad_is_refused(task, start):
+    options = {"start": start, "out_of_bounds": 1.6}
+    env = QuadVectorEnv(16, task, height=1.6, **options)
+    env.reset(seed=1)
+    if task == "hover":  # elsewhere the reference moves away from the limit
+        ending = env.step(np.tile([-1.0, 0.0, 0.0, 0.0], (16, 1)))[4]["ending_code"]
+        assert (ending == 0).all()
+    message = rf"out_of_bounds must be at least 1\.61 m.*start='{start}'.*got out_of_bounds=1\.6 m"
+    for pad in (True, False):
+        with pytest.raises(ValueError, match=message):
+            QuadVectorEnv(16, task, height=1.61, pad=pad, **options)
 
 
 def test_only_pads_from_which_no_episode_can_begin_are_refused():
-    high = {"kind": "hover", "height": 2.0, "out_of_bounds": 1.6}
-    for start in ("hover", "moving"):
-        batch(task=high | {"start": start})
-    lifted = {"start_position_I": (None, None, quad_gym.Uniform(0.0, 0.5))}
-    batch(task=high, randomization=lifted)
-    batch(task={"kind": "waypoints", "height": 2.2, "out_of_bounds": 1.6})  # gates from 1.54 m on
-    with pytest.raises(ValueError, match=r"begins, 1\.61 to 2\.99 m"):
-        batch(task={"kind": "waypoints", "height": 2.3, "out_of_bounds": 1.6})
+    high = {"height": 2.0, "start": "ground"}
+    for changes in ({"out_of_bounds": 2.0}, {"start": "hover"}, {"start": "moving"}):
+        QuadEnv("hover", **high | changes)
+    with pytest.raises(ValueError, match="at least 2 m"):
+        QuadEnv("hover", **high)
+    with pytest.raises(ValueError, match="at least 2 m"):  # draws that leave starts on the pad
+        QuadEnv("hover", **high, randomization={"mass": Uniform(0.9, 1.1, relative=True)})
+    QuadEnv("hover", **high, randomization={"start_position_I": (None, None, Uniform(0.5, 1.0))})
 
 
-def test_an_environment_refuses_a_pad_out_of_its_bounds():
-    with pytest.raises(ValueError, match=r"TaskParams\.start must .* begins, 2 m"):
-        gymnasium.make("QuadGym/Hover-v0", start="ground", height=2.0)
-    gymnasium.make("QuadGym/Hover-v0", start="ground", height=2.0, out_of_bounds=3.0).close()
+class FromAbove(quad_gym.Task):
+    """Says where vehicles start."""
+
+    def reset(self, view, rng):
+        return {"position": view.reference_position - [0.0, 0.0, 0.5]}
+
+
+def test_a_task_that_says_where_vehicles_start_may_have_its_pad_out_of_bounds():
+    env = QuadEnv("hover", height=2.0, start="ground", custom=FromAbove())
+    env.reset(seed=1)
+    assert not env.step(np.zeros(4))[2]
+
+
+@pytest.mark.parametrize(
+    ("task", "refused", "allowed"),
+    [
+        ("waypoints", {"height": 2.3}, {"height": 2.2}),  # the lowest gate is at 0.7 heights
+        ("random_trajectory", {"height": 2.4}, {"height": 2.3}),  # drawn within 0.75 m of it
+    ],
+)
+def test_a_reference_that_may_begin_within_bounds_is_allowed(task, refused, allowed):
+    for keywords, fine in ((refused, False), (allowed, True)):
+        with nullcontext() if fine else pytest.raises(ValueError, match="out_of_bounds must"):
+            QuadEnv(task, start="ground", out_of_bounds=1.6, **keywords)
+
+
+def test_where_a_trajectory_begins_decides():
+    low, high = (Trajectory.through([(0, 0, z), (2, 0, 2), (4, 0, 3)]) for z in (1, 4))
+    QuadEnv("trajectory", start="ground", trajectory=low)
+    with pytest.raises(ValueError, match="at least 4 m"):
+        QuadEnv("trajectory", start="ground", trajectory=[low, high])
