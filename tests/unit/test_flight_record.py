@@ -102,7 +102,8 @@ def test_nees_is_that_of_the_error_and_the_covariance():
 
 
 def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
-    env, flight, _ = recorded("hover", steps=100, gnss_rate=5.0, control_rate=50.0)
+    keywords = {"gnss_rate": 5.0, "control_rate": 50.0, "out_of_bounds": 50.0}
+    env, flight, _ = recorded("hover", steps=100, **keywords)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
     np.testing.assert_array_equal(np.flatnonzero(measured), np.arange(0, 101, 10))
     lever = quad_gym.sensor_suite("lab").gnss.primary_antenna_B
