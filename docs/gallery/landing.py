@@ -44,8 +44,8 @@ class Landing(quad_gym.Task):
 
 
 # %%
-# The actions are velocities. A million steps take about a minute on two cores; the policy that they
-# lead to is kept beside this file.
+# The actions are velocities. A million and a half steps take about a minute on two cores; the
+# policy that they lead to is kept beside this file.
 
 KEYWORDS = {
     "custom": Landing(),
@@ -56,7 +56,7 @@ KEYWORDS = {
     "max_episode_steps": 300,
 }
 RECIPE = Recipe(
-    steps=1_000_000,
+    steps=1_500_000,
     n_envs=128,
     parameters={"n_steps": 32, "batch_size": 1024, "n_epochs": 5, "gamma": 0.98},
     policy={"log_std_init": -1.0},
@@ -83,7 +83,7 @@ miss = np.linalg.norm(batch.read("r")[:, :2] - batch.view.state.pad, axis=1)
 stands = (batch.read("footing") > 0.0) & ~crashed
 landed = (stands & (miss < 0.2)).mean()
 print(f"on the pad {100 * landed:.0f} %, median miss {100 * np.median(miss):.1f} cm")
-assert landed > 0.9
+assert landed > 0.95
 
 plt.plot(np.arange(299) / 50.0, np.array(heights)[:, :20])
 plt.gca().set(xlabel="time [s]", ylabel="height of the center of mass [m]")
