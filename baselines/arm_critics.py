@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 
 from baselines.arm_tasks import Parts, SteadyWary, Sure, scaled_parts
 from quad_gym.tasks.outage_dash import gaps_behind, gaps_of
-from quad_gym.tasks.task import Observed
+from quad_gym.tasks.task import ObservationSpec
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
-_TRUE: Mapping[str, Observed] = {
-    "actual_position_error": Observed("m", "B"),
-    "actual_velocity_error": Observed("m/s", "B"),
-    "actual_up": Observed("-", "B"),
-    "actual_heading": Observed("-", "B"),
-    "actual_body_rates": Observed("rad/s", "B"),
+_TRUE: Mapping[str, ObservationSpec] = {
+    "actual_position_error": ObservationSpec("m", "B"),
+    "actual_velocity_error": ObservationSpec("m/s", "B"),
+    "actual_up": ObservationSpec("-", "B"),
+    "actual_heading": ObservationSpec("-", "B"),
+    "actual_body_rates": ObservationSpec("rad/s", "B"),
 }
-_SCALED_TRUE: Mapping[str, Observed] = {
-    "actual_position_error_scaled": Observed("-", "B"),
-    "actual_velocity_error_scaled": Observed("-", "B"),
-    "actual_up": Observed("-", "B"),
-    "actual_heading": Observed("-", "B"),
-    "actual_body_rates_scaled": Observed("-", "B"),
-    "gnss_fails": Observed("0 or 1", "-"),
+_SCALED_TRUE: Mapping[str, ObservationSpec] = {
+    "actual_position_error_scaled": ObservationSpec("-", "B"),
+    "actual_velocity_error_scaled": ObservationSpec("-", "B"),
+    "actual_up": ObservationSpec("-", "B"),
+    "actual_heading": ObservationSpec("-", "B"),
+    "actual_body_rates_scaled": ObservationSpec("-", "B"),
+    "gnss_fails": ObservationSpec("0 or 1", "-"),
 }
 
 
@@ -44,7 +44,7 @@ class SureForCritic(Sure):
     """
 
     privileged = True
-    observes: Mapping[str, Observed] = {**Sure.observes, **_TRUE}
+    observes: Mapping[str, ObservationSpec] = {**Sure.observes, **_TRUE}
 
     def observe(self, view: "View") -> Parts:
         """As `Sure`, and five parts (n, 3) of the truth."""
@@ -59,7 +59,7 @@ class SteadyWaryForCritic(SteadyWary):
     """
 
     privileged = True
-    observes: Mapping[str, Observed] = {**SteadyWary.observes, **_SCALED_TRUE}
+    observes: Mapping[str, ObservationSpec] = {**SteadyWary.observes, **_SCALED_TRUE}
 
     def observe(self, view: "View") -> Parts:
         """As `SteadyWary`, five parts (n, 3) of the truth, and `gnss_fails` (n,)."""

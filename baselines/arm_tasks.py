@@ -14,7 +14,7 @@ from quad_gym.tasks.look_around import LookAround
 from quad_gym.tasks.outage_dash import OutageDash, gaps_of
 from quad_gym.tasks.rewards import Crash
 from quad_gym.tasks.stale_race import StaleRace
-from quad_gym.tasks.task import Observed
+from quad_gym.tasks.task import ObservationSpec
 
 if TYPE_CHECKING:
     from quad_gym.tasks.draws import FlightRandom
@@ -82,9 +82,9 @@ class Doubting(LookAround):
         super().__init__()
         self._told = check.positive("told", told)
 
-    observes: Mapping[str, Observed] = {
+    observes: Mapping[str, ObservationSpec] = {
         **LookAround.observes,
-        "log_sigma": Observed("log10", "I", -1.0, 6.0),
+        "log_sigma": ObservationSpec("log10", "I", -1.0, 6.0),
     }
 
     def observe(self, view: "View") -> Parts:
@@ -107,7 +107,10 @@ class Remembering(Doubting):
     """
 
     state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _SEEN))}
-    observes: Mapping[str, Observed] = {**Doubting.observes, "past": Observed("mixed", "B")}
+    observes: Mapping[str, ObservationSpec] = {
+        **Doubting.observes,
+        "past": ObservationSpec("mixed", "B"),
+    }
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Every so often, remember the present, and forget the oldest."""
@@ -150,7 +153,7 @@ class RecallingRace(StaleRace):
     """
 
     state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _RECALLED))}
-    observes: Mapping[str, Observed] = {"past": Observed("mixed", "B")}
+    observes: Mapping[str, ObservationSpec] = {"past": ObservationSpec("mixed", "B")}
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Every so often, remember the present, and forget the oldest."""
@@ -171,14 +174,14 @@ class SeenRace(StaleRace):
 
     replaces_observation = True
     keeps: Collection[str] = ("last_action",)
-    observes: Mapping[str, Observed] = {
-        "position_error": Observed("m", "B"),
-        "velocity_error": Observed("m/s", "B"),
-        "up": Observed("-", "B"),
-        "heading": Observed("-", "B"),
-        "body_rates": Observed("rad/s", "B"),
-        "preview_1": Observed("m", "B"),
-        "preview_2": Observed("m", "B"),
+    observes: Mapping[str, ObservationSpec] = {
+        "position_error": ObservationSpec("m", "B"),
+        "velocity_error": ObservationSpec("m/s", "B"),
+        "up": ObservationSpec("-", "B"),
+        "heading": ObservationSpec("-", "B"),
+        "body_rates": ObservationSpec("rad/s", "B"),
+        "preview_1": ObservationSpec("m", "B"),
+        "preview_2": ObservationSpec("m", "B"),
     }
 
     def residual(self, view: "View") -> NDArray[np.float64]:
@@ -244,11 +247,11 @@ def scaled_parts(parts: Parts) -> Parts:
     return {_shown_as(name): _scaled(name, part) for name, part in parts.items()}
 
 
-def _in_numbers(name: str, part: Observed) -> Observed:
+def _in_numbers(name: str, part: ObservationSpec) -> ObservationSpec:
     """A part of `OutageDash` as `Scaled` declares it: without a unit, its bounds scaled."""
     if _shown_as(name) == name:
         return part
-    return Observed("-", part.frame, _scaled(name, part.low), _scaled(name, part.high))
+    return ObservationSpec("-", part.frame, _scaled(name, part.low), _scaled(name, part.high))
 
 
 class Scaled(OutageDash):
@@ -261,7 +264,7 @@ class Scaled(OutageDash):
     policies that fly `OutageDash` are refused here, and those of here are refused there.
     """
 
-    observes: Mapping[str, Observed] = {
+    observes: Mapping[str, ObservationSpec] = {
         _shown_as(name): _in_numbers(name, part) for name, part in OutageDash.observes.items()
     }
 
@@ -278,9 +281,9 @@ class Wary(Scaled):
     standard deviations do not fit through.
     """
 
-    observes: Mapping[str, Observed] = {
+    observes: Mapping[str, ObservationSpec] = {
         **Scaled.observes,
-        "doubt": Observed("log4", "-", -4.0, 4.0),
+        "doubt": ObservationSpec("log4", "-", -4.0, 4.0),
     }
 
     def observe(self, view: "View") -> Parts:
@@ -333,14 +336,14 @@ class Withholding(StaleRace):
     """`StaleRace` with the 15 standard deviations in its observation, some of them withheld.
 
     What is withheld is shown as the constant median of `TOLD_IN_A_RACE`, so that a policy that was
-    trained with `include_covariance=True` can be flown without that part.
+    trained with `include_std=True` can be flown without that part.
 
     Args:
         withheld: Names of `TOLD_IN_A_RACE`.
     """
 
-    observes: Mapping[str, Observed] = {
-        name: Observed(unit, frame, 0.0) for name, (unit, frame, _) in TOLD_IN_A_RACE.items()
+    observes: Mapping[str, ObservationSpec] = {
+        name: ObservationSpec(unit, frame, 0.0) for name, (unit, frame, _) in TOLD_IN_A_RACE.items()
     }
 
     def __init__(self, *withheld: str) -> None:

@@ -81,7 +81,7 @@ ARMS = (
         name="pd_unsure",
         label="PD, facing the features when unsure",
         policy="pd:features_when_unsure",
-        environment={"include_covariance": True},
+        environment={"include_std": True},
     ),
     Arm(name="truth", label="truth", training={"observation": "truth"}),
     Arm(name="noisy", label="truth + independent noise", training={"observation": "noisy"}),
@@ -127,10 +127,10 @@ ARMS = (
 """Those of `QuadGym/LookAround-v0`."""
 
 _TRUTH = {"observation": "truth"}
-_SIGMAS = {"include_covariance": True}
+_SIGMAS = {"include_std": True}
 _STALE = sensor_suite("stale")
 _STAMPED = {
-    "sensors": _STALE.replace(estimator=_STALE.estimator.replace(late_measurements="rewind"))
+    "sensors": _STALE.replace(estimator=_STALE.estimator.replace(delay_compensation="retrodict"))
 }
 """The same sensors, and a filter that knows how old their measurements are."""
 _RECALLING = {"custom": "baselines.arm_tasks:RecallingRace", **_SIGMAS}

@@ -112,9 +112,9 @@ class PDPolicy:
         faces: Where body x points: in the direction of the "reference"; toward the "features" of
             an environment that observes their direction, as LookAround does; or toward them
             "features_when_unsure", while the filter's largest standard deviation of the position is
-            above UNSURE, which the environment must show (`include_covariance=True`).
+            above UNSURE, which the environment must show (`include_std=True`).
         pace: "steady", or "waiting": WAITS_BEFORE a gap that is too narrow for how sure the filter
-            is, which the environment must show (`include_covariance=True`).
+            is, which the environment must show (`include_std=True`).
 
     Raises:
         ValueError: If the environment's observation or action does not admit the controller, or a
@@ -147,7 +147,7 @@ class PDPolicy:
         if lacking:
             raise ValueError(
                 f'env must observe {lacking[0]} for faces="{faces}"'
-                + (": make it with include_covariance=True" if "sigma" in lacking[0] else "")
+                + (": make it with include_std=True" if "sigma" in lacking[0] else "")
             )
         self._waits = check.choice("pace", pace, PACES) == "waiting"
         if self._waits:
@@ -155,7 +155,7 @@ class PDPolicy:
                 if name not in shown:
                     raise ValueError(
                         f'env must observe {name} for pace="waiting", as OutageDash does with '
-                        "include_covariance=True"
+                        "include_std=True"
                     )
         # a task's own observation of a reference at rest has no use for its acceleration
         self._gaps = "gap_width" in shown

@@ -112,11 +112,11 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
         ValueError: If no policy ships for the task and "pretrained" is asked for.
     """
     if name in ("pd:features_when_unsure", "pd:waiting"):
-        return {"include_covariance": True}
+        return {"include_std": True}
     if name != "pretrained":
         return {}
     trained = MlpPolicy.load(pretrained_file(env_id)).record["plan"]["environment"]
-    return {key: trained[key] for key in ("custom", "include_covariance") if key in trained}
+    return {key: trained[key] for key in ("custom", "include_std") if key in trained}
 
 
 def _gains_of(file: Path) -> PDGains:

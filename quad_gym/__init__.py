@@ -20,7 +20,7 @@ from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
 from quad_gym.params.randomization import Randomization
-from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
+from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
 from quad_gym.params.trajectories import Trajectory
@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # what _LAZY imports on first use
     from quad_gym.estimation import UnscentedKalmanFilter as UnscentedKalmanFilter
     from quad_gym.flights.record import Flight as Flight
     from quad_gym.flights.record import FlightRecorder as FlightRecorder
-    from quad_gym.tasks import Observed as Observed
+    from quad_gym.tasks import ObservationSpec as ObservationSpec
     from quad_gym.tasks import Task as Task
     from quad_gym.tasks import TaskError as TaskError
     from quad_gym.tasks import rewards as rewards
@@ -64,7 +64,7 @@ _LAZY = {
     "QuadVectorEnv": "quad_gym.envs.vector",
     "ExtendedKalmanFilter": "quad_gym.estimation",
     "UnscentedKalmanFilter": "quad_gym.estimation",
-    "Observed": "quad_gym.tasks",
+    "ObservationSpec": "quad_gym.tasks",
     "Task": "quad_gym.tasks",
     "TaskError": "quad_gym.tasks",
     "View": "quad_gym.tasks.view",
@@ -84,12 +84,12 @@ __all__ = [
     "GnssParams",
     "GroundParams",
     "ImuParams",
+    "InitialPoseParams",
     "LogUniform",
     "MagnetometerParams",
     "NoisyObservationParams",
     "Normal",
     "PDGains",
-    "PlacementParams",
     "Randomization",
     "SensorSuite",
     "TaskParams",

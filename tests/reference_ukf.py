@@ -236,7 +236,7 @@ class PlainUKF:
         self.r = self.R_IG @ self._array(gnss_position_G) - self.R.T @ self.l_p
         self.v, self.b_a, self.b_g = (self.zeros[:3] for _ in range(3))
         eye, choice, imu = eye_of(self.number), self.sensors.estimator, self.sensors.imu
-        scale = self.number(choice.initial_scale)
+        scale = self.number(choice.initial_covariance_scale)
         self.P = block_diagonal(
             scale * self.R_position,
             self.number(choice.initial_velocity_variance) * eye,
@@ -342,10 +342,10 @@ class PlainUKF:
 
         variance = (self.number(camera.pixel_sigma) * size) ** 2 / (v @ v)
         across = unit(v)
-        if self.sensors.estimator.feature_noise_across != "measured":
+        if self.sensors.estimator.bearing_noise_at != "measured":
             across = direction(self.r, self.R, self.d)
         noise = self._direction_noise(across, variance)
-        if self.sensors.estimator.feature_noise_across == "projected":
+        if self.sensors.estimator.bearing_noise_at == "pinhole":
             projector = eye_of(self.number) - np.outer(across, across)
             in_image = self._array(np.diag([1.0, 1.0, 0.0]))
             noise = variance * projector @ in_image @ projector + self.floor

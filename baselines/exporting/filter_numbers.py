@@ -22,13 +22,19 @@ _FIELDS = {
         *("accel_bias_sigma", "gyro_bias_sigma"),
         *("imu_lever_arm", "sigma_spread", "sigma_beta", "sigma_kappa", "direction_floor"),
         *("gnss_sigma", "heading_sigma", "R_IG", "antenna", "velocity_sigma"),
-        *("initial_velocity_variance", "initial_scale", "initial_tilt_sigma"),
-        *("gate_position", "gate_direction", "gate_uncertainty", "gate_patience"),
+        *("initial_velocity_variance", "initial_covariance_scale", "initial_tilt_sigma"),
+        *("gate_position", "gate_direction", "gate_uncertainty", "max_rejections"),
     ),
     "baseline": ("baseline_noise", "first_baseline_sigma", "baseline", "baseline_length"),
     "camera": (
         *("camera", "R_CB", "pixel_size", "focal_length", "half_image", "pixel_sigma"),
-        *("blur", "features", "noise_at_prediction", "noise_projected", "gradual_above"),
+        *(
+            "blur",
+            "features",
+            "noise_at_prediction",
+            "noise_projected",
+            "recursive_update_threshold",
+        ),
     ),
 }
 """What the filter's kernels read of the parameters: of any suite, of one with two antennas or with
@@ -63,12 +69,12 @@ _MEANINGS = {
     "pixel_sigma": "noise of a pixel per axis",
     "blur": "noise of a pixel per body rate",
     "initial_velocity_variance": "of the velocity at the start",
-    "initial_scale": "factor on the first fix's covariance at the start",
+    "initial_covariance_scale": "factor on the first fix's covariance at the start",
     "initial_tilt_sigma": "of roll and pitch at the start; 0: attitude by Wahba's problem",
 }
 """Words for those that `PARAMS_FIELDS` explains by what stands beside them."""
 
-_CHOICES = ("kind", "integration", "covariance_reset", "feature_noise_across", "late_measurements")
+_CHOICES = ("kind", "integration", "covariance_reset", "bearing_noise_at", "delay_compensation")
 """Words among the parameters of a filter."""
 
 

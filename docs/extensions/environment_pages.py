@@ -118,8 +118,8 @@ def _observations_page() -> str:
         'Relative, the default (`layout="relative"`)': {},
         'Absolute (`layout="absolute"`)': {"layout": "absolute"},
         'Raw measurements (`observation="sensors"`), two features': {"observation": "sensors"},
-        "Relative, with the filter's standard deviations (`include_covariance=True`)": {
-            "include_covariance": True
+        "Relative, with the filter's standard deviations (`include_std=True`)": {
+            "include_std": True
         },
         "Relative, with the truth for a critic (`privileged=True`)": {"privileged": True},
     }
@@ -246,7 +246,7 @@ def _suites_page() -> str:
         "camera": quad_gym.CameraParams,
         "barometer": quad_gym.BarometerParams,
         "magnetometer": quad_gym.MagnetometerParams,
-        "placement": quad_gym.PlacementParams,
+        "initial_pose": quad_gym.InitialPoseParams,
         "estimator": quad_gym.FilterParams,
         "noisy": quad_gym.NoisyObservationParams,
     }.items():

@@ -62,7 +62,7 @@ for values, name in ((clean, "no fault"), (dirty, "5 % outliers")):
     share, _ = np.histogram(values, bins)
     axes.step(centers, share / len(values), where="mid", label=name)
 axes.plot(centers, np.diff(chi2.cdf(bins, 3)), color="0.3", linestyle="--", label="chi-square, 3")
-limit = chi2.isf(quad_gym.sensor_suite("rtk").estimator.gate_false_alarm, 3)
+limit = chi2.isf(quad_gym.sensor_suite("rtk").estimator.false_alarm_probability, 3)
 axes.axvline(limit, color="C3", label="gate")
 axes.set(xscale="log", yscale="log", ylim=(1e-5, 0.2), xlabel="NIS of GNSS positions")
 axes.set(ylabel="share of fixes per bin")
@@ -75,7 +75,7 @@ print(f"rejected: {100 * rejected:.2f} % of the fixes")
 # The gate is what makes the filter bear them:
 
 rtk = quad_gym.sensor_suite("rtk")
-open_gate = rtk.replace(estimator=rtk.estimator.replace(gate_false_alarm=0.0))
+open_gate = rtk.replace(estimator=rtk.estimator.replace(false_alarm_probability=0.0))
 _, _, open_error = fly(open_gate, GnssOutliers(share=0.05))
 print(f"mean error of the estimate: with the gate {1e3 * gated_error.mean():.1f} mm, ", end="")
 print(f"without it {1e3 * open_error.mean():.1f} mm")

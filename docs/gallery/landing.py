@@ -24,7 +24,7 @@ from baselines.recipes import Recipe
 
 class Landing(quad_gym.Task):
     state = {"pad": np.zeros(2)}
-    observes = {"to_pad": quad_gym.Observed("m", "B", -5.0, 5.0)}
+    observes = {"to_pad": quad_gym.ObservationSpec("m", "B", -5.0, 5.0)}
 
     def reset(self, view, rng):
         view.state.pad = view.reference_position[:, :2] + rng.uniform(-1.0, 1.0, (view.count, 2))
@@ -36,7 +36,12 @@ class Landing(quad_gym.Task):
         near = 0.5 * np.exp(-2.0 * self.miss(view)) + 0.5 * np.exp(-10.0 * self.miss(view))
         low = np.exp(-2.0 * np.maximum(view.position[:, 2], 0.0))
         stands = view.truth.on_ground & (self.miss(view) < 0.2)
-        return 0.2 * near + 0.3 * near * low + 0.5 * stands - 0.02 * quad_gym.rewards.Effort()(view)
+        return (
+            0.2 * near
+            + 0.3 * near * low
+            + 0.5 * stands
+            - 0.02 * quad_gym.rewards.ActionRate()(view)
+        )
 
     def observe(self, view):
         pad = np.column_stack([view.state.pad, np.zeros(view.count)])

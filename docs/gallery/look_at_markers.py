@@ -16,7 +16,7 @@ from quad_gym import rewards
 
 
 class LookAtMarkers(quad_gym.Task):
-    observes = {"position_sigma": quad_gym.Observed("m", "I", 0.0, 10.0)}
+    observes = {"position_sigma": quad_gym.ObservationSpec("m", "I", 0.0, 10.0)}
 
     def __init__(self, turned):
         self.turned = turned

@@ -21,7 +21,7 @@ from baselines.recipes import Recipe
 
 class MovingTarget(quad_gym.Task):
     state = {"target": np.zeros(3), "velocity": np.zeros(3), "seen": np.zeros(3)}
-    observes = {"target": quad_gym.Observed("m", "B", -50.0, 50.0)}
+    observes = {"target": quad_gym.ObservationSpec("m", "B", -50.0, 50.0)}
 
     def reset(self, view, rng):
         view.state.target = view.state.seen = view.reference_position
@@ -35,7 +35,7 @@ class MovingTarget(quad_gym.Task):
 
     def reward(self, view):
         distance = np.linalg.norm(view.state.target - view.position, axis=1)
-        return np.exp(-2.0 * distance) - 0.02 * quad_gym.rewards.Effort()(view)
+        return np.exp(-2.0 * distance) - 0.02 * quad_gym.rewards.ActionRate()(view)
 
     def terminated(self, view):
         far = np.linalg.norm(view.state.target - view.position, axis=1) > 5.0

@@ -37,7 +37,7 @@ def fly(*faults):
         observation, _, _, _, info = envs.step(action)
         errors.append((batch.read("r") - batch.read("r_hat"))[:, 0])
         claimed.append(np.sqrt(batch.covariance()[:, 0, 0]))
-        lost.append(info["filter_lost"].mean())
+        lost.append(info["filter_diverged"].mean())
     return np.array(errors), np.array(claimed), np.array(lost)
 
 
@@ -72,8 +72,8 @@ print(f"within 3 sigma: {100 * inside:.1f} % of all errors; lost filters: {100 *
 # deviation that the filter assumes for it. The error grows far beyond what the filter claims. When
 # fixes return, they contradict the estimate so much that the gate rejects them. After ten
 # rejections in a row the filter inflates its covariance, and accepts the next fix.
-# ``info["filter_lost"]`` is true while the filter finds that its covariance does not explain what
-# it measures.
+# ``info["filter_diverged"]`` is true while the filter's covariance does not explain its
+# measurements.
 
 step = AccelBiasStep(start=5.0, duration=float("inf"), size=(0.2, 0.2))
 errors, claimed, lost = fly(outage, step)
@@ -98,6 +98,6 @@ print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 # One recovery is not always enough. Where the new bias is still mostly unknown, the estimate drifts
 # off again, as the 95th percentile shows, until the filter inflates its covariance once more.
 #
-# ``end_when_lost=True`` truncates an episode when its filter is lost. See
+# ``truncate_when_diverged=True`` truncates an episode when its filter is lost. See
 # :doc:`/sensors-and-filter` for the thresholds, and :doc:`/filter-equations` for what is
 # inflated.

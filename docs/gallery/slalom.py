@@ -30,7 +30,7 @@ for k, x in enumerate(GAPS_AT):
 
 
 class Slalom(quad_gym.Task):
-    observes = {"gaps": quad_gym.Observed("m", "B", -15.0, 15.0)}
+    observes = {"gaps": quad_gym.ObservationSpec("m", "B", -15.0, 15.0)}
 
     def reset(self, view, rng):
         start = np.column_stack([np.full(view.count, -2.0), rng.uniform(-1.0, 1.0, view.count)])

@@ -4,7 +4,7 @@
   square below the chi-square quantile that holds 99.73 % of a consistent filter's, as 3 sigma do of
   a single number. Where that filter has 0.27 % of its flights outside at any instant, one has gone
   astray that has more.
-* **Told** is a flight of which `filter_lost` of `info` is true at the same instant.
+* **Told** is a flight of which `filter_diverged` of `info` is true at the same instant.
 * **Far off** is one in which any of these errors exceeds six of its deviations. A missed alarm is a
   flight that is far off for `MISSED_AFTER` on end and not told in all that time; a false alarm is
   one that is told anew without a fault.

@@ -81,7 +81,7 @@ class FlightBatch(FlightMemory):
         action_delay: How much later than commanded an action is carried out, at most
             MAX_ACTION_DELAY, in whole ticks [control steps]. Before, a vehicle hovers.
         layout: What an observation holds.
-        include_covariance: Whether an observation holds the filter's standard deviations.
+        include_std: Whether an observation holds the filter's standard deviations.
         privileged: Whether an observation ends with the truth.
         bounds: (low, high) of the observation, each (n,); None: the batch observes nothing.
         autoreset: When a flight whose episode is over begins the next one.
@@ -91,7 +91,7 @@ class FlightBatch(FlightMemory):
             from the covariance that it has reached.
         innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
             "innovation_sigma", "block_nis"; a gate keeps them anyway, and so does a filter that
-            meets `faults`, or whose task has `end_when_lost`.
+            meets `faults`, or whose task has `truncate_when_diverged`.
         threads: Threads to use; None: as many as there are cores.
         true_vehicle: The vehicle as it is, where it differs from the nominal one that the
             controller knows.
@@ -120,7 +120,7 @@ class FlightBatch(FlightMemory):
         substeps: int = 1,
         action_delay: float = 0.0,
         layout: Layout = Layout.RELATIVE,
-        include_covariance: bool = False,
+        include_std: bool = False,
         privileged: bool = False,
         bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
         autoreset: Autoreset = Autoreset.DISABLED,
@@ -163,16 +163,16 @@ class FlightBatch(FlightMemory):
         self.sensors.require_like(true_sensors)
         self.faults = faults_of(faults, true_sensors)
         self.innovations = check.flag("innovations", innovations)
-        check.flag("include_covariance", include_covariance)
+        check.flag("include_std", include_std)
         check.flag("privileged", privileged)
         check.choice("filter_start", filter_start, FILTER_STARTS)
         if run_filter is None:
-            needed = include_covariance or innovations
+            needed = include_std or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
         self.run_filter = check.flag("run_filter", run_filter)
-        if self.task.end_when_lost and not run_filter:
-            raise ValueError("end_when_lost needs a filter, and none runs here")
-        watches = self.innovations or bool(self.faults) or self.task.end_when_lost
+        if self.task.truncate_when_diverged and not run_filter:
+            raise ValueError("truncate_when_diverged needs a filter, and none runs here")
+        watches = self.innovations or bool(self.faults) or self.task.truncate_when_diverged
         if run_filter:
             self.sensors.require_filter()
 
@@ -201,7 +201,7 @@ class FlightBatch(FlightMemory):
             source=self.source,
             control=self.control,
             layout=Layout(layout),
-            include_covariance=include_covariance,
+            include_std=include_std,
             privileged=privileged,
             autoreset=Autoreset(autoreset),
             run_filter=run_filter,

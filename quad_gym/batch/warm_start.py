@@ -117,7 +117,7 @@ def converged_covariance(
         raise ValueError(
             f"filter_start must be 'cold' for these sensors: after {WARM_UP:g} s of hovering the "
             f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
-            "filter its heading, such as a level baseline or the mark of `placement`?"
+            "filter its heading, such as a level baseline or the mark of `initial_pose`?"
         )
     states = 15 + len(slow_states(sensors).errors)
     mean = np.zeros((states, states))

@@ -191,10 +191,10 @@ def filter_cases(suite: SensorSuite) -> list[Case]:
     ]
     if suite.camera is not None:
         cases += [
-            form("UKF, images always whole", gradual_above=None),
-            form("UKF, pixel noise across the measured direction", feature_noise_across="measured"),
+            form("UKF, images always whole", recursive_update_threshold=None),
+            form("UKF, pixel noise across the measured direction", bearing_noise_at="measured"),
         ]
-    start = {"initial_tilt_sigma": None, "initial_scale": 2.0, "reuse_first_fix": True}
+    start = {"initial_tilt_sigma": None, "initial_covariance_scale": 2.0, "reuse_first_fix": True}
     cases.append(form("UKF, the report's start", **start))
     everything = suite.replace(imu=sampled, estimator=report.estimator)
     return [*cases, Case("UKF, all of the report's form", everything)]

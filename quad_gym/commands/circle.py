@@ -88,7 +88,7 @@ class Args:
     """GNSS fixes per second [Hz]; if not given, one at every IMU sample"""
     camera_rate: float | None = None
     """camera images per second [Hz]; if not given, one at every IMU sample"""
-    feature_noise_across: Literal["measured", "predicted"] = "measured"
+    bearing_noise_at: Literal["measured", "predicted"] = "measured"
     """direction across which the filter takes the camera's noise to lie: measured, as in the
     report, makes it overconfident; predicted hardly does"""
 
@@ -137,7 +137,7 @@ def configure(args: Args) -> Setup:
     suite = sensor_suite("lab").with_rates(
         imu=args.imu_rate, gnss=args.gnss_rate, camera=args.camera_rate
     )
-    estimator = suite.estimator.replace(feature_noise_across=args.feature_noise_across)
+    estimator = suite.estimator.replace(bearing_noise_at=args.bearing_noise_at)
     suite = suite.replace(estimator=estimator)
     cases = {TRUTH: (Source.TRUTH, suite), ESTIMATE: (Source.ESTIMATE, suite)}
     cases[NO_CAMERA] = (Source.ESTIMATE, suite.replace(camera=None))
@@ -248,10 +248,10 @@ def in_words(results: dict[str, Recording], args: Args) -> str:
         found = compare(results, ESTIMATE, NO_CAMERA)
         sentences.append(in_a_sentence("Having the camera", found))
         harmful = found.significant and found.spread.mean > 0.0
-        if harmful and args.feature_noise_across == "measured":
+        if harmful and args.bearing_noise_at == "measured":
             sentences.append(
                 "The report's form of the camera's noise makes the filter overconfident, as its "
-                "NEES shows; compare with --feature-noise-across predicted."
+                "NEES shows; compare with --bearing-noise-at predicted."
             )
     return "\n".join(
         textwrap.fill(text, 98, subsequent_indent="  ", break_on_hyphens=False)

@@ -127,7 +127,7 @@ class Args:
     """how the filter integrates IMU samples, in place of the form's"""
     covariance_reset: Literal["none", "turn"] | None = None
     """whether the covariance turns with the attitude that is corrected, in place of the form's"""
-    feature_noise_across: Literal["measured", "predicted", "projected"] | None = None
+    bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
     """direction to which the filter assumes camera noise is perpendicular, in place of the
     form's"""
     estimator: Literal["ukf", "ekf"] | None = None
@@ -209,7 +209,7 @@ def suite_of(args: Args) -> SensorSuite:
         form = FilterParams() if args.form == "report" else FIELD_FILTER
         suite = suite.replace(estimator=form)
     chosen = {"kind": args.estimator} if args.estimator is not None else {}
-    for name in ("integration", "covariance_reset", "feature_noise_across"):
+    for name in ("integration", "covariance_reset", "bearing_noise_at"):
         if getattr(args, name) is not None:
             chosen[name] = getattr(args, name)
     suite = suite.replace(
@@ -276,7 +276,7 @@ def title_of(batch: FlightBatch, args: Args) -> str:
         f"reset {choices.covariance_reset}",
     ]
     if sensors.camera is not None:
-        parts.append(f"feature noise across the {choices.feature_noise_across} direction")
+        parts.append(f"feature noise across the {choices.bearing_noise_at} direction")
     return ", ".join(parts)
 
 

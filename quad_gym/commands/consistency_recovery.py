@@ -81,7 +81,7 @@ class Trial:
     @property
     def expected(self) -> str:
         """Why filters may stay wrong in silence."""
-        gated = self.flown.estimator.gate_false_alarm > 0.0
+        gated = self.flown.estimator.false_alarm_probability > 0.0
         return "" if gated else "no gate, so it cannot correct itself"
 
 

@@ -9,7 +9,7 @@ from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS
 
 if TYPE_CHECKING:
-    from quad_gym.envs.sb3 import QuadVecEnv
+    from quad_gym.envs.sb3 import QuadSB3VecEnv
     from quad_gym.tasks import Task
 
 IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in (*TASKS, *BENCHMARKS)}
@@ -79,7 +79,7 @@ def _meant(env_id: Any) -> str:
 
 def make_sb3_vec_env(
     env_id: str, n_envs: int = 1, seed: int | None = None, **keywords: Any
-) -> "QuadVecEnv":
+) -> "QuadSB3VecEnv":
     """N flights of an id as a Stable-Baselines3 vector environment.
 
     Args:
@@ -98,12 +98,12 @@ def make_sb3_vec_env(
     given = keywords_of(env_id) | keywords
     check.seed("seed", seed)
     try:
-        from quad_gym.envs.sb3 import QuadVecEnv
+        from quad_gym.envs.sb3 import QuadSB3VecEnv
     except ImportError as error:
         raise ImportError(
             'make_sb3_vec_env needs Stable-Baselines3: pip install "quad-gym[train]"'
         ) from error
-    env = QuadVecEnv(n_envs, **given)
+    env = QuadSB3VecEnv(n_envs, **given)
     if seed is not None:
         env.seed(seed)
     return env

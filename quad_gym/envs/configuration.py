@@ -145,13 +145,13 @@ class Flights:
         observation: str = "estimate",
         action: str = "ctbr",
         layout: str = "relative",
-        include_covariance: bool = False,
+        include_std: bool = False,
         privileged: bool = False,
         sensors: SensorSuite | str = "standard",
         vehicle: VehicleParams | str = "lab",
         actions: ActionParams | None = None,
         camera: bool = True,
-        feature_noise_across: str | None = None,
+        bearing_noise_at: str | None = None,
         estimator: str | None = None,
         filter_start: str = "cold",
         control_rate: float = CONTROL_RATE,
@@ -173,7 +173,7 @@ class Flights:
         check.choice("action", action, tuple(ACTIONS))
         check.choice("layout", layout, tuple(LAYOUTS))
         check.flag("camera", camera)
-        check.flag("include_covariance", include_covariance)
+        check.flag("include_std", include_std)
         check.flag("privileged", privileged)
         suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         if not isinstance(suite, SensorSuite):
@@ -182,8 +182,8 @@ class Flights:
             suite = suite.replace(camera=None)
         elif camera_is_wanted and suite.camera is None:
             raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
-        if feature_noise_across is not None:
-            choices = suite.estimator.replace(feature_noise_across=feature_noise_across)
+        if bearing_noise_at is not None:
+            choices = suite.estimator.replace(bearing_noise_at=bearing_noise_at)
             suite = suite.replace(estimator=choices)
         if estimator is not None:
             check.choice("estimator", estimator, ("ukf", "ekf"))
@@ -196,7 +196,7 @@ class Flights:
         idle = _runs_no_sensor(
             {
                 "observation": observation,
-                "include_covariance": include_covariance,
+                "include_std": include_std,
                 "innovations": innovations,
             }
         )
@@ -205,7 +205,7 @@ class Flights:
             raise ValueError(
                 f"faults must concern what is simulated: {type(felt[0]).__name__} concerns "
                 f'sensors, and none runs with observation="{observation}" (unless '
-                "include_covariance or innovations ask for the filter)"
+                "include_std or innovations ask for the filter)"
             )
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world
@@ -216,7 +216,7 @@ class Flights:
         self.table: tuple[ObservationField, ...] = observation_layout(
             observation,
             layout,
-            include_covariance=include_covariance,
+            include_std=include_std,
             privileged=privileged,
             feature_count=features,
             gnss_velocity=suite.gnss is not None and suite.gnss.velocity_sigma is not None,
@@ -239,7 +239,7 @@ class Flights:
             substeps=substeps,
             action_delay=action_delay,
             layout=Layout.SENSORS if observation == "sensors" else LAYOUTS[layout],
-            include_covariance=include_covariance,
+            include_std=include_std,
             privileged=privileged,
             bounds=bounds,
             filter_start=filter_start,
@@ -292,7 +292,7 @@ _BUILT_WITH = (
 
 def _runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
     """Whether an environment of these keywords simulates no sensor."""
-    asked = any(keywords.get(name) is True for name in ("include_covariance", "innovations"))
+    asked = any(keywords.get(name) is True for name in ("include_std", "innovations"))
     return keywords.get("observation") in ("truth", "noisy") and not asked
 
 

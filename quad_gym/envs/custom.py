@@ -10,7 +10,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.spaces import PRIVILEGED_NAMES, ObservationField, policy_size
 from quad_gym.tasks.batch import TaskBatch
 from quad_gym.tasks.observing import Part
-from quad_gym.tasks.task import Observed, resolve_task
+from quad_gym.tasks.task import ObservationSpec, resolve_task
 
 Table = tuple[ObservationField, ...]
 
@@ -51,7 +51,7 @@ def with_task(
     taken = ({field.name for field in (*kept, *rest)} | PRIVILEGED_NAMES) & set(sizes)
     if taken:
         raise ValueError(f"observe must not return {min(taken)!r}, which is the shipped one's")
-    described = {name: task.observes.get(name, Observed()) for name in sizes}
+    described = {name: task.observes.get(name, ObservationSpec()) for name in sizes}
     own = [ObservationField(name, slice(0, sizes[name]), *described[name]) for name in sizes]
     parts = {n: Part(sizes[n], described[n].low, described[n].high) for n in sizes}
     new, place = [], 0

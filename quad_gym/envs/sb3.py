@@ -1,4 +1,4 @@
-"""`QuadVecEnv`: many flights as a Stable-Baselines3 vector environment."""
+"""`QuadSB3VecEnv`: many flights as a Stable-Baselines3 vector environment."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -25,7 +25,7 @@ from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
 
 
-class QuadVecEnv(VecEnv):
+class QuadSB3VecEnv(VecEnv):
     """N flights for Stable-Baselines3, with the `Monitor`'s episode records built in.
 
     An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with
@@ -142,7 +142,7 @@ class QuadVecEnv(VecEnv):
             "ending": ENDINGS[int(row[COLUMN["ending"]])],
             "ending_code": int(row[COLUMN["ending"]]),
             "filter_status": int(row[COLUMN["filter_status"]]),
-            "filter_lost": bool(row[COLUMN["filter_lost"]] > 0.0),
+            "filter_diverged": bool(row[COLUMN["filter_diverged"]] > 0.0),
             "gates_passed": int(row[COLUMN["gates_passed"]]),
             "episode": {
                 "r": float(row[COLUMN["episode_return"]]),

@@ -26,7 +26,7 @@ _REWARD, _TERMINATED, _TRUNCATED = COLUMN["reward"], COLUMN["terminated"], COLUM
 _POSITION_ERROR, _ESTIMATION_ERROR = COLUMN["position_error"], COLUMN["estimation_error"]
 _ENDING, _FILTER_STATUS = COLUMN["ending"], COLUMN["filter_status"]
 _FILTER_LOST, _GATES_PASSED, _FAULTS = (
-    COLUMN["filter_lost"],
+    COLUMN["filter_diverged"],
     COLUMN["gates_passed"],
     COLUMN["faults"],
 )
@@ -109,7 +109,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     and `StaleRace`: 12 m, `OutageDash`: 300 m), tipped by more than 100 degrees, below -0.5 m
     (`LookAround`: -5 m), through the last gate, or, in a world that has any, where the vehicle
     touches an obstacle or leaves the geofence. Truncated: at the time limit, when the filter has
-    failed (`info["filter_status"]`), or with `end_when_lost=True` when it finds that it is lost.
+    failed (`info["filter_status"]`), or with `truncate_when_diverged=True` when it finds that it is lost.
     `info["ending"]` says which.
 
     ## Start
@@ -125,8 +125,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Info
     `position_error` and `estimation_error` [m], both against the true position; `ending`;
-    `filter_status`, 0 while all is well; `filter_lost`, whether a filter that gates (any,
-    with `faults`, `end_when_lost` or `innovations`) finds that its covariance does not explain what
+    `filter_status`, 0 while all is well; `filter_diverged`, whether a filter that gates (any,
+    with `faults`, `truncate_when_diverged` or `innovations`) finds that its covariance does not explain what
     it measures; `gates_passed`.
     With `randomization` also `drawn`, the parameters of the episode by name. With `faults` also
     `faults`: whether each is active now, by name. With `innovations=True` also `innovations`: the last innovations of the filter, their
@@ -149,7 +149,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         action: "ctbr", "motor", "wrench", "attitude" or "velocity"; by default "velocity" on
             `OutageDash`, "ctbr" elsewhere.
         layout: "relative" or "absolute".
-        include_covariance: Append the square roots of the diagonal of the filter's covariance.
+        include_std: Append the square roots of the diagonal of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
         sensors: "standard", "lab", "rtk", "consumer", "indoor", or a suite that belongs to one task
             (see `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is
@@ -157,12 +157,12 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "standard" has the laboratory's sensors and a consistent filter; "lab" is the report's
             form to the letter, whose filter is overconfident.
         innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
-            block by block; a filter that gates, or any with `faults` or `end_when_lost`, keeps them
+            block by block; a filter that gates, or any with `faults` or `truncate_when_diverged`, keeps them
             for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
         actions: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
-        feature_noise_across: "predicted", "projected" or "measured", see `quad_gym.FilterParams`.
+        bearing_noise_at: "predicted", "pinhole" or "measured", see `quad_gym.FilterParams`.
             None: as the suite has it.
         estimator: "ukf" or "ekf", in place of the suite's.
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
@@ -185,7 +185,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as
             "gnss_outage" or "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
         keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize,
-            duration, out_of_bounds, ground, end_when_lost, max_tilt, max_speed, max_acceleration,
+            duration, out_of_bounds, ground, truncate_when_diverged, max_tilt, max_speed, max_acceleration,
             gate_count, gate_radius, preview, trajectory; see `quad_gym.TaskParams`.
         custom: A task of your own, laid over that of the id (in place of the class of `LookAround`,
             `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
@@ -266,7 +266,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "ending": ENDINGS[0],
             "ending_code": 0,
             "filter_status": int(batch.read("filter_status")[0]),
-            "filter_lost": bool(batch.read("lost")[0] > 0.0),
+            "filter_diverged": bool(batch.read("lost")[0] > 0.0),
             "gates_passed": 0,
             **drawn_info(batch.drawn(), 0),
             **info_of_flight(flight_info(batch, batch.read("faults")), 0),
@@ -304,7 +304,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "ending": ENDINGS[int(row[_ENDING])],
             "ending_code": int(row[_ENDING]),
             "filter_status": int(row[_FILTER_STATUS]),
-            "filter_lost": row[_FILTER_LOST] > 0.0,
+            "filter_diverged": row[_FILTER_LOST] > 0.0,
             "gates_passed": int(row[_GATES_PASSED]),
         }
         if batch.randomization.names:

@@ -143,7 +143,7 @@ def observation_layout(
     observation: str = "estimate",
     layout: str = "relative",
     *,
-    include_covariance: bool = False,
+    include_std: bool = False,
     privileged: bool = False,
     feature_count: int = 2,
     gnss_velocity: bool = False,
@@ -155,7 +155,7 @@ def observation_layout(
     Args:
         observation: The environment's `observation`; "sensors" has a layout of its own.
         layout: The environment's `layout`.
-        include_covariance: Whether the filter's 15 standard deviations follow.
+        include_std: Whether the filter's 15 standard deviations follow.
         privileged: Whether the truth ends the table; its slices go on counting, though the
             environment returns that part under a key of its own.
         feature_count: Features of the camera, for "sensors".
@@ -176,7 +176,7 @@ def observation_layout(
     if observation == "sensors":
         parts = _sensor_fields(feature_count, gnss_velocity, aids)
     parts = (*parts, _LAST_ACTION)
-    if include_covariance:
+    if include_std:
         units = ("m", "m/s", "rad", "m/s^2", "rad/s")
         frames = ("I", "I", "B", "B", "B")
         parts += tuple(

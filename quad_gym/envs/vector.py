@@ -140,7 +140,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "ending": np.full(self.num_envs, ENDINGS[0], object),
             "ending_code": np.zeros(self.num_envs, np.int64),
             "filter_status": batch.read("filter_status").astype(np.int64),
-            "filter_lost": batch.read("lost") > 0.0,
+            "filter_diverged": batch.read("lost") > 0.0,
             "gates_passed": np.zeros(self.num_envs, np.int64),
             **self._drawn(),
             **flight_info(batch, batch.read("faults")),
@@ -230,7 +230,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "ending": self._no_ending.copy(),
             "ending_code": np.zeros(self.num_envs, np.int64),
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
-            "filter_lost": results[:, COLUMN["filter_lost"]] > 0.0,
+            "filter_diverged": results[:, COLUMN["filter_diverged"]] > 0.0,
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
         }
         batch = self.flights.batch
@@ -248,7 +248,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         """Describe the new episode instead, of the flights where one began."""
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.read(name, began)
-        infos["filter_lost"][began] = self.flights.batch.read("lost", began) > 0.0
+        infos["filter_diverged"][began] = self.flights.batch.read("lost", began) > 0.0
         infos["ending"][began], infos["ending_code"][began] = ENDINGS[0], 0
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)

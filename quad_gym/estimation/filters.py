@@ -69,7 +69,7 @@ class _KalmanFilter(Estimate):
 
         With a baseline: attitude by Wahba's problem, the body z axis taken as vertical. A baseline
         within 12 degrees of the vertical hardly tells the heading; then `heading` does, with the
-        deviation `placement.heading_sigma` of the suite.
+        deviation `initial_pose.heading_sigma` of the suite.
 
         Without: the vehicle is taken as level, and its heading comes from the first of these that
         is given: `heading`, `magnetometer`, or with `course` the direction of `gnss_velocity_G`. If
@@ -89,7 +89,7 @@ class _KalmanFilter(Estimate):
                 of a steep baseline then takes it for anything, and as it linearizes, it may be
                 lost.
             heading_sigma: Its deviation, or with `course` that of the body x axis from the course
-                [rad]; None: `placement.heading_sigma`.
+                [rad]; None: `initial_pose.heading_sigma`.
             magnetometer: (3,) magnetic field in B [T], for suites with a magnetometer.
             magnetometer_sigma: Its white noise per axis [T]; None: as the suite says.
             gnss_velocity_G: (3,) velocity in G [m/s]; None: at rest.

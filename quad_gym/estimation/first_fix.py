@@ -124,7 +124,7 @@ def checked_fix(
         )
     if magnetometer is None and magnetometer_sigma is not None:
         raise ValueError("magnetometer_sigma must come with magnetometer")
-    own = sensors.placement.heading_sigma
+    own = sensors.initial_pose.heading_sigma
     if heading_sigma is not None:
         if heading is None and not course:
             raise ValueError("heading_sigma must come with heading or course")
@@ -142,7 +142,7 @@ def checked_fix(
         headings = [_by_baseline(sensors, baseline, tilt)]
     assert sensors.gnss is not None
     antenna_I = ecef_to_enu(sensors.gnss.reference_antenna_G) @ position
-    root = math.sqrt(sensors.estimator.initial_scale) * _root(sigmas, covariance)
+    root = math.sqrt(sensors.estimator.initial_covariance_scale) * _root(sigmas, covariance)
     still = np.zeros(3) if velocity is None else velocity
     starts = [still_start(sensors, antenna_I, root, still, speeds, tilt, h) for h in headings]
     return FirstFix(position, sigmas, None, speeds, np.array([1.0, 0, 0]), np.zeros(3), starts)
@@ -234,7 +234,7 @@ def _by_magnetometer(
 def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> Heading:
     gnss = sensors.gnss
     assert gnss is not None
-    sigma = math.sqrt(sensors.estimator.initial_scale) * gnss.first_baseline_sigma
+    sigma = math.sqrt(sensors.estimator.initial_covariance_scale) * gnss.first_baseline_sigma
     baseline_I = ecef_to_enu(gnss.reference_antenna_G) @ baseline_G
     found = baseline_heading(np.array(gnss.baseline_B), baseline_I, sigma, tilt)
     if found is None:

@@ -86,7 +86,9 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
     for aid, params in sensors.aids.items():
         p["aid_scale"][aid] = params.scale
         p["aid_sigma"][aid], p["aid_matrix_sigma"][aid] = params.white_sigma, params.matrix_sigma
-        p["aid_gate"][aid] = gate_limit(AID_FREEDOMS[aid], sensors.estimator.gate_false_alarm)
+        p["aid_gate"][aid] = gate_limit(
+            AID_FREEDOMS[aid], sensors.estimator.false_alarm_probability
+        )
         for name in ("vector", "scalar"):
             slow = getattr(params, f"slow_{name}")
             if slow is not None:

@@ -105,19 +105,19 @@ def params_record(
             p["baseline_noise"] = gnss.believed_baseline_sigma
         else:  # one that is vertical, as that tells no heading either
             p["baseline"], p["baseline_length"] = (0.0, 0.0, 1.0), 1.0
-            p["baseline_sigma"] = sensors.placement.heading_sigma
-            p["first_baseline_sigma"] = p["baseline_noise"] = sensors.placement.heading_sigma
+            p["baseline_sigma"] = sensors.initial_pose.heading_sigma
+            p["first_baseline_sigma"] = p["baseline_noise"] = sensors.initial_pose.heading_sigma
         p["velocity_sigma"] = gnss.velocity_sigma or 0.0
         period = 1.0 / (gnss.rate * gnss.drift_tau)
         p["drift_decay"] = math.exp(-period)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
     else:  # the place of the start, as if its center and its x axis had been measured
         p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
-        p["gnss_sigma"] = sensors.placement.position_sigma
-        p["baseline_sigma"] = sensors.placement.heading_sigma
-        p["first_baseline_sigma"] = p["baseline_noise"] = sensors.placement.heading_sigma
+        p["gnss_sigma"] = sensors.initial_pose.position_sigma
+        p["baseline_sigma"] = sensors.initial_pose.heading_sigma
+        p["first_baseline_sigma"] = p["baseline_noise"] = sensors.initial_pose.heading_sigma
 
-    p["heading_sigma"] = sensors.placement.heading_sigma
+    p["heading_sigma"] = sensors.initial_pose.heading_sigma
 
     if sensors.camera is not None:
         camera = sensors.camera
@@ -132,17 +132,17 @@ def params_record(
     p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
     p["sigma_kappa"] = estimator.kappa
     p["direction_floor"] = estimator.direction_variance_floor
-    p["noise_at_prediction"] = estimator.feature_noise_across != "measured"
-    p["noise_projected"] = estimator.feature_noise_across == "projected"
+    p["noise_at_prediction"] = estimator.bearing_noise_at != "measured"
+    p["noise_projected"] = estimator.bearing_noise_at == "pinhole"
     p["initial_velocity_variance"] = estimator.initial_velocity_variance
-    p["initial_scale"] = estimator.initial_scale
+    p["initial_covariance_scale"] = estimator.initial_covariance_scale
     p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
-    p["gradual_above"] = estimator.gradual_above or 0.0
-    alarm = estimator.gate_false_alarm
+    p["recursive_update_threshold"] = estimator.recursive_update_threshold or 0.0
+    alarm = estimator.false_alarm_probability
     p["gate_position"] = gate_limit(FREEDOMS[POSITION_BLOCK], alarm)
     p["gate_direction"] = gate_limit(FREEDOMS[BASELINE_BLOCK], alarm)
-    p["gate_patience"] = estimator.gate_patience
-    p["gate_uncertainty"] = np.inf if gnss is None else estimator.gate_direction_sigma**2
+    p["max_rejections"] = estimator.max_rejections
+    p["gate_uncertainty"] = np.inf if gnss is None else estimator.max_direction_sigma**2
     noisy = sensors.noisy
     p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
     return record
@@ -163,9 +163,9 @@ def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int =
         form |= FilterForm.MIDPOINT
     if estimator.covariance_reset == "turn":
         form |= FilterForm.TURN
-    if estimator.gate_false_alarm > 0.0:
+    if estimator.false_alarm_probability > 0.0:
         form |= FilterForm.GATE
-    if estimator.gradual_above is not None:
+    if estimator.recursive_update_threshold is not None:
         form |= FilterForm.GRADUAL
     return FilterForm(form | lever_arm)
 
@@ -216,7 +216,7 @@ def pack_latency(
             settings[f"{name}_delay"] = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
     latest = max(settings["gnss_delay"], settings["camera_delay"], *settings["aid_delay"])
     settings["late"] = latest > 0
-    settings["rewinds"] = believes.estimator.late_measurements == "rewind"
+    settings["rewinds"] = believes.estimator.delay_compensation == "retrodict"
 
 
 def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
@@ -246,7 +246,7 @@ def settings_record(
     source: Source,
     control: Control,
     layout: Layout,
-    include_covariance: bool,
+    include_std: bool,
     privileged: bool,
     autoreset: Autoreset,
     run_filter: bool,
@@ -272,7 +272,7 @@ def settings_record(
         s["camera_phase"] = phase_ticks(sensors.camera.phase, s["camera_ticks"])
         s["feature_count"] = len(sensors.camera.features_I)
     s["source"], s["control"], s["layout"] = source, control, layout
-    s["include_covariance"], s["privileged"] = include_covariance, privileged
+    s["include_std"], s["privileged"] = include_std, privileged
     s["autoreset"], s["run_filter"] = autoreset, run_filter
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
     s["pad"], s["randomize"] = task.pad and task.may_start_on_ground, task.randomize
@@ -280,7 +280,7 @@ def settings_record(
     s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], MAX_HARMONICS)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
-    s["end_when_lost"] = task.end_when_lost
+    s["truncate_when_diverged"] = task.truncate_when_diverged
     s["least_up"] = math.cos(task.max_tilt)
     s["radius"], s["period"], s["height"] = task.radius, task.period, task.height
     s["max_speed"], s["max_acceleration"] = task.max_speed, task.max_acceleration

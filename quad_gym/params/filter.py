@@ -32,15 +32,15 @@ class FilterParams(Checked):
     """secondary scaling; laboratory"""
     direction_variance_floor: float = 1e-8
     """added to the diagonal of a direction's covariance, of rank 2 [-]; report section 3.1"""
-    feature_noise_across: str = "measured"
+    bearing_noise_at: str = "measured"
     """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
     across the "predicted" one, as the baseline's does. The first takes the angle between the two,
     tens of milliradians in the first second, for information that it trusts to 0.1 mrad.
-    "projected": across the predicted one, and less toward the image's center, as pixels far out
+    "pinhole": across the predicted one, and less toward the image's center, as pixels far out
     subtend smaller angles there; the report takes the noise for equal about both axes"""
     initial_velocity_variance: float = 1e-3
     """[m^2/s^2]; laboratory"""
-    initial_scale: float = 2.0
+    initial_covariance_scale: float = 2.0
     """factor on the first fix's covariance; laboratory"""
     initial_tilt_sigma: float | None = None
     """how level the start is, per axis [rad]: the filter starts level, looking as the baseline
@@ -49,30 +49,30 @@ class FilterParams(Checked):
     reuse_first_fix: bool = True
     """whether the fix that starts the filter is also its first measurement, as in the laboratory;
     that counts it twice, so suites other than "lab" do not"""
-    gradual_above: float | None = None
+    recursive_update_threshold: float | None = None
     """deviation of a feature's predicted direction above which images are processed in steps, each
     about the estimate that the one before has left [rad]; None: always whole (report). The
     derivatives of pixels are off by the square of that error, more than a precise camera's noise at
-    a rough start or after an outage. Without a gate, features beyond `gate_direction_sigma` are
+    a rough start or after an outage. Without a gate, features beyond `max_direction_sigma` are
     then left out where there is GNSS, as by a gate"""
-    gate_false_alarm: float = 0.0
+    false_alarm_probability: float = 0.0
     """probability that a valid measurement is rejected: a position, baseline, velocity or feature
     whose normalized innovation squared exceeds the chi-square quantile of this alarm level is left
     out of the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to
     Tracking and Navigation, section 5.4); 0: everything is taken"""
-    gate_patience: int = 10
+    max_rejections: int = 10
     """positions, baselines, velocities or images rejected in a row after which the filter doubts
     itself instead: it adds the square of the innovation to the covariance of what the sensor
     measures, and takes the next one"""
-    gate_direction_sigma: float = 0.2
+    max_direction_sigma: float = 0.2
     """[rad] a gating filter leaves out features whose direction it predicts more vaguely than that,
     as after a long outage: what its model neglects, half the square, is ten times the noise of a
     good camera then. GNSS has to bring such a filter home; one without GNSS takes all features, as
     it has nothing else"""
-    late_measurements: str = "rewind"
-    """what becomes of a measurement that reaches the filter late: "rewind" takes the estimate back
-    to its time stamp over the IMU's samples since then, updates it there, and takes it on again;
-    "as_fresh" ignores the time stamp"""
+    delay_compensation: str = "retrodict"
+    """processing of delayed measurements: "retrodict" takes the estimate back to the time stamp over
+    the IMU samples since then, updates it there, and propagates it forward again; "none" ignores
+    the time stamp"""
     gravity: float = GRAVITY
     """[m/s^2] that a filter which works by itself subtracts; in flights it is the vehicle's"""
 
@@ -82,27 +82,26 @@ class FilterParams(Checked):
             "alpha",
             "direction_variance_floor",
             "initial_velocity_variance",
-            "initial_scale",
-            "gate_direction_sigma",
+            "initial_covariance_scale",
+            "max_direction_sigma",
             "gravity",
         )
         self._check(check.number, "beta", least=0.0)
         self._check(check.choice, "kind", choices=("ukf", "ekf"))
         self._check(check.choice, "integration", choices=("euler", "midpoint"))
         self._check(check.choice, "covariance_reset", choices=("none", "turn"))
-        self._check(check.choice, "late_measurements", choices=("rewind", "as_fresh"))
-        self._check(
-            check.choice, "feature_noise_across", choices=("measured", "predicted", "projected")
-        )
+        self._check(check.choice, "delay_compensation", choices=("retrodict", "none"))
+        self._check(check.choice, "bearing_noise_at", choices=("measured", "predicted", "pinhole"))
         self._check(check.flag, "reuse_first_fix")
         if self.initial_tilt_sigma is not None:
             self._check(check.positive, "initial_tilt_sigma", most=math.pi)
-        if self.gradual_above is not None:
-            self._check(check.positive, "gradual_above")
-        self._check(check.whole, "gate_patience")
-        self._check(check.number, "gate_false_alarm", least=0.0)
-        if self.gate_false_alarm >= 0.5:
+        if self.recursive_update_threshold is not None:
+            self._check(check.positive, "recursive_update_threshold")
+        self._check(check.whole, "max_rejections")
+        self._check(check.number, "false_alarm_probability", least=0.0)
+        if self.false_alarm_probability >= 0.5:
             raise ValueError(
-                f"FilterParams.gate_false_alarm must be below 0.5, got {self.gate_false_alarm}"
+                "FilterParams.false_alarm_probability must be below 0.5, got "
+                f"{self.false_alarm_probability}"
             )
         self._check(check.number, "kappa", least=-14.0)

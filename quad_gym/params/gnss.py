@@ -21,7 +21,7 @@ class GnssParams(Checked):
     """GNSS: position of the primary antenna, and the baseline to the secondary one if there is one.
 
     With one antenna the filter starts with the heading that a magnetometer tells, or else with that
-    of the mark of `PlacementParams`.
+    of the mark of `InitialPoseParams`.
     """
 
     rate: float = 200.0

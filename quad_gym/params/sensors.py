@@ -27,7 +27,7 @@ AID_PARAMS: dict[str, type[AidParams]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacementParams(Checked):
+class InitialPoseParams(Checked):
     """How well the place of the start is known where there is no GNSS to measure it.
 
     The vehicle is put down on a marked spot. The filter starts from the position of the spot and
@@ -86,21 +86,21 @@ class SensorSuite(Checked):
 
     imu: ImuParams = field(default_factory=ImuParams)
     gnss: GnssParams | None = field(default_factory=GnssParams)
-    """None: no GNSS; the filter then starts from `placement`"""
+    """None: no GNSS; the filter then starts from `initial_pose`"""
     camera: CameraParams | None = field(default_factory=CameraParams)
     """None: no camera"""
     barometer: BarometerParams | None = None
     """None: no barometer"""
     magnetometer: MagnetometerParams | None = None
     """None: no magnetometer"""
-    placement: PlacementParams = field(default_factory=PlacementParams)
+    initial_pose: InitialPoseParams = field(default_factory=InitialPoseParams)
     estimator: FilterParams = field(default_factory=FilterParams)
     noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
 
     def __post_init__(self) -> None:
         for name, kind in (
             ("imu", ImuParams),
-            ("placement", PlacementParams),
+            ("initial_pose", InitialPoseParams),
             ("estimator", FilterParams),
             ("noisy", NoisyObservationParams),
         ):

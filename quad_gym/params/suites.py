@@ -41,7 +41,7 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
-from quad_gym.params.sensors import NoisyObservationParams, PlacementParams, SensorSuite
+from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
@@ -58,13 +58,13 @@ _MARKER_RANGE = 13.0
 FIELD_FILTER = FilterParams(
     integration="midpoint",
     covariance_reset="turn",
-    feature_noise_across="projected",
-    initial_scale=1.0,
+    bearing_noise_at="pinhole",
+    initial_covariance_scale=1.0,
     initial_tilt_sigma=0.03,  # how level vehicles stand or hover at the start of an episode
     initial_velocity_variance=0.03**2,  # and how still
     reuse_first_fix=False,
-    gradual_above=0.01,  # its square is below what a pixel subtends
-    gate_false_alarm=1e-4,
+    recursive_update_threshold=0.01,  # its square is below what a pixel subtends
+    false_alarm_probability=1e-4,
 )
 """The filter outside the laboratory: consistent from its start on, and gated."""
 
@@ -206,7 +206,7 @@ INDOOR = SensorSuite(
         gyro_vibration=0.005,
     ),
     gnss=None,
-    placement=PlacementParams(position_sigma=0.05, heading_sigma=0.05),
+    initial_pose=InitialPoseParams(position_sigma=0.05, heading_sigma=0.05),
     camera=CameraParams(
         rate=25.0,
         attitude=(math.radians(90.0), 0.0, math.radians(90.0)),  # looking level ahead
@@ -245,7 +245,7 @@ STALE = RTK.replace(
     # that passes 97 % of the gates on the true state passes 20 %, with these 64 %
     gnss=None if RTK.gnss is None else RTK.gnss.replace(latency=0.04),
     camera=None if RTK.camera is None else RTK.camera.replace(latency=0.01),
-    estimator=RTK.estimator.replace(late_measurements="as_fresh"),
+    estimator=RTK.estimator.replace(delay_compensation="none"),
 )
 """For `StaleRace`: `rtk` with a filter that takes late measurements for fresh."""
 
@@ -253,7 +253,7 @@ STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
     # the laboratory's pixels are coarse, so that images need be processed in steps after outages
     # alone, and no measurement of it is corrupted, so that none has to be rejected
-    estimator=FIELD_FILTER.replace(gradual_above=0.1, gate_false_alarm=0.0),
+    estimator=FIELD_FILTER.replace(recursive_update_threshold=0.1, false_alarm_probability=0.0),
     noisy=NoisyObservationParams(
         position=0.0020, velocity=0.0150, attitude=0.0011, body_rates=0.0124
     ),

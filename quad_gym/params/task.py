@@ -60,7 +60,7 @@ class TaskParams(Checked):
     ground: float = -0.5
     """height at which an episode ends [m]; below 0, as a vehicle without a launch pad sinks while
     its rotors spin up. Where `WorldParams.ground` carries vehicles, at least 0.5 m below it"""
-    end_when_lost: bool = False
+    truncate_when_diverged: bool = False
     """whether an episode is truncated where the filter finds that it is lost"""
     max_tilt: float = math.radians(100.0)
     """angle between the body z axis and the vertical at which an episode ends [rad]"""
@@ -102,7 +102,7 @@ class TaskParams(Checked):
             raise ValueError(
                 f"TaskParams.gate_count must be at most {MAX_GATES}, got {self.gate_count}"
             )
-        check.flag("TaskParams.end_when_lost", self.end_when_lost)
+        check.flag("TaskParams.truncate_when_diverged", self.truncate_when_diverged)
         if not 0.0 < check.number("TaskParams.max_tilt", self.max_tilt) <= math.pi:
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")
         if min(self.preview) < 0.0:

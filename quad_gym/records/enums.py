@@ -170,7 +170,7 @@ class Ending(IntEnum):
     TIME_LIMIT = 1
     OUT_OF_BOUNDS = 2
     TIPPED_OVER = 3
-    ON_THE_GROUND = 4
+    BELOW_MIN_HEIGHT = 4
     LAST_GATE = 5
     FILTER_FAILED = 6
     FILTER_LOST = 7

@@ -115,13 +115,13 @@ PARAMS_FIELDS = (
     Field("noise_projected", (), "0 or 1", "a feature's noise is that of its pixel seen under its angle"),
     Field("noise_at_prediction", (), "0 or 1", "a feature's noise lies across its predicted, not its measured, direction"),
     Field("initial_velocity_variance", (), "m^2/s^2", "of the filter's start"),
-    Field("initial_scale", (), "-", "factor on the first fix's covariance"),
+    Field("initial_covariance_scale", (), "-", "factor on the first fix's covariance"),
     Field("initial_tilt_sigma", (), "rad", "of roll and pitch at a level start; 0: attitude by Wahba's problem"),
-    Field("gradual_above", (), "rad", "deviation of a direction above which images are processed in steps"),
+    Field("recursive_update_threshold", (), "rad", "deviation of a direction above which images are processed in steps"),
     Field("gate_position", (), "-", "largest accepted NIS of a position"),
     Field("gate_direction", (), "-", "largest accepted NIS of a direction"),
     Field("gate_uncertainty", (), "rad^2", "largest sum of the variances of a feature's predicted direction"),
-    Field("gate_patience", (), "-", "rejections in a row that reopen the gate"),
+    Field("max_rejections", (), "-", "rejections in a row that reopen the gate"),
     Field("noisy_sigma", (4,), "mixed", "of a noisy observation: position, velocity, attitude, body rates"),
 )
 # fmt: on

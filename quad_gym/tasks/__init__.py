@@ -1,6 +1,6 @@
 """What a user writes to change a task: `Task`, its `View` of the flights, pieces of rewards."""
 
 from quad_gym.tasks import rewards
-from quad_gym.tasks.task import Observed, Task, TaskError, resolve_task
+from quad_gym.tasks.task import ObservationSpec, Task, TaskError, resolve_task
 
-__all__ = ["Observed", "Task", "TaskError", "resolve_task", "rewards"]
+__all__ = ["ObservationSpec", "Task", "TaskError", "resolve_task", "rewards"]

@@ -74,7 +74,7 @@ VIEW_FIELDS = (
     ViewField("estimate.X_covariance", "(n, 3, 3)", "mixed", "mixed", "its block of X: position, velocity, attitude, accel_bias or gyro_bias"),
     ViewField("estimate.X_sigma", "(n, 3)", "mixed", "mixed", "square roots of the block's diagonal"),
     ViewField("estimate.status", "(n,) int", "bits", "-", "what has failed so far, see `FilterStatus`; 0: nothing"),
-    ViewField("estimate.lost", "(n,) bool", "-", "-", "whether the filter finds that it is lost (one that gates, or with `faults`, `end_when_lost` or `innovations`)"),
+    ViewField("estimate.lost", "(n,) bool", "-", "-", "whether the filter finds that it is lost (one that gates, or with `faults`, `truncate_when_diverged` or `innovations`)"),
     ViewField("estimate.nis", "(n,)", "-", "-", "normalized innovation squared of the last update"),
     ViewField("estimate.nis_dimension", "(n,) int", "-", "-", "measurements in it"),
     # what the controller goes by: the estimate, the truth, or the truth with noise
@@ -103,7 +103,7 @@ VIEW_FIELDS = (
     # what the id's task says of the step
     ViewField("shipped.reward", "(n,)", "-", "-", "as with `reward_per=\"step\"`"),
     ViewField("shipped.terminated", "(n,) bool", "-", "-", ""),
-    ViewField("shipped.truncated", "(n,) bool", "-", "-", "time limit, failed filter, or lost with `end_when_lost`; also where terminated"),
+    ViewField("shipped.truncated", "(n,) bool", "-", "-", "time limit, failed filter, or lost with `truncate_when_diverged`; also where terminated"),
     ViewField("shipped.ending", "(n,) int", "-", "-", "see `quad_gym.records.Ending`"),
 )
 # fmt: on

@@ -157,7 +157,7 @@ class Estimate(Group):
         if not self._flights.run_filter:
             raise ValueError(
                 'view.estimate needs a filter: observation="estimate" or "sensors", or '
-                "include_covariance=True or innovations=True"
+                "include_std=True or innovations=True"
             )
 
     def _rows(self, name: str) -> Floats:
@@ -295,7 +295,7 @@ class Measured(Group):
         if not self._flights.run_filter:
             raise ValueError(
                 'view.measured needs sensors that run: observation="estimate" or "sensors", or '
-                "include_covariance=True or innovations=True"
+                "include_std=True or innovations=True"
             )
 
     @Lazy

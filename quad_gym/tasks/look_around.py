@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.tasks.rewards import Crash, Heading, Piece, Tracking
-from quad_gym.tasks.task import Observed, Task
+from quad_gym.tasks.rewards import Crash, Heading, Term, Tracking
+from quad_gym.tasks.task import ObservationSpec, Task
 
 if TYPE_CHECKING:
     from quad_gym.tasks.view import View
@@ -59,12 +59,14 @@ class LookAround(Task):
         ValueError: If a number is negative or not finite.
     """
 
-    observes: Mapping[str, Observed] = {"features_direction": Observed("-", "B", -1.0, 1.0)}
+    observes: Mapping[str, ObservationSpec] = {
+        "features_direction": ObservationSpec("-", "B", -1.0, 1.0)
+    }
 
     def __init__(
         self, heading_weight: float = HEADING_WEIGHT, crash_cost: float = CRASH_COST
     ) -> None:
-        self.pieces: Piece = (
+        self.pieces: Term = (
             WIDE_WEIGHT * Tracking(1.0)
             + NEAR_WEIGHT * Tracking(5.0)
             + check.number("heading_weight", heading_weight, least=0.0) * Heading()

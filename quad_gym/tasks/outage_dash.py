@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.obstacles import Wall
-from quad_gym.tasks.rewards import BodyRates, Crash, Effort, Piece
-from quad_gym.tasks.task import Observed, Task
+from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, Term
+from quad_gym.tasks.task import ObservationSpec, Task
 
 if TYPE_CHECKING:
     from quad_gym.tasks.draws import FlightRandom
@@ -30,7 +30,7 @@ outage pay late in the course."""
 ACTION_COST, RATE_COST = 0.02, 0.002
 """Of |change of action|^2 and |body rates|^2 in each step, as those that ship."""
 
-_COSTS: Piece = -ACTION_COST * Effort() - RATE_COST * BodyRates()
+_COSTS: Term = -ACTION_COST * ActionRate() - RATE_COST * BodyRates()
 _CRASH = Crash()
 
 PAST = 0.7
@@ -97,7 +97,7 @@ class OutageDash(Task):
     | next_width (1) | of that one | m | - |
     | course_share (1) | of the course that is behind, to the finish | - | - |
 
-    and before it `last_action` (4) and, with `include_covariance=True`, the filter's 15 standard
+    and before it `last_action` (4) and, with `include_std=True`, the filter's 15 standard
     deviations, which tell that GNSS is gone. The next gap is the first one that is not yet 0.7 m
     behind the vehicle; after the last one comes the finish, 12 m further.
 
@@ -119,16 +119,16 @@ class OutageDash(Task):
         *("last_action", "position_sigma", "velocity_sigma", "attitude_sigma"),
         *("accel_bias_sigma", "gyro_bias_sigma"),
     )
-    observes: Mapping[str, Observed] = {
-        "position_error": Observed("m", "B", -200.0, 200.0),
-        "velocity_error": Observed("m/s", "B", -100.0, 100.0),
-        "up": Observed("-", "B", -1.0, 1.0),
-        "heading": Observed("-", "B", -1.0, 1.0),
-        "body_rates": Observed("rad/s", "B", -200.0, 200.0),
-        "gap_width": Observed("m", "-", 0.0, 100.0),
-        "next_gap": Observed("m", "B", -100.0, 100.0),
-        "next_width": Observed("m", "-", 0.0, 100.0),
-        "course_share": Observed("-", "-", -1.0, 2.0),
+    observes: Mapping[str, ObservationSpec] = {
+        "position_error": ObservationSpec("m", "B", -200.0, 200.0),
+        "velocity_error": ObservationSpec("m/s", "B", -100.0, 100.0),
+        "up": ObservationSpec("-", "B", -1.0, 1.0),
+        "heading": ObservationSpec("-", "B", -1.0, 1.0),
+        "body_rates": ObservationSpec("rad/s", "B", -200.0, 200.0),
+        "gap_width": ObservationSpec("m", "-", 0.0, 100.0),
+        "next_gap": ObservationSpec("m", "B", -100.0, 100.0),
+        "next_width": ObservationSpec("m", "-", 0.0, 100.0),
+        "course_share": ObservationSpec("-", "-", -1.0, 2.0),
     }
     state: Mapping[str, ArrayLike] = {"earned": 0.0, "gates_passed": 0}
 

@@ -1,7 +1,7 @@
-"""Pieces of rewards, to weight and add up: `Tracking() + 0.1 * Heading() - 0.02 * Effort()`.
+"""Pieces of rewards, to weight and add up: `Tracking() + 0.1 * Heading() - 0.02 * ActionRate()`.
 
 A piece is a function of a `View` that returns a number per flight, (n,). Sums, differences and
-multiples of pieces are pieces. The rewards that ship are such sums: `FOLLOWING`, and `COURSE` for
+multiples of pieces are pieces. The rewards that ship are such sums: `TRACKING`, and `RACING` for
 gates.
 """
 
@@ -25,49 +25,49 @@ BLOCKS = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 """Blocks of the filter's covariance."""
 
 _CRASHES = (
-    *(Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.ON_THE_GROUND),
+    *(Ending.OUT_OF_BOUNDS, Ending.TIPPED_OVER, Ending.BELOW_MIN_HEIGHT),
     *(Ending.COLLISION, Ending.LEFT_GEOFENCE),
 )
 _CRASHED = np.array([float(ending in _CRASHES) for ending in range(max(Ending) + 1)])
 
 
-class Piece:
+class Term:
     """A term of a reward; called with a view, it returns (n,)."""
 
     def __call__(self, view: "View") -> Floats:
         """(n,) its value in this step."""
         raise NotImplementedError
 
-    def __add__(self, other: Any) -> "Piece":
+    def __add__(self, other: Any) -> "Term":
         return Sum(_terms(self) + _terms(other))
 
-    def __radd__(self, other: Any) -> "Piece":
+    def __radd__(self, other: Any) -> "Term":
         return Sum(_terms(other) + _terms(self))
 
-    def __sub__(self, other: Any) -> "Piece":
+    def __sub__(self, other: Any) -> "Term":
         return self + -1.0 * _piece(other)
 
-    def __rsub__(self, other: Any) -> "Piece":
+    def __rsub__(self, other: Any) -> "Term":
         return _piece(other) + -1.0 * self
 
-    def __neg__(self) -> "Piece":
+    def __neg__(self) -> "Term":
         return -1.0 * self
 
-    def __mul__(self, weight: float) -> "Piece":
+    def __mul__(self, weight: float) -> "Term":
         factor = check.number("weight", weight)
         return Sum(tuple((factor * w, piece) for w, piece in _terms(self)))
 
     __rmul__ = __mul__
 
 
-Term = tuple[float, Piece]
+Weighted = tuple[float, Term]
 
 
 @dataclass(frozen=True)
-class Sum(Piece):
+class Sum(Term):
     """Pieces with weights."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[Weighted, ...]
 
     def __call__(self, view: "View") -> Floats:
         """(n,) their sum."""
@@ -79,7 +79,7 @@ class Sum(Piece):
 
 
 @dataclass(frozen=True)
-class Constant(Piece):
+class Constant(Term):
     """The same in every step; what a number in a sum becomes."""
 
     value: float = 1.0
@@ -90,7 +90,7 @@ class Constant(Piece):
 
 
 @dataclass(frozen=True)
-class OfFunction(Piece):
+class FunctionTerm(Term):
     """What a function of a view returns; what a function in a sum becomes."""
 
     function: "Callable[[View], Floats]"
@@ -100,19 +100,19 @@ class OfFunction(Piece):
         return self.function(view)
 
 
-def _piece(value: Any) -> Piece:
-    if isinstance(value, Piece):
+def _piece(value: Any) -> Term:
+    if isinstance(value, Term):
         return value
-    return OfFunction(value) if callable(value) else Constant(check.number("piece", value))
+    return FunctionTerm(value) if callable(value) else Constant(check.number("piece", value))
 
 
-def _terms(value: Any) -> tuple[Term, ...]:
+def _terms(value: Any) -> tuple[Weighted, ...]:
     piece = _piece(value)
     return piece.terms if isinstance(piece, Sum) else ((1.0, piece),)
 
 
 @dataclass(frozen=True)
-class Tracking(Piece):
+class Tracking(Term):
     """exp(-rate e): 1 on the reference, falling with the true distance e from it."""
 
     rate: float = 2.0
@@ -124,7 +124,7 @@ class Tracking(Piece):
 
 
 @dataclass(frozen=True)
-class Heading(Piece):
+class Heading(Term):
     """x_B . x*: 1 where body x points in the wanted direction, -1 where it points away."""
 
     def __call__(self, view: "View") -> Floats:
@@ -133,7 +133,7 @@ class Heading(Piece):
 
 
 @dataclass(frozen=True)
-class Effort(Piece):
+class ActionRate(Term):
     """`|a - a_last|^2`: how much the action has changed."""
 
     def __call__(self, view: "View") -> Floats:
@@ -143,7 +143,7 @@ class Effort(Piece):
 
 
 @dataclass(frozen=True)
-class BodyRates(Piece):
+class BodyRates(Term):
     """`|w|^2` of the true body rates [rad^2/s^2]."""
 
     def __call__(self, view: "View") -> Floats:
@@ -152,7 +152,7 @@ class BodyRates(Piece):
 
 
 @dataclass(frozen=True)
-class Progress(Piece):
+class Progress(Term):
     """Speed toward the reference; on a course, toward the gate that was next [m/s]."""
 
     def __call__(self, view: "View") -> Floats:
@@ -161,7 +161,7 @@ class Progress(Piece):
 
 
 @dataclass(frozen=True)
-class Gate(Piece):
+class Gate(Term):
     """One over the control period where a gate was passed, as one per gate and second [1/s]."""
 
     def __call__(self, view: "View") -> Floats:
@@ -170,7 +170,7 @@ class Gate(Piece):
 
 
 @dataclass(frozen=True)
-class Crash(Piece):
+class Crash(Term):
     """1 where the id's task finds that the vehicle has crashed, else 0."""
 
     def __call__(self, view: "View") -> Floats:
@@ -179,7 +179,7 @@ class Crash(Piece):
 
 
 @dataclass(frozen=True)
-class Uncertainty(Piece):
+class Uncertainty(Term):
     """How unsure the filter is of a block of its state."""
 
     of: str = "position"
@@ -201,7 +201,7 @@ class Uncertainty(Piece):
 
 
 @dataclass(frozen=True)
-class Visibility(Piece):
+class Visibility(Term):
     """How many features the camera faces."""
 
     def __call__(self, view: "View") -> Floats:
@@ -220,15 +220,15 @@ def _dot(a: Floats, b: Floats) -> Floats:
     return total
 
 
-_COSTS = shipped.ACTION_COST * Effort() + shipped.RATE_COST * BodyRates()
+_COSTS = shipped.ACTION_COST * ActionRate() + shipped.RATE_COST * BodyRates()
 _HEADING = shipped.HEADING_WEIGHT * Heading()
 
-FOLLOWING: Piece = (
+TRACKING: Term = (
     shipped.NEAR_WEIGHT * Tracking(2.0) + shipped.FINE_WEIGHT * Tracking(20.0) + _HEADING - _COSTS
 )
 """The reward that ships for all tasks but courses of gates."""
 
-COURSE: Piece = (
+RACING: Term = (
     shipped.PROGRESS_WEIGHT * Progress() + shipped.GATE_BONUS * Gate() + _HEADING - _COSTS
 )
 """The reward that ships for courses of gates."""

@@ -39,13 +39,13 @@ class Shipped(Group):
 
     @Lazy
     def truncated(self) -> Truths:
-        """(n,) time limit, failed filter, or lost with `end_when_lost`; also where terminated."""
+        """(n,) time limit, failed filter, or `truncate_when_diverged`; also where terminated."""
         flights = self._flights
         over = self._result("filter_status") > 0.0
         if flights.max_steps:
             over |= self._result("episode_steps") >= flights.max_steps
-        if flights.task.end_when_lost:
-            over |= self._result("filter_lost") > 0.0
+        if flights.task.truncate_when_diverged:
+            over |= self._result("filter_diverged") > 0.0
         return over & ~flights.began
 
     @Lazy

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.tasks.rewards import BodyRates, Crash, Effort, Gate, Piece, Progress
+from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, Gate, Progress, Term
 from quad_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ class StaleRace(Task):
     measurement is right, at 4 m/s it is off by 16 cm, many times what the filter expects, so that
     attitude and biases go wrong as well. The faster the flight, the worse the estimate.
 
-    With `sensors` whose filter uses the time stamps (`late_measurements="rewind"`) the same race is
-    easy; that is the control.
+    With `sensors` whose filter uses the time stamps (`delay_compensation="retrodict"`) the same
+    race is easy; that is the control.
 
     ## Reward
     In each step, with the speed s toward the next gate [m/s], the size d of the change of the
@@ -55,13 +55,13 @@ class StaleRace(Task):
     """
 
     def __init__(self, crash_cost: float = CRASH_COST) -> None:
-        self._costs: Piece = (
+        self._costs: Term = (
             PROGRESS_WEIGHT * Progress()
-            - 0.02 * Effort()
+            - 0.02 * ActionRate()
             - 0.002 * BodyRates()
             - check.number("crash_cost", crash_cost, least=0.0) * Crash()
         )
-        self._gate: Piece = GATE_REWARD * Gate()
+        self._gate: Term = GATE_REWARD * Gate()
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) see the class."""

@@ -30,7 +30,7 @@ class HiddenTruthError(RuntimeError):
     """`observe` asked for what the controller cannot know."""
 
 
-class Observed(NamedTuple):
+class ObservationSpec(NamedTuple):
     """What the table of observations says of a part that `observe` returns."""
 
     unit: str = "-"
@@ -75,7 +75,7 @@ class Task:
     """
 
     state: Mapping[str, ArrayLike] = {}
-    observes: Mapping[str, Observed] = {}
+    observes: Mapping[str, ObservationSpec] = {}
     replaces_observation: bool = False
     keeps: Collection[str] = ()
     privileged: bool = False
@@ -94,7 +94,7 @@ class Task:
     def of(
         *,
         state: Mapping[str, ArrayLike] | None = None,
-        observes: Mapping[str, Observed] | None = None,
+        observes: Mapping[str, ObservationSpec] | None = None,
         replaces_observation: bool = False,
         keeps: Collection[str] = (),
         privileged: bool = False,
@@ -184,9 +184,9 @@ def resolve_task(custom: Any) -> Task:
     if isinstance(found.keeps, str) or not all(isinstance(name, str) for name in found.keeps):
         raise ValueError(f"keeps of {label(found)} must hold names, got {found.keeps!r}")
     for name, part in found.observes.items():
-        if not isinstance(part, Observed) or not part.low < part.high:
+        if not isinstance(part, ObservationSpec) or not part.low < part.high:
             raise ValueError(
-                f"observes of {label(found)} must hold Observed with low < high, got {part!r} "
+                f"observes of {label(found)} must hold ObservationSpec with low < high, got {part!r} "
                 f"for {name!r}"
             )
     return found

@@ -48,11 +48,11 @@ def test_both_checkers_pass_for_every_id_observation_action_and_layout():
 @pytest.mark.parametrize(
     "keywords",
     [
-        {"include_covariance": True},
+        {"include_std": True},
         {"privileged": True},
-        {"include_covariance": True, "privileged": True, "layout": "absolute"},
+        {"include_std": True, "privileged": True, "layout": "absolute"},
         {"camera": False},
-        {"camera": False, "privileged": True, "include_covariance": True},
+        {"camera": False, "privileged": True, "include_std": True},
     ],
     ids=lambda keywords: "+".join(keywords),
 )

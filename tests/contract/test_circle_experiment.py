@@ -133,13 +133,13 @@ def test_without_camera(tmp_path, capsys, monkeypatch):
 
 def test_options_reach_the_flights(tmp_path, no_figures):
     line = "--seeds 2 --duration 1 --radius 2 --gains tuned --velocity-gain 4 --gnss-rate 10"
-    configuration = run(tmp_path, f"{line} --feature-noise-across predicted")["configuration"]
+    configuration = run(tmp_path, f"{line} --bearing-noise-at predicted")["configuration"]
     assert configuration["task"]["radius"] == 2.0
     assert configuration["gains"]["position"] == pd_gains("tuned").position
     assert configuration["gains"]["velocity"] == 4.0
     suite = configuration["sensors"]["estimate"]
     assert (suite["gnss"]["rate"], suite["camera"]["rate"]) == (10.0, 200.0)
-    assert suite["estimator"]["feature_noise_across"] == "predicted"
+    assert suite["estimator"]["bearing_noise_at"] == "predicted"
 
 
 def test_crashes_are_counted(tmp_path, capsys):
@@ -149,7 +149,7 @@ def test_crashes_are_counted(tmp_path, capsys):
         assert (case["finished"], case["crashed"]) == (0, 3)
     with (tmp_path / "flights.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert {row["ending"] for row in rows} <= {"out_of_bounds", "tipped_over", "on_the_ground"}
+    assert {row["ending"] for row in rows} <= {"out_of_bounds", "tipped_over", "below_min_height"}
     assert all(0.0 < float(row["ended_at_s"]) <= 4.0 for row in rows)
     assert "too few flights finished" in capsys.readouterr().out
 

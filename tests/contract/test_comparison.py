@@ -112,7 +112,7 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
         (["--observation", "guess"], "observation must be one of"),
         (["--observation", "estimat"], "did you mean estimate?"),
         (
-            ["--policy", "pretrained", "--env", "include_covariance=true"],
+            ["--policy", "pretrained", "--env", "include_std=true"],
             "trained with observations of 9 fields, and the environment gives 14 (it adds "
             "position_sigma, velocity_sigma, attitude_sigma, accel_bias_sigma, gyro_bias_sigma):",
         ),

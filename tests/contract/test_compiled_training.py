@@ -121,7 +121,7 @@ def test_a_training_with_such_a_critic_that_died_goes_on_as_if_it_had_not(tmp_pa
     [
         (asymmetric_plan(critic_only=14), "15 of 47, after .* got 14"),
         (asymmetric_plan(learning={}), "0 of 32, .* got 15"),
-        (asymmetric_plan(environment={"include_covariance": True}), "got 15"),
+        (asymmetric_plan(environment={"include_std": True}), "got 15"),
     ],
 )
 def test_a_critic_sees_more_than_the_policy_by_so_many_numbers(tmp_path, plan, message):

@@ -51,7 +51,7 @@ def test_training_and_evaluation_fly_as_the_options_say(script, monkeypatch):
         monkeypatch.setattr(module, name, keeping(getattr(module, name)))
     options = {"start": "moving", "out_of_bounds": 1.5}
     script.main(script.Args(algorithm="sac", total_timesteps=120, evaluate=4, **options))
-    assert [type(env).__name__ for env in made] == ["QuadVecEnv", "QuadVectorEnv"]
+    assert [type(env).__name__ for env in made] == ["QuadSB3VecEnv", "QuadVectorEnv"]
     for task in (env.unwrapped.flights.task for env in made):
         assert (task.start, task.out_of_bounds) == ("moving", 1.5)
 

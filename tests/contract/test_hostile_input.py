@@ -171,9 +171,7 @@ def test_arguments_of_flights(name):
             assert_refused_or_flown(lambda v: [FlightBatch(v).results], name, value)
         elif name in enumerations and isinstance(value, np.ndarray):
             continue  # Python's own message
-        elif name in ("run_filter", "include_covariance", "privileged") and not isinstance(
-            value, str
-        ):
+        elif name in ("run_filter", "include_std", "privileged") and not isinstance(value, str):
             continue  # anything is true or false to them
         else:
             assert_refused_or_flown(lambda v: fly_batch(**{name: v}), names, value)
@@ -225,7 +223,10 @@ PARAMETERS = {
     "CameraParams": (RTK.camera, lambda p: suite_of(camera=p)),
     "FilterParams": (RTK.estimator, lambda p: suite_of(estimator=p)),
     "NoisyObservationParams": (RTK.noisy, lambda p: suite_of(noisy=p)),
-    "PlacementParams": (INDOOR.placement, lambda p: {"sensors": INDOOR.replace(placement=p)}),
+    "InitialPoseParams": (
+        INDOOR.initial_pose,
+        lambda p: {"sensors": INDOOR.replace(initial_pose=p)},
+    ),
     "SensorSuite": (RTK, lambda p: {"sensors": p}),
 }
 

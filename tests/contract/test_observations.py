@@ -125,8 +125,8 @@ def test_on_a_course_the_previews_are_the_coming_gates():
 
 
 def test_the_covariance_part_is_the_root_of_the_diagonal():
-    env, observation, _ = flown(include_covariance=True)
-    seen = parts_of(observation, include_covariance=True)
+    env, observation, _ = flown(include_std=True)
+    seen = parts_of(observation, include_std=True)
     names = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
     sigmas = np.hstack([seen[f"{name}_sigma"] for name in names])
     P = env.flights.batch.covariance()
@@ -325,7 +325,7 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
         barometer=quad_gym.BarometerParams(),
         magnetometer=quad_gym.MagnetometerParams(),
     )
-    keywords = {"observation": "sensors", "include_covariance": True, "privileged": True}
+    keywords = {"observation": "sensors", "include_std": True, "privileged": True}
     env, observation, actions = flown(
         steps=2, sensors=suite, randomization=nearly_all_draws(), **keywords
     )
@@ -343,7 +343,7 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
 def test_every_observation_fits():
     table = quad_gym.observation_layout(
         "sensors",
-        include_covariance=True,
+        include_std=True,
         privileged=True,
         feature_count=MAX_FEATURES,
         gnss_velocity=True,

@@ -43,7 +43,7 @@ def errors_of_the_compiled_controller(seeds, sensors):
 @pytest.fixture(scope="module")
 def direct():
     suite = quad_gym.sensor_suite("lab")
-    estimator = suite.estimator.replace(feature_noise_across="predicted")
+    estimator = suite.estimator.replace(bearing_noise_at="predicted")
     return errors_of_the_compiled_controller(range(60), suite.replace(estimator=estimator))
 
 

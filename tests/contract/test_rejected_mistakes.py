@@ -134,7 +134,7 @@ def test_a_crash_in_the_last_step_is_a_crash():
     env.reset(seed=1)
     for _ in range(last):
         _, _, terminated, truncated, info = env.step(down)
-    assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")
+    assert (terminated, truncated, info["ending"]) == (True, False, "below_min_height")
 
 
 # ---- global state --------------------------------------------------------------------------------
@@ -203,10 +203,10 @@ NONSENSE = [
     {"vehicle": "balloon"},
     {"vehicle": 5},
     {"actions": "fast"},
-    {"include_covariance": "yes"},
+    {"include_std": "yes"},
     {"privileged": 1},
     {"camera": None},
-    {"feature_noise_across": "both"},
+    {"bearing_noise_at": "both"},
     {"control_rate": 30},
     {"control_rate": 400},
     {"control_rate": 0},

@@ -78,7 +78,7 @@ def test_a_flight_in_a_batch_is_the_flight_alone(task, mode):
         {"observation": "noisy", "action": "attitude"},
         {"observation": "sensors", "gnss_rate": 10, "camera_rate": 25, "action": "motor"},
         {"observation": "truth", "action": "velocity", "randomize": True},
-        {"include_covariance": True, "layout": "absolute", "action": "wrench"},
+        {"include_std": True, "layout": "absolute", "action": "wrench"},
         {"camera": False, "control_rate": 100},
         {"sensors": AVERAGES, "gnss_rate": 20},
     ],

@@ -81,7 +81,7 @@ def test_a_crash_is_not_reported_as_truncation():
             break
     assert dones.all()
     assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
-    assert infos[0]["ending"] == "on_the_ground"
+    assert infos[0]["ending"] == "below_min_height"
 
 
 def test_the_replay_of_sac_tells_time_limits_from_crashes_and_keeps_final_observations():

@@ -21,7 +21,7 @@ from baselines.arms import Arm
 ARMS = (
     Arm(name="facing", label="PD, facing the features", policy="pd:features"),
     Arm(name="truth", label="truth", training={"observation": "truth"}),
-    Arm(name="mine", label="mine", environment={"include_covariance": True}),
+    Arm(name="mine", label="mine", environment={"include_std": True}),
 )
 """
 

@@ -210,7 +210,7 @@ def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
 def test_half_a_meter_below_the_origin_is_on_the_ground(task, options):
     env = QuadEnv(task, **options)
     *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
-    assert (terminated, truncated, info["ending"]) == (True, False, "on_the_ground")
+    assert (terminated, truncated, info["ending"]) == (True, False, "below_min_height")
     assert -1.0 < env.flights.batch.read("r")[0, 2] < -0.5
 
 
@@ -237,7 +237,7 @@ def test_the_last_gate_terminates():
 
 @pytest.mark.parametrize("privileged", [False, True])
 def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
-    env = QuadEnv("hover", privileged=privileged, include_covariance=True)
+    env = QuadEnv("hover", privileged=privileged, include_std=True)
     env.reset(seed=1)
     batch = env.flights.batch
     instant = batch.snapshot()

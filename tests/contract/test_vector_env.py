@@ -74,7 +74,7 @@ def test_it_returns_what_a_loop_over_single_environments_returns(env_id, mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_it_does_so_with_a_dict_of_policy_and_privileged(mode):
-    keywords = {"observation": "noisy", "privileged": True, "include_covariance": True, **SHORT}
+    keywords = {"observation": "noisy", "privileged": True, "include_std": True, **SHORT}
     fly_both(*both("QuadGym/RandomTrajectory-v0", 5, mode, **keywords), steps=40, seed=11)
 
 

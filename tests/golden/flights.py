@@ -145,7 +145,7 @@ def cases():
         "randomization": rtk | {"randomization": RANDOMIZATION},
         "randomization known": rtk
         | {"randomization": quad_gym.Randomization(RANDOMIZATION, known=True)},
-        "privileged": rtk | {"privileged": True, "include_covariance": True},
+        "privileged": rtk | {"privileged": True, "include_std": True},
         "absolute": rtk | {"layout": "absolute"},
         "trajectories": {
             **{"id": "Trajectory", "trajectory": trajectories(), "randomize": True},

@@ -55,7 +55,7 @@ def test_random_actions_leave_no_number_that_is_not_finite(task, action, total):
         action=action,
         observation=OBSERVATIONS[number % 4],
         layout=("relative", "absolute")[number // 4 % 2],
-        include_covariance=True,
+        include_std=True,
         privileged=True,
         **rate,
         **camera,

@@ -19,7 +19,7 @@ from tests.field_flights import fly, nees, state_errors, steps
 def aided(suite, kind="ukf", late=False, gate=True, **sensors):
     """A suite with both, without what a filter does not model; or with those given."""
     plain = quad_gym.sensor_suite(suite).simplified()
-    choices = {} if gate else {"gate_false_alarm": 0.0}
+    choices = {} if gate else {"false_alarm_probability": 0.0}
     both = {
         "barometer": BarometerParams(latency=0.03 * late),
         "magnetometer": MagnetometerParams(latency=0.02 * late),

@@ -180,7 +180,7 @@ def rms_error(suite, faults):
 
 
 GATED_LAB = LAB.replace(
-    estimator=LAB.estimator.replace(gate_false_alarm=1e-4, feature_noise_across="predicted")
+    estimator=LAB.estimator.replace(false_alarm_probability=1e-4, bearing_noise_at="predicted")
 )
 SUITES = {
     "lab": GATED_LAB,
@@ -204,7 +204,7 @@ def test_with_five_percent_outliers_the_error_is_hardly_larger(kind, name):
 @pytest.mark.slow
 def test_without_the_gate_outliers_do_harm():
     suite = SUITES["rtk, no camera"]
-    open_ = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=0.0))
+    open_ = suite.replace(estimator=suite.estimator.replace(false_alarm_probability=0.0))
     clean = rms_error(open_, None)
     corrupt = rms_error(open_, GnssOutliers(share=0.05, size=(10.0, 100.0)))
     assert corrupt > 3.0 * clean
@@ -217,7 +217,7 @@ def test_without_the_gate_outliers_do_harm():
 @pytest.mark.parametrize("name", ["lab", "rtk", "rtk, no camera"])
 @pytest.mark.parametrize("kind", ["ukf", "ekf"])
 def test_a_true_jump_does_not_lock_the_filter_out(kind, name):
-    """The gate refuses the truth at first; after `gate_patience` refusals it opens again."""
+    """The gate refuses the truth at first; after `max_rejections` refusals it opens again."""
     suite = of_kind(SUITES[name], kind)
     jump = PositionJump(start=5.0, size=(2.0, 4.0))
     options = {"source": Source.TRUTH, "run_filter": True, "threads": 1}

@@ -15,7 +15,7 @@ from quad_gym.records import Source
 from tests.reference_ukf import rotation_312
 
 LAB = quad_gym.sensor_suite("lab")
-PREDICTED = LAB.replace(estimator=LAB.estimator.replace(feature_noise_across="predicted"))
+PREDICTED = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at="predicted"))
 FLIGHTS = 1000
 
 
@@ -142,7 +142,7 @@ def test_the_errors_are_about_as_large_as_the_filter_believes(sensors):
 def test_noise_across_the_measured_direction_makes_the_filter_too_sure():
     """Known: the report's form takes the gap between two directions for information along one.
 
-    A median flight is off by half, and the worst by far, which is why `feature_noise_across` can be
+    A median flight is off by half, and the worst by far, which is why `bearing_noise_at` can be
     "predicted". The form is kept, as the report defines it.
     """
     values = nees_after_five_seconds(LAB)

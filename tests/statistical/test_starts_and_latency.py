@@ -58,7 +58,7 @@ def test_any_yaw_is_known_to_a_degree_within_ten_seconds(name, camera):
     suite = delayed(RTK) if name == "late rtk" else RTK
     if name == "lab":  # whose own form is overconfident in its camera
         suite = quad_gym.sensor_suite("lab")
-        suite = suite.replace(estimator=suite.estimator.replace(feature_noise_across="predicted"))
+        suite = suite.replace(estimator=suite.estimator.replace(bearing_noise_at="predicted"))
     if not camera:
         suite = suite.replace(camera=None)
     batch = fly(suite, 2000, task="hover", randomization=ANY_YAW)
@@ -80,7 +80,7 @@ def test_a_vertical_baseline_does_no_harm(camera, start):
     """
     suite = BASELINE_UP if camera else BASELINE_UP.replace(camera=None)
     if start == "warm" and not camera:
-        suite = suite.replace(placement=quad_gym.PlacementParams(heading_sigma=0.02))
+        suite = suite.replace(initial_pose=quad_gym.InitialPoseParams(heading_sigma=0.02))
     batch = fly(suite, 1000, filter_start=start, randomization=ANY_YAW)
     means = [nees(batch).mean()]
     for _ in range(60):

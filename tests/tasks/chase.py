@@ -3,14 +3,14 @@
 import numpy as np
 
 import quad_gym
-from quad_gym.tasks import Observed
+from quad_gym.tasks import ObservationSpec
 
 
 class Chase(quad_gym.Task):
     """Follow a target that moves on a straight line, new in each episode."""
 
     state = {"target": np.zeros(3), "velocity": np.zeros(3), "best": np.inf, "caught": False}
-    observes = {"target": Observed("m", "B", -20.0, 20.0)}
+    observes = {"target": ObservationSpec("m", "B", -20.0, 20.0)}
 
     def reset(self, view, rng):
         view.state.target = view.reference_position + rng.uniform(-0.5, 0.5, (view.count, 3))

@@ -74,7 +74,7 @@ def test_a_controller_may_be_told_another_standard_deviation(name, told):
 
 def test_a_race_tells_the_standard_deviations_but_those_withheld():
     task, steps = "QuadGym/StaleRace-v0", 30
-    plain = gymnasium.make_vec(task, num_envs=6, autoreset_mode="Disabled", include_covariance=True)
+    plain = gymnasium.make_vec(task, num_envs=6, autoreset_mode="Disabled", include_std=True)
     told, some = make("ALL_TOLD", task=task), make("ATTITUDE_WITHHELD", task=task)
     shown, _ = plain.reset(seed=3)
     told, observed, some, partly = *told, *some
@@ -193,7 +193,7 @@ def test_scaled_observations_are_those_of_the_task_over_their_scales():
 
 @pytest.mark.parametrize("name", ["Scaled", "Wary", "Steady", "SteadyWary"])
 def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
-    env, _ = make(name, count=1, task="QuadGym/OutageDash-v0", include_covariance=True)
+    env, _ = make(name, count=1, task="QuadGym/OutageDash-v0", include_std=True)
     table = {field.name: field for field in env.unwrapped.flights.table}
     scaled = ["position_error", "velocity_error", "body_rates"]
     scaled += ["next_gap", "gap_width", "next_width"]

@@ -243,9 +243,9 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
     [
         ({"state": {"a b": 1.0}}, "state must hold values by name"),
         ({"state": {"a": "text"}}, "state must hold numbers"),
-        ({"observes": {"a": 3}, "observe": lambda v: {"a": v.time}}, "must hold Observed"),
+        ({"observes": {"a": 3}, "observe": lambda v: {"a": v.time}}, "must hold ObservationSpec"),
         (
-            {"observes": {"b": quad_gym.Observed()}, "observe": lambda v: {"a": v.time}},
+            {"observes": {"b": quad_gym.ObservationSpec()}, "observe": lambda v: {"a": v.time}},
             "observes has 'b', which observe does not return",
         ),
         ({"observe": lambda v: {"up": v.time}}, "must not return 'up'"),

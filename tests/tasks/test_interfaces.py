@@ -13,7 +13,7 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym.envs import keywords_of
 from quad_gym.evaluation import evaluate, roll_out
-from quad_gym.tasks import Observed
+from quad_gym.tasks import ObservationSpec
 from tests import console_commands
 from tests.contract.comparing import assert_same
 from tests.tasks.chase import Chase
@@ -92,7 +92,7 @@ def test_an_ending_of_the_task_is_no_crash():
 
 
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
-@pytest.mark.parametrize("keywords", [{}, {"privileged": True, "include_covariance": True}])
+@pytest.mark.parametrize("keywords", [{}, {"privileged": True, "include_std": True}])
 def test_pd_control_finds_its_part_of_a_longer_observation(layout, keywords):
     task = quad_gym.Task.of(observe=distance)
     made = {"num_envs": 3, "layout": layout, **keywords}
@@ -129,7 +129,7 @@ def test_the_table_of_observations_has_the_part_of_the_task_before_the_privilege
 def test_observations_are_held_within_the_bounds_of_the_task():
     far = quad_gym.Task.of(
         observe=lambda view: {"a": np.full((view.count, 2), 7.0), "b": np.full(view.count, -1e9)},
-        observes={"a": Observed(low=0.0, high=0.5)},
+        observes={"a": ObservationSpec(low=0.0, high=0.5)},
     )
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, custom=far)
     observation, _ = env.reset(seed=0)

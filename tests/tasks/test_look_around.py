@@ -120,7 +120,7 @@ def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not
 
 
 def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading(facing):
-    env = gymnasium.make_vec(ID, num_envs=60, include_covariance=True)
+    env = gymnasium.make_vec(ID, num_envs=60, include_std=True)
     rule = fly(PDPolicy(env, faces="features_when_unsure"), env, 0, traced=("sigma",))
     assert rule.returns.mean() > facing.returns.mean()
     assert UNSURE < np.nanmax(rule.traces["sigma"]) < 3.0
@@ -131,7 +131,7 @@ def test_the_features_must_be_observed_to_be_faced():
     circle = gymnasium.make("QuadGym/Circle-v0")
     with pytest.raises(ValueError, match='must observe features_direction for faces="features"'):
         PDPolicy(circle, faces="features")
-    with pytest.raises(ValueError, match="include_covariance=True"):
+    with pytest.raises(ValueError, match="include_std=True"):
         PDPolicy(make(1), faces="features_when_unsure")
     with pytest.raises(ValueError, match="faces must be one of"):
         PDPolicy(circle, faces="north")

@@ -163,7 +163,7 @@ def test_gaps_are_counted_by_the_true_position(mode):
 
 
 def test_the_standard_deviations_tell_that_gnss_is_gone():
-    env = make(16, include_covariance=True, **FAST)
+    env = make(16, include_std=True, **FAST)
     assert env.unwrapped.flights.space.shape == (40,)
     policy = PDPolicy(env, max_position_error=0.2)
     observed, _ = env.reset(seed=2)
@@ -187,7 +187,7 @@ def test_the_standard_deviations_tell_that_gnss_is_gone():
 
 def test_flights_on_the_truth_have_no_outage_and_asking_for_one_is_refused():
     assert make(1, observation="truth").unwrapped.flights.batch.faults == ()
-    watched = make(1, observation="truth", include_covariance=True)
+    watched = make(1, observation="truth", include_std=True)
     assert len(watched.unwrapped.flights.batch.faults) == 1
     with pytest.raises(ValueError, match="GnssOutage concerns sensors, and none runs"):
         make(1, observation="truth", faults=[quad_gym.faults.GnssOutage(start=1.0)])

@@ -33,9 +33,9 @@ def test_the_page_names_every_piece_of_rewards():
     pieces = [
         name
         for name, kind in vars(quad_gym.rewards).items()
-        if isinstance(kind, type) and issubclass(kind, quad_gym.rewards.Piece)
+        if isinstance(kind, type) and issubclass(kind, quad_gym.rewards.Term)
     ]
-    inner = {"Piece", "Sum", "Constant", "OfFunction"}
+    inner = {"Term", "Sum", "Constant", "FunctionTerm"}
     assert set(re.findall(r"\| `(\w+)\(", PAGE)) >= set(pieces) - inner
 
 

@@ -11,13 +11,13 @@ from baselines import PDPolicy
 from quad_gym import rewards
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.tasks.rewards import BLOCKS, Constant, Piece
+from quad_gym.tasks.rewards import BLOCKS, Constant, Term
 
 
 @pytest.mark.parametrize("per", ["step", "second"])
 @pytest.mark.parametrize("task", [i for i, task in quad_gym.IDS.items() if task in TASK_DEFAULTS])
 def test_sums_of_pieces_are_the_rewards_that_ship(task, per):
-    piece = rewards.COURSE if "Waypoints" in task else rewards.FOLLOWING
+    piece = rewards.RACING if "Waypoints" in task else rewards.TRACKING
     made = {"num_envs": 6, "reward_per": per, "randomize": True, "max_episode_steps": 120}
     plain = gymnasium.make_vec(task, **made)
     ours = gymnasium.make_vec(task, custom=quad_gym.Task.of(reward=piece), **made)
@@ -44,7 +44,7 @@ def view_after(steps=10, **keywords):
 
 def test_sums_differences_and_multiples_are_pieces():
     view = view_after()
-    a, b = rewards.Tracking(1.0), rewards.Effort()
+    a, b = rewards.Tracking(1.0), rewards.ActionRate()
     x, y = a(view), b(view)
     for piece, expected in (
         (a + b, x + y),
@@ -55,9 +55,9 @@ def test_sums_differences_and_multiples_are_pieces():
         (a + (lambda view: view.time), x + view.time),
         (0.5 * (a + 0.5 * b), 0.5 * x + 0.25 * y),
     ):
-        assert isinstance(piece, Piece)
+        assert isinstance(piece, Term)
         np.testing.assert_allclose(piece(view), expected, rtol=1e-14)
-    assert pickle.loads(pickle.dumps(rewards.FOLLOWING)) == rewards.FOLLOWING
+    assert pickle.loads(pickle.dumps(rewards.TRACKING)) == rewards.TRACKING
     with pytest.raises(ValueError, match="piece must be a number"):
         a + "b"
     with pytest.raises(ValueError, match="weight must be finite"):
@@ -70,7 +70,7 @@ def test_each_piece_is_what_it_says():
     for piece, expected in (
         (rewards.Tracking(3.0), np.exp(-3.0 * view.position_error)),
         (rewards.Heading(), np.einsum("ni,ni->n", view.R_BI[:, 0], view.reference_heading)),
-        (rewards.Effort(), np.linalg.norm(change, axis=1) ** 2),
+        (rewards.ActionRate(), np.linalg.norm(change, axis=1) ** 2),
         (rewards.BodyRates(), np.linalg.norm(view.body_rates, axis=1) ** 2),
         (rewards.Gate(), np.zeros(4)),
         (rewards.Crash(), np.zeros(4)),

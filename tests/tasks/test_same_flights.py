@@ -9,7 +9,7 @@ import pytest
 
 import quad_gym
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.envs.sb3 import QuadVecEnv
+from quad_gym.envs.sb3 import QuadSB3VecEnv
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from tests.contract.comparing import actions_of, assert_same
@@ -82,10 +82,10 @@ def test_a_task_that_changes_nothing_flies_what_ships(task, mode):
     "keywords",
     [
         {"observation": "noisy", "start": "mixed"},
-        {"sensors": "rtk", "innovations": True, "end_when_lost": True},
+        {"sensors": "rtk", "innovations": True, "truncate_when_diverged": True},
         {"observation": "sensors", "privileged": True, "reward_per": "second"},
         {"sensors": "consumer", "randomization": {"mass": quad_gym.Uniform(0.5, 1.0)}},
-        {"faults": "rotor_loss", "include_covariance": True, "filter_start": "warm"},
+        {"faults": "rotor_loss", "include_std": True, "filter_start": "warm"},
     ],
     ids=lambda keywords: "+".join(keywords),
 )
@@ -143,7 +143,7 @@ def test_neither_the_size_of_the_batch_nor_threads_change_a_flight():
 
 
 def test_stable_baselines_flies_the_same():
-    env = QuadVecEnv(FLIGHTS, "hover", custom=Chase(), **SHORT)
+    env = QuadSB3VecEnv(FLIGHTS, "hover", custom=Chase(), **SHORT)
     env.seed(0)
     vector = QuadVectorEnv(FLIGHTS, "hover", autoreset_mode="SameStep", custom=Chase(), **SHORT)
     np.testing.assert_array_equal(env.reset(), vector.reset(seed=0)[0])

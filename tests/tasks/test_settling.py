@@ -117,7 +117,12 @@ def test_returns_go_on_after_a_snapshot_has_been_restored():
     ("task", "sensors", "faults"), [("hover", "rtk", "all"), ("waypoints", "standard", "gnss_jump")]
 )
 def test_a_task_that_says_what_is_built_in_changes_nothing(task, sensors, faults, mode):
-    keywords = {"sensors": sensors, "faults": faults, "end_when_lost": True, "reward_per": "step"}
+    keywords = {
+        "sensors": sensors,
+        "faults": faults,
+        "truncate_when_diverged": True,
+        "reward_per": "step",
+    }
     keywords |= {"autoreset_mode": mode, "max_episode_steps": 90, "max_tilt": 0.25}
     plain = QuadVectorEnv(FLIGHTS, task, **keywords)
     same = QuadVectorEnv(FLIGHTS, task, custom=Same(), **keywords)

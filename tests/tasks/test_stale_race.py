@@ -19,7 +19,7 @@ def test_what_the_task_is_by_default():
     assert (flights.task.gate_count, flights.task.gate_radius) == (8, 0.6)
     suite = flights.batch.sensors
     assert (suite.gnss.latency, suite.camera.latency) == (0.04, 0.01)
-    assert suite.estimator.late_measurements == "as_fresh"
+    assert suite.estimator.delay_compensation == "none"
 
 
 def test_the_reward_is_that_of_its_equation():
@@ -50,7 +50,7 @@ def test_the_reward_is_that_of_its_equation():
 def test_time_stamps_make_the_race_easy():
     """The control: the same sensors, and a filter that knows how old their measurements are."""
     stale = quad_gym.sensor_suite("stale")
-    told = stale.replace(estimator=stale.estimator.replace(late_measurements="rewind"))
+    told = stale.replace(estimator=stale.estimator.replace(delay_compensation="retrodict"))
     errors = {}
     for name, suite in (("stale", stale), ("told", told)):
         env = make(64, sensors=suite)

@@ -183,7 +183,7 @@ def test_a_rotated_attitude_leaves_what_is_known_of_the_field_unchanged(kind):
     field_B = rotation_312(np.array([[0.0, 0.0, 0.15]]))[0] @ plain.magnetometer.field_I
     found = {}
     for reset in ("turn", "none"):
-        estimator = plain.estimator.replace(covariance_reset=reset, gate_false_alarm=0.0)
+        estimator = plain.estimator.replace(covariance_reset=reset, false_alarm_probability=0.0)
         suite = plain.replace(estimator=estimator)
         ours = kind(suite)
         ours.initialize(np.zeros(3), heading=0.0, heading_sigma=0.1)
@@ -197,7 +197,7 @@ def test_a_rotated_attitude_leaves_what_is_known_of_the_field_unchanged(kind):
 
 
 def test_what_is_beyond_the_gate_is_left_out_and_at_last_believed():
-    gated = LAB.estimator.replace(gate_false_alarm=1e-4, gate_patience=5)
+    gated = LAB.estimator.replace(false_alarm_probability=1e-4, max_rejections=5)
     suite = LAB.replace(camera=None, estimator=gated, **BOTH)
     recording = record_circle(suite, 1, 1)
     ours = UnscentedKalmanFilter(suite)

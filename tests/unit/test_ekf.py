@@ -18,7 +18,7 @@ MIDPOINT = {"integration": "midpoint", "covariance_reset": "turn"}
     "choices",
     [
         {},
-        {"feature_noise_across": "predicted"},
+        {"bearing_noise_at": "predicted"},
         {"integration": "midpoint"},
         {"covariance_reset": "turn"},
         MIDPOINT,

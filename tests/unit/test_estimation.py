@@ -198,7 +198,7 @@ def test_a_steep_baseline_leaves_the_heading_to_the_mark(name, heading):
     suite = quad_gym.sensor_suite(name)
     up = {"primary_antenna_B": (0.01, 0.02, 0.05), "secondary_antenna_B": (0.01, 0.02, 0.24)}
     suite = suite.replace(
-        gnss=suite.gnss.replace(**up), placement=quad_gym.PlacementParams(heading_sigma=0.1)
+        gnss=suite.gnss.replace(**up), initial_pose=quad_gym.InitialPoseParams(heading_sigma=0.1)
     )
     fix = R_IG.T @ np.ones(3), R_IG.T @ (0.0, 0.0, 0.19)
     R_BI = rotation_312(np.array([0.0, 0.0, heading]))
@@ -206,7 +206,7 @@ def test_a_steep_baseline_leaves_the_heading_to_the_mark(name, heading):
     ukf.initialize(*fix, heading=heading)
     np.testing.assert_allclose(ukf.R_BI, R_BI, atol=1e-13)
     np.testing.assert_allclose(ukf.position, 1.0 - R_BI.T @ (0.01, 0.02, 0.05), atol=1e-13)
-    variance = suite.estimator.initial_scale * 0.1**2
+    variance = suite.estimator.initial_covariance_scale * 0.1**2
     np.testing.assert_allclose(ukf.covariance[8, 8], variance, rtol=1e-12)
     ukf.initialize(*fix)
     np.testing.assert_allclose(ukf.covariance[8, 8], np.pi**2 / 3, rtol=1e-12)  # any

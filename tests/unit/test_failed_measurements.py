@@ -22,10 +22,10 @@ LAB = quad_gym.sensor_suite("lab")
 LAB = LAB.replace(gnss=LAB.gnss.replace(velocity_sigma=0.05))
 FIELD = LAB.replace(
     estimator=LAB.estimator.replace(
-        feature_noise_across="projected",
+        bearing_noise_at="pinhole",
         integration="midpoint",
         covariance_reset="turn",
-        gate_false_alarm=1e-4,
+        false_alarm_probability=1e-4,
     ),
 )
 RECORDING = record_circle(LAB.replace(estimator=FIELD.estimator), 60, 3)

@@ -16,14 +16,14 @@ INDOOR = quad_gym.sensor_suite("indoor").simplified()
 
 def with_gradual(above, kind="ukf"):
     camera = INDOOR.camera.replace(phase=0.0)
-    estimator = INDOOR.estimator.replace(gradual_above=above, kind=kind)
+    estimator = INDOOR.estimator.replace(recursive_update_threshold=above, kind=kind)
     return INDOOR.replace(camera=camera, estimator=estimator)
 
 
 def started(above, sigma, gate=0.0):
     """A filter before its first image, with an attitude known to `sigma`, and what it sees."""
     suite = with_gradual(above)
-    suite = suite.replace(estimator=suite.estimator.replace(gate_false_alarm=gate))
+    suite = suite.replace(estimator=suite.estimator.replace(false_alarm_probability=gate))
     ukf = quad_gym.UnscentedKalmanFilter(suite)
     P = np.diag(np.repeat([0.05, 0.03, sigma, 0.2, 0.01], 3) ** 2)
     set_at_rest(ukf, P, position=(0.5, -0.3, 1.2))
@@ -81,8 +81,8 @@ def test_a_rough_start_is_consistent_after_the_first_image_in_steps_only(kind):
 
 
 def test_a_deviation_that_is_invalid_is_refused():
-    with pytest.raises(ValueError, match=r"^FilterParams.gradual_above must be"):
-        quad_gym.FilterParams(gradual_above=0.0)
+    with pytest.raises(ValueError, match=r"^FilterParams.recursive_update_threshold must be"):
+        quad_gym.FilterParams(recursive_update_threshold=0.0)
 
 
 @pytest.mark.parametrize("distance", [3.0, 30.0])

@@ -269,7 +269,7 @@ def test_a_hard_landing_is_the_end(start, crashes):
         ended = np.maximum(ended, flights.result("ending"))
         if crashes and ended.any():
             break
-    assert (ended == (float(Ending.ON_THE_GROUND) if crashes else 0.0)).all()
+    assert (ended == (float(Ending.BELOW_MIN_HEIGHT) if crashes else 0.0)).all()
 
 
 def test_a_start_in_the_ground_is_lifted_and_one_on_it_stands():

@@ -22,10 +22,10 @@ from tests.lane_filter import EIGHT, STATE, LaneFilter
 from tests.reference_ukf import PlainUKF
 
 LAB = quad_gym.sensor_suite("lab")
-CONSISTENT = LAB.replace(estimator=LAB.estimator.replace(feature_noise_across="predicted"))
+CONSISTENT = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at="predicted"))
 GATED = LAB.replace(
     estimator=LAB.estimator.replace(
-        feature_noise_across="predicted", gate_false_alarm=1e-4, gate_patience=5
+        bearing_noise_at="predicted", false_alarm_probability=1e-4, max_rejections=5
     )
 )
 RECORDING = record_circle(CONSISTENT, 400, 11)
@@ -70,9 +70,9 @@ class InnovatingUKF(PlainUKF):
             self.nis.append(nu @ np.linalg.solve(block, nu))
 
 
-@pytest.mark.parametrize("across", ["measured", "predicted", "projected"])
+@pytest.mark.parametrize("across", ["measured", "predicted", "pinhole"])
 def test_the_nis_of_each_block_is_that_of_a_plain_filter(across):
-    sensors = LAB.replace(estimator=LAB.estimator.replace(feature_noise_across=across))
+    sensors = LAB.replace(estimator=LAB.estimator.replace(bearing_noise_at=across))
     ours, plain = UnscentedKalmanFilter(sensors), InnovatingUKF(sensors)
     for ukf in (ours, plain):
         ukf.initialize(RECORDING.gnss_position[0], RECORDING.gnss_baseline[0])
@@ -141,8 +141,8 @@ def test_the_gate_is_the_chi_square_quantile_of_its_false_alarm():
 
 @pytest.mark.parametrize("value", [-0.1, 0.5, np.nan])
 def test_a_false_alarm_that_is_no_probability_is_refused(value):
-    with pytest.raises(ValueError, match="gate_false_alarm"):
-        LAB.estimator.replace(gate_false_alarm=value)
+    with pytest.raises(ValueError, match="false_alarm_probability"):
+        LAB.estimator.replace(false_alarm_probability=value)
 
 
 def test_a_lane_gates_for_itself():
@@ -210,7 +210,7 @@ def test_a_measurement_that_fails_leaves_the_estimate_bitwise_unchanged(field, s
 def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
     suite = quad_gym.sensor_suite("consumer").simplified()
     two = suite.gnss.replace(secondary_antenna_B=(0.1, 0.0, 0.0472), baseline_sigma=0.035)
-    suite = suite.replace(gnss=two, estimator=suite.estimator.replace(gate_false_alarm=0.01))
+    suite = suite.replace(gnss=two, estimator=suite.estimator.replace(false_alarm_probability=0.01))
     batch = fly(suite, 400, task="hover")
     steps(batch, 5.0)  # until the start's larger uncertainty is over
     blocks = measured_now(batch).shape[1]  # of GNSS and camera, before those of other sensors

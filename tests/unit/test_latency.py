@@ -47,7 +47,7 @@ def corrected_lab(kind="ukf", quiet=False, **latencies):
         kind=kind,
         integration="midpoint",
         covariance_reset="turn",
-        feature_noise_across="projected",
+        bearing_noise_at="pinhole",
         reuse_first_fix=False,
     )
 
@@ -221,7 +221,7 @@ def test_nees_is_right_at_the_longest_latency_of_any_rate(rates):
 
 def test_taken_as_fresh_it_is_another():
     suite = corrected_lab("ukf", gnss=0.1, camera=0.06)
-    ignorant = late(suite, late_measurements="as_fresh")
+    ignorant = late(suite, delay_compensation="none")
     mean, _ = deviations_from_the_reference(ignorant, PlainUKF)
     assert mean > 1.0
 
@@ -235,7 +235,9 @@ def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
     suite = late(suite, **latencies, kind=kind)
     informed = fly(suite, 400, filter_start="warm")
     ignorant = fly(
-        late(suite, late_measurements="as_fresh", gate_false_alarm=0.0), 400, filter_start="warm"
+        late(suite, delay_compensation="none", false_alarm_probability=0.0),
+        400,
+        filter_start="warm",
     )
     means = {"informed": [], "ignorant": []}
     for _ in range(8):
@@ -305,7 +307,7 @@ def test_a_failure_before_does_not_stop_late_measurements():
 
 
 def test_without_latency_it_does_not_matter_what_a_filter_does_about_it():
-    flown = [fly(late(RTK, late_measurements=choice), 20) for choice in ("rewind", "as_fresh")]
+    flown = [fly(late(RTK, delay_compensation=choice), 20) for choice in ("retrodict", "none")]
     for batch in flown:
         steps(batch, 0.5)
     assert flown[0].snapshot().tobytes() == flown[1].snapshot().tobytes()
@@ -317,7 +319,7 @@ def test_a_flight_in_a_batch_is_the_flight_alone(autoreset):
         "sensors": late(RTK, gnss=0.13, camera=0.06, kind="ekf"),
         "filter_start": "warm",
         "duration": 0.3,
-        "include_covariance": True,
+        "include_std": True,
     }
     vector = QuadVectorEnv(11, "circle", autoreset_mode=autoreset, **keywords)
     together = [vector.reset(seed=3)[0]] + [
@@ -370,5 +372,5 @@ def test_nonsense_is_refused():
         late(INDOOR, camera=0.06).with_rates(camera=50.0)
     with pytest.raises(ValueError, match=r"true_sensors must have the GNSS rate"):
         fly(RTK.with_rates(gnss=20.0), 1, true_sensors=late(RTK, gnss=0.15))
-    with pytest.raises(ValueError, match="late_measurements must be one of rewind, as_fresh"):
-        RTK.estimator.replace(late_measurements="drop")
+    with pytest.raises(ValueError, match="delay_compensation must be one of retrodict, none"):
+        RTK.estimator.replace(delay_compensation="drop")

@@ -302,7 +302,7 @@ def test_pd_control_is_not_shown_other_observations():
 
 def test_pd_control_knows_the_length_of_its_observations():
     policy = PDPolicy(QuadEnv("hover"))
-    wide = QuadEnv("hover", include_covariance=True)
+    wide = QuadEnv("hover", include_std=True)
     refused(r"observation must be \(\.\.\., 28\)", policy.predict, wide.reset(seed=1)[0])
     privileged = PDPolicy(QuadEnv("hover", privileged=True))
     assert privileged.predict({"policy": np.zeros(28)})[0].shape == (4,)

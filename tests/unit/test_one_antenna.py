@@ -114,7 +114,7 @@ def test_without_a_magnetometer_the_mark_of_the_start_tells_the_heading():
     alone = CONSUMER.replace(magnetometer=None)
     batch = fly(alone, 1000, task="hover")
     heading = state_errors(batch)[:, 8]
-    sigma = alone.placement.heading_sigma
+    sigma = alone.initial_pose.heading_sigma
     assert np.sqrt((heading**2).mean()) == pytest.approx(sigma, rel=0.15)
     np.testing.assert_allclose(np.linalg.norm(batch.read("L")[:, 8], axis=1), sigma, rtol=1e-3)
 

@@ -131,7 +131,7 @@ def test_whether_a_flight_is_lost_does_not_depend_on_the_other_flights():
 @pytest.mark.slow  # what the fault does to another filter
 def test_without_inflated_biases_the_step_would_outlast_the_test():
     """The same fault with a gate that never reopens and never doubts: it takes everything."""
-    batch = flown("rtk", STEP, 13.0, gate_false_alarm=0.0)
+    batch = flown("rtk", STEP, 13.0, false_alarm_probability=0.0)
     assert beyond(batch, 6.0).mean() > 0.99
 
 
@@ -159,22 +159,24 @@ def test_info_tells_of_it_and_episodes_can_end_with_it():
     keywords |= {"start": "hover", "filter_start": "warm", "duration": 4.0}
     told, endings = QuadVectorEnv(32, "hover", **keywords), []
     told.reset(seed=0)
-    ended = QuadVectorEnv(32, "hover", end_when_lost=True, **keywords)
+    ended = QuadVectorEnv(32, "hover", truncate_when_diverged=True, **keywords)
     ended.reset(seed=0)
     lost = np.zeros(32, bool)
     for _ in range(150):
         _, _, _, truncated, info = told.step(np.zeros((32, 4)))
-        lost |= info["filter_lost"]
+        lost |= info["filter_diverged"]
         *_, truncated, info = ended.step(np.zeros((32, 4)))
         endings += info["ending"][truncated].tolist()
     assert lost.mean() > 0.9
-    assert endings.count("filter_lost") > 16
+    assert endings.count("filter_diverged") > 16
 
 
 @pytest.mark.parametrize("sensors", ["standard", "rtk"])
 def test_an_end_that_no_filter_could_tell_is_refused(sensors):
-    with pytest.raises(ValueError, match="end_when_lost needs a filter, and none runs here"):
-        QuadVectorEnv(2, "hover", end_when_lost=True, sensors=sensors, observation="truth")
+    with pytest.raises(
+        ValueError, match="truncate_when_diverged needs a filter, and none runs here"
+    ):
+        QuadVectorEnv(2, "hover", truncate_when_diverged=True, sensors=sensors, observation="truth")
 
 
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.params.sensors import PlacementParams
+from quad_gym.params.sensors import InitialPoseParams
 from quad_gym.params.suites import SUITES
 from quad_gym.records import VELOCITY_BLOCK
 from quad_gym.sensors import GnssReceiver
@@ -31,10 +31,10 @@ def test_the_suites_have_names():
 def test_a_suite_of_the_field_is_consistent_by_its_settings(name):
     suite = quad_gym.sensor_suite(name)
     assert suite.imu.samples == "average"
-    assert suite.estimator.feature_noise_across == "projected"
+    assert suite.estimator.bearing_noise_at == "pinhole"
     assert not suite.estimator.reuse_first_fix
     if name != "standard":  # the laboratory's sensors need no gate
-        assert 0.0 < suite.estimator.gate_false_alarm < 0.01
+        assert 0.0 < suite.estimator.false_alarm_probability < 0.01
 
 
 # ---- the start ---------------------------------------------------------------------------------
@@ -269,7 +269,7 @@ def test_velocity_is_observed_with_the_position_by_suites_that_have_it():
 def test_the_place_of_the_start_is_as_uncertain_as_it_is_and_not_as_believed():
     believed = quad_gym.sensor_suite("indoor").simplified()
     believed = believed.replace(camera=believed.camera.replace(phase=0.5))
-    true = believed.replace(placement=PlacementParams(position_sigma=0.2, heading_sigma=0.15))
+    true = believed.replace(initial_pose=InitialPoseParams(position_sigma=0.2, heading_sigma=0.15))
     batch = fly(believed, 4000, task="hover", true_sensors=true, start="ground")
     errors = state_errors(batch)
     assert_normal(errors[:, :3], np.zeros(3), np.eye(3) * 0.2**2)
@@ -290,11 +290,11 @@ def test_a_steep_baseline_leaves_the_heading_to_the_mark_of_the_start(name):
         4000,
         task="hover",
         start="ground",
-        true_sensors=suite.replace(placement=PlacementParams(heading_sigma=0.2)),
+        true_sensors=suite.replace(initial_pose=InitialPoseParams(heading_sigma=0.2)),
         randomization={"start_yaw": quad_gym.Uniform(-np.pi, np.pi)},
     )
     assert_normal(state_errors(batch)[:, 8:9], np.zeros(1), np.eye(1) * 0.2**2)
-    claimed = np.sqrt(suite.estimator.initial_scale) * 0.05
+    claimed = np.sqrt(suite.estimator.initial_covariance_scale) * 0.05
     np.testing.assert_allclose(np.sqrt(batch.covariance()[:, 8, 8]), claimed, rtol=1e-9)
 
 

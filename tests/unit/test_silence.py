@@ -51,11 +51,11 @@ def share_silent(batch, times, every):
 def test_flights_of_the_default_suite_that_meet_faults_say_that_they_are_lost():
     env = QuadVectorEnv(16, "hover", faults=STEP, start="hover", filter_start="warm")
     _, info = env.reset(seed=0)
-    assert not info["filter_lost"].any()
+    assert not info["filter_diverged"].any()
     lost = np.zeros(16, bool)
     for _ in range(150):
         *_, info = env.step(np.zeros((16, 4)))
-        lost |= info["filter_lost"]
+        lost |= info["filter_diverged"]
     assert lost.mean() > 0.9
     assert "innovations" not in info
 
@@ -72,7 +72,7 @@ def test_watching_changes_no_bit_of_a_flight(suite):
 
 
 def test_flights_that_end_when_lost_watch():
-    task = TASK_DEFAULTS["hover"].replace(end_when_lost=True)
+    task = TASK_DEFAULTS["hover"].replace(truncate_when_diverged=True)
     batch = FlightBatch(2, task=task)
     batch.reset(seeds=[0, 1])
     steps(batch, 0.1)

@@ -188,7 +188,7 @@ def test_a_filter_that_cannot_know_its_heading_has_nothing_to_start_warm_with(ca
     up = {"primary_antenna_B": (0.0, 0.0, 0.05), "secondary_antenna_B": (0.0, 0.0, 0.24)}
     suite = rtk.replace(gnss=rtk.gnss.replace(**up), camera=rtk.camera if camera else None)
     FlightBatch(1, sensors=suite, filter_start="warm")  # the mark of the start has told it
-    suite = suite.replace(placement=quad_gym.PlacementParams(heading_sigma=2.0))
+    suite = suite.replace(initial_pose=quad_gym.InitialPoseParams(heading_sigma=2.0))
     with pytest.raises(ValueError, match=r"filter_start must be 'cold' .* baseline"):
         FlightBatch(1, sensors=suite, filter_start="warm")
     FlightBatch(1, sensors=suite)  # cold it may fly
@@ -201,7 +201,7 @@ def test_every_interface_starts_warm_alike():
     keywords = {
         "sensors": "rtk",
         "filter_start": "warm",
-        "include_covariance": True,
+        "include_std": True,
         "randomization": {"start_yaw": Uniform(-np.pi, np.pi)},
     }
     vector = QuadVectorEnv(3, "hover", **keywords)

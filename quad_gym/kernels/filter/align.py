@@ -93,7 +93,7 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
         v_variance: Per axis, added to that of a start at rest [m^2/s^2].
         tilt_variance: Of roll and pitch, likewise [rad^2]; the third counts nothing.
     """
-    inflation = math.sqrt(p.initial_scale)
+    inflation = math.sqrt(p.initial_covariance_scale)
     attitude = inflation * p.first_baseline_sigma
     baseline_B = scale(1.0 / p.baseline_length, load3(p.baseline))
     level_share = math.sqrt(baseline_B[0] * baseline_B[0] + baseline_B[1] * baseline_B[1])

@@ -1,7 +1,7 @@
 """Innovations of all blocks of a measurement: the gate of each, and the statistics of all of them.
 
 See `measurements/gate.py` for one block. Where one kind of measurement has been rejected
-`gate_patience` times in a row, the filter is more likely wrong than the sensor, see `recovery.py`.
+`max_rejections` times in a row, the filter is more likely wrong than the sensor, see `recovery.py`.
 """
 
 import numpy as np

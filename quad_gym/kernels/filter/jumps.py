@@ -6,7 +6,7 @@ the drift has followed, no innovation is left. But corrections of the drift are 
 filter, each with the variance that its update takes away, as those of biases are (`recovery.py`).
 Their sum over about a second has the deviation by which GNSS drifts meanwhile, 0.1 m with
 `consumer`, and shows what drift does not do. Then the position is doubted as much as the drift. The
-same happens when a barometer is rejected `gate_patience` times in a row, as it sees the vertical
+same happens when a barometer is rejected `max_rejections` times in a row, as it sees the vertical
 part of a jump.
 
 Source: ours.

@@ -2,8 +2,8 @@
 
 Four things tell a filter that its covariance does not explain what is measured; three are here.
 
-* **Rejections.** A kind of measurement was rejected `gate_patience` times in a row. Then the filter
-  is more likely wrong than the sensor - unless GNSS is rejected while the camera's features fit,
+* **Rejections.** A kind of measurement was rejected `max_rejections` times in a row. The filter is
+  then more likely wrong than the sensor - unless GNSS is rejected while the camera's features fit,
   which then speak for the estimate: GNSS stays out as long as they do.
 * **Drifts.** Innovations of a right filter are white. Their mean over the last 50 or so, in
   deviations, exceeds `DRIFT_ALARM` in a right filter about once in a million times.
@@ -201,7 +201,7 @@ def drifts(flight, group):
 def suspect_group(flight, p, work, group, free):
     """Note whether a group of measurements makes the filter doubt itself, where it is `free` to."""
     may = (work.taking > 0.0) & free
-    doubted = may & (flight.rejected_in_row[group] >= p.gate_patience)
+    doubted = may & (flight.rejected_in_row[group] >= p.max_rejections)
     work.doubted[group] = select(doubted, 1.0, 0.0)
     work.drifting = select(may & drifts(flight, group), 1.0, work.drifting)
 

@@ -153,7 +153,7 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
 
 @kernel
 def _is_loose(flight, p, work, feature_count):
-    """Where the camera sees a feature whose direction may be off by more than `gradual_above`.
+    """Lanes in which a visible feature's direction is uncertain by `recursive_update_threshold`.
 
     It is off by the errors of attitude and position, whose share is the larger the nearer the
     feature is. Keeps where that is more than a linear model bears even in steps.
@@ -161,7 +161,7 @@ def _is_loose(flight, p, work, feature_count):
     P_rr, P_ee = sum_of_squares(flight.L, R, 3), sum_of_squares(flight.L, E, 9)
     position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
     attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
-    too_much, r = p.gradual_above * p.gradual_above, load3(flight.r_hat)
+    too_much, r = p.recursive_update_threshold * p.recursive_update_threshold, load3(flight.r_hat)
     loose = attitude < 0.0  # nowhere
     for i in range(feature_count):
         offset = sub(load3(p.features[i]), r)

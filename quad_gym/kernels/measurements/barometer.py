@@ -54,7 +54,7 @@ def _expect(flight, p, work, settings, k):
 @kernel
 def _doubt(flight, p, work, settings, mask):
     """Raise the variances of slow error and height to the square of a rejected innovation."""
-    doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
+    doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.max_rejections)
     nu, k = flight.innovation[AID_BLOCKS + _S, 0], D + settings.aid_scalar[_S]
     square = select(doubted, nu * nu, 0.0)
     work.P[k, k] = maximum(work.P[k, k], square)

@@ -147,7 +147,7 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
     F = outer(k, sub(scale(steep, h), k))  # e = F e + ..., of which the tilt is all that counts
     F = add33(((zero + 1.0, zero, zero), (zero, zero + 1.0, zero), (zero, zero, zero + 1.0)), F)
     P_bb, P_dd = P[iron, iron], P[delta, delta]
-    white = p.initial_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
+    white = p.initial_covariance_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
     alone = P_dd + (white + P_bb) / (level * level)
     P_ee = multiply(multiply(F, _full(P)), transpose(F))
     store_block(P, E, E, add_outer(P_ee, scale(alone, k), k))
@@ -168,7 +168,7 @@ def _tie_position(p, P, R_BI, iron, delta):
     x, y, z = load3(p.antenna)
     J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
     J_t = transpose(J)
-    with_attitude, s, k = multiply(_full(P), J_t), load3(p.gnss_sigma), p.initial_scale
+    with_attitude, s, k = multiply(_full(P), J_t), load3(p.gnss_sigma), p.initial_covariance_scale
     white = (
         (k * s[0] * s[0], zero, zero),
         (zero, k * s[1] * s[1], zero),
@@ -250,7 +250,7 @@ def _doubt(flight, p, work, settings, mask):
     variances of the attitude are raised to the square of their mean, as an angle, and those of the
     gyro's biases to that of the turn in `_DRIFT_TIME`.
     """
-    doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.gate_patience)
+    doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.max_rejections)
     nu, k = load3(flight.innovation[AID_BLOCKS + _S]), D + settings.aid_vector[_S]
     m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
     square = nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2]

@@ -202,7 +202,7 @@ def observe(flight, p, settings, row):
     for i in range(4):
         row[k + i] = flight.action[i]
     k += 4
-    if settings.include_covariance:
+    if settings.include_std:
         for i in range(15):
             variance = flight.L[i, 0] * flight.L[i, 0]
             for j in range(1, i + 1):

@@ -16,7 +16,7 @@ PROGRESS_WEIGHT, GATE_BONUS = 1.0, 1.0
 
 _FILTER_LOST = float(Ending.FILTER_LOST)
 _TIME_LIMIT, _FILTER_FAILED = float(Ending.TIME_LIMIT), float(Ending.FILTER_FAILED)
-_ON_THE_GROUND, _TIPPED_OVER = float(Ending.ON_THE_GROUND), float(Ending.TIPPED_OVER)
+_ON_THE_GROUND, _TIPPED_OVER = float(Ending.BELOW_MIN_HEIGHT), float(Ending.TIPPED_OVER)
 _OUT_OF_BOUNDS, _LAST_GATE = float(Ending.OUT_OF_BOUNDS), float(Ending.LAST_GATE)
 
 
@@ -77,7 +77,7 @@ def judge(flight, p, settings, active):
     terminated = active & (finished | lost | tipped | grounded)
     failed = logical_not(flight.filter_status == 0)
     over = (settings.max_steps > 0.0) & (flight.step >= settings.max_steps)
-    ended = (settings.end_when_lost > 0.0) & (flight.lost > 0.0)
+    ended = (settings.truncate_when_diverged > 0.0) & (flight.lost > 0.0)
     truncated = active & (over | failed | ended) & logical_not(terminated)
 
     ending = select(over, _TIME_LIMIT, 0.0)

@@ -108,7 +108,7 @@ def _write_endings(call, verdict, settings):
     for flight in range(count):
         crashed, done = terminated[flight] > 0.0, terminated[flight] + truncated[flight] > 0.0
         timed_out = settings.max_steps > 0.0 and steps[flight] >= settings.max_steps
-        is_lost = settings.end_when_lost > 0.0 and lost[flight] > 0.0
+        is_lost = settings.truncate_when_diverged > 0.0 and lost[flight] > 0.0
         built_in_cut = timed_out or is_lost or status[flight] > 0.0
         flies, ends, is_cut = began[flight] == 0, crashed, built_in_cut
         if terminates:

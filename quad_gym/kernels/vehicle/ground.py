@@ -50,7 +50,7 @@ STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
 Feet that an impact has left below the plane, at an angle or not, stand as well as those on it.
 """
 _FEET, _POINTS = 4, 8
-_ON_THE_GROUND = float(Ending.ON_THE_GROUND)
+_ON_THE_GROUND = float(Ending.BELOW_MIN_HEIGHT)
 
 
 @kernel
