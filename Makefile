@@ -99,11 +99,12 @@ soak: setup  ## 10^8 random-action steps over all tasks, 10^7 filter updates ove
 golden: setup  ## after flights have changed on purpose: their digests anew
 	$(BIN)/python -m tests.golden.flights --renew
 
-lint: setup  ## style, types and import rules
+lint: setup  ## style, types, import rules and words
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.dialect
 
 benchmark: setup  ## steps per second of every face and the cost of each part
 	$(BIN)/quad-gym benchmark --output results/benchmark
