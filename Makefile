@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle animation compare study test test-oldest test-clients test-slow soak golden lint benchmark docs wheel clean
+.PHONY: setup demo circle results test test-oldest test-clients test-slow soak golden lint benchmark docs wheel clean
 
 setup: $(VENV)/.developer
 
@@ -46,27 +46,8 @@ demo: $(VENV)/.user  ## train on truth, noise and the estimate, one seed each, a
 circle: $(VENV)/.user  ## fly the report's experiment over 1,000 seeds; figures and numbers in results/circle
 	$(BIN)/quad-gym circle --output results/circle
 
-animation: setup  ## the animation of README
-	$(BIN)/quad-gym fly circle --no-camera --seed 1 \
-		--faults gnss_outage --fault-time 4 7 --fps 20 --output .github/images/outage.webp
-	rm .github/images/outage.npz
-
-compare: $(VENV)/.user  ## the comparison of docs/results.md: two sensor suites, 5 training seeds
-	$(BIN)/quad-gym compare --engine compiled --sensors standard rtk
-
-study: $(VENV)/.trainer  ## the studies of docs/where-it-matters.md
-	$(BIN)/quad-gym study look_around --video webp --page docs/where-it-matters.md \
-		--arms pd_reference pd_features pd_unsure truth noisy paid sigma sure asymmetric
-	$(BIN)/quad-gym study --arms-file baselines/arms_misled.py --section misled --episodes 200 \
-		--page docs/where-it-matters.md
-	$(BIN)/quad-gym study stale_race --seeds 5 --episodes 400 --video webp \
-		--arms pd truth residual covariance recalling truth_on_truth truth_stamped \
-		covariance_stamped --page docs/where-it-matters.md
-	$(BIN)/quad-gym study stale_race --arms-file baselines/arms_withheld.py --section withheld \
-		--episodes 400 --page docs/where-it-matters.md
-	$(BIN)/quad-gym study outage_dash --seeds 5 --episodes 400 \
-		--arms pd pd_slow pd_waiting truth sigma asymmetric truth_on_truth \
-		--video webp --page docs/where-it-matters.md
+results: $(VENV)/.trainer  ## renew the numbers, tables and figures of README and docs that are out of date
+	$(BIN)/python -m docs.renewal
 
 test: setup  ## the tests, without the slow statistical and soak ones, in JOBS processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"

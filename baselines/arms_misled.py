@@ -1,6 +1,6 @@
 """Arms of a study of what becomes of a policy whose filter lies about its covariance.
 
-    quad-gym study --arms-file baselines/arms_misled.py --section misled
+    quad-gym study --arms-file baselines/arms_misled.py
 
 All fly LookAround with the policy that ships, which was trained with a consistent filter. Nothing
 is trained.

@@ -1,6 +1,6 @@
 """Arms of a study of which standard deviations matter to a policy.
 
-    quad-gym study stale_race --arms-file baselines/arms_withheld.py --section withheld
+    quad-gym study stale_race --arms-file baselines/arms_withheld.py
 
 All fly StaleRace with the policy that ships, which was trained with all fifteen in its observation.
 Nothing is trained. What is withheld is shown as its constant median.

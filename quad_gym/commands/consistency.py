@@ -105,13 +105,10 @@ class Args:
     with --matrix results/consistency_matrix, with --recovery results/consistency_recovery"""
     matrix: bool = False
     """fly the matrix of configurations; of the other options only episodes, seed, duration,
-    output, page, cells and threads concern it"""
+    output, cells and threads concern it"""
     recovery: bool = False
-    """fly faults and see how filters recover; of the other options only episodes, seed, output,
-    page and threads concern it"""
-    page: Path | None = None
-    """with --matrix or --recovery: a page of Markdown whose table is replaced, between
-    <!-- table matrix --> and <!-- end of table matrix -->, or the same with recovery"""
+    """fly faults and see how filters recover; of the other options only episodes, seed, output
+    and threads concern it"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
     threads: int | None = None
@@ -166,8 +163,6 @@ class Args:
             raise ValueError("--cells needs --matrix")
         if self.matrix and self.recovery:
             raise ValueError("--matrix and --recovery must not be given together")
-        if self.page is not None and not self.tables:
-            raise ValueError("--page needs --matrix or --recovery")
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -316,24 +311,19 @@ def fly_tables(args: Args) -> None:
     """Fly a table of configurations, and say where it is written."""
     from quad_gym.commands import consistency_matrix as matrix
     from quad_gym.commands import consistency_recovery as recovery
-    from quad_gym.commands.resumable import put_table, require_table
 
     name = "matrix" if args.matrix else "recovery"
     with usage_errors():
         require_writable("--output", args.folder)
-        if args.page is not None:
-            require_table(args.page, name)
     flown: dict[str, Any] = {"flights": args.count, "first_seed": args.first_seed}
     flown["threads"] = args.threads
     if args.matrix:
         chosen = matrix.cells_of(args.cells)
         found = matrix.run_matrix(chosen, args.folder, duration=args.duration, **flown)
-        wrong, table = matrix.unexpected(found), matrix.table_of(found, args.count)
+        wrong = matrix.unexpected(found)
     else:
         found = recovery.run_recovery(list(recovery.trials()), args.folder, **flown)
-        wrong, table = recovery.unexpected(found), recovery.table_of(found, args.count)
-    if args.page is not None:
-        put_table(args.page, name, table)
+        wrong = recovery.unexpected(found)
     print(f"{len(found)} cells, {wrong} unexpected misses; see {args.folder / name}.md.")
 
 

@@ -55,29 +55,3 @@ def run_cells(
             write_json(file, {**head, "cells": done})
             files.with_suffix(".md").write_text(table(done), encoding="utf-8")
     return {cell.name: done[cell.name] for cell in chosen}
-
-
-def require_table(page: Path, name: str) -> tuple[str, str]:
-    """What a page of Markdown has before and behind the table of that name.
-
-    It stands between the lines `<!-- table NAME -->` and `<!-- end of table NAME -->`.
-
-    Raises:
-        ValueError: If the page lacks one of them, or cannot be read.
-    """
-    first, last = f"<!-- table {name} -->\n", f"<!-- end of table {name} -->"
-    try:
-        text = page.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"--page must be a file that can be read, got {page}: {error}") from None
-    before, found, rest = text.partition(first)
-    _, found_last, after = rest.partition(last)
-    if not (found and found_last):
-        raise ValueError(f"--page must have the lines {first.strip()} and {last}, got {page}")
-    return before + first, last + after
-
-
-def put_table(page: Path, name: str, table: str) -> None:
-    """Replace the table of that name in a page of Markdown."""
-    before, after = require_table(page, name)
-    page.write_text(f"{before}\n{table.strip()}\n\n{after}", encoding="utf-8")

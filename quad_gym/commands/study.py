@@ -45,7 +45,7 @@ from quad_gym.commands.options import (
     with_full_id,
 )
 from quad_gym.commands.study_flights import Flown, fly
-from quad_gym.commands.study_report import marks_of, table_text, update_page, write_report
+from quad_gym.commands.study_report import table_text, write_report
 from quad_gym.commands.study_results import Study
 from quad_gym.commands.study_tasks import STUDIED, WITHIN, StudiedTask, stays
 from quad_gym.commands.study_words import conclusions
@@ -78,7 +78,10 @@ class Args:
     episodes: int = 1000
     """of the test, the same for every policy"""
     seed: int = 0
-    """of the first test episode, and of the first training"""
+    """of the first training"""
+    first_episode: int = 0
+    """seed of the first test episode; choose others than those that you looked at while choosing
+    rewards and parameters"""
     success_within: float | None = None
     """of LookAround: an episode is a success if it is flown to the end, and its mean position error
     in the second half is below this [m]; if not given, 0.5"""
@@ -87,13 +90,8 @@ class Args:
     video: Literal["none", "webp", "gif", "mp4"] = "none"
     """also write a film of this kind: training on truth and on the estimate, side by side in the
     same episode"""
-    page: Path | None = None
-    """write table and conclusions into this page, too, between its marks for the section, and
-    figures and film to the folder images beside it"""
-    section: str | None = None
-    """of the page: the name in its marks, and in the figures' names; if not given, the task's"""
     output: Path | None = None
-    """folder; if not given, results/study/SECTION (with --quick, .../SECTION_quick)"""
+    """folder; if not given, results/study/TASK (with --quick, .../TASK_quick)"""
 
 
 def studied(args: Args) -> StudiedTask:
@@ -160,11 +158,10 @@ def configure(args: Args) -> Study:
     plots.require_matplotlib()
     args = with_full_id(args, STUDIED_IDS)
     about = studied(args)
-    require_at_least(args, seeds=1, episodes=2, seed=0, threads=1)
+    require_at_least(args, seeds=1, episodes=2, seed=0, first_episode=0, threads=1)
     leave(args.env, {"observation": "--arms", "threads": "--threads"})
     arms = arms_of(args)
-    task = IDS[args.env_id]
-    name = args.section or task
+    name = IDS[args.env_id]
     study = Study(
         env_id=args.env_id,
         arms=arms,
@@ -172,7 +169,7 @@ def configure(args: Args) -> Study:
         recipes={arm.algorithm: _recipe(args, arm.algorithm) for arm in arms if arm.trained},
         environment=dict(args.env),
         episodes=QUICK_EPISODES if args.quick else args.episodes,
-        first_episode=first_seed("test", args.seed, args.episodes),
+        first_episode=first_seed("test", args.first_episode, args.episodes),
         about=about,
         folder=args.output or Path("results/study") / (f"{name}_quick" if args.quick else name),
         threads=args.threads,
@@ -186,9 +183,7 @@ def configure(args: Args) -> Study:
     if args.video != "none":
         from quad_gym.commands.study_films import require_film
 
-        require_film(study, args.video, for_page=args.page is not None)
-    if args.page is not None:
-        marks_of(args.page, name)
+        require_film(study, args.video)
     require_writable("--output", study.folder)
     return study
 
@@ -303,8 +298,6 @@ def main(args: Args) -> None:
 
         film = write_film(results, args.video, partial(test_flights, study))
     written = write_report(results, film)
-    if args.page is not None:
-        written = [*update_page(results, args.page, args.section, film), *written]
     print(
         f"\nWrote {len(written)} files to {study.folder} after "
         f"{(time.perf_counter() - began) / 60:.1f} minutes; open {written[-1]}."

@@ -21,29 +21,23 @@ from quad_gym.rendering.video import checked_video_path
 
 RATE = 10.0
 """Pictures per second of a film."""
-SHOWN_ON_PAGES = ("webp", "gif")
-"""Kinds of film that a page shows as it shows a picture."""
 
 
-def require_film(study: Study, kind: str, *, for_page: bool) -> None:
+def require_film(study: Study, kind: str) -> None:
     """See that a film can be made, before anything is trained.
 
     Args:
         study: The study.
         kind: Of the film.
-        for_page: Whether a page is to show it.
 
     Raises:
-        ValueError: If the study has no two policies to compare, or a page does not show the kind.
+        ValueError: If the study has no two policies to compare.
         ImportError: If a library that draws or writes it is not installed.
     """
     trained = [arm.name for arm in study.arms if arm.trained]
     if "truth" not in trained or len(trained) < 2:
         given = ", ".join(arm.name for arm in study.arms)
         raise ValueError(f"--video needs the arm truth and another trained one, got {given}")
-    if for_page and kind not in SHOWN_ON_PAGES:
-        shown = " or ".join(SHOWN_ON_PAGES)
-        raise ValueError(f"--video must be {shown} with --page, got {kind}")
     load_pygame()
     checked_video_path(film_file(study, kind))
 

@@ -3,7 +3,6 @@
 import base64
 import html
 import math
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -129,8 +128,7 @@ def write_report(results: Results, film: Path | None = None) -> list[Path]:
             },
         ),
     ]
-    text = [table_markdown(results), "", *(f"- {s}" for s in conclusions(results)), ""]
-    (folder / "table.md").write_text("\n".join(text), encoding="utf-8")
+    (folder / "table.md").write_text(page_text(results), encoding="utf-8")
     written.append(folder / "table.md")
     figures = {name: plots.save_figure(f, folder / name) for name, f in _figures(results).items()}
     for files in figures.values():
@@ -143,23 +141,8 @@ def write_report(results: Results, film: Path | None = None) -> list[Path]:
     return [*written, _page(results, shown)]
 
 
-def marks_of(page: Path, task: str) -> tuple[str, str, str]:
-    """What a page holds before, between and after the marks of a study.
-
-    Raises:
-        ValueError: If there is no such page, or it lacks the marks.
-    """
-    first, last = f"<!-- study: {task} -->\n", f"<!-- /study: {task} -->"
-    text = page.read_text(encoding="utf-8") if page.is_file() else ""
-    before, found, rest = text.partition(first)
-    between, ended, after = rest.partition(last)
-    if not (found and ended):
-        raise ValueError(f"--page must be a page with the marks {first.strip()} {last}, got {page}")
-    return before + first, between, last + after
-
-
 def page_text(results: Results) -> str:
-    """What stands between the marks of a page: the setting, the table, and the conclusions."""
+    """The setting, the table and the conclusions, in Markdown."""
     study = results.study
     gains = [
         f"{results.arm(name).label}: {number(results.improvement(name, 'truth'), 2)}"
@@ -194,27 +177,6 @@ def _trainings(results: Results) -> str:
     if not results.trained():
         return ""
     return f"Training seeds: {len(study.seeds)}, of {study.steps()} each; "
-
-
-def update_page(
-    results: Results, page: Path, section: str | None = None, film: Path | None = None
-) -> list[Path]:
-    """Write a study into a page, and its figures and film beside it; return what was written."""
-    from quad_gym import IDS
-
-    name_of_section = section or IDS[results.study.env_id]
-    before, _, after = marks_of(page, name_of_section)
-    page.write_text(before + page_text(results) + after, encoding="utf-8")
-    images = page.parent / "images"
-    images.mkdir(exist_ok=True)
-    written = [page]
-    for name, figure in _figures(results).items():
-        written.append(images / f"{name_of_section}_{name}.png")
-        figure.savefig(written[-1], dpi=130)
-    if film is not None:
-        written.append(images / f"{name_of_section}_{film.name}")
-        shutil.copyfile(film, written[-1])
-    return written
 
 
 def _figures(results: Results) -> dict[str, Any]:

@@ -59,20 +59,17 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
     ],
 )
 def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, capsys):
-    folder, page = tmp_path / "out", tmp_path / "page.md"
-    page.write_text(f"before\n<!-- study: {task} -->\n<!-- /study: {task} -->\nafter\n")
+    folder = tmp_path / "out"
     short = ["--quick", "--steps", "4096", "--env", "duration=0.6", "--arms", *arms]
-    assert main(["study", task, *short, "--output", str(folder), "--page", str(page)]) == 0
+    assert main(["study", task, *short, "--output", str(folder)]) == 0
     summary = json.loads((folder / "summary.json").read_text())
     assert set(summary["rows"]) == set(arms)
     assert set(summary["rows"]["truth"]) >= {"success", "crashed", "gates", "speed"}
     assert sorted(f.name for f in (folder / "runs").iterdir()) == sorted(arms)
     assert not list((folder / "runs/truth_on_truth").rglob("best.npz"))
-    text = page.read_text()
+    text = (folder / "table.md").read_text()
     assert "passed" in text.partition("Success: ")[2].partition(".")[0]
-    assert text.startswith("before\n")
-    assert text.endswith("after\n")
-    assert (tmp_path / f"images/{task}_pace.png").stat().st_size > 1000
+    assert (folder / "pace.png").stat().st_size > 1000
 
 
 def test_arms_of_either_engine_are_trained_and_flown_in_one_study(tmp_path, capsys):

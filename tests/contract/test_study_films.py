@@ -27,10 +27,8 @@ QUICK = ["--quick", "--steps", "4096", "--env", f"duration={DURATION}", "--arms"
 def filmed(tmp_path_factory):
     """The folder of a tiny study with a film, and its words."""
     folder = tmp_path_factory.mktemp("film")
-    page = folder / "page.md"
-    page.write_text("<!-- study: look_around -->\n<!-- /study: look_around -->\n")
     words = ["study", "look_around", *QUICK, "--video", "webp", "--output", str(folder / "out")]
-    assert main([*words, "--page", str(page)]) == 0
+    assert main(words) == 0
     return folder, words
 
 
@@ -54,13 +52,11 @@ def test_a_film_lasts_as_long_as_the_episode_and_loops(filmed):
         assert seconds_of(film) == pytest.approx((pictures + round(HOLD * RATE)) / RATE)
 
 
-def test_report_and_page_show_the_film(filmed):
+def test_report_shows_the_film(filmed):
     folder, _ = filmed
     report = (folder / "out/report.html").read_text()
     assert report.count("data:image/webp;base64,") == 1
     assert "training with the best validation" in report
-    beside = folder / "images/look_around_film.webp"
-    assert beside.read_bytes() == (folder / "out/film.webp").read_bytes()
 
 
 def test_a_film_of_the_same_study_is_the_same(filmed):
@@ -100,7 +96,6 @@ def test_a_film_shows_the_episode_of_the_test(filmed):
     [
         (["--arms", "pd_features", "truth"], "--video needs the arm truth and another trained one"),
         (["--arms", "sigma", "estimate"], "--video needs the arm truth and another trained one"),
-        (["--video", "mp4", "--page", "page.md"], "--video must be webp or gif with --page"),
         (["--video", "avi"], "--video"),
     ],
 )

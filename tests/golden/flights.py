@@ -96,6 +96,9 @@ def cases():
         suite = "indoor" if "camera" in fault else "rtk"
         suite = AIDED if "meter" in fault else suite
         found[f"fault {fault}"] = {"sensors": suite, "faults": _early(fault), "start": "hover"}
+    for task in ("LookAround", "StaleRace", "OutageDash"):
+        found[task] = {"id": task}
+        found[f"{task}, truth"] = {"id": task, "observation": "truth"}
     rtk = {"sensors": "rtk", "start": "hover"}
     return found | {
         "late": {"sensors": _late("rtk"), "start": "hover"},

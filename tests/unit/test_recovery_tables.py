@@ -12,7 +12,6 @@ from quad_gym.analysis.recovery import RIGHT, Recovery, follow_recovery, longest
 from quad_gym.commands import consistency
 from quad_gym.commands import consistency_recovery as recovery
 from quad_gym.commands.options import parse
-from quad_gym.commands.resumable import put_table, require_table
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
 from tests.field_flights import fly, nees
@@ -107,31 +106,8 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     assert "| c | 0.2 | 0.0 | 6.0 |" in text
 
 
-def test_a_table_is_put_between_its_marks(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("# One\n<!-- table matrix -->\nold\n<!-- end of table matrix -->\ntwo\n")
-    put_table(page, "matrix", "| new |\n")
-    put_table(page, "matrix", "| newer |\n")
-    assert page.read_text() == (
-        "# One\n<!-- table matrix -->\n\n| newer |\n\n<!-- end of table matrix -->\ntwo\n"
-    )
-    with pytest.raises(ValueError, match="--page must have the lines <!-- table recovery -->"):
-        put_table(page, "recovery", "")
-    with pytest.raises(ValueError, match="--page must be a file"):
-        require_table(tmp_path / "none.md", "matrix")
-
-
-@pytest.mark.parametrize("name", ["matrix", "recovery"])
-def test_the_pages_of_the_documentation_have_the_marks(name):
-    page = {"matrix": "consistency-matrix.md", "recovery": "recovery.md"}[name]
-    file = Path(__file__).parents[2] / "docs" / page
-    before, after = require_table(file, name)
-    table = file.read_text(encoding="utf-8").removeprefix(before).removesuffix(after)
-    assert table.count("\n| ") > 20
-
-
 def test_options_that_do_not_go_together_are_refused():
-    for line in (["--page", "x.md"], ["--matrix", "--recovery"], ["--recovery", "--cells", "all"]):
+    for line in (["--matrix", "--recovery"], ["--recovery", "--cells", "all"]):
         if line[-1] == "all":
             assert parse(consistency.Args, line).count == 400
             continue

@@ -1,0 +1,1 @@
+"""Renewal of every number, table and figure of README and the pages: `make results`."""

@@ -1,0 +1,79 @@
+"""Renew the numbers, tables and figures of README and the pages that are out of date.
+
+    python -m docs.renewal            # all that are stale, and write the pages
+    python -m docs.renewal --list     # which are, and about how long they take
+    python -m docs.renewal --only circle compare
+
+Commands write into results/renewal/NAME. Studies, comparisons, sweeps and large tables go on where
+an interrupted run stopped.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from docs.renewal import ledger, pages
+from docs.renewal.catalog import CATALOG, Result
+
+OUTPUT = Path("results/renewal")
+
+
+def measure(result: Result) -> dict[str, object]:
+    """Run the commands of a result, and copy its figures.
+
+    Returns:
+        Its entry of the ledger.
+    """
+    folder, printed = OUTPUT / result.name, []
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    for number, command in enumerate(result.commands):
+        words = [word.replace("OUT", str(folder / str(number))) for word in command.split()]
+        program = ["-m", "quad_gym"] if not words[0].endswith(".py") else []
+        print(f"  {' '.join(words)}", flush=True)
+        done = subprocess.run(
+            [sys.executable, *program, *words], stdout=subprocess.PIPE, text=True, check=True
+        )
+        (folder / f"{number}.txt").write_text(done.stdout, encoding="utf-8")
+        printed.append(done.stdout)
+    texts = result.texts(folder, printed)
+    for source, target in result.figures.items():
+        (pages.ROOT / target).parent.mkdir(exist_ok=True)
+        shutil.copyfile(folder / source, pages.ROOT / target)
+    return {
+        "commands": result.commands,
+        "flights": ledger.digest(result),
+        "minutes": round((time.monotonic() - began) / 60.0, 1),
+        "texts": texts,
+    }
+
+
+def main() -> int:
+    """Measure what is stale, one result after the other, and write each into the pages."""
+    parser = argparse.ArgumentParser(prog="make results", description=__doc__.split("\n")[0])
+    parser.add_argument("--list", action="store_true", help="say what is stale, and stop")
+    parser.add_argument("--only", nargs="+", choices=sorted(CATALOG), help="names of results")
+    args = parser.parse_args()
+    entries = {name: entry for name, entry in ledger.read().items() if name in CATALOG}
+    chosen = [CATALOG[name] for name in args.only or CATALOG]
+    due = [result for result in chosen if ledger.stale(result, entries)]
+    for result in due:
+        minutes = entries.get(result.name, {}).get("minutes")
+        print(f"{result.name}: stale{'' if minutes is None else f', {minutes:g} min last time'}")
+    if args.list:
+        return 0
+    for result in due:
+        print(f"{result.name} ...", flush=True)
+        entries[result.name] = measure(result)
+        ledger.write(entries)
+    changed = pages.write(ledger.texts(entries))
+    print(f"{len(chosen) - len(due)} results were up to date, {len(due)} are new.")
+    print(f"Wrote {', '.join(page.name for page in changed)}." if changed else "No page changed.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

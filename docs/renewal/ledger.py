@@ -1,0 +1,54 @@
+"""The ledger of results: of each its commands, the digest of what it flies, and its texts.
+
+A result is stale if its commands have changed, or the golden flights of its tasks and suites. A
+change of the code that leaves these flights as they are, bit for bit, leaves results as they are.
+"""
+
+import fnmatch
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from docs.renewal.catalog import Result
+
+FILE = Path(__file__).with_name("ledger.json")
+GOLDEN = Path(__file__).parents[2] / "tests/golden/flights.json"
+
+
+def read() -> dict[str, Any]:
+    """Entries by the names of their results."""
+    return json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
+
+
+def write(entries: dict[str, Any]) -> None:
+    """Keep them."""
+    text = json.dumps(entries, indent=1, sort_keys=True, ensure_ascii=False)
+    FILE.write_text(text + "\n", encoding="utf-8")
+
+
+def digest(result: Result) -> str:
+    """Of the golden flights of the tasks and suites that a result flies.
+
+    Raises:
+        ValueError: If one of its patterns fits no golden flight.
+    """
+    golden = json.loads(GOLDEN.read_text(encoding="utf-8"))
+    chosen: dict[str, str] = {}
+    for pattern in result.flights:
+        names = fnmatch.filter(golden, pattern)
+        if not names:
+            raise ValueError(f"{result.name}: no golden flight is named {pattern}")
+        chosen |= {name: golden[name] for name in names}
+    return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def stale(result: Result, entries: dict[str, Any]) -> bool:
+    """Whether a result has to be measured."""
+    entry = entries.get(result.name, {})
+    return entry.get("commands") != result.commands or entry.get("flights") != digest(result)
+
+
+def texts(entries: dict[str, Any]) -> dict[str, str]:
+    """All texts of all results, by the names of their marks."""
+    return {name: text for entry in entries.values() for name, text in entry["texts"].items()}
