@@ -3,6 +3,7 @@
 import json
 
 import pytest
+
 from docs.renewal import ledger, pages
 from docs.renewal.catalog import Result
 

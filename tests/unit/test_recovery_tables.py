@@ -1,7 +1,6 @@
 """Recovery after faults, counted by hand; the tables of it; and pages whose tables are replaced."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
