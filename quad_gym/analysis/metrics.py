@@ -28,7 +28,7 @@ class Interval(NamedTuple):
     high: float
 
     def holds(self, value: float) -> bool:
-        """Whether a value lies in the range, its ends included."""
+        """Return True if a value lies in the range, its ends included."""
         return self.low <= value <= self.high
 
 
@@ -106,7 +106,7 @@ class RunningSummary:
 
 @dataclass(frozen=True)
 class Spread:
-    """How a number is distributed over seeds; all NaN where there are no seeds."""
+    """Distribution of a number over seeds; all NaN where there are no seeds."""
 
     count: int
     """seeds"""
@@ -228,73 +228,6 @@ def chi_square_quantile(dimension: int, probability: float) -> float:
     from scipy.stats import chi2
 
     return float(chi2.ppf(probability, dimension))
-
-
-def bootstrap_interval(values: ArrayLike, *, probability: float = 0.95, seed: int = 0) -> Interval:
-    """Bootstrap confidence interval of a mean, for samples of any distribution.
-
-    Bias-corrected and accelerated up to 5,000 values; beyond, where that costs too much and a mean
-    is as good as normal, by percentiles.
-
-    Args:
-        values: (n,) independent numbers, at least two; for a paired comparison, their differences.
-        probability: Confidence.
-        seed: Of the resampling, so that the interval can be reproduced.
-
-    Raises:
-        ValueError: If there are fewer than two values or one is not finite.
-    """
-    _require_probability(probability)
-    x = np.asarray(values, np.float64).reshape(-1)
-    if x.size < 2 or not np.isfinite(x).all():
-        raise ValueError(f"values must be at least two finite numbers, got {x.size}")
-    if np.ptp(x) == 0.0:
-        return Interval(float(x[0]), float(x[0]))
-    from scipy.stats import bootstrap
-
-    found = bootstrap(
-        (x,),
-        np.mean,
-        confidence_level=probability,
-        method="BCa" if x.size <= 5000 else "percentile",
-        n_resamples=4999,
-        batch=max(1, 1_000_000 // x.size),
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return Interval(float(found.low), float(found.high))
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """How a number differs between two cases that met the same seeds."""
-
-    spread: Spread
-    """of first less second, seed by seed"""
-    interval: Interval | None
-    """bootstrap 95 % interval of the mean difference; None for fewer than two seeds"""
-
-    @property
-    def significant(self) -> bool:
-        """Whether the interval excludes no difference at all."""
-        return self.interval is not None and not self.interval.holds(0.0)
-
-
-def paired_difference(first: ArrayLike, second: ArrayLike) -> PairedDifference:
-    """Compare two cases seed by seed, so that what a seed does to both drops out.
-
-    Args:
-        first: (n,) one number a seed; a seed with a NaN is left out.
-        second: (n,) likewise, of the same seeds.
-
-    Raises:
-        ValueError: If the shapes differ.
-    """
-    a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    if a.shape != b.shape or a.ndim != 1:
-        raise ValueError(f"first and second must have shape (n,), got {a.shape} and {b.shape}")
-    differences = (a - b)[np.isfinite(a - b)]
-    interval = bootstrap_interval(differences) if differences.size > 1 else None
-    return PairedDifference(spread=spread(differences), interval=interval)
 
 
 def _require_probability(probability: float) -> None:

@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 
 from quad_gym import PDGains, SensorSuite, TaskParams, pd_gains, sensor_suite, vehicle_params
 from quad_gym.analysis import plots
+from quad_gym.analysis.intervals import PairedDifference, paired_difference
 from quad_gym.analysis.metrics import (
     STATE_DIMENSION,
-    PairedDifference,
     TrackingSummary,
     chi_square_quantile,
-    paired_difference,
     spread,
 )
 from quad_gym.analysis.recording import Recording, record_flights

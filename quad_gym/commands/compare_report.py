@@ -16,7 +16,8 @@ from quad_gym.analysis.comparison_plots import (
     matrix_figure,
     paths_figure,
 )
-from quad_gym.analysis.metrics import Interval, bootstrap_interval, paired_difference
+from quad_gym.analysis.intervals import mean_interval, paired_difference
+from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import text_table
 from quad_gym.commands.compare_flights import Floats, Flown
 
@@ -83,7 +84,8 @@ class Cell:
     late_errors: Floats
     crash_rates: Floats
     interval: Interval | None
-    """of the mean error: over training seeds, or for PD over episodes; None for a single seed"""
+    """of the mean error, 95 % by Student's t: over training seeds, or for PD over episodes; None
+    for a single seed"""
 
     def text(self) -> str:
         """For people: millimeters, and the crashes."""
@@ -128,7 +130,7 @@ class Comparison:
             errors,
             np.array([f.late_error for f in flights]),
             np.array([f.crash_rate for f in flights]),
-            bootstrap_interval(sample) if len(sample) > 1 else None,
+            mean_interval(sample) if len(sample) > 1 else None,
         )
 
 
@@ -267,7 +269,8 @@ pre { background: #f6f6f6; padding: 1rem; overflow-x: auto; }
 
 _CAPTIONS = {
     "learning": "How the error falls while training; thin lines are single seeds.",
-    "matrix": "Mean error over whole episodes, with the 95 % interval over training seeds.",
+    "matrix": "Mean error over whole episodes, with the 95 % interval over training seeds "
+    "(Student's t); for PD, over episodes.",
     "errors": "Error over time: median and middle nine tenths of the episodes.",
     "paths": "The first episode of the first training seed.",
 }

@@ -20,7 +20,7 @@ from baselines.seeds import first_seed
 from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import error_over_time_figure, paths_figure
-from quad_gym.analysis.metrics import bootstrap_interval
+from quad_gym.analysis.intervals import mean_interval, rate_interval
 from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import (
     require_writable,
@@ -190,7 +190,7 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
             [
                 *row,
                 f"{1e3 * found['estimation_error']:.1f}",
-                f"{found['crash_rate']:.1%}",
+                _rate(episodes.crashed),
                 f"{found['return']:.2f}",
             ]
         )
@@ -207,8 +207,13 @@ def table(results: dict[Case, Episodes], env: Any) -> str:
 def _with_interval(values: Any) -> str:
     if len(values) < 2:
         return f"{1e3 * values.mean():.1f}"
-    low, high = bootstrap_interval(values)
+    low, high = mean_interval(values)
     return f"{1e3 * values.mean():.1f} [{1e3 * low:.1f}, {1e3 * high:.1f}]"
+
+
+def _rate(happened: Any) -> str:
+    low, high = (100.0 * limit for limit in rate_interval(happened.sum(), len(happened)))
+    return f"{happened.mean():.1%} [{low:.1f}, {high:.1f}]"
 
 
 def write(
@@ -268,8 +273,7 @@ def main(args: Args) -> None:
         f"{args.episodes:,} episodes in each case, from seed {args.seed}.\n"
     )
     print(table(results, next(iter(cases.values()))[1]))
-    if args.episodes > 1:
-        print("In brackets: bootstrap 95 % interval of the mean over episodes.")
+    print("In brackets: 95 % interval over episodes, Student's t or Clopper and Pearson's.")
     written = write(results, tracers, args, folder)
     if args.video != "none":
         written += write_videos(cases, args, folder)

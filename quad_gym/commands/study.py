@@ -9,10 +9,10 @@
 
 Arms of baselines/arms.py (or of a file like it) are trained with the compiled PPO, or with another
 algorithm of Stable-Baselines3 where they name one, and every policy flies the same test episodes on
-the estimate. Prints a table with interquartile means over
-the seeds and bootstrap 95 % intervals, says what can be concluded from them, and writes figures,
-numbers and a report. Each training is a folder: an interrupted study continues where it
-stopped, and a training whose folder was deleted is repeated, but no other.
+the estimate. Prints a table with means over the seeds and 95 % intervals over seeds and episodes,
+says what can be concluded from them, and writes figures, numbers and a report. Each training is a
+folder: an interrupted study continues where it stopped, and a training whose folder was deleted is
+repeated, but no other.
 """
 
 import csv

@@ -237,8 +237,8 @@ def _page(results: Results, shown: Mapping[str, Path]) -> Path:
     parts = [
         f"<h1>{html.escape(study.env_id)}</h1>",
         f"<p>{_trainings(results)}{study.episodes:,} episodes with each policy, flown on the "
-        "estimate unless the arm says otherwise. Interquartile means over seeds; in "
-        "brackets bootstrap 95 % intervals over seeds and episodes. Success: "
+        "estimate unless the arm says otherwise. Means over seeds; in brackets 95 % "
+        "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
         f"{study.about.meaning}.</p>",
         f"<table>{''.join(rows)}</table><ul>",
         *[f"<li>{html.escape(sentence)}</li>" for sentence in conclusions(results)],

@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 from baselines.arms import Arm
 from baselines.keeping import SUFFIXES
 from baselines.recipes import Recipe
-from quad_gym.analysis.reports import as_json
-from quad_gym.analysis.robust import (
+from quad_gym.analysis.intervals import (
     Estimated,
-    estimated,
+    Score,
     mean,
+    mean_over_trainings,
     probability_of_improvement,
+    rate_over_trainings,
 )
+from quad_gym.analysis.reports import as_json
 from quad_gym.commands.study_flights import Flown
 from quad_gym.commands.study_tasks import ALWAYS, StudiedTask
 from quad_gym.kernels.compiling.digest import flights_digest
@@ -95,11 +97,19 @@ class Study:
         """Every column of the table."""
         runs = [flown[arm.name, seed] for seed in self.seeds_of(arm)]
 
-        success = {"success": estimated([self.about.success(run) for run in runs], mean)}
+        success = {"success": _estimated([self.about.success(run) for run in runs], mean)}
         return success | {
-            name: estimated([column.of(run) for run in runs], column.score)
+            name: _estimated([column.of(run) for run in runs], column.score)
             for name, column in {**ALWAYS, **self.about.columns}.items()
         }
+
+
+def _estimated(values: list[NDArray[Any]], score: Score) -> Estimated:
+    """A number of each training and episode, or a truth value, over all of them."""
+    x = np.array(values)
+    if x.dtype == np.bool_:
+        return rate_over_trainings(x.mean(axis=1), x.shape[1])
+    return mean_over_trainings(x, score)
 
 
 @dataclass(frozen=True, eq=False)

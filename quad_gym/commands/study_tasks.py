@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.arms import ARMS_OF, Arm
-from quad_gym.analysis.robust import Score, mean, worst_tenth
+from quad_gym.analysis.intervals import Score, mean, worst_tenth
 from quad_gym.commands.study_flights import Flown
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from baselines.keeping import EVALUATIONS
-from quad_gym.analysis.metrics import bootstrap_interval
+from quad_gym.analysis.intervals import mean_interval, rate_over_trainings
 from quad_gym.analysis.reports import text_table, write_csv
 from quad_gym.commands.sweep_plan import Training
 
@@ -43,12 +43,16 @@ def row_of(training: Training) -> dict[str, Any]:
         "finished": finished,
         "steps": record["steps"] if finished else steps_done(training.folder),
         "best_steps": best.get("steps"),
+        "episodes": training.plan.episodes,
         **{name: best.get(name) for name in SCORES},
     }
 
 
 def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean and bootstrap 95 % interval of each score over the finished seeds of each group."""
+    """Mean of each score over the finished seeds of each group, and its 95 % interval.
+
+    By Student's t; of crash rates by `rate_over_trainings`.
+    """
     found = []
     for group in dict.fromkeys(row["group"] for row in rows):
         those = [row for row in rows if row["group"] == group]
@@ -59,10 +63,13 @@ def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         }
         for name in SCORES:
             values = np.array([row[name] for row in those if row[name] is not None])
-            between = bootstrap_interval(values) if values.size > 1 else None
+            low = high = None
+            if values.size > 1:
+                low, high = mean_interval(values)
+                if name == "crash_rate":
+                    _, low, high = rate_over_trainings(values, those[0]["episodes"])
             summary[name] = float(values.mean()) if values.size else None
-            summary[f"{name}_low"] = None if between is None else between.low
-            summary[f"{name}_high"] = None if between is None else between.high
+            summary[f"{name}_low"], summary[f"{name}_high"] = low, high
         found.append(summary)
     return found
 
@@ -95,7 +102,7 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    mean = "best evaluation: mean over finished seeds [95 % interval]"
+    mean = "best evaluation: mean over finished seeds [95 % interval, Student's t]"
     return "\n\n".join(
         [
             text_table({"": ("group", "finished"), mean: headings}, groups),

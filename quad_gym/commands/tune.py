@@ -27,7 +27,7 @@ from tyro.conf import arg
 from baselines.pd import PDPolicy
 from baselines.seeds import first_seed
 from quad_gym import PDGains, pd_gains
-from quad_gym.analysis.metrics import paired_difference
+from quad_gym.analysis.intervals import paired_difference
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.commands.options import (
     TRACKING,
@@ -281,7 +281,8 @@ def main(args: Args) -> None:
     print(
         f"\nPD on the {args.observation}, sensors {args.sensors}; "
         f"{args.fresh_episodes:,} fresh episodes of each task.\n\n{text}\n"
-        "Change: mean over pairs of episodes that did not crash, with its bootstrap 95 % interval."
+        "Change: mean over pairs of episodes that did not crash, with its 95 % interval\n"
+        "(Student's t)."
     )
     print("\n" + "\n".join(f"{name:14} {value:.3g}" for name, value in _flat(tuned).items()))
     record = {

@@ -33,7 +33,7 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "PD, facing the features" in text
-    assert "with which the intervals say little" in text
+    assert "so few that the intervals are wide" in text
     summary = json.loads((folder / "summary.json").read_text())
     assert set(summary["rows"]) == {"facing", "truth", "mine"}
     assert len(summary["return_of_each_seed"]["mine"]) == 2
@@ -211,18 +211,18 @@ def test_success_is_to_fly_to_the_end_near_the_reference():
 def test_words_say_what_the_numbers_say(tmp_path):
     clear = {"pd_features": (130, 0.0, 0.05), "truth": (60, 0.6, 1.2), "sigma": (150, 0.0, 0.1)}
     words = " ".join(conclusions(results(tmp_path, clear)))
-    assert "the intervals are apart" in words
+    assert "a difference of 100 [88, 100] percentage points" in words
     assert "12.0 times smaller" in words
-    assert "above the best fixed rule (PD, facing the features" in words
+    assert "significantly above the best fixed rule (PD, facing the features" in words
 
     refuted = {"pd_features": (150, 0.0, 0.05), "truth": (99, 0.0, 0.1), "sigma": (99, 0.0, 0.2)}
     words = " ".join(conclusions(results(tmp_path, refuted)))
-    assert "the intervals overlap" in words
+    assert "no significant difference" in words
     assert "0.200 m, not smaller than 0.100 m" in words
-    assert "below the best fixed rule" in words
-    assert "the intervals say little" not in words
+    assert "significantly below the best fixed rule" in words
+    assert "the intervals are wide" not in words
 
 
 def test_words_compare_arms_by_the_probability_of_improvement(tmp_path):
     words = " ".join(conclusions(results(tmp_path, {"estimate": (9, 0, 1), "sigma": (99, 0, 1)})))
-    assert "with probability 1.00 [1.00, 1.00]." in words
+    assert "with probability 1.00 [0.64, 1.00]." in words

@@ -176,65 +176,6 @@ class TestChiSquare:
             metrics.chi_square_quantile(*arguments)
 
 
-class TestBootstrap:
-    def test_interval_is_about_that_of_a_normal_mean(self):
-        x = np.random.default_rng(6).normal(3.0, 2.0, size=400)
-        half = 1.96 * x.std(ddof=1) / np.sqrt(x.size)
-        found = metrics.bootstrap_interval(x)
-        assert found == pytest.approx((x.mean() - half, x.mean() + half), abs=0.2 * half)
-
-    def test_interval_holds_the_mean_as_often_as_it_says(self):
-        rng = np.random.default_rng(7)
-        samples = rng.exponential(size=(100, 30))
-        held = [metrics.bootstrap_interval(x, probability=0.8).holds(1.0) for x in samples]
-        assert np.mean(held) == pytest.approx(0.8, abs=0.12)
-
-    def test_interval_can_be_reproduced(self):
-        x = np.random.default_rng(8).exponential(size=50)
-        assert metrics.bootstrap_interval(x) == metrics.bootstrap_interval(x)
-
-    def test_large_samples(self):
-        x = np.random.default_rng(9).normal(size=6000)
-        assert metrics.bootstrap_interval(x).holds(x.mean())
-
-    def test_interval_of_equal_numbers_is_a_point(self):
-        assert metrics.bootstrap_interval([2.0, 2.0, 2.0]) == (2.0, 2.0)
-
-    @pytest.mark.parametrize("values", [[], [1.0], [1.0, np.nan]])
-    def test_refuses_too_few_or_unknown_values(self, values):
-        with pytest.raises(ValueError, match="at least two finite numbers"):
-            metrics.bootstrap_interval(values)
-
-
-class TestPairedDifference:
-    def test_finds_what_seeds_hide(self):
-        rng = np.random.default_rng(10)
-        seeds = rng.normal(0.0, 10.0, size=200)
-        first, second = seeds + rng.normal(0.5, 0.1, size=200), seeds
-        found = metrics.paired_difference(first, second)
-        assert found.significant
-        assert found.interval.holds(0.5)
-        assert found.spread.mean == pytest.approx(0.5, abs=0.05)
-
-    def test_of_the_same_is_not_significant(self):
-        found = metrics.paired_difference([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
-        assert not found.significant
-        assert found.interval == (0.0, 0.0)
-
-    def test_leaves_out_unknown_seeds(self):
-        found = metrics.paired_difference([1.0, np.nan, 3.0], [0.0, 1.0, 2.0])
-        assert (found.spread.count, found.spread.mean) == (2, 1.0)
-
-    def test_of_one_seed_has_no_interval(self):
-        found = metrics.paired_difference([1.0], [2.0])
-        assert found.interval is None
-        assert not found.significant
-
-    def test_refuses_different_numbers_of_seeds(self):
-        with pytest.raises(ValueError, match="first and second must have shape"):
-            metrics.paired_difference([1.0, 2.0], [1.0])
-
-
 def test_scipy_is_imported_when_it_is_needed():
-    code = "import quad_gym.analysis.metrics, sys; sys.exit('scipy.stats' in sys.modules)"
+    code = "import quad_gym.analysis.intervals, sys; sys.exit('scipy.stats' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
