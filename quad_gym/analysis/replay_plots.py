@@ -6,7 +6,7 @@ import numpy as np
 
 from quad_gym.analysis.metrics import chi_square_quantile
 from quad_gym.analysis.plots import BLUE, GREEN, GREY, ORANGE, PALE, VERMILLION, require_matplotlib
-from quad_gym.estimation.results import Measured, Replay
+from quad_gym.estimation.results import Measured, Replay, by_sensor
 from quad_gym.rotations import dcm_to_euler, quaternion_to_dcm
 
 _AXES = (BLUE, ORANGE, GREEN)
@@ -102,12 +102,5 @@ def replay_figure(result: Replay, title: str) -> Any:
 
 def sensors_of(result: Replay) -> dict[str, Measured]:
     """Innovations by sensor, those of all features together."""
-    kinds = {n: m for n, m in result.measured.items() if not n.startswith("feature_")}
-    features = [m for n, m in result.measured.items() if n.startswith("feature_")]
-    if features:
-        parts = (
-            np.concatenate([getattr(m, name) for m in features])
-            for name in ("time", "received", "innovation", "sigma", "nis", "gate")
-        )
-        kinds["features"] = Measured(*parts)
+    kinds = by_sensor(result.measured)
     return {name: kinds[name] for name in _SENSORS if name in kinds}

@@ -4,10 +4,13 @@
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
 
 A log is a table with commas, or a log of PX4 (which needs `pip install 'quad-gym[ulog]'`).
-docs/logs.md says which columns a table has, and what is taken from PX4.
+docs/logs.md says which columns a table has, and what is taken from PX4. Where units or axes are
+implausible, the suite does not describe the log, or the filter diverges, the last lines say so, and
+the exit code is 1.
 """
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
     from quad_gym.params.sensors import SensorSuite
 
 RESULT = "replay.json"
+MISFIT = 1
+"""Exit code where the suite does not describe the log, or the filter diverged or failed."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,9 @@ class Args:
     heading: float | None = None
     """of the body x axis at the start, from east toward north [deg]; if not given, as a baseline or
     a magnetometer tells it, or else unknown"""
+    start_position: tuple[float, float, float] | None = None
+    """start level and at rest at this position east, north and up [m], with --heading, as a log
+    without GNSS needs it"""
     course: bool = False
     """take the direction of the first GNSS velocity for the heading: the vehicle flies nose
     first"""
@@ -74,6 +82,8 @@ def folder_of(args: Args) -> Path:
 
     if args.course and args.heading is not None:
         raise ValueError("--heading must not be given with --course")
+    if args.start_position is not None and args.heading is None:
+        raise ValueError("--start-position must come with --heading")
     if args.figure:
         require_matplotlib()
     folder = args.output or Path("results/replay") / args.log.stem
@@ -84,9 +94,12 @@ def folder_of(args: Args) -> Path:
 
 def start_of(args: Args) -> dict[str, Any]:
     """What the options say of the start."""
+    start: dict[str, Any] = {"course": True} if args.course else {}
     if args.heading is not None:
-        return {"heading": math.radians(args.heading)}
-    return {"course": True} if args.course else {}
+        start["heading"] = math.radians(args.heading)
+    if args.start_position is not None:
+        start["position"] = args.start_position
+    return start
 
 
 def suite_of(args: Args) -> "SensorSuite":
@@ -126,10 +139,15 @@ def report_of(result: "Replay") -> str:
     if result.unused:
         lines.append(f"Not used, as the suite has none: {', '.join(result.unused)}.")
     if not result.heading_known[-1]:
-        lines.append("Nothing has told the heading: give --heading, or fly.")
-    if result.status:
-        lines.append(f"The filter failed in some cycles: {result.status.name}.")
+        lines.append("The heading is still unknown at the end: give --heading or --course.")
     return "\n".join([table, *lines])
+
+
+def problems_in_words(result: "Replay") -> str:
+    """The problems, for the screen, and advice."""
+    from quad_gym.estimation.plausibility import ADVICE
+
+    return "\n".join([*(f"{text[0].upper()}{text[1:]}" for text in result.problems), ADVICE])
 
 
 def innovations_of(result: "Replay") -> dict[str, list[Any]]:
@@ -158,18 +176,23 @@ def main(args: Args) -> None:
     """Read, filter, draw and write."""
     from quad_gym.analysis.reports import versions, write_csv, write_json
     from quad_gym.estimation import replay
+    from quad_gym.estimation.plausibility import MisfitError
 
     with usage_errors():
         folder = folder_of(args)
-        result = replay(
-            args.log,
-            sensors=suite_of(args),
-            estimator=args.estimator,
-            start=start_of(args),
-            reported_noise=args.reported_noise,
-            window=args.window,
-            body=args.body,
-        )
+        try:
+            result = replay(
+                args.log,
+                sensors=suite_of(args),
+                estimator=args.estimator,
+                start=start_of(args),
+                reported_noise=args.reported_noise,
+                window=args.window,
+                body=args.body,
+            )
+        except MisfitError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(MISFIT) from None
     print(report_of(result))
     files = [write_csv(folder / "estimates.csv", _lists(result.columns()))]
     files.append(write_csv(folder / "innovations.csv", innovations_of(result)))
@@ -188,3 +211,6 @@ def main(args: Args) -> None:
     }
     files.append(write_json(folder / RESULT, found))
     print(f"\nWrote {len(files)} files to {folder}.")
+    if result.problems:
+        print(f"\n{problems_in_words(result)}")
+        raise SystemExit(MISFIT)

@@ -122,6 +122,15 @@ class Estimate:
         return FilterStatus(int(self._of_lane("filter_status")))
 
     @property
+    def diverged(self) -> bool:
+        """True while innovations show that the estimate is wrong, as `filter_diverged` of flights.
+
+        Their NIS is twice its degrees of freedom or more, or they, or corrections of biases, have
+        not been white lately.
+        """
+        return bool(self._of_lane("lost") > 0.0)
+
+    @property
     def nis(self) -> tuple[float, int]:
         """Normalized innovation squared of the last update, and how many measurements it had.
 

@@ -10,9 +10,12 @@ from quad_gym.estimation.estimate import Innovations
 from quad_gym.estimation.filters import LONGEST_STEP, ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.estimation.history import SAME_TIME
 from quad_gym.estimation.logs import Floats, Log, Stream
+from quad_gym.estimation.plausibility import MisfitError, nothing_in_common
 from quad_gym.estimation.results import Measured, Replay
+from quad_gym.estimation.starts import state_at_rest
 from quad_gym.frames import ecef_to_enu
 from quad_gym.packing.aids import blocks_of
+from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, FREEDOMS, Aid
 from quad_gym.rotations import dcm_to_quaternion
@@ -73,7 +76,7 @@ class Player:
             assert suite.camera is not None
             have = self.streams["camera"].values["pixels"].shape[1]
             if have != len(suite.camera.features_I):
-                raise ValueError(
+                raise MisfitError(
                     f"the log must have the {len(suite.camera.features_I)} features of the suite, "
                     f"got {have}"
                 )
@@ -100,9 +103,14 @@ class Player:
                 self._take_measurement(names[kinds[k]], int(places[k]))
         self._keep_row()
         if not self.rows:
+            if self.unused and len(self.streams) == 1:
+                raise MisfitError(
+                    f"{nothing_in_common(self.unused)}: use a suite with these sensors"
+                )
             raise ValueError(
                 "a log must have a GNSS position to start from, with IMU samples after it; or give "
-                "start= the keywords of set_state"
+                "start= a position and a heading (--start-position 0 0 0 --heading 0), or all "
+                "keywords of set_state"
             )
         return self._result()
 
@@ -228,6 +236,14 @@ class Player:
     def _start_from_state(self) -> None:
         """Start from what the caller knows."""
         state = {"time": float(self.log.imu.time[0]), **self.start}
+        if not {"R_BI", "covariance"} & set(state):
+            check.keywords(state, ("position", "heading", "time"), "a start at a position")
+            if "heading" not in state:
+                raise ValueError(
+                    "start must have a heading in addition to the position, or all keywords of "
+                    "set_state"
+                )
+            state = state_at_rest(self.suite, **state)
         try:
             self.filter.set_state(**state)
         except TypeError as error:
@@ -261,11 +277,14 @@ class Player:
                 f.gyro_bias,
                 np.sqrt(np.diag(f.covariance)),
                 f.heading_known,
+                f.diverged,
             )
         )
 
     def _result(self) -> Replay:
-        time, r, v, R, b_a, b_g, sigma, known = (np.array(c) for c in zip(*self.rows, strict=True))
+        time, r, v, R, b_a, b_g, sigma, known, diverged = (
+            np.array(column) for column in zip(*self.rows, strict=True)
+        )
         return Replay(
             estimator=self.estimator,
             sensors=self.suite,
@@ -277,6 +296,7 @@ class Player:
             gyro_bias=b_g,
             sigma=sigma,
             heading_known=known,
+            diverged=diverged,
             status=self.filter.status,
             measured=_measured(self.suite, self.reports),
             too_late=self.too_late,

@@ -1,10 +1,12 @@
 """Replay: a filter processes a log as it would have processed the flight."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.results import Replay
 from quad_gym.estimation.tables import read_log
@@ -28,6 +30,9 @@ def replay(
     The filter starts from the first fix: with its baseline, or else with what `start` says of the
     heading, or else with the magnetometer, or else with any heading.
 
+    Look at `problems` of the result before its estimates: it has a sentence for each sensor that
+    the suite does not describe, and for implausible units and axes.
+
     I has its origin at the suite's reference antenna if the first fix is within 100 km of it, and
     else at the first fix.
 
@@ -36,9 +41,10 @@ def replay(
         sensors: The suite that the filter believes in, or its name. Its rates and latencies do not
             count: the log has its own.
         estimator: "ukf" or "ekf".
-        start: Keywords of `initialize`, such as `{"heading": 0.5}` or `{"course": True}`; or all of
-            `set_state` (with `time`, or from the first sample on), which a suite without GNSS
-            needs.
+        start: Keywords of `initialize`, such as `{"heading": 0.5}` or `{"course": True}`. Without
+            GNSS: `{"position": (0, 0, 0), "heading": 0.0}` of a level vehicle at rest, with the
+            errors of the suite's `initial_pose`, or all keywords of `set_state`; each with `time`,
+            or from the first sample on.
         reported_noise: Whether what the receiver reports of its accuracy counts, where the log has
             it, in place of the suite's numbers.
         window: How late measurements may come [s].
@@ -59,5 +65,5 @@ def replay(
         if origin is not None:
             gnss = suite.gnss.replace(reference_antenna_G=tuple(origin.tolist()))
             suite = suite.replace(gnss=gnss)
-    player = Player(whole, suite, estimator, dict(start or {}), reported_noise, window)
-    return player.play()
+    result = Player(whole, suite, estimator, dict(start or {}), reported_noise, window).play()
+    return replace(result, problems=problems_of(whole, body, suite, result))

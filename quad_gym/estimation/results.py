@@ -1,7 +1,8 @@
-"""What a filter computed from a log: estimates and innovations."""
+"""Results of a replay: estimates, innovations and problems."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from quad_gym.records import FilterStatus, Gate
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The innovations of one kind of measurement."""
+    """Innovations of one kind of measurement."""
 
     time: Floats
     """(m,) time stamps [s]"""
@@ -31,7 +32,12 @@ class Measured:
     @property
     def gated(self) -> Any:
         """(m,) whether they were left out, beyond the gate or as the estimate was too uncertain."""
-        return (self.gate == Gate.REJECTED) | (self.gate == Gate.UNSURE)
+        return self.rejected | (self.gate == Gate.UNSURE)
+
+    @property
+    def rejected(self) -> Any:
+        """(m,) True where they were beyond the gate."""
+        return self.gate == Gate.REJECTED
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +68,20 @@ class Replay:
     """(n, 15) standard deviations of the errors: position, velocity, error angles, biases"""
     heading_known: Any
     """(n,) whether the motion, or something else, had told the heading"""
+    diverged: Any
+    """(n,) True where the innovations showed that the estimate was wrong: the filter diverged"""
     status: FilterStatus
-    """what has gone wrong"""
+    """failures of its arithmetic; 0 does not mean that the suite fits the log, see `problems`"""
     measured: dict[str, Measured]
     """by "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0", ..., "barometer" and
     "magnetometer\""""
     too_late: int
     """measurements older than the window when they arrived, and so left out"""
     unused: tuple[str, ...]
-    """what the log has and the suite has not"""
+    """sensors of the log that the suite does not have"""
+    problems: tuple[str, ...] = ()
+    """sentences on implausible units and axes of the log, on a filter that diverged or failed, and
+    on sensors that the suite does not describe, with likely causes; empty: none was found"""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -91,10 +102,11 @@ class Replay:
         words = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
         for k in range(15):
             table[f"{words[k // 3]}_sigma_{'xyz'[k % 3]}"] = self.sigma[:, k]
+        table["diverged"] = self.diverged.astype(np.float64)
         return table
 
     def summary(self) -> dict[str, Any]:
-        """How many of each measurement there were, were left out, and how large they were."""
+        """Counts and mean NIS of each measurement, share of samples diverged, and `problems`."""
         kinds = {}
         for name, m in self.measured.items():
             used = np.isfinite(m.nis)
@@ -111,5 +123,18 @@ class Replay:
             "too_late": self.too_late,
             "unused": self.unused,
             "status": self.status.name or "",
+            "diverged": float(np.mean(self.diverged)),
+            "problems": self.problems,
             "heading_known": bool(self.heading_known[-1]),
         }
+
+
+def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
+    """The innovations of a replay by sensor, all features together as "features"."""
+    found = {name: m for name, m in measured.items() if not name.startswith("feature_")}
+    features = [m for name, m in measured.items() if name.startswith("feature_")]
+    if features:
+        names = [field.name for field in fields(Measured)]
+        parts = (np.concatenate([getattr(m, name) for m in features]) for name in names)
+        found["features"] = Measured(*parts)
+    return found

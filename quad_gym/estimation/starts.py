@@ -22,12 +22,13 @@ an error of its own with the same mean square, and bounds the third order by the
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.packing.aids import slow_states
+from quad_gym.params import checks as check
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import Aid
 
@@ -243,6 +244,41 @@ def still_start(
         G[first : first + 3, first : first + 3] = sigma * np.eye(3)
     G[_D:, _D:n] = np.diag(slow)
     return FirstEstimate(antenna_I - R_BI.T @ lever, velocity, R_BI, lower_factor(G))
+
+
+def state_at_rest(
+    sensors: SensorSuite, position: ArrayLike, heading: float, time: float
+) -> dict[str, Any]:
+    """Keywords of `set_state` for a level vehicle at rest at a known place.
+
+    Errors of position and heading are those of `SensorSuite.initial_pose`.
+
+    Args:
+        sensors: The suite of the filter.
+        position: (3,) in I [m].
+        heading: Of the body x axis, from east toward north [rad].
+        time: Time stamp of the start [s].
+    """
+    pose, form, imu = sensors.initial_pose, sensors.estimator, sensors.imu
+    tilt = form.initial_tilt_sigma or LEVEL_SIGMA
+    variances = np.concatenate(
+        [
+            np.full(3, pose.position_sigma**2),
+            np.full(3, form.initial_velocity_variance),
+            [tilt**2, tilt**2, pose.heading_sigma**2],
+            np.full(3, imu.accel_bias_sigma**2),
+            np.full(3, imu.gyro_bias_sigma**2),
+        ]
+    )
+    return {
+        "position": check.array("position", position, (3,)),
+        "velocity": np.zeros(3),
+        "R_BI": level(check.number("heading", heading)),
+        "accel_bias": np.zeros(3),
+        "gyro_bias": np.zeros(3),
+        "covariance": np.diag(variances),
+        "time": time,
+    }
 
 
 def lower_factor(root: Floats) -> Floats:

@@ -256,8 +256,10 @@ def test_starts_may_be_told(table):
     assert told.heading_known.all()
     given = replay(short, sensors=suite, start=at_rest(covariance=np.eye(15)))
     assert given.time[0] == short["time"][np.isfinite(short["gyro_x"])][0]
-    with pytest.raises(ValueError, match="keywords of set_state"):
+    with pytest.raises(ValueError, match="must have a heading in addition to the position"):
         replay(short, sensors=suite, start={"position": np.zeros(3)})
+    with pytest.raises(ValueError, match="keywords of set_state"):
+        replay(short, sensors=suite, start={"position": np.zeros(3), "R_BI": np.eye(3)})
 
 
 # ---- what is refused -----------------------------------------------------------------------------

@@ -1,0 +1,226 @@
+"""Replays name implausible units and axes, and suites that do not describe the log."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.commands.main import main
+from quad_gym.estimation import replay
+from quad_gym.params.magnetometer import MICROTESLA
+from quad_gym.rotations import quaternion_to_dcm
+from tests.filter_states import at_rest
+from tests.logged_flights import Recorded, flown
+
+SUITE = quad_gym.sensor_suite("rtk").replace(
+    camera=None,
+    barometer=quad_gym.BarometerParams(),
+    magnetometer=quad_gym.MagnetometerParams(),
+)
+RATE, RADIUS, COUNT, DT = 0.4, 3.0, 1000, 0.005
+
+
+def turntable():
+    """Five seconds on a turntable, as docs/logs.md has them, with a compass and a barometer."""
+    rng, time = np.random.default_rng(1), DT * np.arange(COUNT)
+
+    def noise(sigma):
+        return rng.normal(0.0, sigma, (COUNT, 3))
+
+    angle = RATE * time
+    ahead = np.stack([-np.sin(angle), np.cos(angle), 0.0 * angle], axis=1)
+    east, north, up = SUITE.magnetometer.field_I
+    sideways = np.stack([-ahead[:, 1], ahead[:, 0], 0.0 * angle], axis=1)
+    level = np.array([east, north, 0.0])
+    field = np.stack([ahead @ level, sideways @ level, np.full(COUNT, up)], axis=1)
+    table = {
+        "time": time,
+        "gyro": noise(0.002) + np.array([0.0, 0.0, RATE]),
+        "accel": noise(0.05) + np.array([0.0, RADIUS * RATE**2, 9.8]),
+        "gnss_enu": RADIUS * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        + [0.0, 0.0, SUITE.gnss.primary_antenna_B[2]]
+        + noise(0.01),
+        "gnss_velocity_enu": RADIUS * RATE * ahead + noise(0.05),
+        "barometer": rng.normal(0.0, 0.1, COUNT),
+        "magnetometer": field + noise(0.5 * MICROTESLA),
+    }
+    for name in ("gnss_enu", "gnss_velocity_enu", "barometer", "magnetometer"):
+        table[name][np.arange(COUNT) % 20 > 0] = np.nan
+    return table
+
+
+def replayed(table, sensors=SUITE, **options):
+    return replay(table, sensors=sensors, start={"course": True}, **options)
+
+
+def test_a_sound_log_has_no_problems():
+    result = replayed(turntable())
+    assert result.problems == ()
+    assert result.summary()["problems"] == ()
+    assert not result.diverged.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        ("accel", 1 / 9.80665, "force is 1.0 m/s^2, 9.8 expected: accelerometer in g?"),
+        ("accel", 3.28084, "force is 32.2 m/s^2, 9.8 expected: accelerometer in ft/s^2?"),
+        ("accel", 1000 / 9.80665, "9.8 expected: accelerometer in milli-g or cm/s^2?"),
+        ("accel", 0.3, "force is 2.9 m/s^2, 9.8 expected: unit or scale of the accelerometer?"),
+        ("gyro", 180 / math.pi, "rate is 22.9 rad/s, at most 10 expected: gyro in deg/s?"),
+        ("gyro", 1000 / math.pi, "rad/s, gyros measure up to 35 rad/s: gyro in deg/s?"),
+        ("magnetometer", 1e4, "field is 0.463 T, 4.63e-05 expected: field in gauss?"),
+        ("magnetometer", 1e6, "expected: field in microtesla?"),
+        ("magnetometer", 1e7, "expected: field in milligauss?"),
+        ("magnetometer", 1e9, "expected: field in nanotesla?"),
+        ("magnetometer", 0.01, "expected: unit of the field?"),
+    ],
+)
+def test_units_that_are_wrong_are_named(name, change, sentence):
+    table = turntable()
+    table[name] = table[name] * change
+    assert any(sentence in problem for problem in replayed(table).problems)
+
+
+def test_a_pressure_in_place_of_a_height_is_named():
+    table = turntable()
+    table["barometer"] = 101_325.0 - 12.0 * table["barometer"]
+    (first, *_) = replayed(table).problems
+    assert first.startswith("mean barometric height is 101325 m: pressure in Pa")
+
+
+@pytest.mark.parametrize(
+    ("axes", "body", "sentence"),
+    [
+        ((1, -1, -1), "flu", "along the body's -z axis, +z expected: body='frd' (--body frd)?"),
+        ((1, 1, 1), "frd", "along the body's -z axis, +z expected: body='flu' (--body flu)?"),
+    ],
+)
+def test_axes_of_the_other_frame_are_named(axes, body, sentence):
+    table = turntable()
+    for name in ("gyro", "accel", "magnetometer"):
+        table[name] = table[name] * axes
+    assert sentence in replayed(table, body=body).problems[0]
+
+
+def test_an_imu_mounted_on_its_side_is_named():
+    table = turntable()
+    table["accel"] = np.roll(table["accel"], 1, axis=1)
+    assert "along the body's +x axis, +z expected: axes of the IMU" in replayed(table).problems[0]
+
+
+def test_a_suite_that_does_not_describe_the_log_is_named_by_sensor():
+    table = turntable()
+    wrong = np.random.default_rng(2).normal(0.0, 3.0, (COUNT, 3))
+    table["gnss_velocity_enu"] = table["gnss_velocity_enu"] + wrong
+    problems = replayed(table).problems
+    (velocity,) = [p for p in problems if p.startswith("GNSS velocity: mean NIS ")]
+    assert velocity.endswith("rejected: this suite does not describe this log")
+    assert ", 3 expected, " in velocity
+    assert any(p.startswith("the filter counted as diverged for ") for p in problems)
+
+
+def test_a_rejected_outlier_is_no_problem():
+    table = turntable()
+    table["gnss_enu"][500] += 1000.0
+    result = replayed(table)
+    assert result.measured["gnss_position"].rejected.sum() == 1
+    assert result.summary()["measurements"]["gnss_position"]["mean_nis"] > 100.0
+    assert result.problems == ()
+
+
+def test_a_filter_without_a_gate_that_took_an_outlier_is_named():
+    table = turntable()
+    table["gnss_enu"][500] += 1000.0
+    suite = SUITE.replace(estimator=SUITE.estimator.replace(false_alarm_probability=0.0))
+    assert any(p.startswith("GNSS position: mean NIS") for p in replayed(table, suite).problems)
+
+
+def test_a_log_without_gnss_starts_from_a_position_and_a_heading():
+    suite = quad_gym.sensor_suite("indoor")
+    flight = flown(suite, 4.0)
+    table = Recorded(flight, suite).table()
+    with pytest.raises(ValueError, match=r"--start-position 0 0 0 --heading 0"):
+        replay(table, sensors=suite)
+    x_I = quaternion_to_dcm(flight["attitude"][0])[0]  # the first row of R_BI
+    yaw = math.atan2(x_I[1], x_I[0])
+    result = replay(table, sensors=suite, start={"position": flight["position"][0], "heading": yaw})
+    assert result.problems == ()
+    ticks = np.rint(result.time * suite.imu.rate).astype(int)
+    errors = np.linalg.norm(result.position - flight["position"][ticks], axis=1)
+    assert errors[result.time > 1.0].max() < 0.1
+    sigma = suite.initial_pose
+    np.testing.assert_allclose(result.sigma[0, :3], sigma.position_sigma)
+    np.testing.assert_allclose(result.sigma[0, 8], sigma.heading_sigma)
+    with pytest.raises(ValueError, match="nose is not a keyword of a start at a position"):
+        replay(table, sensors=suite, start={"position": np.zeros(3), "nose": 1.0})
+
+
+def test_a_suite_without_the_sensors_of_the_log_is_refused():
+    with pytest.raises(ValueError, match="this suite uses no measurement of this log, which has"):
+        replay(turntable(), sensors="indoor")
+    result = replay(turntable(), sensors="indoor", start=at_rest(covariance=np.eye(15)))
+    assert result.problems[-1].endswith("magnetometer: the estimates are dead reckoning")
+
+
+def written(table, file):
+    """A table as a CSV."""
+    columns = {}
+    axes = {"gnss_enu": ("gnss_east", "gnss_north", "gnss_up")}
+    axes["gnss_velocity_enu"] = tuple(f"gnss_velocity_{a}" for a in ("east", "north", "up"))
+    for name, values in table.items():
+        if values.ndim == 1:
+            columns[name] = values
+        else:
+            names = axes.get(name) or tuple(f"{name}_{axis}" for axis in "xyz")
+            columns.update(zip(names, values.T, strict=True))
+    np.savetxt(
+        file, np.column_stack(list(columns.values())), "%.9g", ",", header=",".join(columns),
+        comments="",
+    )  # fmt: skip
+
+
+def test_the_command_ends_with_the_problems_and_exit_code_1(tmp_path, capsys):
+    table = turntable()
+    table["accel"] = table["accel"] / 9.80665
+    written(table, tmp_path / "flight.csv")
+    words = ["replay", str(tmp_path / "flight.csv"), "--sensors", "rtk", "--course", "--no-figure"]
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--output", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    *_, units, _, _, _, advice = capsys.readouterr().out.splitlines()
+    assert units == "Mean specific force is 1.0 m/s^2, 9.8 expected: accelerometer in g?"
+    assert advice.startswith("Check the units, axes and time stamps")
+    found = json.loads((tmp_path / "out" / "replay.json").read_text())
+    assert found["problems"][0].startswith("mean specific force is 1.0 m/s^2")
+    assert set(found["measurements"]["gnss_velocity"]) == {
+        "count", "gated", "degrees_of_freedom", "mean_nis",
+    }  # fmt: skip
+    assert (tmp_path / "out" / "estimates.csv").exists()
+
+
+def test_the_command_ends_with_exit_code_1_where_suite_and_log_have_nothing_in_common(
+    tmp_path, capsys
+):
+    written(turntable(), tmp_path / "flight.csv")
+    words = ["replay", str(tmp_path / "flight.csv"), "--sensors", "indoor", "--no-figure"]
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--output", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    assert "this suite uses no measurement of this log" in capsys.readouterr().err
+
+
+def test_the_command_starts_a_log_without_gnss_at_a_position(tmp_path, capsys):
+    table = {n: v for n, v in turntable().items() if not n.startswith("gnss")}
+    written(table, tmp_path / "flight.csv")
+    words = ["replay", str(tmp_path / "flight.csv"), "--sensors", "consumer", "--no-figure"]
+    words += ["--output", str(tmp_path / "out"), "--start-position", "3", "0", "0"]
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "--start-position must come with --heading" in capsys.readouterr().err
+    main([*words, "--heading", "90"])
+    rows = np.genfromtxt(tmp_path / "out/estimates.csv", delimiter=",", names=True)
+    assert rows["position_x"][0] == 3.0
