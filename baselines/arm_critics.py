@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.arm_tasks import Parts, SteadyWary, Sure, scaled_parts
+from baselines.arm_tasks import (
+    ConstantCrashCostWithUncertainty,
+    Parts,
+    WithStdCertaintyReward,
+    scaled_parts,
+)
 from quad_gym.tasks.outage_dash import gaps_behind, gaps_of
 from quad_gym.tasks.task import ObservationSpec
 
@@ -36,33 +41,36 @@ _SCALED_TRUE: Mapping[str, ObservationSpec] = {
 }
 
 
-class SureForCritic(Sure):
-    """`Sure` whose observation ends with the true state relative to the reference.
+class WithStdCertaintyRewardForCritic(WithStdCertaintyReward):
+    """`WithStdCertaintyReward` that observes the true state relative to the reference, too.
 
     What the estimate shows of position and velocity error, vertical, heading and body rates, as it
     truly is.
     """
 
     privileged = True
-    observes: Mapping[str, ObservationSpec] = {**Sure.observes, **_TRUE}
+    observes: Mapping[str, ObservationSpec] = {**WithStdCertaintyReward.observes, **_TRUE}
 
     def observe(self, view: "View") -> Parts:
-        """As `Sure`, and five parts (n, 3) of the truth."""
+        """As `WithStdCertaintyReward`, and five parts (n, 3) of the truth."""
         return {**super().observe(view), **_true_state(view, view.reference_position)}
 
 
-class SteadyWaryForCritic(SteadyWary):
-    """`SteadyWary` whose observation ends with the true state relative to the next gap.
+class ConstantCrashCostWithUncertaintyForCritic(ConstantCrashCostWithUncertainty):
+    """`ConstantCrashCostWithUncertainty` that observes the truth relative to the next gap, too.
 
     The gap is the one that is truly next. The numbers are scaled as those of the estimate are, and
     `gnss_fails` is 1 while GNSS fails.
     """
 
     privileged = True
-    observes: Mapping[str, ObservationSpec] = {**SteadyWary.observes, **_SCALED_TRUE}
+    observes: Mapping[str, ObservationSpec] = {
+        **ConstantCrashCostWithUncertainty.observes,
+        **_SCALED_TRUE,
+    }
 
     def observe(self, view: "View") -> Parts:
-        """As `SteadyWary`, five parts (n, 3) of the truth, and `gnss_fails` (n,)."""
+        """As its base, five parts (n, 3) of the truth, and `gnss_fails` (n,)."""
         gaps = gaps_of(view)
         gap = gaps.centers[np.arange(view.count), gaps_behind(gaps, view.position)]
         fails = view.truth.faults["gnss_outage"].astype(np.float64)

@@ -50,7 +50,7 @@ _WIDTHS = ("gap_width", "next_width")
 _ACTUAL = "actual_"
 """Before the names of parts that show the truth, scaled alike."""
 
-TOLD_IN_A_RACE = {
+RACE_STD = {
     "position_sigma": ("m", "I", 0.008),
     "velocity_sigma": ("m/s", "I", 0.042),
     "attitude_sigma": ("rad", "B", 0.004),
@@ -60,27 +60,27 @@ TOLD_IN_A_RACE = {
 """Standard deviations in the observation of a race: unit, frame, and the median in 200 episodes of
 the policy that ships."""
 
-STEADY_CRASH_COST = 100.0
-"""Of a crash in `Steady`."""
+CONSTANT_CRASH_COST = 100.0
+"""Of a crash in `ConstantCrashCost`."""
 
 _CRASH = Crash()
 
 Parts = dict[str, NDArray[np.float64]]
 
 
-class Doubting(LookAround):
+class WithStd(LookAround):
     """`LookAround` whose observation also says how sure the filter is of its position.
 
     As log10(sigma / TYPICAL) of the largest standard deviation, so that a network sees a doubling
     alike whether it is of millimeters or of meters.
 
     Args:
-        told: What the standard deviation is multiplied by before it is shown.
+        factor: The standard deviation is multiplied by this before it is observed.
     """
 
-    def __init__(self, told: float = 1.0) -> None:
+    def __init__(self, factor: float = 1.0) -> None:
         super().__init__()
-        self._told = check.positive("told", told)
+        self._factor = check.positive("factor", factor)
 
     observes: Mapping[str, ObservationSpec] = {
         **LookAround.observes,
@@ -90,32 +90,34 @@ class Doubting(LookAround):
     def observe(self, view: "View") -> Parts:
         """`features_direction` (n, 3), and `log_sigma` (n,)."""
         try:
-            sigma = self._told * view.estimate.position_sigma.max(axis=1)
+            sigma = self._factor * view.estimate.position_sigma.max(axis=1)
         except ValueError:  # no filter runs: who sees the truth has no doubt
             sigma = np.zeros(view.count)
         return {**super().observe(view), "log_sigma": np.log10(np.maximum(sigma, 1e-9) / TYPICAL)}
 
 
-TOLD_A_QUARTER, TOLD_HALF, TOLD_TWICE, TOLD_FOURFOLD = map(Doubting, (0.25, 0.5, 2.0, 4.0))
-"""A filter that is as it is, and a controller that is told another standard deviation."""
+REPORTED_STD_X1_4, REPORTED_STD_X1_2, REPORTED_STD_X2, REPORTED_STD_X4 = map(
+    WithStd, (0.25, 0.5, 2.0, 4.0)
+)
+"""Tasks in which the controller observes a wrong multiple of the standard deviation."""
 
 
-class Remembering(Doubting):
-    """`Doubting` whose observation also has what was observed 0.2, 0.4, 0.6 and 0.8 s ago.
+class WithStdHistory(WithStd):
+    """`WithStd` whose observation also has what was observed 0.2, 0.4, 0.6 and 0.8 s ago.
 
     At the start of an episode, the past is zero.
     """
 
     state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _SEEN))}
     observes: Mapping[str, ObservationSpec] = {
-        **Doubting.observes,
+        **WithStd.observes,
         "past": ObservationSpec("mixed", "B"),
     }
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Every so often, remember the present, and forget the oldest."""
         due = (view.step % EVERY == 0)[:, np.newaxis, np.newaxis]
-        seen = view.seen
+        seen = view.observed
         direction = LookAround.observe(self, view)["features_direction"]
         now = [seen.position_error, seen.velocity_error, seen.up, seen.heading, seen.body_rates]
         latest = np.concatenate([*now, direction], axis=1)[:, np.newaxis]
@@ -123,11 +125,11 @@ class Remembering(Doubting):
         view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
 
     def observe(self, view: "View") -> Parts:
-        """As `Doubting`, and `past` (n, 72)."""
+        """As `WithStd`, and `past` (n, 72)."""
         return {**super().observe(view), "past": view.state.past.reshape(view.count, -1)}
 
 
-class Paid(LookAround):
+class CertaintyReward(LookAround):
     """`LookAround` that also pays for a sure filter, which the controller does not see.
 
     0.3 (1 - min(sigma / 0.5 m, 1)) a step, sigma the largest standard deviation of the position:
@@ -141,11 +143,11 @@ class Paid(LookAround):
         return super().reward(view) + 0.3 * (1.0 - np.minimum(sigma / 0.5, 1.0))
 
 
-class Sure(Paid, Doubting):
-    """`Doubting` that also pays for a sure filter, as `Paid` does."""
+class WithStdCertaintyReward(CertaintyReward, WithStd):
+    """`WithStd` that also pays for a sure filter, as `CertaintyReward` does."""
 
 
-class RecallingRace(StaleRace):
+class RaceWithHistory(StaleRace):
     """`StaleRace` whose observation also has what was observed 0.1, 0.2, 0.3 and 0.4 s ago.
 
     What a late measurement does to the estimate depends on how the vehicle has been moving. At the
@@ -158,7 +160,7 @@ class RecallingRace(StaleRace):
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Every so often, remember the present, and forget the oldest."""
         due = (view.step % RECALLED_EVERY == 0)[:, np.newaxis, np.newaxis]
-        seen = view.seen
+        seen = view.observed
         now = [seen.position_error, seen.velocity_error, seen.up, seen.body_rates]
         latest = np.concatenate(now, axis=1)[:, np.newaxis]
         past = view.state.past
@@ -169,7 +171,7 @@ class RecallingRace(StaleRace):
         return {"past": view.state.past.reshape(view.count, -1)}
 
 
-class SeenRace(StaleRace):
+class ObservedRace(StaleRace):
     """`StaleRace` observed as `ResidualRace` is: what is seen, without a model of residuals."""
 
     replaces_observation = True
@@ -190,7 +192,7 @@ class SeenRace(StaleRace):
 
     def observe(self, view: "View") -> Parts:
         """The gates relative to a state that is off by the residual."""
-        residual, seen = self.residual(view), view.seen
+        residual, seen = self.residual(view), view.observed
         R_BI = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ seen.R_BI
 
         def in_body(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -208,8 +210,8 @@ class SeenRace(StaleRace):
         }
 
 
-class ResidualRace(SeenRace):
-    """`SeenRace` with residuals that a model of recorded estimation errors draws.
+class ResidualRace(ObservedRace):
+    """`ObservedRace` with residuals that a model of recorded estimation errors draws.
 
     To be trained in on the truth (`observation="truth"`); the episode begins without an error.
     """
@@ -273,7 +275,7 @@ class Scaled(OutageDash):
         return scaled_parts(super().observe(view))
 
 
-class Wary(Scaled):
+class WithUncertainty(Scaled):
     """`Scaled` whose observation also says how unsure the filter is for the next two gaps.
 
     As log4(2 sigma / room), sigma the largest standard deviation of the position, and room what is
@@ -283,20 +285,23 @@ class Wary(Scaled):
 
     observes: Mapping[str, ObservationSpec] = {
         **Scaled.observes,
-        "doubt": ObservationSpec("log4", "-", -4.0, 4.0),
+        "uncertainty": ObservationSpec("log4", "-", -4.0, 4.0),
     }
 
     def observe(self, view: "View") -> Parts:
-        """As `Scaled`, and `doubt` (n, 2)."""
+        """As `Scaled`, and `uncertainty` (n, 2)."""
         parts = super().observe(view)
         scaled = np.stack([parts[f"{name}_scaled"] for name in _WIDTHS], axis=1)
-        return {**parts, "doubt": doubts(view, _HALF_RANGE * scaled + _MIDDLE_WIDTH)}
+        return {
+            **parts,
+            "uncertainty": normalized_uncertainty(view, _HALF_RANGE * scaled + _MIDDLE_WIDTH),
+        }
 
 
-class Steady(Scaled):
+class ConstantCrashCost(Scaled):
     """`Scaled` for training: crashes cost the same everywhere, and episodes begin along the course.
 
-    A crash costs `STEADY_CRASH_COST`, and forfeits nothing. That makes hurrying pay late in the
+    A crash costs `CONSTANT_CRASH_COST`, and forfeits nothing. That makes hurrying pay late in the
     course, but sums of up to 660 that are lost all at once make learning unsteady. So do flights
     that come to the same gap, and lose GNSS, at the same time: a batch shows one part of the course
     alone, and what was learned of the others is lost. Episodes begin before the first wall, or
@@ -314,16 +319,16 @@ class Steady(Scaled):
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) see the class."""
-        less = self._crash_cost + view.state.earned - STEADY_CRASH_COST
+        less = self._crash_cost + view.state.earned - CONSTANT_CRASH_COST
         return super().reward(view) + _CRASH(view) * less
 
 
-class SteadyWary(Steady, Wary):
-    """`Wary` for training, as `Steady` is."""
+class ConstantCrashCostWithUncertainty(ConstantCrashCost, WithUncertainty):
+    """`WithUncertainty` for training, as `ConstantCrashCost` is."""
 
 
-def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, k) log4(2 sigma / room) for gaps of widths (n, k) [m]; see `Wary`."""
+def normalized_uncertainty(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, k) log4(2 sigma / room) for gaps of widths (n, k) [m]; see `WithUncertainty`."""
     try:
         sigma = view.estimate.position_sigma.max(axis=1)
     except ValueError:  # no filter runs: who sees the truth has no doubt
@@ -332,39 +337,39 @@ def doubts(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(0.5 * np.log2(np.maximum(ratio, 2.0**-8)))
 
 
-class Withholding(StaleRace):
-    """`StaleRace` with the 15 standard deviations in its observation, some of them withheld.
+class MaskedStd(StaleRace):
+    """`StaleRace` with the 15 standard deviations in its observation, some of them masked.
 
-    What is withheld is shown as the constant median of `TOLD_IN_A_RACE`, so that a policy that was
+    A masked one is shown as its constant median of `RACE_STD`, so that a policy that was
     trained with `include_std=True` can be flown without that part.
 
     Args:
-        withheld: Names of `TOLD_IN_A_RACE`.
+        masked: Names of `RACE_STD`.
     """
 
     observes: Mapping[str, ObservationSpec] = {
-        name: ObservationSpec(unit, frame, 0.0) for name, (unit, frame, _) in TOLD_IN_A_RACE.items()
+        name: ObservationSpec(unit, frame, 0.0) for name, (unit, frame, _) in RACE_STD.items()
     }
 
-    def __init__(self, *withheld: str) -> None:
+    def __init__(self, *masked: str) -> None:
         super().__init__()
-        for name in withheld:
-            check.choice("withheld", name, tuple(TOLD_IN_A_RACE))
-        self._withheld = withheld
+        for name in masked:
+            check.choice("masked", name, tuple(RACE_STD))
+        self._masked = masked
 
     def observe(self, view: "View") -> Parts:
         """Each (n, 3)."""
-        shown = {name: getattr(view.estimate, name) for name in TOLD_IN_A_RACE}
-        medians = {name: TOLD_IN_A_RACE[name][2] for name in self._withheld}
+        shown = {name: getattr(view.estimate, name) for name in RACE_STD}
+        medians = {name: RACE_STD[name][2] for name in self._masked}
         return {**shown, **{k: np.full((view.count, 3), value) for k, value in medians.items()}}
 
 
-ALL_TOLD = Withholding()
-POSITION_WITHHELD, VELOCITY_WITHHELD, ATTITUDE_WITHHELD, ACCEL_BIAS_WITHHELD, GYRO_BIAS_WITHHELD = (
-    Withholding(name) for name in TOLD_IN_A_RACE
+ALL_SHOWN = MaskedStd()
+POSITION_MASKED, VELOCITY_MASKED, ATTITUDE_MASKED, ACCEL_BIAS_MASKED, GYRO_BIAS_MASKED = (
+    MaskedStd(name) for name in RACE_STD
 )
-POSITION_TOLD, VELOCITY_TOLD, ATTITUDE_TOLD, ACCEL_BIAS_TOLD, GYRO_BIAS_TOLD = (
-    Withholding(*(other for other in TOLD_IN_A_RACE if other != name)) for name in TOLD_IN_A_RACE
+ONLY_POSITION, ONLY_VELOCITY, ONLY_ATTITUDE, ONLY_ACCEL_BIAS, ONLY_GYRO_BIAS = (
+    MaskedStd(*(other for other in RACE_STD if other != name)) for name in RACE_STD
 )
-NONE_TOLD = Withholding(*TOLD_IN_A_RACE)
-"""Which of the standard deviations a controller is told."""
+NONE_SHOWN = MaskedStd(*RACE_STD)
+"""Tasks that differ in which of the standard deviations a controller observes."""

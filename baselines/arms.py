@@ -72,137 +72,140 @@ class Arm(Checked):
 _FAR_SIGHTED = {"gamma": 0.995}
 """Without a reward for being sure, what a look is worth comes seconds later: with the recipe's 0.99
 a third of the flights crashed in pilots."""
-_DOUBTING = {"custom": "baselines.arm_tasks:Doubting"}
+_WITH_STD = {"task": "baselines.arm_tasks:WithStd"}
 
 ARMS = (
     Arm(name="pd_reference", label="PD, facing as rewarded", policy="pd"),
     Arm(name="pd_features", label="PD, facing the features", policy="pd:features"),
     Arm(
-        name="pd_unsure",
-        label="PD, facing the features when unsure",
-        policy="pd:features_when_unsure",
+        name="pd_features_when_uncertain",
+        label="PD, facing the features when uncertain",
+        policy="pd:features_when_uncertain",
         environment={"include_std": True},
     ),
     Arm(name="truth", label="truth", training={"observation": "truth"}),
     Arm(name="noisy", label="truth + independent noise", training={"observation": "noisy"}),
     Arm(name="estimate", label="estimate", parameters=_FAR_SIGHTED),
     Arm(
-        name="sigma",
+        name="std",
         label="estimate + standard deviation",
-        environment=_DOUBTING,
+        environment=_WITH_STD,
         parameters=_FAR_SIGHTED,
     ),
     Arm(
-        name="memory",
-        label="estimate + standard deviation + memory",
-        environment={"custom": "baselines.arm_tasks:Remembering"},
+        name="std_history",
+        label="estimate + standard deviation + history",
+        environment={"task": "baselines.arm_tasks:WithStdHistory"},
         parameters=_FAR_SIGHTED,
     ),
     Arm(
-        name="paid",
-        label="estimate, paid for being sure",
-        learning={"custom": "baselines.arm_tasks:Paid"},
+        name="certainty",
+        label="estimate, reward for certainty",
+        learning={"task": "baselines.arm_tasks:CertaintyReward"},
     ),
     Arm(
-        name="sure",
-        label="estimate + standard deviation, paid for being sure",
-        environment=_DOUBTING,
-        learning={"custom": "baselines.arm_tasks:Sure"},
+        name="std_certainty",
+        label="estimate + standard deviation, reward for certainty",
+        environment=_WITH_STD,
+        learning={"task": "baselines.arm_tasks:WithStdCertaintyReward"},
     ),
     Arm(
-        name="asymmetric",
-        label="estimate + standard deviation, paid for being sure, critic sees the truth",
-        environment=_DOUBTING,
-        learning={"custom": "baselines.arm_critics:SureForCritic"},
+        name="std_certainty_privileged",
+        label="estimate + standard deviation, reward for certainty, privileged critic",
+        environment=_WITH_STD,
+        learning={"task": "baselines.arm_critics:WithStdCertaintyRewardForCritic"},
         parameters={"critic_only": 15},
     ),
-    # paid for being sure as `paid` and `sure` are, so that these differ in what the policy knows
+    # rewarded for certainty as `certainty` and `std_certainty` are, so that these differ in what
+    # the policy knows
     Arm(
         name="recurrent",
-        label="estimate, LSTM, paid for being sure",
-        learning={"custom": "baselines.arm_tasks:Paid"},
+        label="estimate, LSTM, reward for certainty",
+        learning={"task": "baselines.arm_tasks:CertaintyReward"},
         algorithm="recurrent_ppo",
     ),
 )
 """Those of `QuadGym/LookAround-v0`."""
 
 _TRUTH = {"observation": "truth"}
-_SIGMAS = {"include_std": True}
+_STD = {"include_std": True}
 _STALE = sensor_suite("stale")
 _STAMPED = {
     "sensors": _STALE.replace(estimator=_STALE.estimator.replace(delay_compensation="retrodict"))
 }
 """The same sensors, and a filter that knows how old their measurements are."""
-_RECALLING = {"custom": "baselines.arm_tasks:RecallingRace", **_SIGMAS}
+_WITH_HISTORY = {"task": "baselines.arm_tasks:RaceWithHistory", **_STD}
 
 STALE_RACE = (
     Arm(name="pd", label="PD", policy="pd"),
     Arm(name="truth", label="truth", training=_TRUTH),
-    Arm(name="covariance", label="estimate + 15 standard deviations", environment=_SIGMAS),
+    Arm(name="std", label="estimate + 15 standard deviations", environment=_STD),
     Arm(
-        name="recalling",
-        label="estimate + 15 standard deviations + memory",
-        environment=_RECALLING,
+        name="std_history",
+        label="estimate + 15 standard deviations + history",
+        environment=_WITH_HISTORY,
     ),
     Arm(
         name="residual",
         label="truth + residual model",
-        environment={"custom": "baselines.arm_tasks:SeenRace"},
-        training={"custom": "baselines.arm_tasks:ResidualRace", **_TRUTH},
+        environment={"task": "baselines.arm_tasks:ObservedRace"},
+        training={"task": "baselines.arm_tasks:ResidualRace", **_TRUTH},
     ),
-    Arm(name="truth_on_truth", label="truth, flown on it", flies="truth", environment=_TRUTH),
+    Arm(
+        name="truth_on_truth", label="truth, tested on the truth", flies="truth", environment=_TRUTH
+    ),
     Arm(
         name="truth_stamped",
-        label="truth, flown with time stamps",
+        label="truth, tested with delay compensation",
         flies="truth",
         environment=_STAMPED,
     ),
     Arm(
-        name="covariance_stamped",
-        label="estimate + 15 standard deviations, flown with time stamps",
-        flies="covariance",
-        environment={**_SIGMAS, **_STAMPED},
+        name="std_stamped",
+        label="estimate + 15 standard deviations, tested with delay compensation",
+        flies="std",
+        environment={**_STD, **_STAMPED},
     ),
 )
 """Those of `QuadGym/StaleRace-v0`."""
 
-_SCALED = {"custom": "baselines.arm_tasks:Scaled"}
-_WARY = {"custom": "baselines.arm_tasks:Wary"}
-_STEADY = {"custom": "baselines.arm_tasks:Steady"}
+_SCALED = {"task": "baselines.arm_tasks:Scaled"}
+_WITH_UNCERTAINTY = {"task": "baselines.arm_tasks:WithUncertainty"}
+_CONSTANT_CRASH_COST = {"task": "baselines.arm_tasks:ConstantCrashCost"}
 
 OUTAGE_DASH = (
     Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
     Arm(name="pd_slow", label="PD at 2.4 m/s", policy="pd:slow"),
     Arm(
         name="pd_waiting",
-        label="PD that waits when unsure",
+        label="PD that waits when uncertain",
         policy="pd:waiting",
-        environment=_SIGMAS,
+        environment=_STD,
     ),
     Arm(
         name="truth",
         label="truth",
         environment=_SCALED,
         training=_TRUTH,
-        learning=_STEADY,
+        learning=_CONSTANT_CRASH_COST,
     ),
-    Arm(name="estimate", label="estimate", environment=_SCALED, learning=_STEADY),
+    Arm(name="estimate", label="estimate", environment=_SCALED, learning=_CONSTANT_CRASH_COST),
     Arm(
-        name="sigma",
-        label="estimate + doubt",
-        environment=_WARY,
-        learning={"custom": "baselines.arm_tasks:SteadyWary"},
+        name="std",
+        label="estimate + normalized uncertainty",
+        environment=_WITH_UNCERTAINTY,
+        learning={"task": "baselines.arm_tasks:ConstantCrashCostWithUncertainty"},
     ),
     Arm(
-        name="asymmetric",
-        label="estimate + doubt, critic sees the truth",
-        environment=_WARY,
-        learning={"custom": "baselines.arm_critics:SteadyWaryForCritic"},
+        name="std_privileged",
+        label="estimate + normalized uncertainty, privileged critic",
+        environment=_WITH_UNCERTAINTY,
+        learning={"task": "baselines.arm_critics:ConstantCrashCostWithUncertaintyForCritic"},
         parameters={"critic_only": 16},
     ),
     Arm(
         name="truth_on_truth",
-        label="truth, flown on it",
+        label="truth, tested on the truth",
         flies="truth",
         environment={**_SCALED, **_TRUTH},
     ),

@@ -32,7 +32,7 @@ SIGMAS, MARGIN = 2.0, 0.5
 """It waits where so many standard deviations of the position reach from the middle of the next gap
 to within this of its edge, which is the vehicle's radius and a little more [m]."""
 
-FACES = ("reference", "features", "features_when_unsure")
+FACES = ("reference", "features", "features_when_uncertain")
 """Where PD control points body x."""
 
 UNSURE = 0.1
@@ -111,8 +111,8 @@ class PDPolicy:
             observes gaps, as OutageDash does, and unlimited elsewhere.
         faces: Where body x points: in the direction of the "reference"; toward the "features" of
             an environment that observes their direction, as LookAround does; or toward them
-            "features_when_unsure", while the filter's largest standard deviation of the position is
-            above UNSURE, which the environment must show (`include_std=True`).
+            "features_when_uncertain", while the filter's largest standard deviation of the position
+            is above UNSURE, which the environment must show (`include_std=True`).
         pace: "steady", or "waiting": WAITS_BEFORE a gap that is too narrow for how sure the filter
             is, which the environment must show (`include_std=True`).
 
@@ -133,14 +133,14 @@ class PDPolicy:
         if flights is None:
             raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
         _require_plain_observations(env)
-        if flights.observation == "sensors":
-            raise ValueError('env must observe a state: observation="sensors" holds none')
+        if flights.observation == "measurements":
+            raise ValueError('env must observe a state: observation="measurements" holds none')
         needed = _ABSOLUTE_FIELDS if flights.layout == "absolute" else _RELATIVE_FIELDS
         self._faces = check.choice("faces", faces, FACES)
         wanted = {
             "reference": (),
             "features": ("features_direction",),
-            "features_when_unsure": ("features_direction", "position_sigma"),
+            "features_when_uncertain": ("features_direction", "position_sigma"),
         }[faces]
         shown = {field.name for field in flights.table}
         lacking = [name for name in wanted if name not in shown]
@@ -174,7 +174,7 @@ class PDPolicy:
         if flights.action in ("motor", "wrench"):
             self._warn_if_too_slow(flights.control_rate, flights.batch.vehicle.inertia)
         self._vehicle = flights.batch.vehicle
-        self._scales = flights.batch.actions
+        self._scales = flights.batch.action_params
         self._action, self._absolute = flights.action, flights.layout == "absolute"
         self._slices = {field.name: field.slice for field in flights.table}
         self._widths = policy_size(flights.table), flights.table[-1].slice.stop

@@ -24,7 +24,7 @@ NAMES = (
     "pd:tuned",
     "pd:lab",
     "pd:features",
-    "pd:features_when_unsure",
+    "pd:features_when_uncertain",
     "pd:slow",
     "pd:waiting",
     "pretrained",
@@ -58,11 +58,12 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
 
     Args:
         name: "pd" (tuned gains), "pd:lab" (the report's), "pd:features" and
-            "pd:features_when_unsure" (tuned gains, facing the features), "pd:slow" and "pd:waiting"
-            (through gaps, at half the speed, or waiting when unsure), "pd:FILE.json" (gains of
-            `scripts/tune.py`), "pretrained" (the policy that ships for the environment's task), or
-            a file: `.npz` as `MlpPolicy` saves it, or `.zip` as Stable-Baselines3 does. A `.zip`
-            can run code while it is loaded: open only those that you trust.
+            "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
+            "pd:waiting" (through gaps, at half the speed, or waiting when uncertain),
+            "pd:FILE.json" (gains of `scripts/tune.py`), "pretrained" (the pretrained policy of the
+            environment's task), or a file: `.npz` as `MlpPolicy` saves it, or `.zip` as
+            Stable-Baselines3 does. A `.zip` can run code while it is loaded: open only those that
+            you trust.
         env: A `QuadVectorEnv`.
 
     Raises:
@@ -74,7 +75,7 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
     """
     if name in ("pd", "pd:tuned", "pd:lab"):
         return PDPolicy(env, gains="lab" if name == "pd:lab" else "tuned")
-    if name in ("pd:features", "pd:features_when_unsure"):
+    if name in ("pd:features", "pd:features_when_uncertain"):
         return PDPolicy(env, faces=name.removeprefix("pd:"))
     if name in ("pd:slow", "pd:waiting"):
         slow = 0.5 * REACH_OF_GAPS if name == "pd:slow" else None
@@ -111,12 +112,12 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
     Raises:
         ValueError: If no policy ships for the task and "pretrained" is asked for.
     """
-    if name in ("pd:features_when_unsure", "pd:waiting"):
+    if name in ("pd:features_when_uncertain", "pd:waiting"):
         return {"include_std": True}
     if name != "pretrained":
         return {}
     trained = MlpPolicy.load(pretrained_file(env_id)).record["plan"]["environment"]
-    return {key: trained[key] for key in ("custom", "include_std") if key in trained}
+    return {key: trained[key] for key in ("task", "include_std") if key in trained}
 
 
 def _gains_of(file: Path) -> PDGains:

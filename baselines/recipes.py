@@ -95,7 +95,7 @@ _PPO = Recipe(
         "ent_coef": 0.0,
     },
     policy={"log_std_init": -1.0},
-    flights={"start": "mixed", "randomize": True},
+    flights={"start": "mixed", "randomize_reference": True},
 )
 """From a search over learning rates, reward scales, activations and batch shapes on the circle."""
 
@@ -119,7 +119,7 @@ _SAC = Recipe(
     n_envs=256,
     learning_rate=(1e-3, 1e-5),
     critic_layers=(128, 128),
-    flights={"start": "mixed", "randomize": True},
+    flights={"start": "mixed", "randomize_reference": True},
     # a step's reward is about 0.3: an entropy worth 1 at the start would hide it for long, and
     # noise as wide as the usual target's would blur what the last centimeters are worth
     parameters={**_OFF_POLICY, "ent_coef": "auto_0.02", "target_entropy": -8.0},

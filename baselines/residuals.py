@@ -109,7 +109,7 @@ def record(
 
 def error_of(view: Any) -> Floats:
     """(n, 12) what is seen, less what is so."""
-    seen, truth = view.seen, view.truth
+    seen, truth = view.observed, view.truth
     turn = Rotation.from_matrix(seen.R_BI @ truth.R_BI.transpose(0, 2, 1)).as_rotvec()
     return np.concatenate(
         [

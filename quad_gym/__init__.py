@@ -10,7 +10,6 @@ from quad_gym import faults
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
-from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
 from quad_gym.params.distributions import LogUniform, Normal, Uniform
 from quad_gym.params.filter import FilterParams
@@ -78,7 +77,6 @@ __all__ = [
     "BarometerParams",
     "BatteryParams",
     "CameraParams",
-    "Clocks",
     "Cylinder",
     "FilterParams",
     "GnssParams",

@@ -13,7 +13,7 @@ def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **k
         duration=0.0,
         out_of_bounds=1e6,
         max_tilt=np.pi,
-        ground=-1e6,
+        min_height=-1e6,
         start=start or TASK_DEFAULTS[task].start,
     )
     batch = FlightBatch(
@@ -51,14 +51,14 @@ def attitudes(q):
 
 def state_errors(batch):
     """(n, 15) truth less estimate, in the order r, v, e, b_a, b_g."""
-    R_error = attitudes(batch.read("q")) @ batch.read("R_hat").transpose(0, 2, 1)
+    R_error = attitudes(batch.record("q")) @ batch.record("R_hat").transpose(0, 2, 1)
     return np.concatenate(
         [
-            batch.read("r") - batch.read("r_hat"),
-            batch.read("v") - batch.read("v_hat"),
+            batch.record("r") - batch.record("r_hat"),
+            batch.record("v") - batch.record("v_hat"),
             small_euler_angles(R_error),
-            batch.read("b_a") - batch.read("b_a_hat"),
-            batch.read("b_g") - batch.read("b_g_hat"),
+            batch.record("b_a") - batch.record("b_a_hat"),
+            batch.record("b_g") - batch.record("b_g_hat"),
         ],
         axis=1,
     )
@@ -72,5 +72,5 @@ def nees(batch, block=slice(0, 15)):
 
 def measured_now(batch):
     """(n, blocks): which blocks were measured at the present instant."""
-    flags = [batch.read(f"{name}_valid") for name in ("position", "baseline", "velocity")]
-    return np.column_stack([*flags, batch.read("feature_valid")]) > 0.0
+    flags = [batch.record(f"{name}_valid") for name in ("position", "baseline", "velocity")]
+    return np.column_stack([*flags, batch.record("feature_valid")]) > 0.0

@@ -40,8 +40,8 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
 
     def keep_aids():
         batch = env.flights.batch
-        fresh = (batch.read("aid_fresh") + batch.read("aid_valid"))[0] > 0.0
-        aids.append(np.where(fresh[:, np.newaxis], batch.read("aid_measurement")[0], np.nan))
+        fresh = (batch.record("aid_fresh") + batch.record("aid_valid"))[0] > 0.0
+        aids.append(np.where(fresh[:, np.newaxis], batch.record("aid_measurement")[0], np.nan))
 
     keep_aids()
     for _ in range(round(seconds * rate)):
@@ -211,17 +211,17 @@ class ULogWriter:
 def errors_in_flight(recorded, k):
     """(n, 9) errors of position, velocity and attitude of the filter in flight, at rows `k`."""
     f = recorded.flight
-    words = ("position", "velocity", "attitude")
+    words = ("position", "velocity", "quaternion")
     return _errors(f, k, *(f[f"estimated_{word}"][k] for word in words))
 
 
 def errors_in_replay(recorded, result, k):
     """The same of a replay, each row of which is one of the flight."""
-    return _errors(recorded.flight, k, result.position, result.velocity, result.attitude)
+    return _errors(recorded.flight, k, result.position, result.velocity, result.quaternion)
 
 
 def _errors(flight, k, position, velocity, attitude):
-    turned = quaternion_to_dcm(flight["attitude"][k]) @ quaternion_to_dcm(attitude).swapaxes(1, 2)
+    turned = quaternion_to_dcm(flight["quaternion"][k]) @ quaternion_to_dcm(attitude).swapaxes(1, 2)
     angles = 0.5 * np.stack(
         [
             turned[:, 1, 2] - turned[:, 2, 1],

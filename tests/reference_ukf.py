@@ -215,7 +215,7 @@ class PlainUKF:
         self.d = x[15:]
         self.R = rotation_312(e) @ self.R
         self.P = (P + P.T) / 2
-        if self.sensors.estimator.covariance_reset == "turn":
+        if self.sensors.estimator.attitude_reset:
             turn = self._turn(e)
             self.P = turn @ self.P @ turn.T
 

@@ -111,7 +111,7 @@ def controller_of(
         if not isinstance(env.single_observation_space, gymnasium.spaces.Box):
             raise ValueError(f"{file} sees the truth (privileged=True), which no vehicle has")
         batch = flights.batch
-        params = params_record(batch.vehicle, batch.sensors, actions=batch.actions)[0]
+        params = params_record(batch.vehicle, batch.sensors, action_params=batch.action_params)[0]
         controller = Controller(
             policy=found if isinstance(found, MlpPolicy) else mlp_of(found, record),
             source=policy if policy == "pretrained" else file.name,

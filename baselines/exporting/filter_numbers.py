@@ -32,7 +32,7 @@ _FIELDS = {
             "blur",
             "features",
             "noise_at_prediction",
-            "noise_projected",
+            "noise_pinhole",
             "recursive_update_threshold",
         ),
     ),
@@ -74,7 +74,7 @@ _MEANINGS = {
 }
 """Words for those that `PARAMS_FIELDS` explains by what stands beside them."""
 
-_CHOICES = ("kind", "integration", "covariance_reset", "bearing_noise_at", "delay_compensation")
+_CHOICES = ("kind", "integration", "attitude_reset", "bearing_noise_at", "delay_compensation")
 """Words among the parameters of a filter."""
 
 

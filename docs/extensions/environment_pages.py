@@ -117,7 +117,9 @@ def _observations_page() -> str:
     layouts = {
         'Relative, the default (`layout="relative"`)': {},
         'Absolute (`layout="absolute"`)': {"layout": "absolute"},
-        'Raw measurements (`observation="sensors"`), two features': {"observation": "sensors"},
+        'Raw measurements (`observation="measurements"`), two features': {
+            "observation": "measurements"
+        },
         "Relative, with the filter's standard deviations (`include_std=True`)": {
             "include_std": True
         },
@@ -191,7 +193,7 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
     reference, start, limit = (cell.strip() for cell in row[1].split("|"))
     own = BENCHMARKS.get(kind)
     defaults = TASK_DEFAULTS[kind] if own is None else own.task
-    task = None if own is None else _task_class(own.keywords["custom"])
+    task = None if own is None else _task_class(own.keywords["task"])
     spec = sections if task is None else sections | _task_sections(task)
     settings = {} if own is None else dict(own.keywords)
     rows = [

@@ -30,7 +30,7 @@ def fly(source):
     for _ in range(STEPS):
         action, _ = policy.predict(observation)
         observation, reward, terminated, truncated, info = env.step(action)
-        path.append(batch.read("r")[0])
+        path.append(batch.read("position")[0])
         tracking.append(info["position_error"])
         estimation.append(info["estimation_error"])
     return np.array(path), 1e3 * np.array(tracking), 1e3 * np.array(estimation)

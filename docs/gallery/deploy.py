@@ -72,7 +72,7 @@ for name, act in {"policy": lambda o: controller.policy.predict(o)[0], "C": fly_
         if name == "C":
             differences.append(np.abs(act(observations) - controller.act(observations)).max())
         observations, *_ = envs.step(act(observations))
-        path.append(envs.unwrapped.flights.batch.read("r").copy())
+        path.append(envs.unwrapped.flights.batch.read("position").copy())
     paths[name] = np.array(path)
 
 print(f"largest difference of an action   {max(differences):.1e}")

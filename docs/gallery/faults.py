@@ -14,7 +14,7 @@ from scipy.stats import chi2
 import quad_gym
 from baselines import PDPolicy
 from quad_gym.faults import GnssJump, GnssOutliers, GnssRamp
-from quad_gym.records import POSITION_BLOCK, Gate
+from quad_gym.records import POSITION_BLOCK, GateDecision
 
 FLIGHTS, SECONDS = 200, 10
 
@@ -38,7 +38,7 @@ def fly(sensors, *faults):
         found = info["innovations"]
         fresh = found["measured"][:, POSITION_BLOCK]
         nis.append(np.where(fresh, found["nis"][:, POSITION_BLOCK], np.nan))
-        gate.append(np.where(fresh, found["gate"][:, POSITION_BLOCK], Gate.NONE))
+        gate.append(np.where(fresh, found["gate"][:, POSITION_BLOCK], GateDecision.NONE))
         error.append(info["estimation_error"])
     return np.array(nis), np.array(gate), np.array(error)
 
@@ -68,7 +68,7 @@ axes.set(xscale="log", yscale="log", ylim=(1e-5, 0.2), xlabel="NIS of GNSS posit
 axes.set(ylabel="share of fixes per bin")
 axes.legend()
 
-rejected = (gate == Gate.REJECTED).sum() / (gate != Gate.NONE).sum()
+rejected = (gate == GateDecision.REJECTED).sum() / (gate != GateDecision.NONE).sum()
 print(f"rejected: {100 * rejected:.2f} % of the fixes")
 
 # %%

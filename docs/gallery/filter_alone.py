@@ -12,15 +12,16 @@ import numpy as np
 import quad_gym
 from quad_gym.analysis.metrics import chi_square_band, nees, state_error
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.rotations import quaternion_to_dcm
+from quad_gym.frames import ecef_to_enu
 
 # %%
 # A log
 # -----
 #
 # One flight of the circle, under PD control, with GNSS ten times a second and no camera. It steps
-# once per IMU sample, 200 times a second. ``read`` returns a field of all flights; ``[0]`` takes
-# the only one. GNSS measures in the Earth-centered frame, relative to the reference antenna.
+# once per IMU sample, 200 times a second. ``read`` returns a quantity of all flights; ``[0]``
+# takes the only one. It has fixes in the inertial frame I, and NaN where there was none; the filter
+# takes them in the Earth-centered frame G, relative to the reference antenna.
 
 suite = quad_gym.sensor_suite("standard")
 suite = suite.replace(gnss=suite.gnss.replace(rate=10.0), camera=None)
@@ -29,16 +30,16 @@ batch.reset(seeds=[3])
 
 
 def read(*names):
-    """Some fields of the flight."""
+    """Some quantities of the flight."""
     return {name: batch.read(name)[0] for name in names}
 
 
 GNSS = ("gnss_position", "gnss_baseline")
-TRUTH = ("r", "v", "q", "b_a", "b_g")
-log = [read("position_valid", *GNSS, *TRUTH, "r_hat")]
+TRUTH = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias")
+log = [read(*GNSS, *TRUTH)]
 for _ in range(2000):
     batch.step()
-    log.append(read("gyro", "accel", "position_fresh", *GNSS, *TRUTH, "r_hat"))
+    log.append(read("gyro", "accel", *GNSS, *TRUTH, "estimated_position"))
 
 # %%
 # The filter
@@ -48,22 +49,22 @@ for _ in range(2000):
 # takes whatever has been measured.
 
 ukf = UnscentedKalmanFilter(sensors=suite)
-ukf.initialize(log[0]["gnss_position"], log[0]["gnss_baseline"])
+R_IG = ecef_to_enu(suite.gnss.reference_antenna_G)
+ukf.initialize(*(log[0][name] @ R_IG for name in GNSS))
 positions, sigmas, squares, differences = [], [], [], []
 for row in log[1:]:
     ukf.predict(row["gyro"], row["accel"])
-    if row["position_fresh"] > 0:
+    if np.isfinite(row["gnss_position"]).all():
         ukf.update(
-            gnss_position_G=row["gnss_position"],
-            gnss_baseline_G=row["gnss_baseline"],
+            gnss_position_G=row["gnss_position"] @ R_IG,
+            gnss_baseline_G=row["gnss_baseline"] @ R_IG,
         )
-    truth = {"position": row["r"], "velocity": row["v"], "accel_bias": row["b_a"]}
-    truth |= {"gyro_bias": row["b_g"], "R_BI": quaternion_to_dcm(row["q"])}
+    truth = {name: row[name] for name in TRUTH}
     estimate = {name: getattr(ukf, name) for name in truth}
     squares.append(nees(state_error(truth, estimate), ukf.covariance))
-    positions.append(row["r"] - ukf.position)
+    positions.append(row["position"] - ukf.position)
     sigmas.append(np.sqrt(np.diag(ukf.covariance)[:3]))
-    differences.append(np.abs(row["r_hat"] - ukf.position).max())
+    differences.append(np.abs(row["estimated_position"] - ukf.position).max())
 print(f"largest difference from the estimate of the flight: {max(differences):.1e} m")
 
 # %%

@@ -45,7 +45,7 @@ class Landing(quad_gym.Task):
 
     def observe(self, view):
         pad = np.column_stack([view.state.pad, np.zeros(view.count)])
-        return {"to_pad": np.einsum("nij,nj->ni", view.seen.R_BI, pad - view.seen.position)}
+        return {"to_pad": np.einsum("nij,nj->ni", view.observed.R_BI, pad - view.observed.position)}
 
 
 # %%
@@ -53,7 +53,7 @@ class Landing(quad_gym.Task):
 # policy that they lead to is kept beside this file.
 
 KEYWORDS = {
-    "custom": Landing(),
+    "task": Landing(),
     "world": quad_gym.WorldParams(ground=quad_gym.GroundParams(max_touchdown_speed=0.5)),
     "action": "velocity",
     "height": 1.0,
@@ -83,9 +83,9 @@ batch, heights, crashed = envs.unwrapped.flights.batch, [], np.zeros(200, bool)
 for _ in range(299):
     observations, _, terminated, *_ = envs.step(policy.predict(observations)[0])
     crashed |= terminated
-    heights.append(batch.read("r")[:, 2])
-miss = np.linalg.norm(batch.read("r")[:, :2] - batch.view.state.pad, axis=1)
-stands = (batch.read("footing") > 0.0) & ~crashed
+    heights.append(batch.read("position")[:, 2])
+miss = np.linalg.norm(batch.read("position")[:, :2] - batch.view.state.pad, axis=1)
+stands = batch.read("on_ground") & ~crashed
 landed = (stands & (miss < 0.2)).mean()
 print(f"on the pad {100 * landed:.0f} %, median miss {100 * np.median(miss):.1f} cm")
 assert landed > 0.95

@@ -41,7 +41,7 @@ class LookAtMarkers(quad_gym.Task):
 figure, (of_reward, of_sigma) = plt.subplots(1, 2, figsize=(9, 4))
 for turned, label in ((0.0, "toward the markers"), (np.pi, "away from them")):
     envs = gymnasium.make_vec(
-        "QuadGym/Hover-v0", num_envs=50, sensors="indoor", custom=LookAtMarkers(turned)
+        "QuadGym/Hover-v0", num_envs=50, sensors="indoor", task=LookAtMarkers(turned)
     )
     policy, earned, sigma = PDPolicy(envs), [], []
     observations, _ = envs.reset(seed=0)

@@ -42,8 +42,8 @@ class MovingTarget(quad_gym.Task):
         return super().terminated(view) | far
 
     def observe(self, view):
-        gap = view.state.seen - view.seen.position
-        return {"target": np.einsum("nij,nj->ni", view.seen.R_BI, gap)}
+        gap = view.state.seen - view.observed.position
+        return {"target": np.einsum("nij,nj->ni", view.observed.R_BI, gap)}
 
 
 # %%
@@ -52,7 +52,7 @@ class MovingTarget(quad_gym.Task):
 # of ``Hover``, because the target wanders more than 1.6 m away.
 
 KEYWORDS = {
-    "custom": MovingTarget(),
+    "task": MovingTarget(),
     "action": "velocity",
     "out_of_bounds": 3.0,
     "max_episode_steps": 400,
@@ -89,7 +89,7 @@ def fly(act):
     batch, distances = envs.unwrapped.flights.batch, []
     for _ in range(399):
         observations, *_ = envs.step(act(observations))
-        distances.append(np.linalg.norm(batch.view.state.target - batch.read("r"), axis=1))
+        distances.append(np.linalg.norm(batch.view.state.target - batch.read("position"), axis=1))
     return np.array(distances)
 
 

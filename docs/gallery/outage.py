@@ -35,7 +35,8 @@ def fly(*faults):
     for _ in range(50 * SECONDS - 1):
         action, _ = policy.predict(observation)
         observation, _, _, _, info = envs.step(action)
-        errors.append((batch.read("r") - batch.read("r_hat"))[:, 0])
+        error = batch.read("position") - batch.read("estimated_position")
+        errors.append(error[:, 0])
         claimed.append(np.sqrt(batch.covariance()[:, 0, 0]))
         lost.append(info["filter_diverged"].mean())
     return np.array(errors), np.array(claimed), np.array(lost)

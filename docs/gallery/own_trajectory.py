@@ -24,15 +24,15 @@ for name, value in path.check(quad_gym.vehicle_params("lab"))._asdict().items():
     print(name, np.round(value, 2))
 
 # %%
-# Twenty flights, each from the start of the trajectory. ``randomize=True`` would start each flight
-# at a random point, and turn the trajectory by a random angle.
+# Twenty flights, each from the start of the trajectory. ``randomize_reference=True`` would start
+# each flight at a random point, and turn the trajectory by a random angle.
 
 envs = gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=20, trajectory=path)
 policy, flown = PDPolicy(envs), []
 observations, _ = envs.reset(seed=0)
 for _ in range(envs.unwrapped.flights.batch.max_steps - 1):
     observations, _, _, _, info = envs.step(policy.predict(observations)[0])
-    flown.append(envs.unwrapped.flights.batch.read("r"))
+    flown.append(envs.unwrapped.flights.batch.read("position"))
 print(f"mean error in the last step: {1e3 * info['position_error'].mean():.0f} mm")
 
 # %%

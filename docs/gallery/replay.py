@@ -12,7 +12,6 @@ import numpy as np
 
 import quad_gym
 from quad_gym.estimation import replay
-from quad_gym.frames import ecef_to_enu
 
 # %%
 # A simulated flight takes the place of a real one. One row in a hundred gets lost, and fixes reach
@@ -22,17 +21,17 @@ suite = quad_gym.sensor_suite("rtk").replace(camera=None)
 batch = quad_gym.FlightBatch(1, sensors=suite, gains="tuned")
 batch.reset(seeds=[4])
 rng, rows, truth = np.random.default_rng(0), [], []
-R_IG, nothing = ecef_to_enu(suite.gnss.reference_antenna_G), np.full(3, np.nan)
+nothing = np.full(3, np.nan)
 fields = ("gyro", "accel", "gnss_position", "gnss_velocity")
 for k in range(2001):
     if k > 0:
         batch.step()
     time, (gyro, accel, place, speed) = 0.005 * k, (batch.read(name)[0] for name in fields)
     rows.append([time, time, *(gyro if k else nothing), *accel, *nothing, *nothing])
-    if batch.read("position_fresh")[0] + batch.read("position_valid")[0] > 0:
+    if np.isfinite(place).all():
         stamps = (time - 0.1, time + rng.uniform(0.0, 0.05)) if k else (0.0, 0.0)
-        rows.append([*stamps, *nothing, *nothing, *R_IG @ place, *R_IG @ speed])
-    truth.append(batch.read("r")[0])
+        rows.append([*stamps, *nothing, *nothing, *place, *speed])
+    truth.append(batch.read("position")[0])
 rows = np.array(rows)[rng.random(len(rows)) > 0.01]
 
 # %%

@@ -70,7 +70,9 @@ for name, suite in (("rtk", "rtk"), ("mine", mine)):
 batch = quad_gym.FlightBatch(
     200,
     sensors=mine,
-    task=endless(quad_gym.TaskParams(kind="random_trajectory", start="hover", randomize=True)),
+    task=endless(
+        quad_gym.TaskParams(kind="random_trajectory", start="hover", randomize_reference=True)
+    ),
     gains="tuned",
     innovations=True,
 )

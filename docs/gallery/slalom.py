@@ -47,8 +47,8 @@ class Slalom(quad_gym.Task):
     def observe(self, view):
         gaps = 0.5 * (view.obstacles[:, ::2] + view.obstacles[:, 1::2])
         gaps[:, :, 2] = 1.5
-        ahead = gaps - view.seen.position[:, None]
-        return {"gaps": np.einsum("nij,nkj->nki", view.seen.R_BI, ahead).reshape(-1, 9)}
+        ahead = gaps - view.observed.position[:, None]
+        return {"gaps": np.einsum("nij,nkj->nki", view.observed.R_BI, ahead).reshape(-1, 9)}
 
 
 # %%
@@ -56,7 +56,7 @@ class Slalom(quad_gym.Task):
 # kept beside this file.
 
 KEYWORDS = {
-    "custom": Slalom(),
+    "task": Slalom(),
     "world": quad_gym.WorldParams(obstacles=tuple(WALLS)),
     "action": "velocity",
     "radius": 0.01,
@@ -87,7 +87,7 @@ observations, _ = envs.reset(seed=1_000)
 batch, ways, through = envs.unwrapped.flights.batch, [], np.zeros(200, bool)
 flying = ~through
 for _ in range(399):
-    ways.append(np.where(flying[:, None], batch.read("r")[:, :2], np.nan))
+    ways.append(np.where(flying[:, None], batch.read("position")[:, :2], np.nan))
     observations, _, terminated, truncated, infos = envs.step(policy.predict(observations)[0])
     through |= flying & (infos["ending"] == "task")
     flying &= ~(terminated | truncated)

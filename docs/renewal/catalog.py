@@ -319,13 +319,13 @@ CATALOG = {
             figures=_film_and_figures("stale_race", "pace"),
         ),
         Result(
-            name="withheld",
+            name="masked",
             commands=[
-                "study stale_race --arms-file baselines/arms_withheld.py --output OUT "
+                "study stale_race --arms-file baselines/arms_masked.py --output OUT "
                 "--first-episode 100000"
             ],
             flights=("StaleRace",),
-            texts=_study("withheld"),
+            texts=_study("masked"),
         ),
         Result(
             name="outage_dash",

@@ -26,7 +26,7 @@ from quad_gym.records import (
     VELOCITY_BLOCK,
     WIDTH,
     Aid,
-    Gate,
+    GateDecision,
 )
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 
@@ -57,18 +57,18 @@ Floats = NDArray[np.float64]
 def flight_errors(batch: FlightBatch) -> Floats:
     """(count, 15) errors of a batch's filters, in the coordinates of their covariances."""
     truth = {
-        "position": batch.read("r"),
-        "velocity": batch.read("v"),
-        "R_BI": quaternion_to_dcm(batch.read("q")),
-        "accel_bias": batch.read("b_a"),
-        "gyro_bias": batch.read("b_g"),
+        "position": batch.record("r"),
+        "velocity": batch.record("v"),
+        "R_BI": quaternion_to_dcm(batch.record("q")),
+        "accel_bias": batch.record("b_a"),
+        "gyro_bias": batch.record("b_g"),
     }
     estimate = {
-        "position": batch.read("r_hat"),
-        "velocity": batch.read("v_hat"),
-        "R_BI": batch.read("R_hat"),
-        "accel_bias": batch.read("b_a_hat"),
-        "gyro_bias": batch.read("b_g_hat"),
+        "position": batch.record("r_hat"),
+        "velocity": batch.record("v_hat"),
+        "R_BI": batch.record("R_hat"),
+        "accel_bias": batch.record("b_a_hat"),
+        "gyro_bias": batch.record("b_g_hat"),
     }
     return state_error(truth, estimate)
 
@@ -84,17 +84,17 @@ def start_matched(batch: FlightBatch, seed: int) -> None:
         batch: The flights, just reset; only their estimates change.
         seed: Of the draws.
     """
-    flights, factor = batch.count, batch.read("L")
+    flights, factor = batch.count, batch.record("L")
     draws = np.random.default_rng(seed).normal(size=(flights, STATE_DIMENSION, 1))
     errors = (factor @ draws)[..., 0]
-    R_BI = quaternion_to_dcm(batch.read("q"))
+    R_BI = quaternion_to_dcm(batch.record("q"))
     R_hat = np.swapaxes(euler_to_dcm(errors[:, PARTS["attitude"]]), 1, 2) @ R_BI
     estimates = {
-        "r_hat": batch.read("r") - errors[:, PARTS["position"]],
-        "v_hat": batch.read("v") - errors[:, PARTS["velocity"]],
+        "r_hat": batch.record("r") - errors[:, PARTS["position"]],
+        "v_hat": batch.record("v") - errors[:, PARTS["velocity"]],
         "R_hat": R_hat,
-        "b_a_hat": batch.read("b_a") - errors[:, PARTS["accel_bias"]],
-        "b_g_hat": batch.read("b_g") - errors[:, PARTS["gyro_bias"]],
+        "b_a_hat": batch.record("b_a") - errors[:, PARTS["accel_bias"]],
+        "b_g_hat": batch.record("b_g") - errors[:, PARTS["gyro_bias"]],
     }
     blocks, flight = batch.snapshot(), np.arange(flights)
     for name, values in estimates.items():
@@ -287,12 +287,12 @@ class InnovationRecorder:
     def add(self, batch: FlightBatch, time: float) -> None:
         """Take in what was measured at the present instant, `time` after the start [s]."""
         names = ("position", "baseline", "velocity", "feature", "aid")
-        valid = np.column_stack([batch.read(f"{name}_valid") for name in names]) > 0.0
+        valid = np.column_stack([batch.record(f"{name}_valid") for name in names]) > 0.0
         if not valid.any():
             return
-        valid &= batch.read("gate") != Gate.UNSURE  # not made use of
-        nis, innovation = batch.read("block_nis"), batch.read("innovation")
-        white = innovation / batch.read("innovation_sigma")
+        valid &= batch.record("gate") != GateDecision.UNSURE  # not made use of
+        nis, innovation = batch.record("block_nis"), batch.record("innovation")
+        white = innovation / batch.record("innovation_sigma")
         span = min(int(np.searchsorted(self._bins, time - 1e-9, "right")), self._bins.size - 1) - 1
         for name, blocks in SENSOR_BLOCKS.items():
             seen = valid[:, blocks]

@@ -25,7 +25,7 @@ from quad_gym.params.task import TaskParams
 def endless(task: TaskParams) -> TaskParams:
     """A task in which nothing ends a flight, so that all flights last equally long."""
     return task.replace(  # type: ignore[no-any-return]
-        duration=0.0, out_of_bounds=1e9, ground=-1e9, max_tilt=math.pi
+        duration=0.0, out_of_bounds=1e9, min_height=-1e9, max_tilt=math.pi
     )
 
 
@@ -147,7 +147,7 @@ def measure_consistency(
         claimed=claimed,
         tracking=tracking.result(),
         astray=astray,
-        failed=int((batch.read("filter_status") != 0).sum()),
+        failed=int((batch.record("filter_status") != 0).sum()),
         counted_as_noise=_counted_as_noise(batch),
     )
 

@@ -105,12 +105,12 @@ def record_flights(
             over = flying & (batch.result("terminated") + batch.result("truncated") > 0.0)
             ending[over], ended_at[over] = batch.result("ending")[over], times[step]
             flying &= ~over
-        errors = batch.read("position_error")
+        errors = batch.record("position_error")
         tracking.add(errors, flying)
-        estimation.add(batch.read("estimation_error"), flying)
+        estimation.add(batch.record("estimation_error"), flying)
         if flying.any():
             percentiles[:, step] = np.percentile(errors[flying], (5.0, 95.0))
-        position[step], quaternion[step] = batch.read("r")[0], batch.read("q")[0]
+        position[step], quaternion[step] = batch.record("r")[0], batch.record("q")[0]
         error[step] = errors[0]
         row = int(np.searchsorted(samples, step))
         if estimating and samples[row] == step and flying.any():
@@ -165,14 +165,14 @@ class Tracer:
         if step == 0:
             self.control_rate = batch.clocks.control_rate
             times = np.arange(batch.max_steps + 1) / self.control_rate
-            gates = batch.read("gates", first)[:, : batch.task.gate_count]
+            gates = batch.record("gates", first)[:, : batch.task.gate_count]
             course = batch.task.kind == "waypoints"
             paths = [reference_of_flight(batch, int(i), times) for i in first]
             self._references = gates if course else np.stack(paths)
         here = flying[first, np.newaxis]
-        self._errors.append(np.where(flying, batch.read("position_error"), np.nan))
-        self._positions.append(np.where(here, batch.read("r", first), np.nan))
-        R_BI = quaternion_to_dcm(batch.read("q", first))
+        self._errors.append(np.where(flying, batch.record("position_error"), np.nan))
+        self._positions.append(np.where(here, batch.record("r", first), np.nan))
+        R_BI = quaternion_to_dcm(batch.record("q", first))
         self._headings.append(np.where(here, R_BI[:, 0, :2], np.nan))
 
     @property
@@ -212,10 +212,10 @@ class Tracer:
 def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
     """Normalized estimation error squared of the chosen flights at the present instant, (m,)."""
     names = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
-    truth: dict[str, Any] = {word: batch.read(name)[chosen] for word, name in names.items()}
-    estimate = {word: batch.read(f"{name}_hat")[chosen] for word, name in names.items()}
-    truth["R_BI"] = quaternion_to_dcm(batch.read("q")[chosen])
-    estimate["R_BI"] = batch.read("R_hat")[chosen]
+    truth: dict[str, Any] = {word: batch.record(name)[chosen] for word, name in names.items()}
+    estimate = {word: batch.record(f"{name}_hat")[chosen] for word, name in names.items()}
+    truth["R_BI"] = quaternion_to_dcm(batch.record("q")[chosen])
+    estimate["R_BI"] = batch.record("R_hat")[chosen]
     return nees(state_error(truth, estimate), batch.covariance()[chosen])
 
 
@@ -225,7 +225,7 @@ def reference_of_flight(batch: FlightBatch, flight: int, times: Floats) -> Float
     if followed is not None:
         trajectory, phase = followed
         return trajectory(times + phase)
-    omega, center = batch.read("ref_omega")[flight], batch.read("ref_center")[flight]
-    cosines, sines = batch.read("ref_cos")[flight], batch.read("ref_sin")[flight]
+    omega, center = batch.record("ref_omega")[flight], batch.record("ref_center")[flight]
+    cosines, sines = batch.record("ref_cos")[flight], batch.record("ref_sin")[flight]
     angles = omega * np.outer(times, np.arange(1, len(cosines) + 1))
     return np.asarray(center + np.cos(angles) @ cosines + np.sin(angles) @ sines)

@@ -137,7 +137,7 @@ def follow_recovery(
         errors, covariances = flight_errors(batch)[:, MOTION], batch.covariance()[:, MOTION, MOTION]
         sigma = np.sqrt(np.einsum("nii->ni", covariances))
         right[k] = nees(errors, covariances) < bound
-        told[k] = batch.read("lost") > 0.0
+        told[k] = batch.record("diverged") > 0.0
         far_off[k] = (np.abs(errors) > FAR_OFF * sigma).any(axis=1)
     time = np.array([batch.sensors.imu.dt * stride * k for k in range(1, looks + 1)])
     return Recovery(time, right, told, far_off)

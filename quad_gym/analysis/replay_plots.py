@@ -31,7 +31,7 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
     first = {"position": 0, "velocity": 3, "attitude": 6}[name]
     labels, scale = ("east", "north", "up"), 1.0
     if name == "attitude":
-        angles = dcm_to_euler(quaternion_to_dcm(result.attitude))
+        angles = dcm_to_euler(quaternion_to_dcm(result.quaternion))
         values, labels, scale = np.unwrap(angles, axis=0), ("roll", "pitch", "yaw"), 180.0 / np.pi
     else:
         values = getattr(result, name)

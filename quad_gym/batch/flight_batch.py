@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quad_gym.batch import quantities
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.following import check_trajectories, followed
 from quad_gym.batch.memory import FlightMemory
@@ -72,7 +73,7 @@ class FlightBatch(FlightMemory):
         vehicle: The vehicle, or the name of a preset.
         sensors: The sensor suite, or the name of a preset.
         gains: Gains of `Control.PD`, or the name of a preset.
-        actions: Scaling of actions and bandwidths of the inner loops.
+        action_params: Scaling of actions and bandwidths of the inner loops.
         task: Reference, start and endings.
         source: What the controller sees.
         control: What an action means; `Control.PD` flies by itself.
@@ -112,7 +113,7 @@ class FlightBatch(FlightMemory):
         vehicle: VehicleParams | str = "lab",
         sensors: SensorSuite | str = "standard",
         gains: PDGains | str = "lab",
-        actions: ActionParams | None = None,
+        action_params: ActionParams | None = None,
         task: TaskParams | None = None,
         source: Source = Source.ESTIMATE,
         control: Control = Control.PD,
@@ -138,7 +139,7 @@ class FlightBatch(FlightMemory):
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
         self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
-        self.actions = ActionParams() if actions is None else actions
+        self.action_params = ActionParams() if action_params is None else action_params
         self.task = TaskParams() if task is None else task
         self.world = world_params(world) if isinstance(world, str) else world
         self.randomization = Randomization.of(randomization)
@@ -146,7 +147,7 @@ class FlightBatch(FlightMemory):
             ("vehicle", self.vehicle, VehicleParams),
             ("sensors", self.sensors, SensorSuite),
             ("gains", self.gains, PDGains),
-            ("actions", self.actions, ActionParams),
+            ("action_params", self.action_params, ActionParams),
             ("task", self.task, TaskParams),
             ("true_vehicle", self.vehicle if true_vehicle is None else true_vehicle, VehicleParams),
             ("true_sensors", self.sensors if true_sensors is None else true_sensors, SensorSuite),
@@ -168,7 +169,7 @@ class FlightBatch(FlightMemory):
         check.choice("filter_start", filter_start, FILTER_STARTS)
         if run_filter is None:
             needed = include_std or innovations
-            run_filter = needed or self.source in (Source.ESTIMATE, Source.SENSORS)
+            run_filter = needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
         self.run_filter = check.flag("run_filter", run_filter)
         if self.task.truncate_when_diverged and not run_filter:
             raise ValueError("truncate_when_diverged needs a filter, and none runs here")
@@ -186,10 +187,10 @@ class FlightBatch(FlightMemory):
         if longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
-        check_trajectories(self.task, self.vehicle, self.actions, self.control)
+        check_trajectories(self.task, self.vehicle, self.action_params, self.control)
         check_standing(self.task, true_vehicle, self.world, draws)
-        model = params_record(self.vehicle, self.sensors, self.gains, self.actions)
-        true = params_record(true_vehicle, true_sensors, self.gains, self.actions, self.world)
+        model = params_record(self.vehicle, self.sensors, self.gains, self.action_params)
+        true = params_record(true_vehicle, true_sensors, self.gains, self.action_params, self.world)
         true["action_delay"] = self.action_delay
         self._model, self._world = params_block(model), params_block(true)
         self._own = [self._world.copy() for _ in range(self.threads)]
@@ -307,7 +308,7 @@ class FlightBatch(FlightMemory):
         """
         if not self._begun:
             self._require_begun()
-        self._actions[: self.count] = self.read("action") if actions is None else actions
+        self._actions[: self.count] = self.record("action") if actions is None else actions
         return self._run(Command.STEP)
 
     def _require_begun(self) -> None:
@@ -356,6 +357,28 @@ class FlightBatch(FlightMemory):
         self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
         threads = (self._own, self._believed, self._work)
         return Calls(self._blocks, self._room, shared, numbers, *threads, self._paths)
+
+    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """A quantity of the flights, as a new array (n, ...).
+
+        Args:
+            name: One of `quad_gym.batch.quantities.QUANTITIES`, such as "position",
+                "estimated_velocity" or "reference_position"; or a parameter that
+                `randomization` draws, such as "mass".
+            flights: Numbers of the flights; None: all of them.
+
+        Raises:
+            ValueError: If there is no such quantity, or no filter runs that would estimate it.
+        """
+        if name in self.randomization.names:
+            values = self.drawn()[name]
+            return values if flights is None else values[flights]
+        return quantities.read(self, name, flights)
+
+    @property
+    def R_IG(self) -> NDArray[np.float64]:
+        """(3, 3) from G, the frame of GNSS, to I."""
+        return np.array(self._model["R_IG"][0, ..., 0])
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the threads, which a copy makes anew."""

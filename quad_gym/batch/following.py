@@ -55,9 +55,9 @@ def followed(batch: "FlightBatch", flight: int) -> tuple[Trajectory, float] | No
     if not trajectories:
         return None
     which = np.array([flight])
-    chosen = trajectories[int(batch.read("path", which)[0])]
-    cosine, sine = batch.read("path_turn", which)[0]
+    chosen = trajectories[int(batch.record("path", which)[0])]
+    cosine, sine = batch.record("path_turn", which)[0]
     if cosine == 0.0 == sine:  # never reset
         cosine = 1.0
-    share = float(batch.read("path_share", which)[0])
+    share = float(batch.record("path_share", which)[0])
     return chosen.turned(math.atan2(sine, cosine)), share * chosen.duration * chosen.closed

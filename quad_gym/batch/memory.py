@@ -59,28 +59,24 @@ class FlightMemory:
 
     # ---- reading ------------------------------------------------------------------------------
 
-    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """One field, such as "r" or "b_a_hat", or one drawn parameter, as a new array (n, ...).
+    def record(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """A field of the records by the name that kernels have for it, as a new array (n, ...).
+
+        `FlightBatch.read` has the quantities that users need, by their public names.
 
         Args:
-            name: The field; or what is drawn for every episode, such as "mass".
-            flights: Whose, by their numbers; None: all flights'.
+            name: The field, such as "r" or "b_a_hat".
+            flights: Numbers of the flights; None: all of them.
 
         Raises:
-            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`, and no such draw.
+            ValueError: If there is no such field, see `records.FLIGHT_FIELDS`.
         """
-        if name in self.randomization.names:
-            values = self.drawn()[name]
-            return values if flights is None else values[flights]
         if name in _PARTS_OF:
             field, part = _PARTS_OF[name]
-            return self.read(field, flights)[(slice(None), *part)]
+            return self.record(field, flights)[(slice(None), *part)]
         if name not in (FLIGHT_BLOCK.names or ()):
-            drawn = ", or one of the drawn " + ", ".join(self.randomization.names)
-            raise ValueError(
-                f"name must be a field of a flight{drawn if self.randomization.names else ''}, "
-                f"got {name!r}"
-            )
+            known = check.did_you_mean(name, FLIGHT_BLOCK.names or ())
+            raise ValueError(f"name must be a field of a flight's record, got {name!r}{known}")
         if not self._room.holds(name):
             return self._unused(name, self.count if flights is None else len(flights))
         if flights is None:
@@ -95,7 +91,7 @@ class FlightMemory:
         return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
-        """What the present episodes have drawn, by name: (count,) or (count, components)."""
+        """Drawn parameters of the present episodes, by name: (count,) or (count, components)."""
         found = {}
         for name in self.randomization.names:
             values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
@@ -113,18 +109,18 @@ class FlightMemory:
         """
         count = 0 if self.sensors.camera is None else len(self.sensors.camera.features_I)
         if self._room.holds("feature_place"):
-            return np.ascontiguousarray(self.read("feature_place")[:, :count])
+            return np.ascontiguousarray(self.record("feature_place")[:, :count])
         believed = self._world if self.randomization.known else self._model
         nominal = believed["features"][0, :count, :, 0].copy()
         return np.broadcast_to(nominal, (self.count, *nominal.shape))
 
     def active_faults(self) -> dict[str, NDArray[np.bool_]]:
         """Which of the faults that can come are there now, by name: (count,) each."""
-        return named_faults(self.faults, self.read("faults"))
+        return named_faults(self.faults, self.record("faults"))
 
     def covariance(self) -> NDArray[np.float64]:
         """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
-        factor = self.read("L")
+        factor = self.record("L")
         return factor @ factor.transpose(0, 2, 1)
 
     # ---- keeping ------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ def _reference_heights(task: TaskParams) -> list[tuple[float, float]]:
         return [(task.height, task.height)]
     heights = []
     for path in task.trajectories:
-        anywhere = task.randomize and path.closed
+        anywhere = task.randomize_reference and path.closed
         z = path(path.instants(200))[:, 2] if anywhere else path(0.0)[2:3]
         heights.append((float(z.min()), float(z.max())))
     return heights

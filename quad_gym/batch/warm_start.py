@@ -104,10 +104,10 @@ def converged_covariance(
     if task.start == "ground":
         at_rest = np.zeros((FLIGHTS, 3))
         batch.reset(
-            seeds=range(FLIGHTS), position=batch.read("r") * (1.0, 1.0, 0.0), velocity=at_rest
+            seeds=range(FLIGHTS), position=batch.record("r") * (1.0, 1.0, 0.0), velocity=at_rest
         )
     batch.step(np.zeros((FLIGHTS, 4)))  # one step, as long as the whole
-    if batch.read("filter_status").any():
+    if batch.record("filter_status").any():
         raise ValueError(
             f"filter_start must be 'cold' for these sensors: the filter fails within {WARM_UP:g} s "
             "of hovering"
@@ -121,7 +121,7 @@ def converged_covariance(
         )
     states = 15 + len(slow_states(sensors).errors)
     mean = np.zeros((states, states))
-    for q, L in zip(batch.read("q"), _factors(batch), strict=True):
+    for q, L in zip(batch.record("q"), _factors(batch), strict=True):
         root = portable.product(_turned_east(q, sensors).T[:states, :states], L[:states, :states])
         mean += portable.product(root, root.T) / FLIGHTS
     return mean
@@ -129,14 +129,14 @@ def converged_covariance(
 
 def _attitude_errors(batch: Any) -> Floats:
     """(n, 3) Euler angles from the estimated to the true attitude [rad]."""
-    R_hat = batch.read("R_hat")
-    return dcm_to_euler(quaternion_to_dcm(batch.read("q")) @ R_hat.transpose(0, 2, 1))
+    R_hat = batch.record("R_hat")
+    return dcm_to_euler(quaternion_to_dcm(batch.record("q")) @ R_hat.transpose(0, 2, 1))
 
 
 def _factors(batch: Any) -> Floats:
     """(n, 24, 24) factors of the joint covariances."""
     factors = np.zeros((batch.count, MAX_STATES, MAX_STATES))
-    factors[:, :15, :15], factors[:, 15:] = batch.read("L"), batch.read("L_slow")
+    factors[:, :15, :15], factors[:, 15:] = batch.record("L"), batch.record("L_slow")
     return factors
 
 

@@ -186,7 +186,7 @@ def filter_cases(suite: SensorSuite) -> list[Case]:
     cases = [
         form("UKF", kind="ukf"),
         form("EKF", kind="ekf"),
-        form("UKF, covariance not turned", covariance_reset="none"),
+        form("UKF, covariance not turned", attitude_reset=False),
         Case("UKF, IMU sampled and held", suite.replace(imu=sampled, estimator=held)),
     ]
     if suite.camera is not None:

@@ -122,8 +122,8 @@ class Args:
     """what an IMU sample holds, in place of the form's"""
     integration: Literal["euler", "midpoint"] | None = None
     """how the filter integrates IMU samples, in place of the form's"""
-    covariance_reset: Literal["none", "turn"] | None = None
-    """whether the covariance turns with the attitude that is corrected, in place of the form's"""
+    attitude_reset: bool | None = None
+    """transform the covariance when the attitude is corrected, in place of what the form does"""
     bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
     """direction to which the filter assumes camera noise is perpendicular, in place of the
     form's"""
@@ -204,7 +204,7 @@ def suite_of(args: Args) -> SensorSuite:
         form = FilterParams() if args.form == "report" else FIELD_FILTER
         suite = suite.replace(estimator=form)
     chosen = {"kind": args.estimator} if args.estimator is not None else {}
-    for name in ("integration", "covariance_reset", "bearing_noise_at"):
+    for name in ("integration", "attitude_reset", "bearing_noise_at"):
         if getattr(args, name) is not None:
             chosen[name] = getattr(args, name)
     suite = suite.replace(
@@ -268,7 +268,7 @@ def title_of(batch: FlightBatch, args: Args) -> str:
         f"{choices.kind.upper()}, suite {args.sensors}, {args.start} start",
         f"{sensors.imu.samples} samples",
         f"{choices.integration}",
-        f"reset {choices.covariance_reset}",
+        f"attitude reset {'on' if choices.attitude_reset else 'off'}",
     ]
     if sensors.camera is not None:
         parts.append(f"feature noise across the {choices.bearing_noise_at} direction")

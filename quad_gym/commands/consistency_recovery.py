@@ -156,7 +156,7 @@ def measure(
         "values": values,
         "miss": not calm and values["silent"] > 100.0 * (1.0 - WANTED) + 1e-9,
         "expected": "" if calm else trial.expected,
-        "filters_failed": int((batch.read("filter_status") != 0).sum()),
+        "filters_failed": int((batch.record("filter_status") != 0).sum()),
         "sensors": batch.sensors,
         "task": batch.task,
         "faults": batch.faults,

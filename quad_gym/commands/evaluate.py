@@ -62,7 +62,7 @@ class Args:
     learned on them)"""
     sensors: OwnSuite = None
     env: Keywords = field(default_factory=dict)
-    """further keywords of the environment, such as camera=false gnss_rate=10"""
+    """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
     """flown in each case"""
     seed: int = 0
@@ -96,10 +96,10 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
         raise ValueError("--observation must name at least one, got none")
     if args.policy == ():
         raise ValueError("--policy must name at least one, got none")
-    if args.policy is None and "sensors" in args.observation:
+    if args.policy is None and "measurements" in args.observation:
         raise ValueError(
-            "--observation sensors shows no state, which PD control needs: name a --policy that "
-            "was trained on it"
+            "--observation measurements shows no state, which PD control needs: name a --policy "
+            "that was trained on it"
         )
     first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
     plots.require_matplotlib()

@@ -26,7 +26,7 @@ import numpy as np
 from tyro.conf import arg
 
 from baselines.policies import keywords_of_policy, load_policy
-from quad_gym import IDS, Flight, FlightRecorder, sensor_suite
+from quad_gym import IDS, Flight, FlightRecorder, SensorSuite, sensor_suite
 from quad_gym.analysis.reports import require_writable
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
@@ -60,7 +60,7 @@ class Args:
     policy: str = "pd"
     """who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for the
     task), or a file of quad-gym train (.zip or .npz)"""
-    observation: Literal["estimate", "truth", "noisy", "sensors"] = "estimate"
+    observation: Literal["estimate", "truth", "noisy", "measurements"] = "estimate"
     """what the controller sees"""
     action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] | None = None
     """what the controller commands; if not given, the task's"""
@@ -174,6 +174,16 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
     return tuple(fault.replace(start=start, duration=end - start, rate=0.0) for fault in faults)
 
 
+def suite_of(args: Args) -> SensorSuite:
+    """The sensor suite, at the rates that the options give.
+
+    Raises:
+        ValueError: If a rate is invalid, or of a sensor that the suite lacks.
+    """
+    suite = sensor_suite(sensors_of(args.env_id, args.sensors))
+    return suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate)
+
+
 def make_env(args: Args) -> Any:
     """An environment of one flight.
 
@@ -181,7 +191,7 @@ def make_env(args: Args) -> Any:
         ValueError: If an option is invalid.
     """
     args = with_full_id(args)
-    options = ("observation", "action", "sensors", "camera", "gnss_rate", "camera_rate", "duration")
+    options = ("observation", "action", "sensors", "camera", "duration")
     named = {name: f"--{name.replace('_', '-')}" for name in options}
     given = leave(args.env, {**named, "faults": "--faults"})
     keywords = {**keywords_of_policy(args.policy, args.env_id), **given}
@@ -196,9 +206,7 @@ def make_env(args: Args) -> Any:
         num_envs=1,
         autoreset_mode="Disabled",
         observation=args.observation,
-        sensors=sensors_of(args.env_id, args.sensors),
-        gnss_rate=args.gnss_rate,
-        camera_rate=args.camera_rate,
+        sensors=suite_of(args),
         duration=args.duration,
         **keywords,
     )
@@ -236,7 +244,7 @@ def in_words(flight: Flight) -> str:
     """How long a flight was and how well it went."""
     error = 1e3 * flight["position_error"].mean()
     words = f"{flight['time'][-1]:.2f} s, mean tracking error {error:.1f} mm"
-    if flight.stage.observation != "truth":
+    if flight.scene.observation != "truth":
         words += f", mean estimation error {1e3 * flight['estimation_error'].mean():.1f} mm"
     return words
 
@@ -245,7 +253,7 @@ def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switc
     """Show a flight while it is flown; return whether to go on to the next one."""
     renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
     for flight in flights:
-        waiting += 1.0 / flight.stage.control_rate / args.speed
+        waiting += 1.0 / flight.scene.control_rate / args.speed
         if waiting < 0.999 / WINDOW_RATE:
             continue
         seconds, waiting = min(waiting, 1.0), 0.0

@@ -80,7 +80,13 @@ _SPEED = Column(heading="mean speed [m/s]", of=lambda run: run.speed, digits=2)
 STUDIED: Mapping[str, StudiedTask] = {
     "look_around": StudiedTask(
         arms=ARMS_OF["look_around"],
-        carrying=("pd_reference", "pd_features", "pd_unsure", "truth", "sure"),
+        carrying=(
+            "pd_reference",
+            "pd_features",
+            "pd_features_when_uncertain",
+            "truth",
+            "std_certainty",
+        ),
         success=stays,
         meaning="flown to the end, with a mean position error below "
         f"{WITHIN:g} m in the second half",
@@ -95,8 +101,8 @@ STUDIED: Mapping[str, StudiedTask] = {
     "stale_race": StudiedTask(
         arms=ARMS_OF["stale_race"],
         carrying=(
-            *("pd", "truth", "covariance", "truth_on_truth", "truth_stamped"),
-            "covariance_stamped",
+            *("pd", "truth", "std", "truth_on_truth", "truth_stamped"),
+            "std_stamped",
         ),
         evaluations=8,
         success=lambda run: passes(run, 8),
@@ -112,9 +118,7 @@ STUDIED: Mapping[str, StudiedTask] = {
     ),
     "outage_dash": StudiedTask(
         arms=ARMS_OF["outage_dash"],
-        carrying=(
-            *("pd", "pd_slow", "pd_waiting", "truth", "estimate", "sigma", "truth_on_truth"),
-        ),
+        carrying=(*("pd", "pd_slow", "pd_waiting", "truth", "estimate", "std", "truth_on_truth"),),
         evaluations=12,
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",

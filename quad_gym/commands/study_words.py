@@ -35,10 +35,10 @@ def conclusions(results: Results) -> list[str]:
     if results.fixed() and results.trained():
         found.append(_against_rules(results, results.best(results.trained())))
     several = len(results.study.seeds) > 1
-    if several and {"estimate", "sigma"} <= set(results.trained()):
-        found.append(_of_pair(results, "sigma", "estimate"))
-    if several and {"memory", "sigma"} <= set(results.trained()):
-        found.append(_of_pair(results, "memory", "sigma"))
+    if several and {"estimate", "std"} <= set(results.trained()):
+        found.append(_of_pair(results, "std", "estimate"))
+    if several and {"std_history", "std"} <= set(results.trained()):
+        found.append(_of_pair(results, "std_history", "std"))
     if results.trained() and len(results.study.seeds) < FEW:
         wide = "so few that the intervals are wide"
         alone = "so that the intervals cover the episodes alone and say nothing of other trainings"

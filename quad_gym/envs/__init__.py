@@ -25,12 +25,12 @@ def register_all() -> None:
     """Make the ids known to Gymnasium, once."""
     for env_id, task in IDS.items():
         if env_id not in registry:
-            register(env_id, **_ENTRY_POINTS, kwargs={"task": task})  # type: ignore[arg-type]
+            register(env_id, **_ENTRY_POINTS, kwargs={"base": task})  # type: ignore[arg-type]
 
 
 def register_task(
     env_id: str,
-    custom: "Task | type[Task] | str",
+    task: "Task | type[Task] | str",
     base: str = "QuadGym/Circle-v0",
     **keywords: Any,
 ) -> None:
@@ -38,7 +38,7 @@ def register_task(
 
     Args:
         env_id: A new id, such as "Mine/Chase-v0".
-        custom: The task, see `quad_gym.Task`.
+        task: The task, see `quad_gym.Task`.
         base: The id of the environment that it changes.
         keywords: Those of `QuadEnv`, as defaults.
 
@@ -48,12 +48,12 @@ def register_task(
     check.choice("base", base, tuple(IDS))
     if env_id in IDS:
         raise ValueError(f"env_id must be a new one, got {env_id!r}")
-    kwargs = {"task": IDS[base], "custom": custom, **keywords}
+    kwargs = {"base": IDS[base], "task": task, **keywords}
     register(env_id, **_ENTRY_POINTS, kwargs=kwargs)  # type: ignore[arg-type]
 
 
 def keywords_of(env_id: str) -> dict[str, Any]:
-    """The keywords of an id, "task" among them: of one of `IDS`, or of `register_task`.
+    """The keywords of an id, "base" among them: of one of `IDS`, or of `register_task`.
 
     Raises:
         ValueError: If there is no such id.

@@ -24,12 +24,12 @@ BENCHMARKS = {
             radius=2.5,
             height=2.0,
             period=12.0,
-            randomize=True,
+            randomize_reference=True,
             duration=15.0,  # a vehicle that never looks is lost by then
             out_of_bounds=8.0,  # room to be mistaken, and to find oneself again
-            ground=-5.0,
+            min_height=-5.0,
         ),
-        {"sensors": "one_wall", "custom": "quad_gym.tasks.look_around:LookAround"},
+        {"sensors": "one_wall", "task": "quad_gym.tasks.look_around:LookAround"},
     ),
     "stale_race": Benchmark(
         TaskParams(
@@ -42,7 +42,7 @@ BENCHMARKS = {
             gate_count=8,
             gate_radius=0.6,  # some times what the measurements are off by at racing speed
         ),
-        {"sensors": "stale", "custom": "quad_gym.tasks.stale_race:StaleRace"},
+        {"sensors": "stale", "task": "quad_gym.tasks.stale_race:StaleRace"},
     ),
     "outage_dash": Benchmark(
         TaskParams(
@@ -52,7 +52,7 @@ BENCHMARKS = {
             height=4.0,
             duration=45.0,  # 27 s at the speed that is paid for, and 15 s for the longest outage
             out_of_bounds=300.0,
-            ground=0.0,
+            min_height=0.0,
         ),
         {
             "sensors": "consumer",
@@ -60,7 +60,7 @@ BENCHMARKS = {
             "control_rate": 10.0,
             "world": "slalom",
             "faults": (GnssOutage(start=(2.0, 8.0), duration=(5.0, 15.0)),),
-            "custom": "quad_gym.tasks.outage_dash:OutageDash",
+            "task": "quad_gym.tasks.outage_dash:OutageDash",
         },
     ),
 }

@@ -45,7 +45,12 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
     "circle": TaskParams(kind="circle", start="mixed"),
     "lemniscate": TaskParams(kind="lemniscate", start="hover", radius=3.0),
     "random_trajectory": TaskParams(
-        kind="random_trajectory", start="hover", radius=2.5, height=2.0, period=12.0, randomize=True
+        kind="random_trajectory",
+        start="hover",
+        radius=2.5,
+        height=2.0,
+        period=12.0,
+        randomize_reference=True,
     ),
     "waypoints": TaskParams(
         kind="waypoints", start="hover", radius=3.5, height=1.5, duration=20.0, out_of_bounds=12.0
@@ -84,13 +89,43 @@ MAX_STEPS = 10**9
 """Longest time limit in steps; a duration of 0 has none."""
 
 
+def kind_and_task(
+    task: "Task | type[Task] | str | None", base: str | None
+) -> "tuple[str, Task | type[Task] | str | None]":
+    """The kind of task that is flown, and the user's own that is laid over it, if any.
+
+    Args:
+        task: The name of a kind, a task of the user's own as `resolve_task` takes it, or None.
+        base: The kind that this is laid over; None: the one that `task` names, or the circle.
+
+    Raises:
+        ValueError: If there is no such kind, or both name one.
+    """
+    kinds = (*TASK_DEFAULTS, *BENCHMARKS)
+    kind = "circle" if base is None else check.choice("base", base, kinds)
+    if not isinstance(task, str) or ":" in task:
+        return kind, task
+    if base is None and task in kinds:
+        return task, None
+    if task in kinds:
+        raise ValueError(
+            f'task must be a quad_gym.Task, or its "module:name", where an id or base names the '
+            f"kind {kind}, got {task!r}: choose the id of {task} instead"
+        )
+    raise ValueError(
+        f'task must be one of {", ".join(kinds)}, or a quad_gym.Task, or its "module:name", got '
+        f"{task!r}{check.did_you_mean(task, kinds)}"
+    )
+
+
 class Flights:
     """The flights behind an environment, with its observation's table.
 
     Args:
-        task: One of TASK_DEFAULTS or BENCHMARKS.
+        task: A kind of task, or a task of the user's own; see `QuadEnv`.
         count: Number of flights.
         autoreset: When a flight whose episode is over begins the next one.
+        base: The kind of task that the user's own is laid over; see `QuadEnv`.
         keywords: The environment's keywords; see `QuadEnv`.
 
     Raises:
@@ -98,23 +133,33 @@ class Flights:
         ValueError: If a keyword is another task's, or its value is invalid.
     """
 
-    def __init__(self, task: str, count: int, autoreset: Autoreset, **keywords: Any) -> None:
-        check.choice("task", task, (*TASK_DEFAULTS, *BENCHMARKS))
-        self.name = task
-        defaults, own = BENCHMARKS.get(task) or (TASK_DEFAULTS[task], {})
+    def __init__(
+        self,
+        task: "Task | type[Task] | str | None",
+        count: int,
+        autoreset: Autoreset,
+        *,
+        base: str | None = None,
+        **keywords: Any,
+    ) -> None:
+        name, own_task = kind_and_task(task, base)
+        self.name = name
+        defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
         check.keywords(
             keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *INTERFACE_KEYWORDS), "environments"
         )
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
-        for name in given:
-            if ONE_TASK_KEYWORDS.get(name, defaults.kind) != defaults.kind:
+        for keyword in given:
+            if ONE_TASK_KEYWORDS.get(keyword, defaults.kind) != defaults.kind:
                 raise ValueError(
-                    f"{name} belongs to the task {ONE_TASK_KEYWORDS[name]}, and must not be given "
-                    f"for {task}"
+                    f"{keyword} belongs to the task {ONE_TASK_KEYWORDS[keyword]}, and must not be "
+                    f"given for {name}"
                 )
-            if name in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ()):
-                raise ValueError(f"{name} means nothing to the task {task}, and must not be given")
+            if keyword in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ()):
+                raise ValueError(
+                    f"{keyword} means nothing to the task {name}, and must not be given"
+                )
         self.task: TaskParams = defaults.replace(**given)
         if "pad" in given and not self.task.may_start_on_ground:
             raise ValueError(
@@ -124,6 +169,8 @@ class Flights:
             longest = max(path.duration for path in self.task.trajectories)
             self.task = self.task.replace(duration=longest)
         keywords = {**own, **keywords}
+        if own_task is not None:
+            keywords["task"] = own_task
         if "faults" in own and keywords["faults"] is own["faults"] and _runs_no_sensor(keywords):
             del keywords["faults"]  # the task's own, which nobody would notice
         steps = keywords.pop("max_episode_steps", None)
@@ -149,16 +196,12 @@ class Flights:
         privileged: bool = False,
         sensors: SensorSuite | str = "standard",
         vehicle: VehicleParams | str = "lab",
-        actions: ActionParams | None = None,
+        action_params: ActionParams | None = None,
         camera: bool = True,
-        bearing_noise_at: str | None = None,
         estimator: str | None = None,
         filter_start: str = "cold",
         control_rate: float = CONTROL_RATE,
         action_delay: float = 0.0,
-        imu_rate: float | None = None,
-        gnss_rate: float | None = None,
-        camera_rate: float | None = None,
         substeps: int = 1,
         innovations: bool = False,
         threads: int | None = None,
@@ -167,7 +210,7 @@ class Flights:
         world: WorldParams | str = "calm",
         randomization: Randomization | Mapping[str, Given] | None = None,
         faults: FaultsGiven = None,
-        custom: "Task | type[Task] | str | None" = None,
+        task: "Task | type[Task] | str | None" = None,
     ) -> None:
         check.choice("observation", observation, tuple(OBSERVATIONS))
         check.choice("action", action, tuple(ACTIONS))
@@ -182,14 +225,9 @@ class Flights:
             suite = suite.replace(camera=None)
         elif camera_is_wanted and suite.camera is None:
             raise ValueError(f"camera must not be True: the sensors {sensors!r} have none")
-        if bearing_noise_at is not None:
-            choices = suite.estimator.replace(bearing_noise_at=bearing_noise_at)
-            suite = suite.replace(estimator=choices)
         if estimator is not None:
             check.choice("estimator", estimator, ("ukf", "ekf"))
             suite = suite.replace(estimator=suite.estimator.replace(kind=estimator))
-        suite = suite.with_rates(imu=imu_rate, gnss=gnss_rate, camera=camera_rate)
-
         if true_sensors is not None:
             check.instance("true_sensors", true_sensors, SensorSuite)
         befall = faults_of(faults, suite if true_sensors is None else true_sensors)
@@ -210,7 +248,7 @@ class Flights:
         drawn = Randomization.of(randomization)
         place = world_params(world) if isinstance(world, str) else world
         check.instance("world", place, WorldParams)
-        if place.ground is None and custom is None and "start_position_I" not in drawn.names:
+        if place.ground is None and task is None and "start_position_I" not in drawn.names:
             check_pad(self.task)  # a task of one's own may say where vehicles start
         features = 0 if suite.camera is None else len(suite.camera.features_I)
         self.table: tuple[ObservationField, ...] = observation_layout(
@@ -231,14 +269,14 @@ class Flights:
             FlightBatch,
             vehicle=vehicle,
             sensors=suite,
-            actions=actions,
+            action_params=action_params,
             task=self.task,
             source=OBSERVATIONS[observation],
             control=ACTIONS[action],
             control_rate=control_rate,
             substeps=substeps,
             action_delay=action_delay,
-            layout=Layout.SENSORS if observation == "sensors" else LAYOUTS[layout],
+            layout=Layout.MEASUREMENTS if observation == "measurements" else LAYOUTS[layout],
             include_std=include_std,
             privileged=privileged,
             bounds=bounds,
@@ -250,10 +288,10 @@ class Flights:
             randomization=drawn,
             faults=befall,
         )
-        if custom is not None:
-            from quad_gym.envs.custom import with_task
+        if task is not None:
+            from quad_gym.envs.own_task import with_task
 
-            make, self.table = with_task(custom, make, self.table)
+            make, self.table = with_task(task, make, self.table)
         self.space = observation_space(self.table)
         self._split = policy_size(self.table) if privileged else None
         self.batch = make(count, autoreset=autoreset, threads=threads)

@@ -36,20 +36,20 @@ def innovations_of(batch: FlightBatch) -> dict[str, NDArray[Any]]:
     Returns:
         Arrays (n, blocks, ...): "measured" (since the last step), "innovation" and "sigma" (what
         the filter expected), three numbers each, of which a direction has two; "nis"; "gate", see
-        `quad_gym.records.Gate`; "rejections" in this episode. NaN: not measured yet.
+        `quad_gym.records.GateDecision`; "rejections" in this episode. NaN: not measured yet.
     """
     blocks = list(blocks_of(batch.sensors))
-    position, baseline = batch.read("position_fresh"), batch.read("baseline_fresh")
+    position, baseline = batch.record("position_fresh"), batch.record("baseline_fresh")
     has_velocity = batch.sensors.gnss is not None and batch.sensors.gnss.velocity_sigma is not None
-    others = batch.read("feature_fresh"), batch.read("aid_fresh")
+    others = batch.record("feature_fresh"), batch.record("aid_fresh")
     measured = np.column_stack([position, baseline, position * has_velocity, *others])
     return {
         "measured": measured[:, blocks] > 0.0,
-        "innovation": batch.read("innovation")[:, blocks],
-        "sigma": batch.read("innovation_sigma")[:, blocks],
-        "nis": batch.read("block_nis")[:, blocks],
-        "gate": batch.read("gate")[:, blocks].astype(np.int64),
-        "rejections": batch.read("rejections")[:, blocks].astype(np.int64),
+        "innovation": batch.record("innovation")[:, blocks],
+        "sigma": batch.record("innovation_sigma")[:, blocks],
+        "nis": batch.record("block_nis")[:, blocks],
+        "gate": batch.record("gate")[:, blocks].astype(np.int64),
+        "rejections": batch.record("rejections")[:, blocks].astype(np.int64),
     }
 
 
@@ -67,7 +67,7 @@ def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
 def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[np.intp]) -> None:
     """Describe the present instant of some flights instead, where `info` has faults."""
     if batch.faults:
-        now = named_faults(batch.faults, batch.read("faults", flights))
+        now = named_faults(batch.faults, batch.record("faults", flights))
         for name, values in now.items():
             infos["faults"][name][flights] = values
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -24,6 +24,9 @@ from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
 
+if TYPE_CHECKING:
+    from quad_gym.tasks import Task
+
 
 class QuadSB3VecEnv(VecEnv):
     """N flights for Stable-Baselines3, with the `Monitor`'s episode records built in.
@@ -36,7 +39,8 @@ class QuadSB3VecEnv(VecEnv):
 
     Args:
         num_envs: Number of flights.
-        task: The kind of task.
+        task: As of `QuadEnv`.
+        base: As of `QuadEnv`.
         threads: Threads to use; None: as many as there are cores.
         render_flights: Numbers of the flights that are rendered; None: all of them.
         keywords: Those of `QuadEnv`; `render_mode` may be "human" or "rgb_array".
@@ -49,8 +53,9 @@ class QuadSB3VecEnv(VecEnv):
     def __init__(
         self,
         num_envs: int,
-        task: str,
+        task: "Task | type[Task] | str | None" = None,
         *,
+        base: str | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
         **keywords: Any,
@@ -58,7 +63,9 @@ class QuadSB3VecEnv(VecEnv):
         if render_mode not in (None, "human", "rgb_array"):
             raise ValueError(f"render_mode must be human or rgb_array, got {render_mode!r}")
         look = rendering_options(keywords)
-        self.flights = Flights(task, num_envs, Autoreset.SAME_STEP, threads=threads, **keywords)
+        self.flights = Flights(
+            task, num_envs, Autoreset.SAME_STEP, base=base, threads=threads, **keywords
+        )
         self.render_mode = render_mode
         self.rendering = rendering_of(self.flights, render_mode, **look)
         self.spec: Any = None
@@ -232,11 +239,11 @@ class QuadSB3VecEnv(VecEnv):
     def _infos_of_start(self) -> list[dict[str, Any]]:
         batch = self.flights.batch
         errors: Iterable[tuple[float, float]] = zip(
-            batch.read("position_error").tolist(),
-            batch.read("estimation_error").tolist(),
+            batch.record("position_error").tolist(),
+            batch.record("estimation_error").tolist(),
             strict=True,
         )
-        drawn, more = batch.drawn(), flight_info(batch, batch.read("faults"))
+        drawn, more = batch.drawn(), flight_info(batch, batch.record("faults"))
         return [
             {
                 "position_error": p,

@@ -2,7 +2,7 @@
 
 import copy
 import inspect
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -22,10 +22,13 @@ from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
 from quad_gym.records import Autoreset
 
+if TYPE_CHECKING:
+    from quad_gym.tasks import Task
+
 _REWARD, _TERMINATED, _TRUNCATED = COLUMN["reward"], COLUMN["terminated"], COLUMN["truncated"]
 _POSITION_ERROR, _ESTIMATION_ERROR = COLUMN["position_error"], COLUMN["estimation_error"]
 _ENDING, _FILTER_STATUS = COLUMN["ending"], COLUMN["filter_status"]
-_FILTER_LOST, _GATES_PASSED, _FAULTS = (
+_FILTER_DIVERGED, _GATES_PASSED, _FAULTS = (
     COLUMN["filter_diverged"],
     COLUMN["gates_passed"],
     COLUMN["faults"],
@@ -47,7 +50,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | on a launch pad below it, rotors stopped, or hovering (`start="mixed"`) | 10 s |
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
     | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
-    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize=True`: anywhere) | hovering near the origin | 20 s |
+    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize_reference=True`: anywhere) | hovering near the origin | 20 s |
     | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; unless given, a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; unless given, 10 s |
     | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a cost of looking at them | hovering near it | 15 s |
     | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
@@ -74,7 +77,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     The body frame is that of the attitude that the controller sees. `layout="absolute"` gives
     position, velocity, rotation matrix, biases and reference in the inertial frame;
-    `observation="sensors"` gives the raw measurements of the step with flags (a measurement that
+    `observation="measurements"` gives the raw measurements of the step with flags (a measurement that
     was not taken is zero, its flag too), of the IMU the last sample and the mean over the step, and
     has that layout only.
     `quad_gym.observation_layout(...)` returns any of these tables, with bounds; observations are
@@ -143,9 +146,13 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     the body frame and the draws, each less the middle of its distribution over its spread.
 
     Args:
-        task: The kind of task; `gymnasium.make` fills it in from the id.
+        task: A task of your own, laid over that of the id (in place of the class of `LookAround`,
+            `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
+            Without an id, also the name of a kind of task, such as "hover".
+        base: The kind of task that yours is laid over; `gymnasium.make` fills it in from the id.
+            None: the circle.
         observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the
-            converged filter's errors), or "sensors".
+            converged filter's errors), or "measurements".
         action: "ctbr", "motor", "wrench", "attitude" or "velocity"; by default "velocity" on
             `OutageDash`, "ctbr" elsewhere.
         layout: "relative" or "absolute".
@@ -160,10 +167,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             block by block; a filter that gates, or any with `faults` or `truncate_when_diverged`, keeps them
             for the latter anyway.
         vehicle: A preset by name, or `VehicleParams`.
-        actions: Scales of the actions and bandwidths of the inner loops.
+        action_params: Scales of the actions and bandwidths of the inner loops.
         camera: Whether there is a camera.
-        bearing_noise_at: "predicted", "pinhole" or "measured", see `quad_gym.FilterParams`.
-            None: as the suite has it.
         estimator: "ukf" or "ekf", in place of the suite's.
         filter_start: "cold": the filter starts from its first fix, or from the mark where there is
             no GNSS; "warm": it has been running for 10 s before the episode and has converged.
@@ -172,9 +177,6 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         action_delay: How much later than commanded the vehicle carries out an action, in control
             steps (whole ticks), at most 10; 0 by default. Until the first action arrives it carries
             out zeros, which hover. `last_action` in the observation is the commanded one.
-        imu_rate: In place of the suite's [Hz].
-        gnss_rate: In place of the suite's [Hz].
-        camera_rate: In place of the suite's [Hz].
         substeps: Runge-Kutta steps in a tick.
         max_episode_steps: Time limit in steps, in place of the task's own, be it longer or shorter;
             with a `duration` given, too, the earlier of both holds.
@@ -184,11 +186,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         randomization: What is drawn for every episode: distributions by name, or `Randomization`.
         faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as
             "gnss_outage" or "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
-        keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize,
-            duration, out_of_bounds, ground, truncate_when_diverged, max_tilt, max_speed, max_acceleration,
+        keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize_reference,
+            duration, out_of_bounds, min_height, truncate_when_diverged, max_tilt, max_speed, max_acceleration,
             gate_count, gate_radius, preview, trajectory; see `quad_gym.TaskParams`.
-        custom: A task of your own, laid over that of the id (in place of the class of `LookAround`,
-            `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.
         render_size: Width and height of a frame [pixels].
@@ -209,11 +209,16 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     metadata: dict[str, Any] = RENDERING_METADATA
 
     def __init__(
-        self, task: str = "circle", *, render_mode: str | None = None, **keywords: Any
+        self,
+        task: "Task | type[Task] | str | None" = None,
+        *,
+        base: str | None = None,
+        render_mode: str | None = None,
+        **keywords: Any,
     ) -> None:
         look = rendering_options(keywords)
         keywords.setdefault("max_episode_steps", limit_asked_of_make())
-        self.flights = Flights(task, 1, Autoreset.DISABLED, threads=1, **keywords)
+        self.flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **keywords)
         self.render_mode = render_mode
         self.rendering = rendering_of(self.flights, render_mode, **look)
         self.metadata = self.metadata | {"render_fps": round(self.flights.control_rate)}
@@ -261,15 +266,15 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         if self.rendering is not None:
             self.rendering.observe(reset=True)
         return self.flights.split(observations[0]), {
-            "position_error": float(batch.read("position_error")[0]),
-            "estimation_error": float(batch.read("estimation_error")[0]),
+            "position_error": float(batch.record("position_error")[0]),
+            "estimation_error": float(batch.record("estimation_error")[0]),
             "ending": ENDINGS[0],
             "ending_code": 0,
-            "filter_status": int(batch.read("filter_status")[0]),
-            "filter_diverged": bool(batch.read("lost")[0] > 0.0),
+            "filter_status": int(batch.record("filter_status")[0]),
+            "filter_diverged": bool(batch.record("diverged")[0] > 0.0),
             "gates_passed": 0,
             **drawn_info(batch.drawn(), 0),
-            **info_of_flight(flight_info(batch, batch.read("faults")), 0),
+            **info_of_flight(flight_info(batch, batch.record("faults")), 0),
         }
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -304,7 +309,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "ending": ENDINGS[int(row[_ENDING])],
             "ending_code": int(row[_ENDING]),
             "filter_status": int(row[_FILTER_STATUS]),
-            "filter_diverged": row[_FILTER_LOST] > 0.0,
+            "filter_diverged": row[_FILTER_DIVERGED] > 0.0,
             "gates_passed": int(row[_GATES_PASSED]),
         }
         if batch.randomization.names:

@@ -153,14 +153,14 @@ def observation_layout(
     """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
 
     Args:
-        observation: The environment's `observation`; "sensors" has a layout of its own.
+        observation: The environment's `observation`; "measurements" has a layout of its own.
         layout: The environment's `layout`.
         include_std: Whether the filter's 15 standard deviations follow.
         privileged: Whether the truth ends the table; its slices go on counting, though the
             environment returns that part under a key of its own.
-        feature_count: Features of the camera, for "sensors".
-        gnss_velocity: Whether GNSS measures velocity, for "sensors".
-        aids: Barometer and magnetometer, as far as there are such, for "sensors".
+        feature_count: Features of the camera, for "measurements".
+        gnss_velocity: Whether GNSS measures velocity, for "measurements".
+        aids: Barometer and magnetometer, as far as there are such, for "measurements".
         drawn: What is drawn for every episode, see `quad_gym.Randomization`: the truth ends with
             the wind and the draws. None: in a calm world without draws it does not.
 
@@ -173,7 +173,7 @@ def observation_layout(
     check.choice("observation", observation, tuple(OBSERVATIONS))
     check.choice("layout", layout, tuple(LAYOUTS))
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
-    if observation == "sensors":
+    if observation == "measurements":
         parts = _sensor_fields(feature_count, gnss_velocity, aids)
     parts = (*parts, _LAST_ACTION)
     if include_std:

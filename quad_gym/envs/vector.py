@@ -1,6 +1,6 @@
 """`QuadVectorEnv`: many flights as a Gymnasium vector environment."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -23,6 +23,9 @@ from quad_gym.envs.single import seeds_of, with_limit
 from quad_gym.envs.spaces import action_space
 from quad_gym.records import Autoreset
 
+if TYPE_CHECKING:
+    from quad_gym.tasks import Task
+
 _MODES = {
     AutoresetMode.NEXT_STEP: Autoreset.NEXT_STEP,
     AutoresetMode.SAME_STEP: Autoreset.SAME_STEP,
@@ -41,7 +44,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
 
     Args:
         num_envs: Number of flights.
-        task: The kind of task; `gymnasium.make_vec` fills it in from the id.
+        task: As of `QuadEnv`.
+        base: As of `QuadEnv`; `gymnasium.make_vec` fills it in from the id.
         autoreset_mode: "NextStep" (default), "SameStep" or "Disabled", or the enum.
         threads: Threads to use; None: as many as there are cores.
         render_flights: Numbers of the flights that are rendered; None: all of them.
@@ -55,8 +59,9 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     def __init__(
         self,
         num_envs: int = 1,
-        task: str = "circle",
+        task: "Task | type[Task] | str | None" = None,
         *,
+        base: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         render_mode: str | None = None,
@@ -65,7 +70,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         look = rendering_options(keywords)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         mode = _MODES[self.autoreset_mode]
-        self.flights = Flights(task, num_envs, mode, threads=threads, **keywords)
+        self.flights = Flights(task, num_envs, mode, base=base, threads=threads, **keywords)
         self.num_envs = self.flights.batch.count
         self.render_mode = render_mode
         self.rendering = rendering_of(self.flights, render_mode, **look)
@@ -135,15 +140,15 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         if self.rendering is not None:
             self.rendering.observe(reset=True)
         infos: dict[str, Any] = {
-            "position_error": batch.read("position_error"),
-            "estimation_error": batch.read("estimation_error"),
+            "position_error": batch.record("position_error"),
+            "estimation_error": batch.record("estimation_error"),
             "ending": np.full(self.num_envs, ENDINGS[0], object),
             "ending_code": np.zeros(self.num_envs, np.int64),
-            "filter_status": batch.read("filter_status").astype(np.int64),
-            "filter_diverged": batch.read("lost") > 0.0,
+            "filter_status": batch.record("filter_status").astype(np.int64),
+            "filter_diverged": batch.record("diverged") > 0.0,
             "gates_passed": np.zeros(self.num_envs, np.int64),
             **self._drawn(),
-            **flight_info(batch, batch.read("faults")),
+            **flight_info(batch, batch.record("faults")),
         }
         return self.flights.split(observations), _masked(infos, mask)
 
@@ -247,8 +252,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
         """Describe the new episode instead, of the flights where one began."""
         for name in ("position_error", "estimation_error", "filter_status"):
-            infos[name][began] = self.flights.batch.read(name, began)
-        infos["filter_diverged"][began] = self.flights.batch.read("lost", began) > 0.0
+            infos[name][began] = self.flights.batch.record(name, began)
+        infos["filter_diverged"][began] = self.flights.batch.record("diverged", began) > 0.0
         infos["ending"][began], infos["ending_code"][began] = ENDINGS[0], 0
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)

@@ -24,7 +24,7 @@ class Innovations(NamedTuple):
     nis: NDArray[np.float64]
     """(n,) normalized squares, chi-square with 3, 2, 3, 2, 1 and 3 degrees of freedom"""
     gate: NDArray[np.float64]
-    """(n,) what became of them, see `quad_gym.records.Gate`"""
+    """(n,) what became of them, see `quad_gym.records.GateDecision`"""
 
 
 class Estimate:
@@ -128,7 +128,7 @@ class Estimate:
         Their NIS is twice its degrees of freedom or more, or they, or corrections of biases, have
         not been white lately.
         """
-        return bool(self._of_lane("lost") > 0.0)
+        return bool(self._of_lane("diverged") > 0.0)
 
     @property
     def nis(self) -> tuple[float, int]:
@@ -149,7 +149,7 @@ class Estimate:
 
     @property
     def gate_decisions(self) -> NDArray[np.int64]:
-        """(n,) what became of each of these, see `quad_gym.records.Gate`."""
+        """(n,) what became of each of these, see `quad_gym.records.GateDecision`."""
         return self._read("gate")[list(blocks_of(self.sensors))].astype(np.int64)
 
     @property

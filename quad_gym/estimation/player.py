@@ -291,7 +291,7 @@ class Player:
             time=time,
             position=r,
             velocity=v,
-            attitude=dcm_to_quaternion(R),
+            quaternion=dcm_to_quaternion(R),
             accel_bias=b_a,
             gyro_bias=b_g,
             sigma=sigma,

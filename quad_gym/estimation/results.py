@@ -9,7 +9,7 @@ import numpy as np
 
 from quad_gym.estimation.logs import Floats
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.records import FilterStatus, Gate
+from quad_gym.records import FilterStatus, GateDecision
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,17 +27,17 @@ class Measured:
     nis: Floats
     """(m,) normalized squares, chi-square with d degrees of freedom in a filter that is right"""
     gate: Floats
-    """(m,) what became of them, see `quad_gym.records.Gate`"""
+    """(m,) what became of them, see `quad_gym.records.GateDecision`"""
 
     @property
     def gated(self) -> Any:
         """(m,) whether they were left out, beyond the gate or as the estimate was too uncertain."""
-        return self.rejected | (self.gate == Gate.UNSURE)
+        return self.rejected | (self.gate == GateDecision.UNSURE)
 
     @property
     def rejected(self) -> Any:
         """(m,) True where they were beyond the gate."""
-        return self.gate == Gate.REJECTED
+        return self.gate == GateDecision.REJECTED
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Replay:
     """(n, 3) in I [m]"""
     velocity: Floats
     """(n, 3) in I [m/s]"""
-    attitude: Floats
+    quaternion: Floats
     """(n, 4) unit quaternions (w, x, y, z), body to inertial"""
     accel_bias: Floats
     """(n, 3) in B [m/s^2]"""
@@ -92,7 +92,7 @@ class Replay:
         names = {
             "position": self.position,
             "velocity": self.velocity,
-            "attitude": self.attitude,
+            "quaternion": self.quaternion,
             "accel_bias": self.accel_bias,
             "gyro_bias": self.gyro_bias,
         }

@@ -4,9 +4,9 @@ The archive (`.npz`, readable by `numpy.load` alone) holds
 
 | entry | what |
 |---|---|
-| `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and what the stage has in single numbers |
+| `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and what the scene has in single numbers |
 | `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.record.COLUMNS` |
-| `stage/NAME` | one float64 array per array of `quad_gym.flights.stage.Stage` |
+| `scene/NAME` | one float64 array per array of `quad_gym.flights.flight_scene.FlightScene` |
 
 A table has the same columns with one number each, vectors as `_x`, `_y`, `_z` (`_w`, `_x`, `_y`,
 `_z` for quaternions, `_1` ... where there are no axes), and in place of the covariance the square
@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import COLUMNS, Column, Flight, row_dtype
-from quad_gym.flights.stage import Stage
 
 if TYPE_CHECKING:
     import pandas
@@ -49,10 +49,10 @@ def save_flight(flight: Flight, path: Path) -> Path:
     arrays: dict[str, Any] = {
         f"columns/{c.name}": np.ascontiguousarray(flight[c.name]) for c in COLUMNS
     }
-    for field in dataclasses.fields(Stage):
-        value = getattr(flight.stage, field.name)
+    for field in dataclasses.fields(FlightScene):
+        value = getattr(flight.scene, field.name)
         if isinstance(value, np.ndarray):
-            arrays[f"stage/{field.name}"] = value
+            arrays[f"scene/{field.name}"] = value
         else:
             header[field.name] = value
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,9 +89,9 @@ def load_flight(path: Path) -> Flight:
         raise ValueError(f"{path} is not a flight, or damaged: {error}") from None
     header = _header(path, entries)
     try:
-        stage = _stage(header, entries)
-        rows = _rows(entries, len(stage.features_I))
-        return Flight(rows, stage, dict(header["about"]))
+        scene = _scene(header, entries)
+        rows = _rows(entries, len(scene.features_I))
+        return Flight(rows, scene, dict(header["about"]))
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path} is not a complete flight: {error}") from None
 
@@ -112,15 +112,15 @@ def _header(path: Path, entries: dict[str, NDArray[Any]]) -> dict[str, Any]:
     return dict(header)
 
 
-def _stage(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> Stage:
+def _scene(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> FlightScene:
     found: dict[str, Any] = {}
-    for field in dataclasses.fields(Stage):
-        value = entries.get(f"stage/{field.name}", header.get(field.name))
+    for field in dataclasses.fields(FlightScene):
+        value = entries.get(f"scene/{field.name}", header.get(field.name))
         if value is not None:
             found[field.name] = value
         elif field.default is field.default_factory is dataclasses.MISSING:
             raise ValueError(f"it lacks {field.name}")  # others came later: older files lack them
-    return Stage(**found)
+    return FlightScene(**found)
 
 
 def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
@@ -163,11 +163,11 @@ def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
 
 def _parts(column: Column, count: int) -> Sequence[str]:
     """What the numbers of a row of a column are called."""
-    if column.name == "gnss_gate":
+    if column.name == "gnss_decision":
         return "position", "baseline", "velocity"
-    if column.name in ("action", "rotor_speeds", "feature_gate"):
+    if column.name in ("action", "rotor_speeds", "feature_decision"):
         return [str(k + 1) for k in range(count)]
-    return "wxyz" if column.name.endswith("attitude") else "xyz"
+    return "wxyz" if column.name.endswith("quaternion") else "xyz"
 
 
 def write_flight_csv(flight: Flight, path: Path) -> Path:

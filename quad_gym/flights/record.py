@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.flights.stage import Stage
+from quad_gym.batch.quantities import QUANTITIES
+from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.packing.flight import params_record
 from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, Source
-from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+from quad_gym.rotations import quaternion_to_dcm
 
 if TYPE_CHECKING:
     import pandas
@@ -46,7 +47,7 @@ COLUMNS = (
     # the truth
     Column("position", (3,), "m", "I", "true position of the center of mass"),
     Column("velocity", (3,), "m/s", "I", "true velocity"),
-    Column("attitude", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
+    Column("quaternion", (4,), "-", "B to I", "true attitude, unit quaternion (w, x, y, z)"),
     Column("body_rates", (3,), "rad/s", "B", "true body rates"),
     Column("rotor_speeds", (4,), "rad/s", "-", "true rotor speeds"),
     Column("accel_bias", (3,), "m/s^2", "B", "true accelerometer bias"),
@@ -57,26 +58,27 @@ COLUMNS = (
     # the filter
     Column("estimated_position", (3,), "m", "I", "the filter's"),
     Column("estimated_velocity", (3,), "m/s", "I", "the filter's"),
-    Column("estimated_attitude", (4,), "-", "B to I", "the filter's, as a quaternion"),
+    Column("estimated_quaternion", (4,), "-", "B to I", "the filter's, as a quaternion"),
     Column("estimated_accel_bias", (3,), "m/s^2", "B", "the filter's"),
     Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's"),
     Column("covariance", (15, 15), "mixed", "mixed", "of position, velocity, attitude error, accelerometer and gyro bias"),
     Column("filter_status", (), "bits", "-", "failures of the filter so far, see `FilterStatus`"),
+    Column("filter_diverged", (), "0 or 1", "-", "whether the covariance does not explain the last innovations"),
     Column("nees", (), "-", "-", "normalized estimation error squared; 15 on average if the filter is consistent"),
     Column("nis", (), "-", "-", "normalized innovation squared of the last update"),
     Column("nis_dimension", (), "-", "-", "measurements in the last update"),
     # what the controller saw
-    Column("seen_position", (3,), "m", "I", "position that the controller believed in"),
-    Column("seen_attitude", (4,), "-", "B to I", "attitude that the controller believed in"),
+    Column("observed_position", (3,), "m", "I", "position that the controller believed in"),
+    Column("observed_quaternion", (4,), "-", "B to I", "attitude that the controller believed in"),
     # the last measurements since the row before
     Column("gyro", (3,), "rad/s", "B", "angular rate"),
     Column("accel", (3,), "m/s^2", "B", "specific force"),
     Column("gnss_position", (3,), "m", "I", "primary antenna"),
     Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
     Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
-    Column("gnss_gate", (3,), "-", "-", "what the filter made of position, baseline and velocity, see `Gate`; 0: it has no gate"),
+    Column("gnss_decision", (3,), "-", "-", "what the filter made of position, baseline and velocity, see `GateDecision`; 0: it has no gate"),
     Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's center"),
-    Column("feature_gate", (FEATURES,), "-", "-", "what the filter made of them, likewise"),
+    Column("feature_decision", (FEATURES,), "-", "-", "what the filter made of them, likewise"),
     # the task
     Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),
     Column("reference_position", (3,), "m", "I", "where the vehicle should be; on a course, the next gate"),
@@ -87,42 +89,16 @@ COLUMNS = (
 )
 # fmt: on
 
-_DIRECT = {
-    "position": "r",
-    "velocity": "v",
-    "attitude": "q",
-    "body_rates": "w",
-    "rotor_speeds": "rotor_speeds",
-    "accel_bias": "b_a",
-    "gyro_bias": "b_g",
-    "disturbance": "disturbance",
-    "wind": "wind",
-    "faults": "faults",
-    "seen_position": "r_seen",
-    "action": "action",
-    "gates_passed": "gate_next",
-    "reward": "reward",
-    "position_error": "position_error",
-    "estimation_error": "estimation_error",
-}
-"""Columns that are fields of a flight's record as they stand."""
-
-_ESTIMATED = {
-    "estimated_position": "r_hat",
-    "estimated_velocity": "v_hat",
-    "estimated_accel_bias": "b_a_hat",
-    "estimated_gyro_bias": "b_g_hat",
-    "filter_status": "filter_status",
-    "nis": "nis",
-    "nis_dimension": "nis_dimension",
-}
-"""Likewise, where a filter runs."""
+_READ = tuple(
+    column.name
+    for column in COLUMNS
+    if column.name in QUANTITIES and column.name != "reference_position"
+)
+"""Columns that a batch of flights has as they stand."""
 
 _WITH_FILTER = (
-    *_ESTIMATED,
-    *("estimated_attitude", "covariance", "nees"),
-    *("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "gnss_gate"),
-    *("pixels", "feature_gate"),
+    *(name for name in _READ if QUANTITIES[name].filtered),
+    *("covariance", "nees", "gnss_decision", "feature_decision"),
 )
 """Columns that hold NaN where no filter, and so no sensor, runs."""
 
@@ -133,13 +109,13 @@ class Flight:
 
     Args:
         rows: (n,) records with the fields of `COLUMNS`.
-        stage: Where it takes place.
+        scene: Where it takes place.
         about: What else is worth knowing, such as seed and policy; of the types of JSON. Pictures
             are titled with its "task", if it has one.
     """
 
     rows: NDArray[Any]
-    stage: Stage
+    scene: FlightScene
     about: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -235,9 +211,8 @@ class FlightRecorder:
         features = 0 if camera is None else len(camera.features_I)
         self._rows = np.zeros(256, row_dtype(features))
         self._count = 0
-        self._stage: Stage | None = None
-        model = params_record(batch.vehicle, batch.sensors)[0]
-        self._R_IG, self._model = model["R_IG"], model
+        self._scene: FlightScene | None = None
+        self._model = params_record(batch.vehicle, batch.sensors)[0]
 
     @property
     def flight(self) -> Flight:
@@ -246,78 +221,62 @@ class FlightRecorder:
         Raises:
             ValueError: If nothing was kept yet.
         """
-        if self._stage is None:
+        if self._scene is None:
             raise ValueError("there is no flight yet: reset the environment first")
-        return Flight(self._rows[: self._count], self._stage, self._about)
+        return Flight(self._rows[: self._count], self._scene, self._about)
 
     def keep(self) -> None:
         """Keep the present instant; the first of an episode begins a new flight."""
         tick = self._read("tick")
-        if tick == 0.0 or self._stage is None:
+        if tick == 0.0 or self._scene is None:
             self._rows, self._count = np.zeros_like(self._rows), 0  # earlier flights live on
-            self._stage = self._stage_of_episode()
+            self._scene = self._scene_of_episode()
         if self._count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._fill(self._rows[self._count], tick)
+        self._fill(self._rows[self._count])
         self._count += 1
 
     def _read(self, name: str) -> Any:
-        return self._batch.read(name, self._which)[0]
+        return self._batch.record(name, self._which)[0]
 
-    def _fill(self, row: Any, tick: float) -> None:
-        row["time"] = tick * self._batch.sensors.imu.dt
-        for column, name in _DIRECT.items():
-            row[column] = self._read(name)
-        assert self._stage is not None
-        row["reference_position"] = self._stage.reference(row["time"])[0]
-        if self._stage.task == "waypoints":
+    def _fill(self, row: Any) -> None:
+        runs = self._batch.run_filter
+        for name in _READ:
+            if runs or name not in _WITH_FILTER:
+                row[name] = self._batch.read(name, self._which)[0]
+        assert self._scene is not None
+        row["reference_position"] = self._scene.reference(row["time"])[0]
+        if self._scene.task == "waypoints":
             row["reference_position"] = self._read("ref_center")
-        row["seen_attitude"] = _quaternion(self._read("R_seen"))
-        if self._batch.run_filter:
-            self._fill_estimate(row)
-            self._fill_measurements(row)
+        if runs:
+            self._fill_covariance(row)
+            self._fill_decisions(row)
         else:
             for name in _WITH_FILTER:
                 row[name] = np.nan
 
-    def _fill_estimate(self, row: Any) -> None:
-        for column, name in _ESTIMATED.items():
-            row[column] = self._read(name)
+    def _fill_covariance(self, row: Any) -> None:
         factor, R_hat = self._read("L"), self._read("R_hat")
         row["covariance"] = factor @ factor.T
-        row["estimated_attitude"] = _quaternion(R_hat)
         words = ("position", "velocity", "accel_bias", "gyro_bias")
         truth = {word: row[word] for word in words}
         estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
         try:
-            truth["R_BI"] = quaternion_to_dcm(row["attitude"])
+            truth["R_BI"] = quaternion_to_dcm(row["quaternion"])
             row["nees"] = nees(state_error(truth, estimate), row["covariance"])
         except ValueError:  # a state that is not finite, or a singular covariance: nothing to say
             row["nees"] = np.nan
 
-    def _fill_measurements(self, row: Any) -> None:
-        row["gyro"], row["accel"] = self._read("gyro"), self._read("accel")
-        gnss, gate = self._batch.sensors.gnss, self._read("gate")
-        gives_velocity = gnss is not None and gnss.velocity_sigma is not None
-        for block, (column, flag, given) in enumerate(
-            (
-                ("gnss_position", "position", True),
-                ("gnss_baseline", "baseline", True),
-                ("gnss_velocity", "position", gives_velocity),
-            )
-        ):
-            # at the start nothing is "fresh" but everything has been measured
-            measured = given and self._read(f"{flag}_fresh") + self._read(f"{flag}_valid") > 0.0
-            row[column] = self._R_IG @ self._read(column) if measured else np.nan
-            row["gnss_gate"][block] = gate[block] if measured else np.nan
-        features = row["pixels"].shape[0]
-        if features:
-            seen = self._read("feature_fresh") + self._read("feature_valid") > 0.0
-            pixels = np.where(seen[:, np.newaxis], self._read("pixels"), np.nan)
-            row["pixels"] = pixels[:features]
-            row["feature_gate"] = np.where(seen, gate[FEATURE_BLOCKS:AID_BLOCKS], np.nan)[:features]
+    def _fill_decisions(self, row: Any) -> None:
+        """Decisions of the filter's gate, NaN where nothing was measured."""
+        gate = self._read("gate")
+        for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
+            row["gnss_decision"][block] = np.nan if np.isnan(row[name]).all() else gate[block]
+        seen = np.isfinite(row["pixels"]).all(axis=1)
+        decisions = gate[FEATURE_BLOCKS:AID_BLOCKS][: len(seen)]
+        row["feature_decision"] = np.where(seen, decisions, np.nan)
 
-    def _stage_of_episode(self) -> Stage:
+    def _scene_of_episode(self) -> FlightScene:
         batch, model = self._batch, self._model
         camera = batch.sensors.camera
         antennas_B, gnss = np.full((2, 3), np.nan), batch.sensors.gnss
@@ -326,7 +285,7 @@ class FlightRecorder:
         if gnss is not None and gnss.has_baseline:
             antennas_B[1] = model["antenna"] + model["baseline"]
         gate_count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
-        return Stage(
+        return FlightScene(
             task=batch.task.kind,
             observation=Source(batch.source).name.lower(),
             control_rate=batch.clocks.control_rate,
@@ -352,7 +311,7 @@ class FlightRecorder:
         )
 
     def _obstacles(self) -> Floats:
-        """(n, 9) those of the present episode, see `Stage`."""
+        """(n, 9) those of the present episode, see `FlightScene`."""
         obstacles, centers = self._batch.world.obstacles, self._read("obstacle_center")
         rows = [
             (float(o.shape), *center, *o.half_size, *o.axis)
@@ -361,7 +320,7 @@ class FlightRecorder:
         return np.array(rows).reshape(-1, 9)
 
     def _trajectory_of_episode(self) -> dict[str, Any]:
-        """The stage's fields of a trajectory, where the task follows one."""
+        """The scene's fields of a trajectory, where the task follows one."""
         found = self._batch.trajectory(int(self._which[0]))
         if found is None:
             return {}
@@ -372,8 +331,3 @@ class FlightRecorder:
             "trajectory_closed": trajectory.closed,
             "trajectory_phase": phase,
         }
-
-
-def _quaternion(R_BI: Floats) -> Floats:
-    """The quaternion of an attitude, NaN where a flight has left the finite numbers."""
-    return dcm_to_quaternion(R_BI) if np.isfinite(R_BI).all() else np.full(4, np.nan)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import STATE_DIMENSION, chi_square_band
 from quad_gym.flights.record import Flight
-from quad_gym.records import Gate, Shape
+from quad_gym.records import GateDecision, Shape
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 Floats = NDArray[np.float64]
@@ -55,14 +55,14 @@ def rerun_recording(flight: Flight) -> Any:
     rr = load_rerun()
     recording = rr.RecordingStream("quad_gym")
     log = _Log(flight, rr, recording)
-    log.stage()
+    log.scene()
     log.vehicles()
     log.reference()
     log.plots()
     if flight.estimated:
         log.estimate()
         log.fixes()
-        if flight.stage.has_camera:
+        if flight.scene.has_camera:
             log.camera()
     recording.send_blueprint(_blueprint(flight))
     return recording
@@ -87,7 +87,7 @@ class _Log:
     """Sends the columns of a flight, one entity after the other."""
 
     def __init__(self, flight: Flight, rr: Any, recording: Any) -> None:
-        self._flight, self._stage, self._rr, self._recording = flight, flight.stage, rr, recording
+        self._flight, self._scene, self._rr, self._recording = flight, flight.scene, rr, recording
 
     def _static(self, entity: str, what: Any) -> None:
         self._recording.log(entity, what, static=True, strict=True)
@@ -99,41 +99,41 @@ class _Log:
 
     # ---- the world ----------------------------------------------------------------------------
 
-    def stage(self) -> None:
+    def scene(self) -> None:
         """What stays as it is."""
-        rr, stage = self._rr, self._stage
+        rr, scene = self._rr, self._scene
         self._static("about", rr.TextDocument(self._about(), media_type=rr.MediaType.MARKDOWN))
         self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        if stage.reference_period and not len(stage.gates_I):
-            path = stage.reference(np.linspace(0.0, stage.reference_period, 81 + stage.pieces))
+        if scene.reference_period and not len(scene.gates_I):
+            path = scene.reference(np.linspace(0.0, scene.reference_period, 81 + scene.pieces))
             self._static("world/reference/path", rr.LineStrips3D([path], colors=[NEUTRAL]))
-        if len(stage.gates_I):
+        if len(scene.gates_I):
             self._static(
                 "world/gates",
                 rr.Ellipsoids3D(
-                    centers=stage.gates_I,
-                    half_sizes=np.full((len(stage.gates_I), 3), stage.gate_radius),
+                    centers=scene.gates_I,
+                    half_sizes=np.full((len(scene.gates_I), 3), scene.gate_radius),
                     colors=[REFERENCE],
-                    labels=_numbers(len(stage.gates_I)),
+                    labels=_numbers(len(scene.gates_I)),
                 ),
             )
         self._obstacles()
-        if stage.has_camera:
+        if scene.has_camera:
             self._static(
                 "world/features",
                 rr.Points3D(
-                    stage.features_I,
+                    scene.features_I,
                     radii=0.04,
                     colors=[NEUTRAL],
-                    labels=_numbers(len(stage.features_I)),
+                    labels=_numbers(len(scene.features_I)),
                 ),
             )
 
     def _obstacles(self) -> None:
         """Walls as boxes, cylinders as such, and the geofence as edges."""
-        rr, stage = self._rr, self._stage
-        is_wall = stage.obstacles[:, 0] == Shape.WALL
-        walls, cylinders = stage.obstacles[is_wall], stage.obstacles[~is_wall]
+        rr, scene = self._rr, self._scene
+        is_wall = scene.obstacles[:, 0] == Shape.WALL
+        walls, cylinders = scene.obstacles[is_wall], scene.obstacles[~is_wall]
         if len(walls):
             yaw = np.arctan2(walls[:, 8], walls[:, 7])
             zero = np.zeros_like(yaw)
@@ -157,26 +157,26 @@ class _Log:
                     fill_mode="solid",
                 ),
             )
-        if len(stage.geofence_I):
-            low, high = stage.geofence_I
+        if len(scene.geofence_I):
+            low, high = scene.geofence_I
             box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[NEUTRAL])
             self._static("world/geofence", box)
 
     def _about(self) -> str:
-        stage = self._stage
-        about = {"task": stage.task, "observation": stage.observation, **self._flight.about}
+        scene = self._scene
+        about = {"task": scene.task, "observation": scene.observation, **self._flight.about}
         rows = [f"| {name} | {json.dumps(value)} |" for name, value in about.items()]
         return "\n".join(["| | |", "|---|---|", *rows])
 
     def reference(self) -> None:
         """Where the vehicle should be, and where in the next second."""
-        rr, flight, stage = self._rr, self._flight, self._stage
+        rr, flight, scene = self._rr, self._flight, self._scene
         at = rr.Points3D.columns(positions=flight["reference_position"])
         self._static("world/reference/now", rr.Points3D.from_fields(radii=0.05, colors=[REFERENCE]))
         self._send("world/reference/now", at)
-        if stage.reference_period and not len(stage.gates_I):
+        if scene.reference_period and not len(scene.gates_I):
             ahead = flight["time"][:, np.newaxis] + np.linspace(0.0, AHEAD_SECONDS, 13)
-            strips = stage.reference(ahead.ravel()).reshape(len(flight), -1, 3)
+            strips = scene.reference(ahead.ravel()).reshape(len(flight), -1, 3)
             style = rr.LineStrips3D.from_fields(radii=0.015, colors=[REFERENCE])
             self._static("world/reference/next_second", style)
             self._send("world/reference/next_second", rr.LineStrips3D.columns(strips=strips))
@@ -185,7 +185,7 @@ class _Log:
 
     def vehicles(self) -> None:
         """The vehicle where it is, with body axes."""
-        self._body("world/truth", "position", "attitude", TRUTH)
+        self._body("world/truth", "position", "quaternion", TRUTH)
         axes = 0.42 * np.eye(3)
         arrows = self._rr.Arrows3D(vectors=axes, colors=[NEUTRAL], labels=list("xyz"))
         self._static("world/truth/axes", arrows)
@@ -194,7 +194,7 @@ class _Log:
     def estimate(self) -> None:
         """The vehicle where the filter believes it to be, and how sure it is."""
         rr, flight = self._rr, self._flight
-        self._body("world/estimate", "estimated_position", "estimated_attitude", ESTIMATE)
+        self._body("world/estimate", "estimated_position", "estimated_quaternion", ESTIMATE)
         self._trail("estimate", "estimated_position", ESTIMATE)
         good = np.isfinite(flight["covariance"]).all(axis=(1, 2))
         values, vectors = np.linalg.eigh(flight["covariance"][good, :3, :3])
@@ -210,7 +210,7 @@ class _Log:
         self._send("world/ellipsoid", columns, good)
 
     def _body(self, entity: str, position: str, attitude: str, color: tuple[int, ...]) -> None:
-        rr, flight, hubs = self._rr, self._flight, self._stage.rotor_positions_B
+        rr, flight, hubs = self._rr, self._flight, self._scene.rotor_positions_B
         good = np.isfinite(flight[position]).all(axis=1) & np.isfinite(flight[attitude]).all(axis=1)
         columns = rr.Transform3D.columns(
             translation=flight[position][good], quaternion=_xyzw(flight[attitude][good])
@@ -239,7 +239,7 @@ class _Log:
         rr, fixes = self._rr, self._flight["gnss_position"]
         measured = np.isfinite(fixes).all(axis=1)
         if measured.any():
-            refused = self._flight["gnss_gate"][measured, 0] == Gate.REJECTED
+            refused = self._flight["gnss_decision"][measured, 0] == GateDecision.REJECTED
             colors = np.where(refused[:, np.newaxis], NEUTRAL, FIX).astype(np.uint8)
             self._static("world/gnss", rr.Points3D.from_fields(radii=0.025))
             points = rr.Points3D.columns(positions=fixes[measured], colors=colors)
@@ -247,24 +247,24 @@ class _Log:
 
     def camera(self) -> None:
         """The image plane with what was measured and what the estimate predicts, and the rays."""
-        rr, flight, stage = self._rr, self._flight, self._stage
-        turn = _xyzw(dcm_to_quaternion(stage.R_CB))
+        rr, flight, scene = self._rr, self._flight, self._scene
+        turn = _xyzw(dcm_to_quaternion(scene.R_CB))
         camera = "world/truth/camera"
-        self._static(camera, rr.Transform3D(translation=stage.camera_B, quaternion=turn))
+        self._static(camera, rr.Transform3D(translation=scene.camera_B, quaternion=turn))
         self._static(
             f"{camera}/image",
             rr.Pinhole(
-                resolution=2.0 * stage.half_image,
-                focal_length=stage.focal_length,
-                principal_point=stage.half_image,
+                resolution=2.0 * scene.half_image,
+                focal_length=scene.focal_length,
+                principal_point=scene.half_image,
                 image_plane_distance=FRUSTUM_DEPTH,
                 color=RAY,
             ),
         )
-        size = float(stage.half_image[0]) / 60.0
-        R_BI = quaternion_to_dcm(np.nan_to_num(flight["estimated_attitude"], nan=1.0))
-        predicted = stage.project_features(flight["estimated_position"], R_BI)
-        inside = (np.abs(predicted) <= stage.half_image).all(axis=2)
+        size = float(scene.half_image[0]) / 60.0
+        R_BI = quaternion_to_dcm(np.nan_to_num(flight["estimated_quaternion"], nan=1.0))
+        predicted = scene.project_features(flight["estimated_position"], R_BI)
+        inside = (np.abs(predicted) <= scene.half_image).all(axis=2)
         seen = np.isfinite(flight["pixels"]).all(axis=2)
         for name, pixels, shown, color, radius in (
             ("predicted", predicted, inside, ESTIMATE, 1.6 * size),
@@ -272,14 +272,14 @@ class _Log:
         ):
             entity = f"{camera}/image/{name}"
             self._static(entity, rr.Points2D.from_fields(radii=radius, colors=[color]))
-            points = rr.Points2D.columns(positions=(pixels + stage.half_image)[shown])
+            points = rr.Points2D.columns(positions=(pixels + scene.half_image)[shown])
             self._send(entity, points.partition(shown.sum(axis=1)))
 
         eyes = flight["position"] + np.einsum(
-            "nij,i->nj", quaternion_to_dcm(flight["attitude"]), stage.camera_B
+            "nij,i->nj", quaternion_to_dcm(flight["quaternion"]), scene.camera_B
         )
         row, feature = np.nonzero(seen)
-        strips = np.stack([eyes[row], stage.features_I[feature]], axis=1)
+        strips = np.stack([eyes[row], scene.features_I[feature]], axis=1)
         self._static("world/rays", rr.LineStrips3D.from_fields(radii=0.005, colors=[RAY]))
         if len(strips):
             rays = rr.LineStrips3D.columns(strips=strips)
@@ -291,7 +291,7 @@ class _Log:
         """Errors, the filter's consistency, rotors and actions over time."""
         flight = self._flight
         self._plot("errors/tracking", flight["position_error"], TRUTH, "tracking error [m]")
-        if self._stage.observation != "truth":
+        if self._scene.observation != "truth":
             words = "estimation error [m]"
             self._plot("errors/estimation", flight["estimation_error"], ESTIMATE, words)
         if flight.estimated:
@@ -347,7 +347,7 @@ def _blueprint(flight: Flight) -> Any:
             for axis in ("east", "north", "up")
         ]
         plots.append(rrb.Tabs(*axes))
-        if flight.stage.has_camera:
+        if flight.scene.has_camera:
             image = [rrb.Spatial2DView(origin="world/truth/camera/image", name="camera")]
     plots.append(
         rrb.Tabs(

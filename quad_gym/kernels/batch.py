@@ -48,7 +48,7 @@ _EPISODE_RETURN = int(Result.EPISODE_RETURN)
 _EPISODE_ERROR_SUM = int(Result.EPISODE_ERROR_SUM)
 _GATES_PASSED = int(Result.GATES_PASSED)
 _FAULTS = int(Result.FAULTS)
-_FILTER_LOST = int(Result.FILTER_LOST)
+_FILTER_DIVERGED = int(Result.FILTER_DIVERGED)
 
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
@@ -136,7 +136,7 @@ def _write_results(call, flight, index):
     store_lanes(here + _EPISODE_ERROR_SUM * pitch, flight.episode_error)
     store_lanes(here + _GATES_PASSED * pitch, flight.gate_next)
     store_lanes(here + _FAULTS * pitch, flight.faults)
-    store_lanes(here + _FILTER_LOST * pitch, flight.lost)
+    store_lanes(here + _FILTER_DIVERGED * pitch, flight.diverged)
     block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
     status = _floats_at(here + _FILTER_STATUS * pitch, WIDTH)
     for lane in range(WIDTH):
@@ -179,7 +179,7 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
     if settings.run_filter and settings.aids > 0:
         for s in range(AIDS):
             flight.aid_fresh[s] = 0.0
-    if settings.run_filter and settings.layout == Layout.SENSORS:
+    if settings.run_filter and settings.layout == Layout.MEASUREMENTS:
         for i in range(3):
             flight.gyro_sum[i] = flight.accel_sum[i] = 0.0
     instant = flight.instant

@@ -139,7 +139,7 @@ def tick(flight, world, model, settings, work, stages, last):
     if settings.faults:
         call_stage(stages, _ADVANCE_FAULTS, flight, world, model, settings, work, 0)
     sense(flight, world, model, settings, work, stages, everyone, 0, 0 if last else 1)
-    if settings.run_filter and settings.layout == Layout.SENSORS:
+    if settings.run_filter and settings.layout == Layout.MEASUREMENTS:
         work.mask = 1.0
         call_stage(stages, _SUM_IMU, flight, world, model, settings, work, 0)
 

@@ -43,12 +43,12 @@ def params_record(
     vehicle: VehicleParams,
     sensors: SensorSuite,
     gains: PDGains | None = None,
-    actions: ActionParams | None = None,
+    action_params: ActionParams | None = None,
     world: WorldParams | None = None,
 ) -> NDArray[Any]:
     """The numbers of a vehicle, its sensors, gains and world as one scalar record, shape (1,)."""
     gains = PDGains() if gains is None else gains
-    actions = ActionParams() if actions is None else actions
+    scales = ActionParams() if action_params is None else action_params
     imu, gnss, estimator = sensors.imu, sensors.gnss, sensors.estimator
     record = np.zeros(1, PARAMS)
     p = record[0]
@@ -67,14 +67,14 @@ def params_record(
     p["gain_K"], p["gain_Kd"] = gains.attitude, gains.body_rates
 
     p["rate_bandwidth"], p["attitude_bandwidth"] = (
-        actions.rate_bandwidth,
-        actions.attitude_bandwidth,
+        scales.rate_bandwidth,
+        scales.attitude_bandwidth,
     )
     p["velocity_bandwidth"], p["velocity_scale"] = (
-        actions.velocity_bandwidth,
-        actions.velocity_scale,
+        scales.velocity_bandwidth,
+        scales.velocity_scale,
     )
-    p["rate_scale"], p["tilt_scale"] = actions.rate_scale, actions.tilt_scale
+    p["rate_scale"], p["tilt_scale"] = scales.rate_scale, scales.tilt_scale
     p["torque_scale"] = vehicle.hover_torques
 
     p["dt"], p["imu_lever_arm"] = imu.dt, imu.lever_arm_B
@@ -133,7 +133,7 @@ def params_record(
     p["sigma_kappa"] = estimator.kappa
     p["direction_floor"] = estimator.direction_variance_floor
     p["noise_at_prediction"] = estimator.bearing_noise_at != "measured"
-    p["noise_projected"] = estimator.bearing_noise_at == "pinhole"
+    p["noise_pinhole"] = estimator.bearing_noise_at == "pinhole"
     p["initial_velocity_variance"] = estimator.initial_velocity_variance
     p["initial_covariance_scale"] = estimator.initial_covariance_scale
     p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
@@ -161,7 +161,7 @@ def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int =
         form |= FilterForm.EKF
     if estimator.integration == "midpoint":
         form |= FilterForm.MIDPOINT
-    if estimator.covariance_reset == "turn":
+    if estimator.attitude_reset:
         form |= FilterForm.TURN
     if estimator.false_alarm_probability > 0.0:
         form |= FilterForm.GATE
@@ -275,11 +275,14 @@ def settings_record(
     s["include_std"], s["privileged"] = include_std, privileged
     s["autoreset"], s["run_filter"] = autoreset, run_filter
     s["task"], s["start"] = Task[task.kind.upper()], Start[task.start.upper()]
-    s["pad"], s["randomize"] = task.pad and task.may_start_on_ground, task.randomize
+    s["pad"], s["randomize_reference"] = (
+        task.pad and task.may_start_on_ground,
+        task.randomize_reference,
+    )
     s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
     s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], MAX_HARMONICS)
     s["max_steps"] = round(task.duration * clocks.control_rate)
-    s["out_of_bounds"], s["ground"] = task.out_of_bounds, task.ground
+    s["out_of_bounds"], s["min_height"] = task.out_of_bounds, task.min_height
     s["truncate_when_diverged"] = task.truncate_when_diverged
     s["least_up"] = math.cos(task.max_tilt)
     s["radius"], s["period"], s["height"] = task.radius, task.period, task.height

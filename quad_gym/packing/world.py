@@ -119,7 +119,7 @@ def pack_obstacles(s: Any, world: WorldParams) -> None:
     if world.ground is not None:
         s["grounded"], s["friction"] = True, world.ground.friction
         # the ground ends no episode but in a crash; only who has fallen through is far below it
-        s["ground"] = min(s["ground"], world.ground_height - FALLEN_THROUGH)
+        s["min_height"] = min(s["min_height"], world.ground_height - FALLEN_THROUGH)
         s["hard_speed"] = world.ground.max_touchdown_speed
         s["hard_up"] = math.cos(world.ground.max_touchdown_tilt)
     s["contacts"] = bool(world.obstacles) or world.geofence is not None

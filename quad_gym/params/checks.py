@@ -37,12 +37,31 @@ def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
 
 
 def closest(name: Any, known: Iterable[str]) -> str | None:
-    """The one of `known` that a misspelt name may stand for, whatever its case; None: none."""
+    """The one of `known` that a misspelt name may stand for, whatever its case; None: none.
+
+    A word that `name` resembles as a whole comes before one of which it resembles a part, as
+    `rate` does of `control_rate`.
+    """
     if not isinstance(name, str):
         return None
-    by_case = {word.lower(): word for word in known}
-    close = difflib.get_close_matches(name.lower(), by_case, n=1)
-    return by_case[close[0]] if close else None
+    best, found = _RESEMBLES, None
+    for word in known:
+        whole = _likeness(name, word)
+        parts = [part for part in word.split("_") if len(part) > 2]
+        part = max((_likeness(name, part) for part in parts), default=0.0)
+        likeness = max(whole, _PART * part if part >= _PART else 0.0)
+        if likeness > best:
+            best, found = likeness, word
+    return found
+
+
+_RESEMBLES, _PART = 0.6, 0.8
+"""Likeness above which a word may be meant, and at which a part of it may; a part counts less."""
+
+
+def _likeness(a: str, b: str) -> float:
+    """The likeness of two words, whatever their case: from 0 to 1, the same."""
+    return difflib.SequenceMatcher(None, a.lower(), b.lower()).ratio()
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:

@@ -19,11 +19,11 @@ class FilterParams(Checked):
     """how the prediction carries the estimate over a tick: "euler", as if the sample of its start
     held (report), or "midpoint", turning the attitude exactly and the force with the attitude
     halfway, which belongs to `ImuParams.samples` "average\""""
-    covariance_reset: str = "none"
-    """what becomes of the covariance when the mean error angles go over into the attitude: "none"
-    (report), or "turn", S^-1 P S^-T, as the error angles are counted from another attitude then. It
-    tells the two forms of the filter apart and is no knob: in the other suites it moves the NEES by
-    less than its sampling error, and errors by 1 % at most"""
+    attitude_reset: bool = False
+    """whether the covariance is transformed, S^-1 P S^-T, when the mean error angles are added to
+    the attitude, as error angles then refer to another attitude; the report's filter leaves it as
+    it is. This distinguishes the two forms of the filter and is not a tuning parameter: in the
+    other suites it moves the NEES by less than its sampling error, and errors by 1 % at most"""
     alpha: float = 1e-3
     """spread of the sigma points; laboratory"""
     beta: float = 2.0
@@ -70,9 +70,9 @@ class FilterParams(Checked):
     good camera then. GNSS has to bring such a filter home; one without GNSS takes all features, as
     it has nothing else"""
     delay_compensation: str = "retrodict"
-    """processing of delayed measurements: "retrodict" takes the estimate back to the time stamp over
-    the IMU samples since then, updates it there, and propagates it forward again; "none" ignores
-    the time stamp"""
+    """processing of delayed measurements: "retrodict" takes the estimate back to the time stamp
+    over the IMU samples since then, updates it there, and propagates it forward again; "none"
+    ignores the time stamp"""
     gravity: float = GRAVITY
     """[m/s^2] that a filter which works by itself subtracts; in flights it is the vehicle's"""
 
@@ -89,7 +89,7 @@ class FilterParams(Checked):
         self._check(check.number, "beta", least=0.0)
         self._check(check.choice, "kind", choices=("ukf", "ekf"))
         self._check(check.choice, "integration", choices=("euler", "midpoint"))
-        self._check(check.choice, "covariance_reset", choices=("none", "turn"))
+        self._check(check.flag, "attitude_reset")
         self._check(check.choice, "delay_compensation", choices=("retrodict", "none"))
         self._check(check.choice, "bearing_noise_at", choices=("measured", "predicted", "pinhole"))
         self._check(check.flag, "reuse_first_fix")

@@ -57,7 +57,7 @@ _MARKER_RANGE = 13.0
 
 FIELD_FILTER = FilterParams(
     integration="midpoint",
-    covariance_reset="turn",
+    attitude_reset=True,
     bearing_noise_at="pinhole",
     initial_covariance_scale=1.0,
     initial_tilt_sigma=0.03,  # how level vehicles stand or hover at the start of an episode

@@ -49,7 +49,7 @@ class TaskParams(Checked):
     reward_per: str = "step"
     """"step": a reward of the order of one in each step, as learning algorithms expect; "second":
     the same times the control period"""
-    randomize: bool = False
+    randomize_reference: bool = False
     """draw the reference anew each episode: phase, radius, period and sense of circle and
     lemniscate, the heading of a random trajectory and of a course of gates; a trajectory of one's
     own is turned about the vertical through the origin, and a closed one begins anywhere"""
@@ -57,7 +57,7 @@ class TaskParams(Checked):
     """time limit of an episode [s], at least half a control period; 0: none; report section 4.2"""
     out_of_bounds: float = 3.0
     """distance from the reference at which an episode ends [m]"""
-    ground: float = -0.5
+    min_height: float = -0.5
     """height at which an episode ends [m]; below 0, as a vehicle without a launch pad sinks while
     its rotors spin up. Where `WorldParams.ground` carries vehicles, at least 0.5 m below it"""
     truncate_when_diverged: bool = False
@@ -93,8 +93,8 @@ class TaskParams(Checked):
         self._check(check.positive, "radius", "height", most=FARTHEST)
         self._check(check.number, "period", least=MIN_PERIOD)
         self._check(check.number, "duration", least=0.0, most=1e9)
-        self._check(check.number, "ground")
-        self._check(check.flag, "randomize")
+        self._check(check.number, "min_height")
+        self._check(check.flag, "randomize_reference")
         self._check(check.vector, "preview", length=2)
         self._set("trajectory", checked_trajectories(self.kind, self.trajectory))
         self._check(check.whole, "gate_count")

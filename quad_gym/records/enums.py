@@ -33,7 +33,7 @@ class FilterForm(IntFlag):
     """updates process images in steps while the attitude is uncertain"""
 
 
-class Gate(IntEnum):
+class GateDecision(IntEnum):
     """What became of a block of the last measurement."""
 
     NONE = 0
@@ -52,7 +52,7 @@ class Source(IntEnum):
     TRUTH = 0
     ESTIMATE = 1
     NOISY = 2
-    SENSORS = 3
+    MEASUREMENTS = 3
 
 
 class Control(IntEnum):
@@ -152,7 +152,7 @@ class Layout(IntEnum):
 
     RELATIVE = 0
     ABSOLUTE = 1
-    SENSORS = 2
+    MEASUREMENTS = 2
 
 
 class Autoreset(IntEnum):
@@ -173,7 +173,7 @@ class Ending(IntEnum):
     BELOW_MIN_HEIGHT = 4
     LAST_GATE = 5
     FILTER_FAILED = 6
-    FILTER_LOST = 7
+    FILTER_DIVERGED = 7
     TASK = 8
     """a user's task says so, see `quad_gym.Task`"""
     COLLISION = 9

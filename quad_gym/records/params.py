@@ -112,7 +112,7 @@ PARAMS_FIELDS = (
     Field("sigma_beta", (), "-", "beta of the unscented transform"),
     Field("sigma_kappa", (), "-", "kappa of the unscented transform"),
     Field("direction_floor", (), "-", "variance added to every direction's diagonal"),
-    Field("noise_projected", (), "0 or 1", "a feature's noise is that of its pixel seen under its angle"),
+    Field("noise_pinhole", (), "0 or 1", "a feature's noise is that of its pixel seen under its angle"),
     Field("noise_at_prediction", (), "0 or 1", "a feature's noise lies across its predicted, not its measured, direction"),
     Field("initial_velocity_variance", (), "m^2/s^2", "of the filter's start"),
     Field("initial_covariance_scale", (), "-", "factor on the first fix's covariance"),

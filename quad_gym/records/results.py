@@ -18,7 +18,7 @@ class Result(IntEnum):
     EPISODE_ERROR_SUM = 9
     GATES_PASSED = 10
     FAULTS = 11
-    FILTER_LOST = 12
+    FILTER_DIVERGED = 12
 
 
 RESULTS = tuple(result.name.lower() for result in Result)

@@ -138,15 +138,15 @@ def fixed_view(flight: Flight, width: float, height: float, also: Floats | None 
         height: Of the picture [pixels].
         also: (n, 3) further points to show, in I [m].
     """
-    stage, start = flight.stage, flight["position"][0]
-    times = np.linspace(0.0, stage.reference_period or 1.0, max(64, stage.pieces // 4))
-    around = [stage.reference(times), start[np.newaxis], stage.gates_I, stage.features_I]
+    scene, start = flight.scene, flight["position"][0]
+    times = np.linspace(0.0, scene.reference_period or 1.0, max(64, scene.pieces // 4))
+    around = [scene.reference(times), start[np.newaxis], scene.gates_I, scene.features_I]
     around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # what lies below
     points = np.concatenate(around)
-    if len(stage.obstacles):  # all of them within the geofence, or else those around
+    if len(scene.obstacles):  # all of them within the geofence, or else those around
         low, high = points.min(axis=0) - AROUND, points.max(axis=0) + AROUND
-        low, high = stage.geofence_I if len(stage.geofence_I) else (low, high)
-        places = np.clip(stage.obstacles[:, 1:4], low, high)
+        low, high = scene.geofence_I if len(scene.geofence_I) else (low, high)
+        places = np.clip(scene.obstacles[:, 1:4], low, high)
         points = np.concatenate([points, places * (1.0, 1.0, 0.0), places])
     if also is not None:
         points = np.concatenate([points, also])
@@ -163,9 +163,9 @@ def chase_view(flight: Flight, width: float, height: float) -> View:
 
     It depends on the last half second alone, so a replay shows what was seen live.
     """
-    recent = flight.rows[-max(2, round(0.5 * flight.stage.control_rate)) :]
+    recent = flight.rows[-max(2, round(0.5 * flight.scene.control_rate)) :]
     here = np.array(recent["position"][-1])
-    ahead = quaternion_to_dcm(recent["attitude"])[:, 0, :2].mean(axis=0)
+    ahead = quaternion_to_dcm(recent["quaternion"])[:, 0, :2].mean(axis=0)
     heading = np.arctan2(ahead[1], ahead[0]) - np.radians(28.0)
     behind = np.array([np.cos(heading), np.sin(heading), 0.0])
     eye = here - 2.4 * behind + (0.0, 0.0, 1.15)
@@ -181,7 +181,7 @@ def course_view(flight: Flight, width: float, height: float) -> View:
     leaves the course's line is seen to leave it.
     """
     start = np.array(flight["position"][0]) * (1.0, 1.0, 0.0)
-    ahead = flight.stage.obstacles[:, 1:4].mean(axis=0) * (1.0, 1.0, 0.0) - start
+    ahead = flight.scene.obstacles[:, 1:4].mean(axis=0) * (1.0, 1.0, 0.0) - start
     ahead = ahead / np.linalg.norm(ahead)
     here = start + ((flight["position"][-1] - start) @ ahead) * ahead
     eye = here - 15.0 * ahead + (0.0, 0.0, 25.0)

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import Flight
-from quad_gym.flights.stage import Stage
-from quad_gym.records import Gate
+from quad_gym.records import GateDecision
 from quad_gym.rendering.canvas import GREY, INK, PALE, VERMILLION, WHITE, Canvas
 from quad_gym.rendering.strip import Box
 from quad_gym.rotations import quaternion_to_dcm
@@ -13,24 +13,24 @@ from quad_gym.rotations import quaternion_to_dcm
 Floats = NDArray[np.float64]
 
 
-def place_in_inset(pixels: Floats, stage: Stage, box: Box) -> Floats:
+def place_in_inset(pixels: Floats, scene: FlightScene, box: Box) -> Floats:
     """Where pixels of the camera, from its image's center, are in the inset.
 
     The image is turned upright: half a turn, where the camera's y axis points up in the body.
 
     Args:
         pixels: (..., 2).
-        stage: Of the flight.
+        scene: Of the flight.
         box: The inset, as wide and high as the image in proportion.
     """
-    turn = -1.0 if stage.R_CB[1, 2] > 0.0 else 1.0
+    turn = -1.0 if scene.R_CB[1, 2] > 0.0 else 1.0
     center = np.array([box.left + box.width / 2, box.top + box.height / 2])
-    return np.asarray(center + turn * pixels * box.width / (2.0 * stage.half_image[0]))
+    return np.asarray(center + turn * pixels * box.width / (2.0 * scene.half_image[0]))
 
 
-def inset_box(stage: Stage, right: float, top: float, width: float) -> Box:
+def inset_box(scene: FlightScene, right: float, top: float, width: float) -> Box:
     """A box in the proportions of the image, by its right edge, top and width."""
-    height = width * float(stage.half_image[1] / stage.half_image[0])
+    height = width * float(scene.half_image[1] / scene.half_image[0])
     return Box(right - width, top, width, height)
 
 
@@ -40,8 +40,8 @@ def last_image(flight: Flight) -> NDArray[np.void]:
     Where cameras are slower than control most rows have no image; if the last one held no feature,
     this is the present row.
     """
-    stage = flight.stage
-    held = max(1, round(stage.control_rate / stage.camera_rate))
+    scene = flight.scene
+    held = max(1, round(scene.control_rate / scene.camera_rate))
     rows = flight.rows[-held:]
     seen = np.flatnonzero(np.isfinite(rows["pixels"]).any(axis=(1, 2)))
     return rows[seen[-1] if seen.size else -1]
@@ -49,7 +49,7 @@ def last_image(flight: Flight) -> NDArray[np.void]:
 
 def rejected_features(row: NDArray[np.void]) -> NDArray[np.bool_]:
     """Which features of a row the filter's gate has left out, (n,)."""
-    return np.asarray(row["feature_gate"] == Gate.REJECTED)
+    return np.asarray(row["feature_decision"] == GateDecision.REJECTED)
 
 
 class Inset:
@@ -66,18 +66,18 @@ class Inset:
 
     def draw(self, flight: Flight) -> None:
         """Measured features as crosses, those that the estimate predicts as rings."""
-        canvas, box, stage, image = self._canvas, self._box, flight.stage, last_image(flight)
+        canvas, box, scene, image = self._canvas, self._box, flight.scene, last_image(flight)
         canvas.box(box.left, box.top, box.width, box.height, WHITE)
         x, y = box.left + box.width / 2, box.top + box.height / 2
         canvas.line(np.array([[box.left, y], [box.left + box.width, y]]), PALE)
         canvas.line(np.array([[x, box.top], [x, box.top + box.height]]), PALE)
         canvas.inside((box.left, box.top, box.width, box.height))
-        q = image["estimated_attitude"]
+        q = image["estimated_quaternion"]
         if np.isfinite(q).all():
-            predicted = stage.project_features(image["estimated_position"], quaternion_to_dcm(q))
-            for at in place_in_inset(predicted, stage, box):
+            predicted = scene.project_features(image["estimated_position"], quaternion_to_dcm(q))
+            for at in place_in_inset(predicted, scene, box):
                 canvas.disc(at, 6.0, VERMILLION, 1.5)
-        places, refused = place_in_inset(image["pixels"], stage, box), rejected_features(image)
+        places, refused = place_in_inset(image["pixels"], scene, box), rejected_features(image)
         canvas.crosses(places[~refused], 3.2, INK, 1.6)
         canvas.crosses(places[refused], 3.2, GREY, 1.6)
         canvas.inside(None)
@@ -97,5 +97,5 @@ class Inset:
         canvas.text(words, box.left + 4.0, top + 1.0, size, INK if seen.any() else GREY)
         if len(seen) <= 4:
             for k in np.flatnonzero(seen):
-                x, y = place_in_inset(image["pixels"][k], flight.stage, box)
+                x, y = place_in_inset(image["pixels"][k], flight.scene, box)
                 canvas.text(str(k + 1), x + 8.0, y - 6.0, self._size - 2)

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.analysis.reports import short_name
+from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import Flight
-from quad_gym.flights.stage import Stage
 from quad_gym.params import checks as check
-from quad_gym.records import FaultKind, FilterStatus, Gate
+from quad_gym.records import FaultKind, FilterStatus, GateDecision
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,
@@ -53,7 +53,7 @@ class Renderer:
         self._scene_height = round(0.765 * height)
         strip = Box(0.0, self._scene_height, width, height - self._scene_height)
         self._strip = Strip(self._canvas, strip, self._text)
-        self._stage: Stage | None = None
+        self._scene: FlightScene | None = None
         """of the flight that the kept view and background belong to"""
         self._fixed: View
 
@@ -72,8 +72,8 @@ class Renderer:
         canvas.inside((0.0, 0.0, width, self._scene_height))
         labels = scene.draw()
         inset = None
-        if flight.stage.has_camera and flight.estimated:
-            box = inset_box(flight.stage, width - 8.0, 8.0, 0.27 * width)
+        if flight.scene.has_camera and flight.estimated:
+            box = inset_box(flight.scene, width - 8.0, 8.0, 0.27 * width)
             inset = Inset(canvas, box, small)
             inset.draw(flight)
         canvas.inside(None)
@@ -96,13 +96,13 @@ class Renderer:
         width = self.size[0]
         if self.view == "chase":
             return chase_view(flight, width, self._scene_height)
-        if self._stage is not flight.stage:
+        if self._scene is not flight.scene:
             self._fixed = fixed_view(flight, width, self._scene_height)
         return self._fixed
 
     def _draw_background(self, flight: Flight, scene: Scene) -> None:
         """What does not change: of a fixed view everything, of a chase the strip."""
-        known, moves = self._stage is flight.stage, self.view == "chase"
+        known, moves = self._scene is flight.scene, self.view == "chase"
         if known:
             self._canvas.show_background(self._scene_height if moves else 0.0)
         if moves or not known:
@@ -110,30 +110,29 @@ class Renderer:
             scene.draw_background()
             self._canvas.inside(None)
         if not known:
-            stage = flight.stage
-            self._strip.draw_background(stage.hover_rotor_speed / stage.max_rotor_speed)
+            flown = self._scene = flight.scene
+            self._strip.draw_background(flown.hover_rotor_speed / flown.max_rotor_speed)
             self._canvas.keep_background()
-            self._stage = stage
 
     def _write_legend(self, flight: Flight) -> None:
         """What, when, what the colors mean, and what is wrong, in the upper left corner."""
-        canvas, stage, now = self._canvas, flight.stage, flight.rows[-1]
+        canvas, scene, now = self._canvas, flight.scene, flight.rows[-1]
         large, small = self._text + 2, self._text - 1
-        name = str(flight.about.get("task", stage.task)).replace("_", " ")
-        title = f"{name} on {_SEEN[stage.observation]}"
-        aim = "reference, next second" if stage.reference_period else "reference"
-        aim = "next gate" if len(stage.gates_I) else aim
+        name = str(flight.about.get("task", scene.task)).replace("_", " ")
+        title = f"{name} on {_SEEN[scene.observation]}"
+        aim = "reference, next second" if scene.reference_period else "reference"
+        aim = "next gate" if len(scene.gates_I) else aim
         entries: list[tuple[str, Color]] = [(aim, GREEN), ("truth", BLUE)]
         if flight.estimated:
             scale = ellipsoid_scale(flight)
             size = "3-sigma ellipsoid, true size"
             size = size if scale == 1.0 else f"3-sigma ellipsoid, error, drawn x {scale:g}"
             entries += [("estimate", VERMILLION), (size, VERMILLION)]
-            if stage.has_gnss:
-                refused = (flight.rows["gnss_gate"][:, 0] == Gate.REJECTED).any()
+            if scene.has_gnss:
+                refused = (flight.rows["gnss_decision"][:, 0] == GateDecision.REJECTED).any()
                 words = "GNSS fix (gray: rejected)" if refused else "GNSS fix"
                 entries.append((words, PURPLE))
-        elif stage.observation == "noisy":
+        elif scene.observation == "noisy":
             entries.append(("what the controller sees", VERMILLION))
         policy, warnings = flight.about.get("policy"), self._warnings(flight)
         flown_by = [f"flown by {short_name(str(policy))}"] if policy else []
@@ -171,7 +170,7 @@ class Renderer:
             return found
         fixes = np.flatnonzero(np.isfinite(rows["gnss_position"][:, 0]))
         age = now["time"] - rows["time"][fixes[-1]] if fixes.size else now["time"]
-        if flight.stage.has_gnss and age > STALE_FIX:
+        if flight.scene.has_gnss and age > STALE_FIX:
             found.append(f"no GNSS fix for {age:.1f} s")
         if now["filter_status"] != 0:
             names = [str(s.name).lower() for s in FilterStatus if s & int(now["filter_status"])]
@@ -194,7 +193,7 @@ _SEEN = {
     "truth": "the truth",
     "estimate": "the estimate",
     "noisy": "noisy truth",
-    "sensors": "raw sensors",
+    "measurements": "raw measurements",
 }
 
 

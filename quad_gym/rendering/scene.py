@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.flights.record import Flight
-from quad_gym.records import Gate
+from quad_gym.records import GateDecision
 from quad_gym.rendering.canvas import (
     BLUE,
     GREEN,
@@ -73,7 +73,7 @@ def ellipsoid_scale(flight: Flight) -> float:
 
     It depends on the largest standard deviation of the last seconds, so it changes seldom.
     """
-    recent = flight.rows[-max(1, round(SCALE_SECONDS * flight.stage.control_rate)) :]
+    recent = flight.rows[-max(1, round(SCALE_SECONDS * flight.scene.control_rate)) :]
     variances = np.diagonal(recent["covariance"][:, :3, :3], axis1=1, axis2=2)
     variances = variances[np.isfinite(variances)]
     largest = SIGMAS * np.sqrt(variances.max()) if variances.size else 0.0
@@ -104,16 +104,16 @@ class Scene:
     ) -> None:
         self._canvas, self._flight, self._view, self._moving = canvas, flight, view, moving
         self._magnified, self._spacing = magnified, spacing
-        self._stage, self._now = flight.stage, flight.rows[-1]
-        self._R_BI = self._attitude("attitude")
+        self._scene, self._now = flight.scene, flight.rows[-1]
+        self._R_BI = self._attitude("quaternion")
         self.labels: list[Label] = []
 
     def draw_background(self) -> None:
         """Draw what stays as it is during a flight: ground, axes, and a path that does not move."""
         self._ground()
-        stage = self._stage
-        if stage.reference_period and not len(stage.gates_I):
-            self._path(stage.reference(np.linspace(0.0, stage.reference_period, 1 + stage.pieces)))
+        scene = self._scene
+        if scene.reference_period and not len(scene.gates_I):
+            self._path(scene.reference(np.linspace(0.0, scene.reference_period, 1 + scene.pieces)))
 
     def draw(self) -> list[Label]:
         """Draw the rest from back to front; return the labels to write when all is drawn."""
@@ -139,7 +139,7 @@ class Scene:
         view, canvas = self._view, self._canvas
         n = GRID_HALF_SIZE
         shift = np.zeros(3)
-        wide = bool((np.abs(self._stage.obstacles[:, 1:3]) > n).any())
+        wide = bool((np.abs(self._scene.obstacles[:, 1:3]) > n).any())
         if self._moving or wide:  # over a plane without an end, with the grid around the vehicle
             shift[:2] = self._spacing * np.round(self._now["position"][:2] / self._spacing)
             canvas.clear(SKY, bottom=view.horizon)
@@ -156,15 +156,15 @@ class Scene:
         canvas.segments(view.segments(origin, tips), GREY, 1.6)
 
     def _reference(self) -> None:
-        stage, view, canvas = self._stage, self._view, self._canvas
+        scene, view, canvas = self._scene, self._view, self._canvas
         now = float(self._now["time"])
-        if len(stage.gates_I):
+        if len(scene.gates_I):
             first = int(self._now["gates_passed"])
-            self._path(np.concatenate([self._now["position"][np.newaxis], stage.gates_I[first:]]))
+            self._path(np.concatenate([self._now["position"][np.newaxis], scene.gates_I[first:]]))
             return
-        if stage.reference_period:
+        if scene.reference_period:
             ahead = np.linspace(now, now + AHEAD_SECONDS, 24)
-            canvas.line(view.project(stage.reference(ahead))[0], GREEN, 3.0)
+            canvas.line(view.project(scene.reference(ahead))[0], GREEN, 3.0)
         at, _ = view.project(self._now["reference_position"])
         canvas.disc(at, 5.0, WHITE)
         canvas.disc(at, 5.0, GREEN, 2.0)
@@ -175,12 +175,12 @@ class Scene:
     def _gates(self) -> None:
         view, canvas = self._view, self._canvas
         passed = int(self._now["gates_passed"])
-        for k, gate in enumerate(self._stage.gates_I):
+        for k, gate in enumerate(self._scene.gates_I):
             color = PALE if k < passed else GREEN if k == passed else GREY
-            sphere = self._stage.gate_radius * np.eye(3)
+            sphere = self._scene.gate_radius * np.eye(3)
             outline = ellipsoid_outline(gate, sphere, view)
             foot = np.array([[gate[0], gate[1], 0.0]])
-            top = (gate - (0.0, 0.0, self._stage.gate_radius))[np.newaxis]
+            top = (gate - (0.0, 0.0, self._scene.gate_radius))[np.newaxis]
             canvas.segments(view.segments(foot, top), color)
             if k == passed:
                 canvas.polygon(outline, color, 0.15)
@@ -196,7 +196,7 @@ class Scene:
         view, canvas = self._view, self._canvas
         far = np.linalg.norm(self._now["position"] - view.eye)
         chosen = []
-        for obstacle in self._stage.obstacles:
+        for obstacle in self._scene.obstacles:
             faces = faces_of(obstacle, view.eye)
             # a wall is long: the point of it that is nearest to the eye counts
             distance = min(float(np.linalg.norm(face - view.eye, axis=1).min()) for face in faces)
@@ -212,7 +212,7 @@ class Scene:
 
     def _fence(self) -> None:
         """Draw the edges of the geofence."""
-        fence = self._stage.geofence_I
+        fence = self._scene.geofence_I
         if len(fence):
             corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
             places = np.where(corners == 0, fence[0], fence[1])
@@ -228,7 +228,7 @@ class Scene:
 
     def _trail(self, column: str) -> Floats:
         """Pixels of the last seconds of a position, thinned out evenly."""
-        count, wanted = len(self._flight.rows), round(TRAIL_SECONDS * self._stage.control_rate)
+        count, wanted = len(self._flight.rows), round(TRAIL_SECONDS * self._scene.control_rate)
         stride = -(-wanted // TRAIL_POINTS)
         # rows are counted from the flight's start, so that a trail does not flicker
         first = -(-max(0, count - wanted) // stride) * stride
@@ -243,14 +243,14 @@ class Scene:
     # ---- sensors ------------------------------------------------------------------------------
 
     def _camera(self) -> None:
-        stage, view, canvas = self._stage, self._view, self._canvas
-        if not stage.has_camera:
+        scene, view, canvas = self._scene, self._view, self._canvas
+        if not scene.has_camera:
             return
         if not self._flight.estimated:  # nothing measures, but the features stand there
-            self._features(np.zeros(len(stage.features_I), bool))
+            self._features(np.zeros(len(scene.features_I), bool))
             return
         r_I = self._now["position"]
-        corners = stage.frustum_corners(r_I, self._R_BI, FRUSTUM_DEPTH)
+        corners = scene.frustum_corners(r_I, self._R_BI, FRUSTUM_DEPTH)
         apex = np.repeat(corners[:1], 4, axis=0)
         image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
         if len(image) == 4 and not self._moving:  # from near it would cover what lies behind
@@ -258,7 +258,7 @@ class Scene:
         canvas.segments(view.segments(apex, corners[1:]), LIGHT_BLUE)
         canvas.segments(image, LIGHT_BLUE, 1.3)
         seen = np.isfinite(last_image(self._flight)["pixels"]).all(axis=1)
-        features = stage.features_I
+        features = scene.features_I
         if seen.any():
             eye = np.repeat(corners[:1], seen.sum(), axis=0)
             canvas.segments(view.segments(eye, features[seen]), LIGHT_BLUE, 1.4)
@@ -266,7 +266,7 @@ class Scene:
 
     def _features(self, seen: NDArray[np.bool_]) -> None:
         canvas = self._canvas
-        places = self._view.project(self._stage.features_I)[0]
+        places = self._view.project(self._scene.features_I)[0]
         for at, visible in zip(places, seen, strict=True):
             if np.isfinite(at).all():
                 x, y = at
@@ -274,14 +274,14 @@ class Scene:
                 canvas.box(x - 4.0, y - 4.0, 8.0, 8.0, INK, 1.2)
 
     def _fixes(self) -> None:
-        rows = self._flight.rows[-max(1, round(FIX_SECONDS * self._stage.control_rate)) :]
+        rows = self._flight.rows[-max(1, round(FIX_SECONDS * self._scene.control_rate)) :]
         fixes = rows["gnss_position"]
         measured = np.isfinite(fixes[:, 0])
         if not measured.any():
             return
         ages = self._now["time"] - rows["time"][measured]
         places = self._view.project(fixes[measured])[0]
-        refused = rows["gnss_gate"][measured, 0] == Gate.REJECTED
+        refused = rows["gnss_decision"][measured, 0] == GateDecision.REJECTED
         stride = -(-len(places) // 40)
         old = ages > 0.5 * FIX_SECONDS
         for color, which in ((PALE_PURPLE, old), (PURPLE, ~old), (GREY, refused)):
@@ -289,7 +289,7 @@ class Scene:
             self._canvas.crosses(places[chosen][::stride], 2.6, color, 1.3)
         color = GREY if refused[-1] else PURPLE
         self._canvas.crosses(places[-1:], 4.0, color, 2.0)
-        if ages[-1] < 0.3 and len(places) < 0.5 * FIX_SECONDS * self._stage.control_rate:
+        if ages[-1] < 0.3 and len(places) < 0.5 * FIX_SECONDS * self._scene.control_rate:
             radius = 6.0 + 40.0 * float(ages[-1])
             self._canvas.disc(places[-1], radius, color, 1.5)  # a ripple, where fixes are few
 
@@ -300,11 +300,11 @@ class Scene:
         return quaternion_to_dcm(q) if np.isfinite(q).all() else np.eye(3)
 
     def _estimate(self) -> None:
-        believed = self._flight["seen_position"][-1]
-        attitude = "seen_attitude"
+        believed = self._flight["observed_position"][-1]
+        attitude = "observed_quaternion"
         if self._flight.estimated:
-            believed, attitude = self._now["estimated_position"], "estimated_attitude"
-        elif self._stage.observation != "noisy":
+            believed, attitude = self._now["estimated_position"], "estimated_quaternion"
+        elif self._scene.observation != "noisy":
             return
         if not np.isfinite(believed).all():
             return
@@ -330,8 +330,8 @@ class Scene:
 
     def _body(self, r_I: Floats, R_BI: Floats, ghost: bool) -> None:
         """Arms and rotors; a ghost is drawn in outline."""
-        view, canvas, stage = self._view, self._canvas, self._stage
-        hubs_B = stage.rotor_positions_B
+        view, canvas, scene = self._view, self._canvas, self._scene
+        hubs_B = scene.rotor_positions_B
         hubs = r_I + hubs_B @ R_BI
         thickness = float(np.clip(0.035 * view.scale_at(r_I), 1.6, 6.0))
         color = VERMILLION if ghost else BLUE
@@ -341,7 +341,7 @@ class Scene:
             canvas.segments(arms, color, 1.2)
         else:
             canvas.segments(arms, INK, thickness)
-        speeds = np.nan_to_num(self._now["rotor_speeds"]) / stage.max_rotor_speed
+        speeds = np.nan_to_num(self._now["rotor_speeds"]) / scene.max_rotor_speed
         discs = view.project(hubs[:, np.newaxis] + (ROTOR_RADIUS * _RING) @ R_BI)[0]
         for disc, hub_B, speed in zip(discs, hubs_B, speeds, strict=True):
             front = hub_B[0] > 1e-9

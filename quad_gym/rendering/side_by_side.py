@@ -146,9 +146,9 @@ class _Half:
         labels = scene.draw()
         self._mark(flight, view)
         inset = None
-        if flight.stage.has_camera and self._side.course is None:
+        if flight.scene.has_camera and self._side.course is None:
             self._wedge(flight, view)
-            inset = Inset(canvas, inset_box(flight.stage, width - 8.0, box.top + 8.0, 118.0), 15)
+            inset = Inset(canvas, inset_box(flight.scene, width - 8.0, box.top + 8.0, 118.0), 15)
             inset.draw(flight)
         canvas.inside(None)
         canvas.box(0.0, 0.0, width, _BAND, self._tint)
@@ -170,7 +170,7 @@ class _Half:
     @property
     def _moves(self) -> bool:
         """Whether the view goes along, as a course of obstacles is too long for one picture."""
-        return len(self._side.flight.stage.obstacles) > 0
+        return len(self._side.flight.scene.obstacles) > 0
 
     def _view(self, flight: Flight) -> View:
         box = self._scene
@@ -193,8 +193,8 @@ class _Half:
     def _wedge(self, flight: Flight, view: View) -> None:
         """Draw the level slice of what the camera sees, as far as WEDGE."""
         now = flight.rows[-1]
-        R_BI = quaternion_to_dcm(now["attitude"])
-        apex, a, b, c, d = flight.stage.frustum_corners(now["position"], R_BI, WEDGE)
+        R_BI = quaternion_to_dcm(now["quaternion"])
+        apex, a, b, c, d = flight.scene.frustum_corners(now["position"], R_BI, WEDGE)
         outline = view.outline(np.stack([apex, (a + d) / 2, (b + c) / 2]))
         self._canvas.polygon(outline, LIGHT_BLUE, 0.25)
         self._canvas.line(outline, LIGHT_BLUE, 1.0, closed=True)
@@ -213,11 +213,11 @@ class _Half:
 
     def _write_legend(self, flight: Flight) -> None:
         """What the colors mean, and what is wrong, in the scene's upper left corner."""
-        canvas, stage = self._canvas, flight.stage
+        canvas, scene = self._canvas, flight.scene
         entries: list[tuple[str, Color]] = [("truth", BLUE), ("estimate, 3 sigma", VERMILLION)]
         if not self._moves:
-            entries.append(("next gate" if len(stage.gates_I) else "reference", GREEN))
-        if stage.has_gnss:
+            entries.append(("next gate" if len(scene.gates_I) else "reference", GREEN))
+        if scene.has_gnss:
             entries.append(("GNSS fix", PURPLE))
         step = canvas.line_height(_SMALL) + 2
         top = _BAND + 6.0

@@ -15,7 +15,7 @@ def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:
     """The faces of an obstacle that are turned to the eye.
 
     Args:
-        obstacle: (9,) a row of `Stage.obstacles`.
+        obstacle: (9,) a row of `FlightScene.obstacles`.
         eye: (3,) in I [m].
 
     Returns:

@@ -94,7 +94,7 @@ def shows(flight: Flight, column: str) -> bool:
     """Whether a curve has anything to say: on the truth, nothing is estimated."""
     if column == "nees":
         return flight.estimated
-    return column != "estimation_error" or flight.stage.observation != "truth"
+    return column != "estimation_error" or flight.scene.observation != "truth"
 
 
 class Strip:
@@ -138,11 +138,11 @@ class Strip:
 
     def draw(self, flight: Flight) -> None:
         """Draw the curves and the rotors."""
-        rows = flight.rows[-max(2, round(WINDOW_SECONDS * flight.stage.control_rate)) :]
+        rows = flight.rows[-max(2, round(WINDOW_SECONDS * flight.scene.control_rate)) :]
         for plot, place in zip(PLOTS, self._boxes, strict=True):
             self._draw_curves(plot, place, flight, rows)
         canvas, place = self._canvas, self._rotors
-        speeds = flight.rows["rotor_speeds"][-1] / flight.stage.max_rotor_speed
+        speeds = flight.rows["rotor_speeds"][-1] / flight.scene.max_rotor_speed
         for k, speed in enumerate(np.clip(np.nan_to_num(speeds), 0.0, 1.0)):
             left, height = place.left + (k + 0.25) * place.width / 4, speed * place.height
             canvas.box(left, place.top + place.height - height, 0.125 * place.width, height, BLUE)
@@ -184,7 +184,7 @@ class Strip:
             value = float(flight.rows[-1][column])
             number = f"{value:.0f}" if plot is CONSISTENCY else format_length(value)
             words = f"{name} {'-' if np.isnan(value) else number}"
-            if plot is ERRORS and column == "position_error" and len(flight.stage.gates_I):
+            if plot is ERRORS and column == "position_error" and len(flight.scene.gates_I):
                 words = f"to the gate {number}"
             if plot is ERRORS and column == "estimation_error" and roomy:
                 words += " error"

@@ -37,7 +37,7 @@ class TaskBatch(ReadableBatch):
 
     Args:
         count: Number of flights.
-        custom: The task.
+        own_task: The task.
         parts: What its `observe` returns, by name; None: it is not asked.
         split: Where that stands in an observation: after so many shipped numbers.
         kept: Which of these stay; None: all.
@@ -52,7 +52,7 @@ class TaskBatch(ReadableBatch):
         self,
         count: int,
         *,
-        custom: Task,
+        own_task: Task,
         parts: Mapping[str, Part] | None = None,
         split: int = 0,
         kept: Sequence[int] | None = None,
@@ -62,16 +62,16 @@ class TaskBatch(ReadableBatch):
         self._in_kernel = autoreset == Autoreset.NEXT_STEP
         mode = Autoreset.NEXT_STEP if self._in_kernel else Autoreset.DISABLED
         super().__init__(count, autoreset=mode, **keywords)
-        self.custom = custom
-        self.methods = frozenset(method for method in METHODS if custom.has(method))
+        self.own_task = own_task
+        self.methods = frozenset(method for method in METHODS if own_task.has(method))
         self._same_step = autoreset == Autoreset.SAME_STEP
         self._split, self._joiner = split, None
         if parts is not None and "observe" in self.methods:
             self._joiner = Joiner(self.count, parts, self._low.size, split, kept)
         self.period = 1.0 / self.clocks.control_rate
         self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
-        self._state = State(self.count, custom.state)
-        self._counts_gates = "gates_passed" in custom.state
+        self._state = State(self.count, own_task.state)
+        self._counts_gates = "gates_passed" in own_task.state
         self._failed: Truths | None = None  # None: no flight has failed
         self._began_in_step: Truths = np.zeros(self.count, bool)
         self.began: Truths = self._began_in_step
@@ -125,7 +125,7 @@ class TaskBatch(ReadableBatch):
         """
         if self._failed is not None:
             raise check.NotResetError(
-                f"call reset() before step(): a method of {label(self.custom)} has failed for "
+                f"call reset() before step(): a method of {label(self.own_task)} has failed for "
                 f"{answers.flights_named(np.flatnonzero(self._failed))}"
             )
         if not self._begun:
@@ -171,11 +171,11 @@ class TaskBatch(ReadableBatch):
             shipped = self._begin(self._began_in_step, {}, shipped)
         if "update" in self.methods:
             with self._writing(~self.began, _UPDATE_DRAWS) as rng:
-                answers.ask(self.custom, "update", self.view, rng)
+                answers.ask(self.own_task, "update", self.view, rng)
         self._judge()
         observations = self._observed(shipped)
-        if self._joiner and self.custom.privileged:
-            self.view.shipped.read()
+        if self._joiner and self.own_task.privileged:
+            self.view.builtin.read()
         ended = self._settle()
         if ended and self._same_step:
             over = self.result("terminated") + self.result("truncated") > 0.0
@@ -195,10 +195,10 @@ class TaskBatch(ReadableBatch):
         if "reset" not in self.methods:
             return shipped
         with self._writing(chosen, _RESET_DRAWS) as rng:
-            start = answers.ask(self.custom, "reset", self.view, rng)
+            start = answers.ask(self.own_task, "reset", self.view, rng)
         if start is not None:
             shipped = self._begin_again(
-                chosen, starts(self.custom, start, chosen, given, self.task, self.world)
+                chosen, starts(self.own_task, start, chosen, given, self.task, self.world)
             )
         return shipped
 
@@ -218,20 +218,20 @@ class TaskBatch(ReadableBatch):
 
     def _judge(self) -> None:
         """Ask for reward and endings, and keep the answers."""
-        custom, view, methods, count = self.custom, self.view, self.methods, self.count
+        own_task, view, methods, count = self.own_task, self.view, self.methods, self.count
         if "reward" in methods:
-            self._rewards[:] = answers.reward(custom, view, count)
+            self._rewards[:] = answers.reward(own_task, view, count)
         if "terminated" in methods:
-            self._terminated[:] = answers.truths(custom, "terminated", view, count)
+            self._terminated[:] = answers.truths(own_task, "terminated", view, count)
         if "truncated" in methods:
-            self._truncated[:] = answers.truths(custom, "truncated", view, count)
+            self._truncated[:] = answers.truths(own_task, "truncated", view, count)
 
     def _settle(self) -> int:
         """Let results and records say what the task has judged; return how many flights end."""
         ended: int = settle(self._calls.words, self._verdict, self.reward_scale)
         if ended < 0:
             sound = np.abs(self._rewards) <= LARGEST_REWARD
-            answers.require(sound, self.custom, "reward", self._rewards, "finite rewards")
+            answers.require(sound, self.own_task, "reward", self._rewards, "finite rewards")
         if self._counts_gates:
             passed = np.where(self.began, 0.0, self._state.gates_passed)
             self._results[Result.GATES_PASSED, : self.count] = passed
@@ -267,19 +267,19 @@ class TaskBatch(ReadableBatch):
     def final_observations(self, value: Singles) -> None:
         """The kernels' own are never written, as their episodes begin where a step begins."""
 
-    def shipped_observation(self) -> Singles:
+    def builtin_observation(self) -> Singles:
         """(count, k) what the kernels observe, less its privileged part."""
         return self._observations[:, : self._split]
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
         """What `observe` returns at the present instant, (count, k) each."""
-        return answers.parts(self.custom, self._asked_to_observe(), self.count)
+        return answers.parts(self.own_task, self._asked_to_observe(), self.count)
 
     def _asked_to_observe(self) -> Any:
         view = self.view
-        view.hide(not self.custom.privileged)
+        view.hide(not self.own_task.privileged)
         try:
-            return answers.ask(self.custom, "observe", view)
+            return answers.ask(self.own_task, "observe", view)
         finally:
             view.hide(False)
 
@@ -320,7 +320,7 @@ class TaskBatch(ReadableBatch):
             if getattr(kind, "names", None) != ("flights", "state") or (
                 snapshot["state"].dtype != self._state.dtype()
             ):
-                raise ValueError(f"snapshot must be that of a batch with {label(self.custom)}")
+                raise ValueError(f"snapshot must be that of a batch with {label(self.own_task)}")
             flights = snapshot["flights"]
         super().restore(flights)
         if len(self._state):

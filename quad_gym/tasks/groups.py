@@ -77,7 +77,7 @@ class Truth(Group):
             of_gate = np.linalg.norm(target - self.position, axis=1)
             distance = np.where(view.gate_passed, of_gate, distance)
         speed = (self._flights.error_before - distance) / view.period
-        return np.where(view.began, 0.0, speed)
+        return np.where(view.is_first, 0.0, speed)
 
     @Lazy
     def nees(self) -> Floats:
@@ -156,7 +156,7 @@ class Estimate(Group):
     def _need_filter(self) -> None:
         if not self._flights.run_filter:
             raise ValueError(
-                'view.estimate needs a filter: observation="estimate" or "sensors", or '
+                'view.estimate needs a filter: observation="estimate" or "measurements", or '
                 "include_std=True or innovations=True"
             )
 
@@ -231,10 +231,10 @@ class Estimate(Group):
         return self._status
 
     @Lazy
-    def lost(self) -> Truths:
-        """(n,) whether the filter finds that it is lost."""
+    def diverged(self) -> Truths:
+        """(n,) whether the filter flags itself as diverged."""
         self._need_filter()
-        return self._flights.columns("lost") > 0.0
+        return self._flights.columns("diverged") > 0.0
 
     @Lazy
     def nis(self) -> Floats:
@@ -249,7 +249,7 @@ class Estimate(Group):
         return self._flights.counts("nis_dimension")  # type: ignore[no-any-return]
 
 
-class Seen(Group):
+class Observed(Group):
     """What the controller goes by: the estimate, the truth, or the truth with noise."""
 
     position = Shown("r_seen", "(n, 3) in I [m].")
@@ -294,8 +294,8 @@ class Measured(Group):
     def _need_sensors(self) -> None:
         if not self._flights.run_filter:
             raise ValueError(
-                'view.measured needs sensors that run: observation="estimate" or "sensors", or '
-                "include_std=True or innovations=True"
+                'view.measured needs sensors that run: observation="estimate" or "measurements", '
+                "or include_std=True or innovations=True"
             )
 
     @Lazy

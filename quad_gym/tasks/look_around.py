@@ -85,6 +85,6 @@ class LookAround(Task):
         """
         if view.features.shape[1] == 0:
             raise ValueError("LookAround needs a camera, expected camera=True, got False")
-        gap = view.features.mean(axis=1) - view.seen.position
+        gap = view.features.mean(axis=1) - view.observed.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
-        return {"features_direction": (view.seen.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}
+        return {"features_direction": (view.observed.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}

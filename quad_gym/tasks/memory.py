@@ -159,7 +159,7 @@ class ReadableBatch(FlightBatch):
     def columns(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (..., n)."""
         if name not in self._fields and not self._room.holds(name):
-            return np.ascontiguousarray(np.moveaxis(self.read(name), 0, -1))
+            return np.ascontiguousarray(np.moveaxis(self.record(name), 0, -1))
         values = self._field(name)
         if values.ndim == 2:
             return values.flatten()[: self.count]
@@ -170,7 +170,7 @@ class ReadableBatch(FlightBatch):
     def rows(self, name: str) -> NDArray[Any]:
         """A field of the flights' records as a new array (n, ...)."""
         if name not in self._fields and not self._room.holds(name):
-            return self.read(name)
+            return self.record(name)
         values = self._field(name)
         if values.ndim == 3:
             return self.columns(name).T
@@ -215,6 +215,8 @@ class ReadableBatch(FlightBatch):
         """(n,) whether the true state of flights is finite; looked at where `chosen`."""
         finite = np.ones(self.count, bool)
         flights = np.flatnonzero(chosen)
-        state = np.concatenate([self.read(name, flights) for name in ("r", "v", "q", "w")], axis=1)
+        state = np.concatenate(
+            [self.record(name, flights) for name in ("r", "v", "q", "w")], axis=1
+        )
         finite[flights] = np.isfinite(state).all(axis=1)
         return finite

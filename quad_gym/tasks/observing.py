@@ -101,11 +101,11 @@ class Joiner:
 
     def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
         """What `observe` has returned, (n, k) each by name, in the order of the observation."""
-        found = answers.parts(flights.custom, value, flights.count)
+        found = answers.parts(flights.own_task, value, flights.count)
         sizes = {name: part.shape[1] for name, part in found.items()}
         if sizes != self._sizes:
             raise TaskError(
-                f"{label(flights.custom)}.observe must return as many numbers as at first, "
+                f"{label(flights.own_task)}.observe must return as many numbers as at first, "
                 f"{self._sizes}, got {sizes}"
             )
         return {name: found[name] for name in self._sizes}
@@ -123,6 +123,6 @@ class Joiner:
                 sound = np.isfinite(values).all(axis=1)
                 if not sound.all():
                     sound |= ~flights.finite(~sound)
-                    answers.require(sound, flights.custom, "observe", values, f"finite {name!r}")
+                    answers.require(sound, flights.own_task, "observe", values, f"finite {name!r}")
             np.nan_to_num(ours, copy=False)
         np.clip(ours, self._low, self._high, out=ours)

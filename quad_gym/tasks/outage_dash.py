@@ -152,11 +152,11 @@ class OutageDash(Task):
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) whether the vehicle has crashed, or is beyond the finish."""
         finish = gaps_of(view).centers[:, -1, 0]
-        return view.shipped.terminated | (view.position[:, 0] < finish)
+        return view.builtin.terminated | (view.position[:, 0] < finish)
 
     def observe(self, view: "View") -> dict[str, Floats]:
         """See the class."""
-        seen, gaps = view.seen, gaps_of(view)
+        seen, gaps = view.observed, gaps_of(view)
         through = gaps_behind(gaps, seen.position)
         every, last = np.arange(view.count), gaps.widths.shape[1] - 1
         after = np.minimum(through + 1, last)
@@ -207,7 +207,7 @@ def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
 def _share(view: "View", gaps: Gaps) -> Floats:
     """(n,) of the course that is behind the seen position."""
     start, finish = view.reference_position[:, 0], gaps.centers[:, -1, 0]
-    return np.asarray((start - view.seen.position[:, 0]) / (start - finish))
+    return np.asarray((start - view.observed.position[:, 0]) / (start - finish))
 
 
 def westward(view: "View") -> Floats:

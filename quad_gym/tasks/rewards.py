@@ -161,7 +161,7 @@ class Progress(Term):
 
 
 @dataclass(frozen=True)
-class Gate(Term):
+class GatePassed(Term):
     """One over the control period where a gate was passed, as one per gate and second [1/s]."""
 
     def __call__(self, view: "View") -> Floats:
@@ -175,7 +175,7 @@ class Crash(Term):
 
     def __call__(self, view: "View") -> Floats:
         """(n,) 0 or 1."""
-        return _CRASHED[view.shipped.ending]
+        return _CRASHED[view.builtin.ending]
 
 
 @dataclass(frozen=True)
@@ -229,6 +229,6 @@ TRACKING: Term = (
 """The reward that ships for all tasks but courses of gates."""
 
 RACING: Term = (
-    shipped.PROGRESS_WEIGHT * Progress() + shipped.GATE_BONUS * Gate() + _HEADING - _COSTS
+    shipped.PROGRESS_WEIGHT * Progress() + shipped.GATE_BONUS * GatePassed() + _HEADING - _COSTS
 )
 """The reward that ships for courses of gates."""

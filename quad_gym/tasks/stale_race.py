@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, Gate, Progress, Term
+from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, GatePassed, Progress, Term
 from quad_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class StaleRace(Task):
             - 0.002 * BodyRates()
             - check.number("crash_cost", crash_cost, least=0.0) * Crash()
         )
-        self._gate: Term = GATE_REWARD * Gate()
+        self._gate: Term = GATE_REWARD * GatePassed()
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) see the class."""

@@ -45,7 +45,7 @@ class Task:
     """Your own reward, endings, observation and reset; the id's task does what it leaves out.
 
     Each method is called once in a control step, for all flights at once, with a `View` whose arrays
-    have one row per flight. `gymnasium.make(id, custom=Mine())`, `make_vec` and `make_sb3_vec_env`
+    have one row per flight. `gymnasium.make(id, task=Mine())`, `make_vec` and `make_sb3_vec_env`
     fly the same flights with it, bit for bit as far as its methods treat every row alike.
 
     | method | returns |
@@ -129,7 +129,7 @@ class Task:
         """Begin episodes: set `view.state`, choose starts. The view shows the episodes that begin.
 
         Args:
-            view: All flights; `view.began` says which begin. What is written to the rows of the
+            view: All flights; `view.is_first` says which begin. What is written to the rows of the
                 others does not count.
             rng: Draws for each flight from its own stream.
 
@@ -144,15 +144,15 @@ class Task:
 
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) the reward of the step that has been flown."""
-        return view.shipped.reward  # type: ignore[no-any-return]
+        return view.builtin.reward  # type: ignore[no-any-return]
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) whether a crash, or the goal, ends the episode."""
-        return view.shipped.terminated  # type: ignore[no-any-return]
+        return view.builtin.terminated  # type: ignore[no-any-return]
 
     def truncated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) whether something else ends it, such as the time limit; `terminated` comes first."""
-        return view.shipped.truncated  # type: ignore[no-any-return]
+        return view.builtin.truncated  # type: ignore[no-any-return]
 
     def observe(self, view: "View") -> Any:
         """(n,) or (n, k) numbers, or such arrays by name."""
@@ -163,21 +163,21 @@ class Task:
         return method in vars(self) or getattr(type(self), method) is not getattr(Task, method)
 
 
-def resolve_task(custom: Any) -> Task:
-    """The task that the keyword `custom` means.
+def resolve_task(given: Any) -> Task:
+    """The task that the keyword `task` means.
 
     Args:
-        custom: A `Task`; a class of them, made without arguments; or "module:name" of either, which
+        given: A `Task`; a class of them, made without arguments; or "module:name" of either, which
             is looked for in the working directory, too.
 
     Raises:
         ValueError: If it is none of these, or its attributes are invalid.
     """
-    found = _named(custom) if isinstance(custom, str) else custom
+    found = _named(given) if isinstance(given, str) else given
     if isinstance(found, type) and issubclass(found, Task):
         found = found()
     if not isinstance(found, Task):
-        raise ValueError(f'custom must be a quad_gym.Task, or its "module:name", got {custom!r}')
+        raise ValueError(f'task must be a quad_gym.Task, or its "module:name", got {given!r}')
     for name in ("replaces_observation", "privileged"):
         if not isinstance(getattr(found, name), bool):
             raise ValueError(f"{name} of {label(found)} must be True or False")
@@ -200,7 +200,7 @@ def _named(name: str) -> Any:
     """
     module, colon, attribute = name.partition(":")
     if not (colon and module and attribute):
-        raise ValueError(f'custom must be "module:name" of a quad_gym.Task, got {name!r}')
+        raise ValueError(f'task must be "module:name" of a quad_gym.Task, got {name!r}')
     here = os.getcwd()
     added = here not in sys.path and "" not in sys.path
     if added:  # as a console command has not
@@ -208,7 +208,7 @@ def _named(name: str) -> Any:
     try:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"custom must name a quad_gym.Task, got {name!r}: {error}") from None
+        raise ValueError(f"task must name a quad_gym.Task, got {name!r}: {error}") from None
     finally:
         if added:
             sys.path.remove(here)

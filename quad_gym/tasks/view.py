@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.records import SHOWN
-from quad_gym.tasks.groups import Estimate, Measured, Seen, Truth
+from quad_gym.tasks.builtin import Builtin
+from quad_gym.tasks.groups import Estimate, Measured, Observed, Truth
 from quad_gym.tasks.lazy import Attribute, Group, Lazy, Shown
-from quad_gym.tasks.shipped import Shipped
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import HiddenTruthError
 
@@ -27,18 +27,18 @@ class View(Group):
 
     Arrays have one row per flight, are made when they are first read, and cannot be written to.
     `quad_gym.tasks.fields.VIEW_FIELDS` lists them all with shapes, units and frames. They are in
-    groups: `truth`, `estimate` (of the filter), `seen` (what the controller sees), `measured`,
-    `shipped` (built-in reward and endings). `view.position` is short for `view.truth.position`,
+    groups: `truth`, `estimate` (of the filter), `observed` (what the controller sees), `measured`,
+    `builtin` (built-in reward and endings). `view.position` is short for `view.truth.position`,
     likewise the other states. `view.state` holds what the task keeps.
     """
 
     __slots__ = (
-        *("_hidden", "_shipped", "_truth"),
-        *("estimate", "measured", "seen", "state"),
+        *("_hidden", "_builtin", "_truth"),
+        *("estimate", "measured", "observed", "state"),
     )
 
     estimate: Estimate
-    seen: Seen
+    observed: Observed
     measured: Measured
     state: State
 
@@ -46,11 +46,11 @@ class View(Group):
         of_instant: list[Attribute] = []
         super().__init__(flights, of_instant)
         self._hidden = False
-        self._truth, self._shipped = Truth(flights, of_instant, self), Shipped(flights, [])
+        self._truth, self._builtin = Truth(flights, of_instant, self), Builtin(flights, [])
         for name, group in (
             ("estimate", Estimate(flights, of_instant)),
             ("measured", Measured(flights, of_instant)),
-            ("seen", Seen(flights, of_instant)),
+            ("observed", Observed(flights, of_instant)),
             ("state", state),
         ):
             object.__setattr__(self, name, group)
@@ -58,12 +58,12 @@ class View(Group):
     def step_over(self) -> None:
         """Forget all arrays, as a step has been flown."""
         self.forget()
-        self._shipped.step_over()
+        self._builtin.step_over()
 
     def begin(self, chosen: Truths) -> None:
         """Forget what belongs to the last episodes of flights that have begun others."""
         self.forget()
-        self._shipped.begin(chosen)
+        self._builtin.begin(chosen)
 
     def hide(self, hidden: bool) -> None:
         """Whether the truth is hidden, as from `observe`."""
@@ -74,7 +74,7 @@ class View(Group):
     def _refuse(self, name: str) -> NoReturn:
         raise HiddenTruthError(
             f"observe cannot read the truth (view.{name}), which no controller knows: read "
-            "view.seen or view.estimate, or set privileged = True in the task"
+            "view.observed or view.estimate, or set privileged = True in the task"
         )
 
     @property
@@ -85,11 +85,11 @@ class View(Group):
         return self._truth
 
     @property
-    def shipped(self) -> Shipped:
+    def builtin(self) -> Builtin:
         """Built-in reward and endings of the step, which follow from the truth."""
         if self._hidden:
-            self._refuse("shipped")
-        return self._shipped
+            self._refuse("builtin")
+        return self._builtin
 
     @property
     def position(self) -> Floats:
@@ -185,7 +185,7 @@ class View(Group):
     step = Shown("step", "(n,) steps since the start of the episode.")
 
     @Lazy
-    def began(self) -> Truths:
+    def is_first(self) -> Truths:
         """(n,) whether the episode has just begun, and nothing was flown in it."""
         return self._flights.began.copy()
 
@@ -242,5 +242,5 @@ class View(Group):
 
     @Lazy
     def observation(self) -> NDArray[np.float32]:
-        """(n, k) the shipped observation, less its privileged part."""
-        return self._flights.shipped_observation().copy()
+        """(n, k) the built-in observation, less its privileged part."""
+        return self._flights.builtin_observation().copy()

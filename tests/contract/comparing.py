@@ -12,7 +12,7 @@ IDS = (
     "QuadGym/LookAround-v0",
     "QuadGym/StaleRace-v0",
 )
-OBSERVATIONS = ("estimate", "truth", "noisy", "sensors")
+OBSERVATIONS = ("estimate", "truth", "noisy", "measurements")
 ACTIONS = ("ctbr", "motor", "wrench", "attitude", "velocity")
 LAYOUTS = ("relative", "absolute")
 

@@ -75,7 +75,7 @@ def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
     ticks = blocks["tick"][:, 0]
     assert set(ticks - ticks.min()) == set(range(40))
     batch.restore(blocks)
-    assert batch.read("position_valid").mean() == pytest.approx(1 / 20, abs=0.02)
+    assert batch.record("position_valid").mean() == pytest.approx(1 / 20, abs=0.02)
 
 
 def test_what_takes_turns_is_timed_by_turns():

@@ -8,7 +8,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
-import quad_gym  # noqa: F401 - registers the ids
+from quad_gym import sensor_suite
+from quad_gym.commands.options import sensors_of
 from tests.contract.comparing import ACTIONS, IDS, LAYOUTS, OBSERVATIONS
 
 EVERYTHING = list(itertools.product(IDS, OBSERVATIONS, ACTIONS, LAYOUTS))
@@ -62,9 +63,12 @@ def test_both_checkers_pass_with_more_and_with_less_to_see(observation, keywords
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_both_checkers_pass_at_other_rates(env_id):
-    gnss = {} if "LookAround" in env_id else {"gnss_rate": 10}  # which has none
-    passes_both_checkers(env_id, control_rate=100, camera_rate=20, **gnss)
-    passes_both_checkers(env_id, imu_rate=400, control_rate=40, substeps=2)
+    suite = sensor_suite(sensors_of(env_id, None))
+    gnss = None if suite.gnss is None else 10.0
+    camera = None if suite.camera is None else 20.0
+    slow = suite.with_rates(gnss=gnss, camera=camera)
+    passes_both_checkers(env_id, control_rate=100, sensors=slow)
+    passes_both_checkers(env_id, sensors=suite.with_rates(imu=400.0), control_rate=40, substeps=2)
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -89,8 +89,8 @@ def asymmetric_plan(critic_only=15, **changes):
     return small_plan(
         **{
             "env_id": "QuadGym/LookAround-v0",
-            "environment": {"duration": 1.0, "custom": "baselines.arm_tasks:Doubting"},
-            "learning": {"custom": "baselines.arm_critics:SureForCritic"},
+            "environment": {"duration": 1.0, "task": "baselines.arm_tasks:WithStd"},
+            "learning": {"task": "baselines.arm_critics:WithStdCertaintyRewardForCritic"},
             "recipe": plan.recipe.replace(parameters=parameters),
             **changes,
         }

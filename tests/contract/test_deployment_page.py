@@ -40,7 +40,7 @@ def test_its_c_observes_as_the_environment(tmp_path):
     subprocess.run([COMPILER, *flags, str(tmp_path / "it.c"), "-o", str(library)], check=True)
     observe = ctypes.CDLL(str(library)).observe
 
-    keywords = {"num_envs": 3, "start": "hover", "randomize": True}
+    keywords = {"num_envs": 3, "start": "hover", "randomize_reference": True}
     absolute, relative = (
         gymnasium.make_vec("QuadGym/Circle-v0", layout=layout, **keywords)
         for layout in ("absolute", "relative")

@@ -9,7 +9,7 @@ from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, RotorLoss
 from quad_gym.faults.presets import faults_of
-from quad_gym.records import FEATURE_BLOCKS, Aid, FaultKind, Gate
+from quad_gym.records import FEATURE_BLOCKS, Aid, FaultKind, GateDecision
 from tests.contract.comparing import actions_of, assert_same
 from tests.contract.test_same_flights import SHORT, STEPS, fly_single, fly_vector, future_of
 
@@ -97,7 +97,7 @@ def test_without_faults_info_says_nothing_of_them():
 
 def test_info_tells_every_interface_the_innovations():
     keywords = {"sensors": "rtk", "innovations": True, "faults": "gnss_outliers"}
-    keywords |= {"out_of_bounds": 1e3, "ground": -1e3, "max_tilt": np.pi}
+    keywords |= {"out_of_bounds": 1e3, "min_height": -1e3, "max_tilt": np.pi}
     env = QuadVectorEnv(3, "hover", **keywords)
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=7, **keywords)
     singles = [QuadEnv("hover", **keywords) for _ in range(3)]
@@ -118,9 +118,9 @@ def test_info_tells_every_interface_the_innovations():
             assert mine["innovation"].shape == mine["sigma"].shape == (FEATURE_BLOCKS + 12, 3)
             has = mine["measured"]
             assert np.isfinite(mine["nis"][has]).all()
-            assert (mine["gate"][has] != Gate.NONE).all()
+            assert (mine["gate"][has] != GateDecision.NONE).all()
             measured += has[0]
-            rejected += has[0] and mine["gate"][0] == Gate.REJECTED
+            rejected += has[0] and mine["gate"][0] == GateDecision.REJECTED
     assert info["rejections"][:, 0].sum() == rejected
     assert 0 < rejected < measured / 5
 

@@ -39,7 +39,12 @@ def test_keywords_that_a_task_does_not_use_are_refused(task, keyword, value):
 
 @pytest.mark.parametrize(
     ("given", "meant"),
-    [("sensor", "sensors"), ("fault", "faults"), ("randomise", "randomize"), ("rate", "imu_rate")],
+    [
+        ("sensor", "sensors"),
+        ("fault", "faults"),
+        ("randomise", "randomize_reference"),
+        ("rate", "control_rate"),
+    ],
 )
 def test_unknown_keywords_are_answered_with_what_may_be_meant(given, meant):
     with pytest.raises(TypeError, match=f"did you mean {meant}"):

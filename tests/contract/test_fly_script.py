@@ -95,7 +95,7 @@ def test_faults_come_and_go_at_the_given_time(tmp_path):
     sigma = np.sqrt(flight["covariance"][:, 0, 0])
     assert sigma[99] > 10.0 * sigma[50]  # the filter knows that it is lost
     assert sigma[110] < 0.1 * sigma[99]
-    assert not flight.stage.has_camera
+    assert not flight.scene.has_camera
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def fly_batch(controls=(Control.PD, Control.VELOCITY), **keywords):
         batch.reset(seeds=range(4))
         for _ in range(20):
             batch.step(np.full((4, 4), 0.2))
-        seen += [batch.read(name) for name in FIELDS]
+        seen += [batch.record(name) for name in FIELDS]
     return seen
 
 
@@ -185,7 +185,7 @@ def test_arguments_of_a_batch_that_is_reset(name):
         if name == "keys":
             batch.reset(keys=value)
         batch.step()
-        return [batch.read("r"), batch.read("v")]
+        return [batch.record("r"), batch.record("v")]
 
     for value in [*NUMBERS, *OTHERS, *vectors(3)]:
         assert_refused_or_flown(reset, name, value)
@@ -207,7 +207,7 @@ def imu_suite(imu):
 PARAMETERS = {
     "VehicleParams": (quad_gym.VehicleParams(), lambda p: {"vehicle": p}),
     "PDGains": (quad_gym.PDGains(), lambda p: {"gains": p}),
-    "ActionParams": (quad_gym.ActionParams(), lambda p: {"actions": p}),
+    "ActionParams": (quad_gym.ActionParams(), lambda p: {"action_params": p}),
     "TaskParams": (TaskParams(), lambda p: {"task": p}),
     "WorldParams": (quad_gym.WorldParams(), lambda p: {"world": p}),
     "BatteryParams": (

@@ -57,9 +57,9 @@ def seen_state(env, source):
     """r, v, R_BI and w_B as the controller's source has them."""
     batch = env.flights.batch
     if source == "truth":
-        return batch.read("r"), batch.read("v"), body_axes(batch.read("q")), batch.read("w")
-    rates = batch.read("w_meas") - batch.read("b_g_hat")
-    return batch.read("r_hat"), batch.read("v_hat"), batch.read("R_hat"), rates
+        return batch.record("r"), batch.record("v"), body_axes(batch.record("q")), batch.record("w")
+    rates = batch.record("w_meas") - batch.record("b_g_hat")
+    return batch.record("r_hat"), batch.record("v_hat"), batch.record("R_hat"), rates
 
 
 def in_body(R_BI, v_I):
@@ -94,8 +94,8 @@ def test_the_absolute_layout(source):
     close(seen["position"], r, 4)
     close(seen["velocity"], v, 4)
     close(seen["R_BI"], R.reshape(-1, 9))
-    close(seen["accel_bias"], batch.read(f"b_a{hat}"))
-    close(seen["gyro_bias"], batch.read(f"b_g{hat}"))
+    close(seen["accel_bias"], batch.record(f"b_a{hat}"))
+    close(seen["gyro_bias"], batch.record(f"b_g{hat}"))
     close(seen["body_rates"], w, 10)
     close(seen["reference_position"], r_ref, 4)
     close(seen["reference_velocity"], v_ref, 4)
@@ -109,7 +109,7 @@ def test_the_absolute_layout(source):
 def test_the_estimate_is_not_the_truth_but_near_it():
     env, observation, _ = flown(steps=100, start="hover", layout="absolute")
     seen = parts_of(observation, layout="absolute")
-    off = np.linalg.norm(seen["position"] - env.flights.batch.read("r"), axis=1)
+    off = np.linalg.norm(seen["position"] - env.flights.batch.record("r"), axis=1)
     assert (off > 1e-5).all()
     assert (off < 0.1).all()
 
@@ -118,8 +118,8 @@ def test_on_a_course_the_previews_are_the_coming_gates():
     env = QuadVectorEnv(5, "waypoints", observation="truth", gate_count=3)
     observation, _ = env.reset(seed=2)
     seen = parts_of(observation, observation="truth")
-    gates, R = env.flights.batch.read("gates"), body_axes(env.flights.batch.read("q"))
-    close(seen["position_error"], in_body(R, gates[:, 0] - env.flights.batch.read("r")), 4)
+    gates, R = env.flights.batch.record("gates"), body_axes(env.flights.batch.record("q"))
+    close(seen["position_error"], in_body(R, gates[:, 0] - env.flights.batch.record("r")), 4)
     close(seen["preview_1"], in_body(R, gates[:, 1] - gates[:, 0]), 4)
     close(seen["preview_2"], in_body(R, gates[:, 2] - gates[:, 0]), 4)
 
@@ -134,23 +134,23 @@ def test_the_covariance_part_is_the_root_of_the_diagonal():
     assert (sigmas > 0).all()
 
 
-@pytest.mark.parametrize("source", ["estimate", "noisy", "sensors", "truth"])
+@pytest.mark.parametrize("source", ["estimate", "noisy", "measurements", "truth"])
 def test_the_privileged_part_is_the_truth(source):
     env, observation, _ = flown(observation=source, privileged=True)
     assert set(observation) == {"policy", "privileged"}
     seen = parts_of(observation, observation=source, privileged=True)
     batch = env.flights.batch
-    R = body_axes(batch.read("q"))
+    R = body_axes(batch.record("q"))
     r_ref, v_ref, _, x_ref = on_circle(13 * SECONDS)
-    close(seen["true_position_error"], in_body(R, r_ref - batch.read("r")), 4)
-    close(seen["true_velocity_error"], in_body(R, v_ref - batch.read("v")), 4)
+    close(seen["true_position_error"], in_body(R, r_ref - batch.record("r")), 4)
+    close(seen["true_velocity_error"], in_body(R, v_ref - batch.record("v")), 4)
     close(seen["true_up"], R[:, :, 2])
     close(seen["true_heading"], in_body(R, x_ref))
-    close(seen["true_body_rates"], batch.read("w"), 10)
-    close(seen["true_accel_bias"], batch.read("b_a"))
-    close(seen["true_gyro_bias"], batch.read("b_g"))
+    close(seen["true_body_rates"], batch.record("w"), 10)
+    close(seen["true_accel_bias"], batch.record("b_a"))
+    close(seen["true_gyro_bias"], batch.record("b_g"))
     hover = np.sqrt(0.78 * 9.8 / 4 / (6.11e-8 / 0.104719755**2))
-    close(seen["rotor_speeds"], batch.read("rotor_speeds") / hover)
+    close(seen["rotor_speeds"], batch.record("rotor_speeds") / hover)
 
 
 # ---- sensors -------------------------------------------------------------------------------------
@@ -158,11 +158,12 @@ def test_the_privileged_part_is_the_truth(source):
 
 def test_measurements_come_with_flags_at_their_own_rates():
     # looking at the origin from where the camera sees both features
-    env = QuadVectorEnv(4, "hover", observation="sensors", gnss_rate=10, camera_rate=25)
+    suite = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
+    env = QuadVectorEnv(4, "hover", observation="measurements", sensors=suite)
     observation, _ = env.reset(seed=2)
     flags = []
     for _ in range(21):
-        seen = parts_of(observation, observation="sensors")
+        seen = parts_of(observation, observation="measurements")
         for name in ("gnss_position", "gnss_baseline", "feature_1", "feature_2"):
             off = seen[f"{name}_valid"][:, 0] == 0.0
             assert set(np.unique(seen[f"{name}_valid"])) <= {0.0, 1.0}
@@ -176,28 +177,29 @@ def test_measurements_come_with_flags_at_their_own_rates():
 
 
 def test_a_slow_controller_hears_of_every_fix_since_its_last_step():
-    env = QuadVectorEnv(2, "hover", observation="sensors", control_rate=10, gnss_rate=25)
+    suite = quad_gym.sensor_suite("standard").with_rates(gnss=25.0)
+    env = QuadVectorEnv(2, "hover", observation="measurements", control_rate=10, sensors=suite)
     env.reset(seed=1)
     for _ in range(5):
-        seen = parts_of(env.step(np.zeros((2, 4)))[0], observation="sensors")
+        seen = parts_of(env.step(np.zeros((2, 4)))[0], observation="measurements")
         assert seen["gnss_position_valid"].all()
 
 
 @pytest.mark.parametrize("suite", ["lab", "rtk"])  # instant samples; averages with vibration
 def test_the_mean_of_imu_samples_is_that_of_all_samples_since_the_last_step(suite):
-    given = {"observation": "sensors", "action": "motor", "sensors": suite, "start": "hover"}
+    given = {"observation": "measurements", "action": "motor", "sensors": suite, "start": "hover"}
     slow = QuadVectorEnv(3, "circle", **given)
     fast = QuadVectorEnv(3, "circle", **given, control_rate=200)  # shows every sample
     observation, _ = slow.reset(seed=4)
     fast.reset(seed=4)
-    seen = parts_of(observation, observation="sensors", **SHOWN_BY[suite])
+    seen = parts_of(observation, observation="measurements", **SHOWN_BY[suite])
     np.testing.assert_array_equal(seen["gyro_mean"], seen["gyro"])
     np.testing.assert_array_equal(seen["accel_mean"], seen["accel"])
     for k in range(5):
         actions = 0.2 * np.stack([actions_of(i, 5)[k] for i in range(3)])
-        seen = parts_of(slow.step(actions)[0], observation="sensors", **SHOWN_BY[suite])
+        seen = parts_of(slow.step(actions)[0], observation="measurements", **SHOWN_BY[suite])
         each = [
-            parts_of(fast.step(actions)[0], observation="sensors", **SHOWN_BY[suite])
+            parts_of(fast.step(actions)[0], observation="measurements", **SHOWN_BY[suite])
             for _ in range(4)
         ]
         for name in ("gyro", "accel"):
@@ -207,23 +209,25 @@ def test_the_mean_of_imu_samples_is_that_of_all_samples_since_the_last_step(suit
 
 
 def test_an_episode_that_begins_in_a_step_shows_no_sample_of_the_one_before():
-    env = QuadVectorEnv(2, "hover", observation="sensors", duration=0.04, autoreset_mode="SameStep")
+    env = QuadVectorEnv(
+        2, "hover", observation="measurements", duration=0.04, autoreset_mode="SameStep"
+    )
     env.reset(seed=1)
     env.step(np.ones((2, 4)))
     observation, _, _, truncated, info = env.step(np.ones((2, 4)))
     assert truncated.all()
-    first = parts_of(observation, observation="sensors")
+    first = parts_of(observation, observation="measurements")
     np.testing.assert_array_equal(first["gyro_mean"], first["gyro"])
-    last = parts_of(np.stack(info["final_obs"]), observation="sensors")
+    last = parts_of(np.stack(info["final_obs"]), observation="measurements")
     assert (last["gyro_mean"] != last["gyro"]).all()
 
 
 def test_measurements_scatter_about_what_the_true_state_implies():
     n = 1500
-    env, observation, _ = flown(n=n, start="hover", observation="sensors", sensors="lab")
-    seen, batch = parts_of(observation, observation="sensors"), env.flights.batch
+    env, observation, _ = flown(n=n, start="hover", observation="measurements", sensors="lab")
+    seen, batch = parts_of(observation, observation="measurements"), env.flights.batch
     suite = quad_gym.sensor_suite("lab")
-    r, R = batch.read("r"), body_axes(batch.read("q"))
+    r, R = batch.record("r"), body_axes(batch.record("q"))
     antenna = r + np.array(suite.gnss.primary_antenna_B) @ R
     baseline = unit(suite.gnss.baseline_B @ R)
     off = seen["gnss_position"] - antenna
@@ -232,7 +236,7 @@ def test_measurements_scatter_about_what_the_true_state_implies():
     angle = np.linalg.norm(seen["gnss_baseline"] - baseline, axis=1)
     assert np.sqrt((angle**2).mean()) == pytest.approx(np.sqrt(2) * 0.05, rel=0.1)
     np.testing.assert_allclose(np.linalg.norm(seen["gnss_baseline"], axis=1), 1.0, atol=1e-6)
-    gyro = seen["gyro"] - batch.read("w") - batch.read("b_g")
+    gyro = seen["gyro"] - batch.record("w") - batch.record("b_g")
     np.testing.assert_allclose(gyro.std(axis=0), np.radians(0.05) * np.sqrt(200), rtol=0.1)
 
     R_CB, camera = rotation_312(np.array(suite.camera.attitude)), suite.camera
@@ -250,16 +254,16 @@ def test_measurements_scatter_about_what_the_true_state_implies():
 
 
 def test_positions_are_east_north_up_though_gnss_measures_in_ecef():
-    env, observation, _ = flown(observation="sensors")
-    measured = env.flights.batch.read("gnss_position")
+    env, observation, _ = flown(observation="measurements")
+    measured = env.flights.batch.record("gnss_position")
     R_IG = east_north_up(quad_gym.sensor_suite("lab").gnss.reference_antenna_G)
-    seen = parts_of(observation, observation="sensors")["gnss_position"]
+    seen = parts_of(observation, observation="measurements")["gnss_position"]
     np.testing.assert_allclose(seen, measured @ R_IG.T, atol=1e-6)
 
 
 def test_without_a_camera_no_features_are_seen():
-    _, observation, _ = flown(observation="sensors", camera=False)
-    parts_of(observation, observation="sensors", feature_count=0)
+    _, observation, _ = flown(observation="measurements", camera=False)
+    parts_of(observation, observation="measurements", feature_count=0)
 
 
 # ---- noise ---------------------------------------------------------------------------------------
@@ -273,14 +277,14 @@ def test_noisy_observations_have_the_stated_noise_and_no_memory():
     seconds = []
     for _ in range(2):
         seen = parts_of(env.step(np.zeros((n, 4)))[0], layout="absolute")
-        R = body_axes(batch.read("q"))
+        R = body_axes(batch.record("q"))
         E = seen["R_BI"].reshape(-1, 3, 3) @ R.transpose(0, 2, 1)
         turn = np.stack([E[:, 1, 2] - E[:, 2, 1], E[:, 2, 0] - E[:, 0, 2], E[:, 0, 1] - E[:, 1, 0]])
         errors = {
-            "position": seen["position"] - batch.read("r"),
-            "velocity": seen["velocity"] - batch.read("v"),
+            "position": seen["position"] - batch.record("r"),
+            "velocity": seen["velocity"] - batch.record("v"),
             "attitude": 0.5 * turn.T,
-            "body_rates": seen["body_rates"] - batch.read("w"),
+            "body_rates": seen["body_rates"] - batch.record("w"),
         }
         for name, error in errors.items():
             stated = getattr(sigma, name)
@@ -325,7 +329,7 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
         barometer=quad_gym.BarometerParams(),
         magnetometer=quad_gym.MagnetometerParams(),
     )
-    keywords = {"observation": "sensors", "include_std": True, "privileged": True}
+    keywords = {"observation": "measurements", "include_std": True, "privileged": True}
     env, observation, actions = flown(
         steps=2, sensors=suite, randomization=nearly_all_draws(), **keywords
     )

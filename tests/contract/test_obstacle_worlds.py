@@ -26,8 +26,8 @@ class Near(quad_gym.Task):
 
     def observe(self, view):
         return {
-            "wall_distance": view.seen.obstacle_distance,
-            "wall_vector": view.seen.obstacle_vector,
+            "wall_distance": view.observed.obstacle_distance,
+            "wall_vector": view.observed.obstacle_vector,
         }
 
 
@@ -41,8 +41,8 @@ def hovering(count=6, **keywords):
 
 
 def test_all_three_interfaces_fly_the_same_flights():
-    many = hovering(3, custom=Near)
-    lone = [QuadEnv("hover", world=WORLD, custom=Near) for _ in range(3)]
+    many = hovering(3, task=Near)
+    lone = [QuadEnv(base="hover", world=WORLD, task=Near) for _ in range(3)]
     seen, _ = many.reset(seed=4)
     for i, env in enumerate(lone):
         np.testing.assert_array_equal(env.reset(seed=4 + i)[0], seen[i])
@@ -56,13 +56,13 @@ def test_all_three_interfaces_fly_the_same_flights():
             assert one[4]["ending"] == info["ending"][i]
         over |= terminated | truncated
     pytest.importorskip("stable_baselines3")
-    third = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=4, world=WORLD, custom=Near)
-    first = QuadVectorEnv(3, "hover", world=WORLD, custom=Near).reset(seed=4)[0]
+    third = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=4, world=WORLD, task=Near)
+    first = QuadVectorEnv(3, base="hover", world=WORLD, task=Near).reset(seed=4)[0]
     np.testing.assert_array_equal(third.reset(), first)
 
 
 def test_hitting_a_wall_is_a_crash_and_info_says_so():
-    env = QuadEnv("hover", world=WORLD, observation="truth", custom=Near)
+    env = QuadEnv(base="hover", world=WORLD, observation="truth", task=Near)
     env.reset(seed=0)
     for _ in range(400):
         _, _, terminated, truncated, info = env.step(EASTWARD)
@@ -78,7 +78,7 @@ def test_hitting_a_wall_is_a_crash_and_info_says_so():
 
 def test_leaving_the_geofence_is_a_crash_too():
     fenced = WORLD.replace(obstacles=())
-    env = QuadEnv("hover", world=fenced, observation="truth", custom=Near, out_of_bounds=50.0)
+    env = QuadEnv(base="hover", world=fenced, observation="truth", task=Near, out_of_bounds=50.0)
     with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):
         env.reset(seed=0)
     env = QuadEnv("hover", world=fenced, observation="truth", out_of_bounds=50.0)
@@ -98,13 +98,13 @@ def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
     )
     env.reset(seed=0)
     batch = env.unwrapped.flights.batch
-    places, endings, lasted = [batch.read("obstacle_center")], [], []
+    places, endings, lasted = [batch.record("obstacle_center")], [], []
     for _ in range(300):
         *_, info = env.step(np.tile(EASTWARD, (4, 1)))
-        places.append(batch.read("obstacle_center"))
+        places.append(batch.record("obstacle_center"))
         ended = info.get("final_info", info)
         endings += [str(name) for name in np.ravel(ended["ending"])]
-        lasted.append(batch.read("step"))
+        lasted.append(batch.record("step"))
     episodes = (np.diff(np.array(places)[:, 0, 0, 0]) != 0.0).sum()
     assert endings.count("collision") > 4
     assert episodes >= 1
@@ -124,7 +124,12 @@ def test_a_snapshot_brings_back_obstacles_and_contact():
         found = []
         for action in actions(5, 60, seed=2):
             seen, reward, *_ = env.step(action)
-            found += [seen.copy(), reward, batch.read("obstacle_center"), batch.read("collided")]
+            found += [
+                seen.copy(),
+                reward,
+                batch.record("obstacle_center"),
+                batch.record("collided"),
+            ]
         return found
 
     first = on()
@@ -134,19 +139,19 @@ def test_a_snapshot_brings_back_obstacles_and_contact():
 
 
 def test_a_task_reads_the_distance_of_what_is_seen_and_of_what_is_so():
-    env = hovering(6, custom=Near, sensors="rtk")
+    env = hovering(6, task=Near, sensors="rtk")
     seen, _ = env.reset(seed=3)
     batch = env.flights.batch
     for action in actions(6, 30):
         seen, *_ = env.step(action)
     view = batch.view
-    np.testing.assert_array_equal(view.obstacles, batch.read("obstacle_center")[:, :2])
-    vector_I = np.einsum("nji,nj->ni", view.seen.R_BI, view.seen.obstacle_vector)
-    truth, believed = view.truth.obstacle_vector, view.seen.position - view.position
+    np.testing.assert_array_equal(view.obstacles, batch.record("obstacle_center")[:, :2])
+    vector_I = np.einsum("nji,nj->ni", view.observed.R_BI, view.observed.obstacle_vector)
+    truth, believed = view.truth.obstacle_vector, view.observed.position - view.position
     near_wall = np.abs(truth[:, 0]) > np.abs(truth[:, 1])  # flat, so that the gap adds up
     np.testing.assert_allclose((vector_I - truth)[near_wall, 0], -believed[near_wall, 0], atol=1e-9)
     np.testing.assert_allclose(view.truth.obstacle_distance, np.linalg.norm(truth, axis=1))
-    np.testing.assert_allclose(seen[:, -4], view.seen.obstacle_distance, atol=1e-6)
+    np.testing.assert_allclose(seen[:, -4], view.observed.obstacle_distance, atol=1e-6)
 
 
 class Peeking(quad_gym.Task):
@@ -156,7 +161,7 @@ class Peeking(quad_gym.Task):
 
 def test_the_true_distance_is_hidden_from_the_controller():
     with pytest.raises(quad_gym.TaskError, match="observe cannot read the truth"):
-        QuadEnv("hover", world=WORLD, custom=Peeking)
+        QuadEnv(base="hover", world=WORLD, task=Peeking)
 
 
 def test_starts_within_obstacles_are_refused():
@@ -172,7 +177,7 @@ class InTheWall(quad_gym.Task):
 
 
 def test_starts_that_a_task_puts_into_obstacles_are_refused():
-    env = hovering(2, custom=InTheWall)
+    env = hovering(2, task=InTheWall)
     with pytest.raises(
         quad_gym.TaskError, match=r"InTheWall\.reset returned a wrong start: position"
     ):
@@ -195,12 +200,12 @@ def flown(world, steps=3, **keywords):
 
 def test_a_flight_keeps_its_obstacles(tmp_path):
     flight, batch = flown(WORLD)
-    centers = batch.read("obstacle_center")[0, :2]
-    np.testing.assert_array_equal(flight.stage.obstacles[:, 1:4], centers)
-    np.testing.assert_array_equal(flight.stage.obstacles[:, 0], [0.0, 1.0])
-    np.testing.assert_array_equal(flight.stage.obstacles[1, 4:7], [0.3, 0.3, 1.5])
-    again = Flight.load(flight.save(tmp_path / "flight.npz")).stage
-    np.testing.assert_array_equal(again.obstacles, flight.stage.obstacles)
+    centers = batch.record("obstacle_center")[0, :2]
+    np.testing.assert_array_equal(flight.scene.obstacles[:, 1:4], centers)
+    np.testing.assert_array_equal(flight.scene.obstacles[:, 0], [0.0, 1.0])
+    np.testing.assert_array_equal(flight.scene.obstacles[1, 4:7], [0.3, 0.3, 1.5])
+    again = Flight.load(flight.save(tmp_path / "flight.npz")).scene
+    np.testing.assert_array_equal(again.obstacles, flight.scene.obstacles)
     np.testing.assert_array_equal(again.geofence_I, WORLD.geofence)
 
 
@@ -210,9 +215,9 @@ def test_files_from_before_there_were_obstacles_can_be_read(tmp_path):
     with np.load(path) as file:
         kept = {n: file[n] for n in file.files if "obstacles" not in n and "geofence" not in n}
     np.savez(path, **kept)
-    stage = Flight.load(path).stage
-    assert stage.obstacles.shape == (0, 9)
-    assert stage.geofence_I.shape == (0, 3)
+    scene = Flight.load(path).scene
+    assert scene.obstacles.shape == (0, 9)
+    assert scene.geofence_I.shape == (0, 3)
 
 
 @pytest.mark.parametrize("view", ["fixed", "chase"])

@@ -177,7 +177,7 @@ def test_ctrl_c_in_the_middle_leaves_no_traceback(tmp_path):
         assert process.stderr is not None
         err = ""
         while not re.search(r"[1-9]\d*/2001 ", err):
-            char = process.stderr.read(1)
+            char = process.stderr.record(1)
             assert char, err  # it is still running
             err += char
         process.send_signal(signal.SIGINT)

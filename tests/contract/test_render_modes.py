@@ -45,7 +45,7 @@ def test_every_task_has_frames(env_id, view):
     assert (frame != env.render()).any()
 
 
-@pytest.mark.parametrize("observation", ["truth", "noisy", "sensors"])
+@pytest.mark.parametrize("observation", ["truth", "noisy", "measurements"])
 def test_every_observation_has_frames(observation):
     env = flown(QuadEnv("circle", observation=observation, render_mode="rgb_array", **SMALL))
     assert env.render().shape == (240, 320, 3)

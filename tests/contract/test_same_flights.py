@@ -21,6 +21,7 @@ SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 """Episodes end by the time limit and by tipping over, at different steps in different flights."""
 
 LAB = quad_gym.sensor_suite("lab")
+SLOW = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
 AVERAGES = LAB.replace(
     imu=LAB.imu.replace(samples="average"),
     estimator=LAB.estimator.replace(integration="midpoint"),
@@ -76,11 +77,11 @@ def test_a_flight_in_a_batch_is_the_flight_alone(task, mode):
     "keywords",
     [
         {"observation": "noisy", "action": "attitude"},
-        {"observation": "sensors", "gnss_rate": 10, "camera_rate": 25, "action": "motor"},
-        {"observation": "truth", "action": "velocity", "randomize": True},
+        {"observation": "measurements", "sensors": SLOW, "action": "motor"},
+        {"observation": "truth", "action": "velocity", "randomize_reference": True},
         {"include_std": True, "layout": "absolute", "action": "wrench"},
         {"camera": False, "control_rate": 100},
-        {"sensors": AVERAGES, "gnss_rate": 20},
+        {"sensors": AVERAGES.with_rates(gnss=20.0)},
     ],
     ids=lambda keywords: "+".join(map(str, keywords)),
 )

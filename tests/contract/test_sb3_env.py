@@ -130,16 +130,16 @@ def test_options_hold_for_the_next_reset_only():
     env = make(3)
     env.set_options({"position": [3.0, 1.0, 2.0], "yaw": 1.0})
     env.reset()
-    np.testing.assert_array_equal(env.flights.batch.read("r"), np.tile([3.0, 1.0, 2.0], (3, 1)))
+    np.testing.assert_array_equal(env.flights.batch.record("r"), np.tile([3.0, 1.0, 2.0], (3, 1)))
     env.reset()
-    assert (env.flights.batch.read("r") != [3.0, 1.0, 2.0]).all()
+    assert (env.flights.batch.record("r") != [3.0, 1.0, 2.0]).all()
 
 
 def test_options_may_be_given_one_by_one():
     env = make(2)
     env.set_options([{"position": [1.0, 0.0, 1.0]}, {"position": [0.0, 1.0, 2.0]}])
     env.reset()
-    np.testing.assert_array_equal(env.flights.batch.read("r"), [[1.0, 0.0, 1.0], [0.0, 1.0, 2.0]])
+    np.testing.assert_array_equal(env.flights.batch.record("r"), [[1.0, 0.0, 1.0], [0.0, 1.0, 2.0]])
 
 
 def test_unknown_options_change_nothing():

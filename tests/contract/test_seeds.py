@@ -21,7 +21,7 @@ def keys_of(seeds):
 
 
 def keys_flown(batch):
-    return {tuple(key) for key in batch.read("key").tolist()}
+    return {tuple(key) for key in batch.record("key").tolist()}
 
 
 def assert_disjoint(sets):
@@ -109,15 +109,17 @@ START = ("r", "v", "q", "w", "b_a", "b_g", "ref_cos", "ref_sin", "key")
 
 def starts_of(rng, episodes, count=11):
     """What each episode began with; flights do what they like, for as long as they like."""
-    task = TaskParams(kind="random_trajectory", start="hover", randomize=True, duration=0.0)
+    task = TaskParams(
+        kind="random_trajectory", start="hover", randomize_reference=True, duration=0.0
+    )
     batch = FlightBatch(count, task=task, sensors="rtk", control=Control.CTBR, control_rate=50.0)
     batch.reset(seeds=range(300, 300 + count))
-    found = [{name: batch.read(name) for name in START}]
+    found = [{name: batch.record(name) for name in START}]
     for _ in range(episodes - 1):
         for _ in range(int(rng.integers(1, 30))):
             batch.step(rng.uniform(-1.0, 1.0, (count, 4)))
         batch.reset()
-        found.append({name: batch.read(name) for name in START})
+        found.append({name: batch.record(name) for name in START})
     return found
 
 
@@ -142,8 +144,8 @@ def test_pairs_last_where_episodes_end_by_themselves_at_other_times():
         found, at = np.full((count, 10), np.nan), np.zeros(count, int)
         for step in range(260):
             _, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, (count, 4)))
-            begun = (terminated | truncated) & (batch.read("episode") == 10.0)
-            found[begun] = np.hstack([batch.read(name) for name in ("r", "q", "b_a")])[begun]
+            begun = (terminated | truncated) & (batch.record("episode") == 10.0)
+            found[begun] = np.hstack([batch.record(name) for name in ("r", "q", "b_a")])[begun]
             at[begun] = step
         assert np.isfinite(found).all()
         return found, at

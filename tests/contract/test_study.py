@@ -54,8 +54,8 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("task", "arms"),
     [
-        ("stale_race", ["pd", "truth", "covariance", "truth_on_truth", "covariance_stamped"]),
-        ("outage_dash", ["pd_waiting", "truth", "sigma", "truth_on_truth"]),
+        ("stale_race", ["pd", "truth", "std", "truth_on_truth", "std_stamped"]),
+        ("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
     ],
 )
 def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, capsys):
@@ -75,28 +75,30 @@ def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, c
 def test_arms_of_either_engine_are_trained_and_flown_in_one_study(tmp_path, capsys):
     pytest.importorskip("sb3_contrib")
     words = [*QUICK, "--set", "n_steps=8", "batch_size=512", "n_epochs=1"]
-    words += ["--arms", "asymmetric", "recurrent", "--output", str(tmp_path / "out")]
+    words += ["--arms", "std_certainty_privileged", "recurrent", "--output", str(tmp_path / "out")]
     assert main(words) == 0
     assert "4 trainings of 4,096 steps" in capsys.readouterr().out
     runs = tmp_path / "out" / "runs"
-    assert (runs / "asymmetric/seed_1/best.npz").exists()
+    assert (runs / "std_certainty_privileged/seed_1/best.npz").exists()
     assert (runs / "recurrent/seed_1/best.zip").exists()
     plans = {
         name: json.loads((runs / name / "seed_0/training.json").read_text())["plan"]
-        for name in ("asymmetric", "recurrent")
+        for name in ("std_certainty_privileged", "recurrent")
     }
     assert plans["recurrent"]["recipe"]["algorithm"] == "recurrent_ppo"
     assert plans["recurrent"]["engine"] == "sb3"
-    assert plans["asymmetric"]["engine"] == "compiled"
+    assert plans["std_certainty_privileged"]["engine"] == "compiled"
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert set(summary["study"]["recipes"]) == {"ppo", "recurrent_ppo"}
 
 
 def test_steps_are_told_of_each_algorithm():
-    two = command.configure(command.Args(arms=("asymmetric", "recurrent")))
+    two = command.configure(command.Args(arms=("std_certainty_privileged", "recurrent")))
     counts = [recipe("QuadGym/LookAround-v0", name).steps for name in ("ppo", "recurrent_ppo")]
     assert two.steps() == f"{counts[0]:,} (ppo) or {counts[1]:,} (recurrent_ppo) steps"
-    same = command.configure(command.Args(arms=("asymmetric", "recurrent"), steps=5000))
+    same = command.configure(
+        command.Args(arms=("std_certainty_privileged", "recurrent"), steps=5000)
+    )
     assert same.steps() == "5,000 steps"
 
 
@@ -109,7 +111,10 @@ def test_steps_are_told_of_each_algorithm():
         (["--episodes", "1"], "--episodes must be at least 2"),
         (["--success-within", "-1"], "--success-within must be"),
         (["stale_race", "--success-within", "1"], "--success-within belongs to LookAround"),
-        (["stale_race", "--arms", "truth_stamped"], "--arms must name truth, whose policies"),
+        (
+            ["stale_race", "--arms", "truth_stamped"],
+            "--arms must name truth, whose policies",
+        ),
         (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
         (["--env", "observation=truth"], "--env must leave observation to --arms"),
         (["--set", "gammma=0.9"], "gammma"),
@@ -143,13 +148,13 @@ def test_wrong_arms_are_refused():
 
 
 def test_a_reward_of_an_arm_holds_in_training_alone():
-    args = command.Args(arms=("sure",))
+    args = command.Args(arms=("std_certainty",))
     setting = command.configure(args)
     plan = command.plan_of(setting, setting.arms[0], 0)
     learned = plan.make_vector_flights().unwrapped.flights.batch
     judged = plan.make_judge().unwrapped.flights.batch
-    assert type(learned.custom).__name__ == "Sure"
-    assert type(judged.custom).__name__ == "Doubting"
+    assert type(learned.own_task).__name__ == "WithStdCertaintyReward"
+    assert type(judged.own_task).__name__ == "WithStd"
     assert judged.task.out_of_bounds == 8.0
 
 
@@ -209,13 +214,13 @@ def test_success_is_to_fly_to_the_end_near_the_reference():
 
 
 def test_words_say_what_the_numbers_say(tmp_path):
-    clear = {"pd_features": (130, 0.0, 0.05), "truth": (60, 0.6, 1.2), "sigma": (150, 0.0, 0.1)}
+    clear = {"pd_features": (130, 0.0, 0.05), "truth": (60, 0.6, 1.2), "std": (150, 0.0, 0.1)}
     words = " ".join(conclusions(results(tmp_path, clear)))
     assert "a difference of 100 [88, 100] percentage points" in words
     assert "12.0 times smaller" in words
     assert "significantly above the best fixed rule (PD, facing the features" in words
 
-    refuted = {"pd_features": (150, 0.0, 0.05), "truth": (99, 0.0, 0.1), "sigma": (99, 0.0, 0.2)}
+    refuted = {"pd_features": (150, 0.0, 0.05), "truth": (99, 0.0, 0.1), "std": (99, 0.0, 0.2)}
     words = " ".join(conclusions(results(tmp_path, refuted)))
     assert "no significant difference" in words
     assert "0.200 m, not smaller than 0.100 m" in words
@@ -224,5 +229,5 @@ def test_words_say_what_the_numbers_say(tmp_path):
 
 
 def test_words_compare_arms_by_the_probability_of_improvement(tmp_path):
-    words = " ".join(conclusions(results(tmp_path, {"estimate": (9, 0, 1), "sigma": (99, 0, 1)})))
+    words = " ".join(conclusions(results(tmp_path, {"estimate": (9, 0, 1), "std": (99, 0, 1)})))
     assert "with probability 1.00 [0.64, 1.00]." in words

@@ -20,7 +20,7 @@ pytest.importorskip("pygame")
 Image = pytest.importorskip("PIL.Image")
 
 DURATION = 0.6
-QUICK = ["--quick", "--steps", "4096", "--env", f"duration={DURATION}", "--arms", "truth", "sigma"]
+QUICK = ["--quick", "--steps", "4096", "--env", f"duration={DURATION}", "--arms", "truth", "std"]
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_a_film_shows_the_episode_of_the_test(filmed):
     folder, _ = filmed
     study = command.configure(
         command.Args(
-            *("look_around", ("truth", "sigma")),
+            *("look_around", ("truth", "std")),
             quick=True,
             steps=4096,
             env={"duration": DURATION},
@@ -95,7 +95,7 @@ def test_a_film_shows_the_episode_of_the_test(filmed):
     ("words", "message"),
     [
         (["--arms", "pd_features", "truth"], "--video needs the arm truth and another trained one"),
-        (["--arms", "sigma", "estimate"], "--video needs the arm truth and another trained one"),
+        (["--arms", "std", "estimate"], "--video needs the arm truth and another trained one"),
         (["--video", "avi"], "--video"),
     ],
 )
@@ -155,16 +155,14 @@ def curves(best):
 
 
 def test_races_show_the_best_validated_trainings_and_the_first_crash_on_truth(tmp_path):
-    study = study_of(
-        "stale_race", "QuadGym/StaleRace-v0", ("truth", "estimate", "covariance"), tmp_path
-    )
+    study = study_of("stale_race", "QuadGym/StaleRace-v0", ("truth", "estimate", "std"), tmp_path)
     speed = {"speed": np.ones((2, 4))}
     crashes = {0: [True] * 4, 1: [True] * 4, 2: [False, False, True, True]}
     found, seen = {}, {}
     for name, level, tops in (
         ("truth", 1.0, (5.0, 6.0, 7.0)),
         ("estimate", 2.0, (9.0, 1.0, 1.0)),
-        ("covariance", 3.0, (2.0, 4.0, 3.0)),
+        ("std", 3.0, (2.0, 4.0, 3.0)),
     ):
         for seed, curve in curves(tops).items():
             found[name, seed] = flown(
@@ -172,27 +170,27 @@ def test_races_show_the_best_validated_trainings_and_the_first_crash_on_truth(tm
             )
             seen[name, seed] = curve
     pair = pair_of(study.results(found, seen))
-    assert pair.trainings == {"truth": 2, "covariance": 1}
+    assert pair.trainings == {"truth": 2, "std": 1}
     assert pair.episode == 2
 
 
 def test_look_around_shows_the_first_episode_with_a_far_heading(tmp_path):
-    study = study_of("look_around", "QuadGym/LookAround-v0", ("truth", "sigma"), tmp_path)
+    study = study_of("look_around", "QuadGym/LookAround-v0", ("truth", "std"), tmp_path)
     off = np.radians([30.0, -99.0, 179.0, 150.0])
     traces = {"off_wall": np.tile(off, (2, 1)), "off_reward": np.zeros((2, 4))}
     traces["off_wall"][1, 0] = np.nan  # it ended there
     found = {
         (name, seed): flown(1.0, [False] * 4, traces)
-        for name in ("truth", "sigma")
+        for name in ("truth", "std")
         for seed in range(3)
     }
     seen = {key: curves((1.0, 1.0, 0.0))[key[1]] for key in found}
     pair = pair_of(study.results(found, seen))
-    assert pair.trainings == {"truth": 0, "sigma": 0}
+    assert pair.trainings == {"truth": 0, "std": 0}
     assert pair.episode == 2
 
 
 def test_without_truth_there_is_no_pair(tmp_path):
-    study = study_of("look_around", "QuadGym/LookAround-v0", ("sigma",), tmp_path)
-    found = {("sigma", seed): flown(1.0, [False] * 4, {}) for seed in range(3)}
+    study = study_of("look_around", "QuadGym/LookAround-v0", ("std",), tmp_path)
+    found = {("std", seed): flown(1.0, [False] * 4, {}) for seed in range(3)}
     assert pair_of(study.results(found, {})) is None

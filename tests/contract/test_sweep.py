@@ -61,11 +61,15 @@ def test_values_that_are_added_leave_the_other_folders_in_place(tmp_path):
 
 def test_arms_bring_what_they_are_trained_on(tmp_path):
     arms = {arm.name: arm for arm in ARMS}
-    given = {"env_ids": ["QuadGym/LookAround-v0"], "arms": ["truth", "sure"], "engine": "compiled"}
+    given = {
+        "env_ids": ["QuadGym/LookAround-v0"],
+        "arms": ["truth", "std_certainty"],
+        "engine": "compiled",
+    }
     truth, sure = expand(given, arms, tmp_path)
     assert truth.group == "look_around,compiled_ppo,truth"
     assert truth.plan.environment["observation"] == "truth"
-    assert sure.plan.learning == arms["sure"].learning
+    assert sure.plan.learning == arms["std_certainty"].learning
     with pytest.raises(ValueError, match="arms must be trained, got pd_reference"):
         expand({**given, "arms": ["pd_reference"]}, arms, tmp_path)
 

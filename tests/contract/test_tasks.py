@@ -14,7 +14,7 @@ from tests.contract.comparing import actions_of
 
 SECONDS = 1 / 50
 """A control period."""
-UNBOUNDED = {"out_of_bounds": 50.0, "max_tilt": np.pi, "ground": -50.0}
+UNBOUNDED = {"out_of_bounds": 50.0, "max_tilt": np.pi, "min_height": -50.0}
 
 
 def body_axes(q):
@@ -52,9 +52,11 @@ def reference_of(task, t, batch):
         heading = level(np.array([3 * w * np.cos(w * t), 3 * w * np.cos(2 * w * t), 0.0]))
     else:
         k = np.arange(1, 7)[np.newaxis, :, np.newaxis]
-        phase = k * batch.read("ref_omega")[:, np.newaxis, np.newaxis] * t
-        waves = batch.read("ref_cos") * np.cos(phase) + batch.read("ref_sin") * np.sin(phase)
-        return batch.read("ref_center") + waves.sum(axis=1), level(batch.read("ref_heading_point"))
+        phase = k * batch.record("ref_omega")[:, np.newaxis, np.newaxis] * t
+        waves = batch.record("ref_cos") * np.cos(phase) + batch.record("ref_sin") * np.sin(phase)
+        return batch.record("ref_center") + waves.sum(axis=1), level(
+            batch.record("ref_heading_point")
+        )
     return np.tile(r, (n, 1)), np.tile(heading, (n, 1))
 
 
@@ -76,13 +78,13 @@ def test_the_reward_of_a_tracking_task_is_the_documented_formula(task):
         _, reward, _, _, info = env.step(given)
         action = np.clip(given.astype(float), -1.0, 1.0)
         r_ref, x_ref = reference_of(task, (k + 1) * SECONDS, batch)
-        e = np.linalg.norm(r_ref - batch.read("r"), axis=1)
-        aligned = (body_axes(batch.read("q"))[:, 0] * x_ref).sum(axis=1)
+        e = np.linalg.norm(r_ref - batch.record("r"), axis=1)
+        aligned = (body_axes(batch.record("q"))[:, 0] * x_ref).sum(axis=1)
         expected = np.exp(-2 * e) + 0.5 * np.exp(-20 * e) + 0.1 * aligned
-        expected -= costs(action, last, batch.read("w"))
+        expected -= costs(action, last, batch.record("w"))
         np.testing.assert_allclose(reward, expected, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(info["position_error"], e, rtol=1e-9)
-        seen = np.linalg.norm(batch.read("r_hat") - batch.read("r"), axis=1)
+        seen = np.linalg.norm(batch.record("r_hat") - batch.record("r"), axis=1)
         np.testing.assert_allclose(info["estimation_error"], seen, rtol=1e-9, atol=1e-12)
         last = action
 
@@ -92,22 +94,22 @@ def test_the_reward_of_waypoints_is_the_documented_formula():
     env = QuadVectorEnv(n, "waypoints", autoreset_mode="Disabled", gate_count=4)
     batch, policy = env.flights.batch, PDPolicy(env, gains="lab")
     observation, info = env.reset(seed=3)
-    gates, passed = batch.read("gates"), np.zeros(n, int)
+    gates, passed = batch.record("gates"), np.zeros(n, int)
     last, rows = np.zeros((n, 4)), np.arange(n)
     np.testing.assert_allclose(
-        info["position_error"], np.linalg.norm(gates[:, 0] - batch.read("r"), axis=1)
+        info["position_error"], np.linalg.norm(gates[:, 0] - batch.record("r"), axis=1)
     )
     for _ in range(500):
-        before = np.linalg.norm(gates[rows, passed] - batch.read("r"), axis=1)
+        before = np.linalg.norm(gates[rows, passed] - batch.record("r"), axis=1)
         action, _ = policy.predict(observation)
         observation, reward, terminated, truncated, info = env.step(action)
-        distance = np.linalg.norm(gates[rows, passed] - batch.read("r"), axis=1)
+        distance = np.linalg.norm(gates[rows, passed] - batch.record("r"), axis=1)
         through = distance < 0.3
         passed += through
-        aligned = body_axes(batch.read("q"))[:, 0, 0]  # body x with east
+        aligned = body_axes(batch.record("q"))[:, 0, 0]  # body x with east
         action = action.astype(float)
         expected = (before - distance + through) / SECONDS
-        expected += 0.1 * aligned - costs(action, last, batch.read("w"))
+        expected += 0.1 * aligned - costs(action, last, batch.record("w"))
         np.testing.assert_allclose(reward, expected, rtol=1e-9, atol=1e-7)
         np.testing.assert_array_equal(info["gates_passed"], passed)
         np.testing.assert_array_equal(terminated, passed == 4)
@@ -181,7 +183,7 @@ def test_farther_from_the_reference_than_its_bound_is_out_of_bounds(task):
 def test_no_hovering_start_is_out_of_bounds():
     flights = QuadVectorEnv(20_000, "hover", observation="truth").flights.batch
     flights.reset(seeds=range(20_000))
-    away = np.abs(flights.read("r") - reference_of("hover", 0.0, flights)[0])
+    away = np.abs(flights.record("r") - reference_of("hover", 0.0, flights)[0])
     farthest = np.linalg.norm(away.max(axis=0))  # each axis reaches its limit
     np.testing.assert_allclose(farthest, 0.9 * math.sqrt(3.0), rtol=1e-12)
     assert farthest < flights.task.out_of_bounds
@@ -196,10 +198,10 @@ def test_a_course_has_wider_bounds():
 
 
 def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
-    env = QuadEnv("hover", action="motor", out_of_bounds=100.0, ground=-100.0)
+    env = QuadEnv("hover", action="motor", out_of_bounds=100.0, min_height=-100.0)
     *_, terminated, truncated, info = last_step(env, np.array([0.2, -0.2, -0.2, 0.2]))
     assert (terminated, truncated, info["ending"]) == (True, False, "tipped_over")
-    up = body_axes(env.flights.batch.read("q"))[0, 2, 2]
+    up = body_axes(env.flights.batch.record("q"))[0, 2, 2]
     assert up < np.cos(np.radians(100.0))
 
 
@@ -211,7 +213,7 @@ def test_half_a_meter_below_the_origin_is_on_the_ground(task, options):
     env = QuadEnv(task, **options)
     *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
     assert (terminated, truncated, info["ending"]) == (True, False, "below_min_height")
-    assert -1.0 < env.flights.batch.read("r")[0, 2] < -0.5
+    assert -1.0 < env.flights.batch.record("r")[0, 2] < -0.5
 
 
 @pytest.mark.parametrize(("task", "steps"), [("hover", 500), ("waypoints", 1000)])
@@ -227,7 +229,7 @@ def test_the_time_limit_truncates(task, steps):
 def test_the_last_gate_terminates():
     env = QuadEnv("waypoints", gate_count=1)
     env.reset(seed=1)
-    gate = env.flights.batch.read("gates")[0, 0]
+    gate = env.flights.batch.record("gates")[0, 0]
     env.reset(seed=1, options={"position": gate, "velocity": [0, 0, 0]})
     _, reward, terminated, truncated, info = env.step(STILL)
     assert (terminated, truncated, info["ending"]) == (True, False, "last_gate")
@@ -261,18 +263,18 @@ def test_a_hovering_start_has_the_documented_spread():
     env = QuadVectorEnv(n, "hover", observation="truth")
     env.reset(seed=1)
     batch = env.flights.batch
-    offset = batch.read("r") - [4.0, 0.0, 1.0]
-    axes = body_axes(batch.read("q"))
+    offset = batch.record("r") - [4.0, 0.0, 1.0]
+    axes = body_axes(batch.record("q"))
     yaw = np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
     tilts = axes[:, :2, 2]
     off_yaw = (yaw - np.pi + np.pi) % (2 * np.pi) - np.pi
     for values, sigma in ((offset[:, :2], 0.3), (off_yaw, 0.2), (tilts, 0.03)):
         np.testing.assert_allclose(values.std(axis=0), sigma, rtol=0.05)
         assert (abs(values.mean(axis=0)) < 4.5 * sigma / np.sqrt(n)).all()
-    assert (batch.read("r")[:, 2] >= 0.1).all()
-    assert (abs(batch.read("v")) < 0.2).all()
-    assert not batch.read("w").any()
-    lift = (6.11e-8 / 0.104719755**2 * batch.read("rotor_speeds") ** 2).sum(axis=1)
+    assert (batch.record("r")[:, 2] >= 0.1).all()
+    assert (abs(batch.record("v")) < 0.2).all()
+    assert not batch.record("w").any()
+    lift = (6.11e-8 / 0.104719755**2 * batch.record("rotor_speeds") ** 2).sum(axis=1)
     np.testing.assert_allclose(lift, 0.78 * 9.8, rtol=1e-9)
 
 
@@ -280,11 +282,11 @@ def test_the_circle_starts_on_the_ground_or_hovering():
     env = QuadVectorEnv(2000, "circle", observation="truth")
     env.reset(seed=1)
     batch = env.flights.batch
-    grounded = (batch.read("r") == [4.0, 0.0, 0.0]).all(axis=1)
+    grounded = (batch.record("r") == [4.0, 0.0, 0.0]).all(axis=1)
     assert abs(grounded.mean() - 0.5) < 5.0 * 0.5 / np.sqrt(2000)
-    assert not batch.read("rotor_speeds")[grounded].any()
-    assert (batch.read("rotor_speeds")[~grounded] > 0.0).all()
-    off = np.linalg.norm(batch.read("r")[~grounded] - [4.0, 0.0, 1.0], axis=1)
+    assert not batch.record("rotor_speeds")[grounded].any()
+    assert (batch.record("rotor_speeds")[~grounded] > 0.0).all()
+    off = np.linalg.norm(batch.record("r")[~grounded] - [4.0, 0.0, 1.0], axis=1)
     assert off.max() < 0.3 * 6.0
 
 
@@ -292,38 +294,39 @@ def test_a_start_on_the_ground_is_the_reports():
     env = QuadVectorEnv(50, "circle", start="ground")
     env.reset(seed=1)
     batch = env.flights.batch
-    np.testing.assert_allclose(batch.read("r"), np.tile([4.0, 0.0, 0.0], (50, 1)), atol=1e-12)
+    np.testing.assert_allclose(batch.record("r"), np.tile([4.0, 0.0, 0.0], (50, 1)), atol=1e-12)
     for name in ("v", "w", "rotor_speeds"):
-        assert not batch.read(name).any()
-    axes = body_axes(batch.read("q"))
+        assert not batch.record(name).any()
+    axes = body_axes(batch.record("q"))
     np.testing.assert_allclose(axes[:, 0], np.tile([-1.0, 0.0, 0.0], (50, 1)), atol=1e-9)
-    assert batch.read("b_a").std() == pytest.approx(0.98, rel=0.25)
+    assert batch.record("b_a").std() == pytest.approx(0.98, rel=0.25)
 
 
 @pytest.mark.parametrize("task", ["circle", "lemniscate", "hover"])
 def test_randomize_draws_phase_radius_period_and_sense(task):
     n = 2000
     plain, drawn = (
-        QuadVectorEnv(n, task, randomize=flag, out_of_bounds=99) for flag in (0 > 1, 1 > 0)
+        QuadVectorEnv(n, task, randomize_reference=flag, out_of_bounds=99)
+        for flag in (0 > 1, 1 > 0)
     )
     first, second = plain.reset(seed=1), drawn.reset(seed=1)
     assert first[0].shape == second[0].shape
     size = 3.0 if task == "lemniscate" else 4.0
-    assert np.ptp(np.abs(plain.flights.batch.read("ref_omega"))) == 0.0
+    assert np.ptp(np.abs(plain.flights.batch.record("ref_omega"))) == 0.0
     batch = drawn.flights.batch
-    harmonic = batch.read("ref_center") if task == "hover" else batch.read("ref_cos")[:, 0]
-    harmonic = batch.read("ref_sin")[:, 0] if task == "lemniscate" else harmonic
+    harmonic = batch.record("ref_center") if task == "hover" else batch.record("ref_cos")[:, 0]
+    harmonic = batch.record("ref_sin")[:, 0] if task == "lemniscate" else harmonic
     radius = np.linalg.norm(harmonic[:, :2], axis=1)
     assert 0.5 * size <= radius.min() < 0.55 * size
     assert 1.2 * size < radius.max() <= 1.25 * size
     phase = np.arctan2(harmonic[:, 1], harmonic[:, 0])
     assert abs(np.exp(1j * phase).mean()) < 0.1
     if task != "hover":
-        period = 2 * np.pi / batch.read("ref_omega")
+        period = 2 * np.pi / batch.record("ref_omega")
         assert 8.0 <= period.min() < 8.2
         assert 14.8 < period.max() <= 15.0
     if task == "circle":
-        turn = np.cross(batch.read("ref_cos")[:, 0], batch.read("ref_sin")[:, 0])[:, 2]
+        turn = np.cross(batch.record("ref_cos")[:, 0], batch.record("ref_sin")[:, 0])[:, 2]
         assert 0.4 < (turn > 0).mean() < 0.6
 
 
@@ -345,7 +348,7 @@ def test_random_trajectories_keep_their_bounds_and_differ():
 def test_gates_lie_within_the_radius_and_apart():
     env = QuadVectorEnv(500, "waypoints")
     env.reset(seed=1)
-    gates = env.flights.batch.read("gates")[:, :5]
+    gates = env.flights.batch.record("gates")[:, :5]
     assert np.linalg.norm(gates[..., :2], axis=2).max() <= 3.5
     assert gates[..., 2].min() > 0.5
     assert np.linalg.norm(np.diff(gates, axis=1), axis=2).min() > 1.0

@@ -77,9 +77,9 @@ def test_the_same_seed_gives_the_same_policy_and_another_one_does_not(tmp_path):
 def test_keywords_of_the_environment_hold_in_training_too():
     plan = small_plan()
     assert plan.make_flights().unwrapped.flights.batch.task.start == "mixed"  # the recipe's
-    given = {"start": "ground", "randomize": False, "sensors": "rtk"}
+    given = {"start": "ground", "randomize_reference": False, "sensors": "rtk"}
     batch = small_plan(environment=given).make_flights().unwrapped.flights.batch
-    assert (batch.task.start, batch.task.randomize) == ("ground", False)
+    assert (batch.task.start, batch.task.randomize_reference) == ("ground", False)
     assert batch.sensors == quad_gym.sensor_suite("rtk")
 
 
@@ -234,7 +234,7 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
         train(small_plan(seed=3), tmp_path, resume=True, quiet=True, tensorboard=False)
     record = json.loads((tmp_path / "training.json").read_text())
     assert record["finished"]
-    assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize": True}
+    assert record["plan"]["recipe"]["flights"] == {"start": "mixed", "randomize_reference": True}
     assert os.path.getsize(tmp_path / "evaluations.csv") > 0
 
 

@@ -17,7 +17,7 @@ from tests.contract.comparing import actions_of
 
 FIVE = [(0, 0, 1.5), (1, 0.5, 2), (1, -0.5, 1), (-1, 0.5, 2), (-1, -0.5, 1)]
 WHEN = [0.0, 1.0, 2.2, 3.2, 4.8]
-RADIUS = {"out_of_bounds": 50.0, "max_tilt": np.pi, "ground": -50.0}
+RADIUS = {"out_of_bounds": 50.0, "max_tilt": np.pi, "min_height": -50.0}
 TRUTH = {"source": Source.TRUTH, "run_filter": False, "threads": 1}
 OPEN = Trajectory.through(FIVE, WHEN, yaw=[0.0, 0.5, 1.0, 1.5, 2.0])
 CLOSED = Trajectory.through(FIVE, [*WHEN, 6.2], closed=True, look_at=(0.2, 5.0))
@@ -44,28 +44,28 @@ def assert_on_reference(batch, time):
         t = time + phase
         for k, name in enumerate(("path_r", "path_v", "path_a")):
             np.testing.assert_allclose(
-                batch.read(name)[i], path(t, k), rtol=0.0, atol=1e-12 * (1 + 100 * k)
+                batch.record(name)[i], path(t, k), rtol=0.0, atol=1e-12 * (1 + 100 * k)
             )
         heading, speed = direction(path.yaw(t)), np.linalg.norm(path(t, 1))
         miss = 1e-12 * max(1.0, 1.0 / (speed + 1e-6))  # of the direction of a short velocity
-        np.testing.assert_allclose(batch.read("path_x")[i], heading, rtol=0.0, atol=miss)
+        np.testing.assert_allclose(batch.record("path_x")[i], heading, rtol=0.0, atol=miss)
         ahead = path(t + np.array(batch.task.preview))
-        np.testing.assert_allclose(batch.read("path_ahead")[i], ahead, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(batch.record("path_ahead")[i], ahead, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("randomize", [False, True])
 @pytest.mark.parametrize("preview", [(0.2, 0.4), (0.0, 1.0)])
 def test_kernels_evaluate_what_python_does(randomize, preview):
-    batch = batch_of(SEVERAL, count=9, randomize=randomize, preview=preview)
+    batch = batch_of(SEVERAL, count=9, randomize_reference=randomize, preview=preview)
     batch.reset(seeds=range(9))
-    assert len(set(batch.read("path"))) == 3
+    assert len(set(batch.record("path"))) == 3
     for step in range(350):  # at knots, and past the ends
         if step % 10 == 0:
             assert_on_reference(batch, step / 50.0)
-        error = np.linalg.norm(batch.read("r") - batch.read("path_r"), axis=1)
-        np.testing.assert_allclose(batch.read("position_error"), error, rtol=1e-12)
+        error = np.linalg.norm(batch.record("r") - batch.record("path_r"), axis=1)
+        np.testing.assert_allclose(batch.record("position_error"), error, rtol=1e-12)
         batch.step()
-    before = batch_of(SEVERAL, randomize=randomize, preview=preview)
+    before = batch_of(SEVERAL, randomize_reference=randomize, preview=preview)
     before.reset(seeds=range(9))
     before._blocks["tick"] = -104.0  # before the start, where no flight ever is
     before.step()
@@ -81,37 +81,42 @@ def test_many_segments_and_long_flights():
     for tick in (0.0, 12_345.0, 44_444.0, 59_799.0, 59_800.0, 80_000.0):
         batch._blocks["tick"] = tick - 4.0
         batch.step()
-        t = batch.read("tick")[0] / 200.0
+        t = batch.record("tick")[0] / 200.0
         assert t == tick / 200.0
         for k, name in enumerate(("path_r", "path_v", "path_a")):
-            np.testing.assert_allclose(batch.read(name)[0], path(t, k), rtol=0, atol=1e-10)
+            np.testing.assert_allclose(batch.record(name)[0], path(t, k), rtol=0, atol=1e-10)
 
 
 def test_an_episode_draws_its_trajectory_phase_and_turn():
     n = 3000
     plain = batch_of(SEVERAL, count=n)
     plain.reset(seeds=range(n))
-    counts = np.bincount(plain.read("path").astype(int), minlength=3)
+    counts = np.bincount(plain.record("path").astype(int), minlength=3)
     assert abs(counts - n / 3).max() < 5.0 * np.sqrt(n * 2 / 9)
-    assert (plain.read("path_turn") == [1.0, 0.0]).all()
-    assert (plain.read("path_share") == 0.0).all()
-    drawn = batch_of(SEVERAL, count=n, randomize=True)
+    assert (plain.record("path_turn") == [1.0, 0.0]).all()
+    assert (plain.record("path_share") == 0.0).all()
+    drawn = batch_of(SEVERAL, count=n, randomize_reference=True)
     drawn.reset(seeds=range(n))
-    np.testing.assert_array_equal(drawn.read("path"), plain.read("path"))
-    share = drawn.read("path_share")
-    turn = np.arctan2(*drawn.read("path_turn").T[::-1]) / (2.0 * np.pi) % 1.0
+    np.testing.assert_array_equal(drawn.record("path"), plain.record("path"))
+    share = drawn.record("path_share")
+    turn = np.arctan2(*drawn.record("path_turn").T[::-1]) / (2.0 * np.pi) % 1.0
     for values in (share, turn):
         deciles = np.histogram(values, 10, (0.0, 1.0))[0]
         assert abs(deciles - n / 10).max() < 5.0 * np.sqrt(n * 0.09)
     assert abs(np.corrcoef(share, turn)[0, 1]) < 5.0 / np.sqrt(n)
-    again = drawn.read("path")
+    again = drawn.record("path")
     drawn.reset()
-    assert (drawn.read("path") != again).any()
+    assert (drawn.record("path") != again).any()
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_flights_are_the_same_in_every_interface(mode):
-    keywords = {"trajectory": SEVERAL, "randomize": True, "observation": "truth", "duration": 1.0}
+    keywords = {
+        "trajectory": SEVERAL,
+        "randomize_reference": True,
+        "observation": "truth",
+        "duration": 1.0,
+    }
     envs = QuadVectorEnv(5, "trajectory", autoreset_mode=mode, **keywords)
     observations, _ = envs.reset(seed=7)
     actions = 0.1 * np.stack([actions_of(i, 40) for i in range(5)], axis=1)
@@ -138,7 +143,7 @@ def test_stable_baselines():
 
 
 def test_snapshots_copies_and_pickles_go_on_bit_for_bit():
-    batch = batch_of(SEVERAL, randomize=True)
+    batch = batch_of(SEVERAL, randomize_reference=True)
     batch.reset(seeds=range(9))
     for _ in range(20):
         batch.step()
@@ -162,8 +167,8 @@ def test_a_users_task_sees_the_reference():
             seen.update(r=view.reference_position.copy(), v=view.reference_velocity.copy())
             return super().reward(view)
 
-    keywords = {"trajectory": SEVERAL, "randomize": True, "observation": "truth"}
-    envs = QuadVectorEnv(4, "trajectory", custom=Watch(), **keywords)
+    keywords = {"trajectory": SEVERAL, "randomize_reference": True, "observation": "truth"}
+    envs = QuadVectorEnv(4, base="trajectory", task=Watch(), **keywords)
     plain = QuadVectorEnv(4, "trajectory", **keywords)
     envs.reset(seed=3), plain.reset(seed=3)
     for k in range(1, 20):
@@ -177,7 +182,9 @@ def test_a_users_task_sees_the_reference():
 
 
 def test_a_recorded_flight_knows_its_trajectory(tmp_path):
-    env = QuadEnv("trajectory", trajectory=[CLOSED, OPEN], randomize=True, observation="truth")
+    env = QuadEnv(
+        "trajectory", trajectory=[CLOSED, OPEN], randomize_reference=True, observation="truth"
+    )
     recorder = FlightRecorder(env.flights.batch)
     policy, times = PDPolicy(env), np.linspace(0.0, 7.0, 50)
     for seed in (0, 1, 5):
@@ -191,11 +198,11 @@ def test_a_recorded_flight_knows_its_trajectory(tmp_path):
         expected = path(flight["time"] + phase)
         np.testing.assert_allclose(flight["reference_position"], expected, rtol=0.0, atol=1e-12)
         loaded = quad_gym.Flight.load(flight.save(tmp_path / f"{seed}.npz"))
-        for stage in (flight.stage, loaded.stage):
+        for scene in (flight.scene, loaded.scene):
             np.testing.assert_allclose(
-                stage.reference(times), path(times + phase), rtol=0.0, atol=1e-12
+                scene.reference(times), path(times + phase), rtol=0.0, atol=1e-12
             )
-            assert stage.reference_period == path.duration
+            assert scene.reference_period == path.duration
 
 
 def test_the_path_is_drawn():
@@ -216,7 +223,7 @@ def test_the_path_is_drawn():
 def test_pd_control_follows_the_default(action):
     layout = "absolute" if action == "velocity" else "relative"
     env = gymnasium.make_vec(
-        "QuadGym/Trajectory-v0", num_envs=20, action=action, layout=layout, randomize=True
+        "QuadGym/Trajectory-v0", num_envs=20, action=action, layout=layout, randomize_reference=True
     )
     policy, errors = PDPolicy(env), []
     observation, _ = env.reset(seed=0)
@@ -238,8 +245,8 @@ def test_the_report_s_controller_follows_at_every_tick():
     batch.reset(seeds=[0, 1], position=(0.0, 0.0, 1.5), velocity=(0.0, 0.0, 0.0))
     for _ in range(2000):
         batch.step()
-        assert batch.read("path_r").shape == (2, 3)
-    assert batch.read("position_error").max() < 0.15
+        assert batch.record("path_r").shape == (2, 3)
+    assert batch.record("position_error").max() < 0.15
 
 
 def test_the_filter_starts_warm_on_it():

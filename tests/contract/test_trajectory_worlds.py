@@ -27,7 +27,7 @@ def fly(trajectory, world, count=4, **options):
     for _ in range(round(seconds * flights.clocks.imu_rate)):
         flights.step()
         names = ("r", "collided", "obstacle_distance", "obstacle_center")
-        found.append([flights.read(name) for name in names])
+        found.append([flights.record(name) for name in names])
     return [np.array(part) for part in zip(*found, strict=True)]
 
 
@@ -57,7 +57,7 @@ def test_each_episode_draws_a_trajectory_and_its_obstacles(mode):
     made = {
         "trajectory": [THROUGH, INTO_A_WALL],
         "world": WorldParams(obstacles=(*GAP, Cylinder(center_I=(2.0, -2.0, 1.5)))),
-        "randomize": False,
+        "randomize_reference": False,
         "sensors": "indoor",
         "action": "velocity",
     }
@@ -66,9 +66,9 @@ def test_each_episode_draws_a_trajectory_and_its_obstacles(mode):
     many, _ = together.reset(seed=list(range(16)))
     one, _ = alone.reset(seed=3)
     batch, single = together.unwrapped.flights.batch, alone.unwrapped.flights.batch
-    drawn = batch.read("path")
+    drawn = batch.record("path")
     assert set(drawn) == {0.0, 1.0}
-    assert (batch.read("obstacle_center")[3] == single.read("obstacle_center")[0]).all()
+    assert (batch.record("obstacle_center")[3] == single.record("obstacle_center")[0]).all()
     for _ in range(80):
         assert (many[3] == one).all()
         action = np.array([0.3, 0.0, 0.0, 0.0], np.float32)
@@ -81,13 +81,16 @@ def test_each_episode_draws_a_trajectory_and_its_obstacles(mode):
 def test_a_task_sees_the_wall_and_the_way_ahead():
     class Sees(quad_gym.Task):
         def observe(self, view):
-            return {"wall": view.seen.obstacle_vector, "ahead": view.seen.preview.reshape(-1, 6)}
+            return {
+                "wall": view.observed.obstacle_vector,
+                "ahead": view.observed.preview.reshape(-1, 6),
+            }
 
     world = WorldParams(obstacles=GAP)
-    made = {"trajectory": THROUGH, "world": world, "custom": Sees(), "observation": "truth"}
+    made = {"trajectory": THROUGH, "world": world, "task": Sees(), "observation": "truth"}
     env = gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=3, **made)
     observations, _ = env.reset(seed=0)
     flights = env.unwrapped.flights
     place = next(field.slice for field in flights.table if field.name == "wall")
     lengths = np.linalg.norm(observations[:, place], axis=1)
-    np.testing.assert_allclose(lengths, flights.batch.read("obstacle_distance"), rtol=1e-5)
+    np.testing.assert_allclose(lengths, flights.batch.record("obstacle_distance"), rtol=1e-5)

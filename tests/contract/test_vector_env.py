@@ -80,7 +80,8 @@ def test_it_does_so_with_a_dict_of_policy_and_privileged(mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_it_does_so_with_sensors_at_low_rates(mode):
-    keywords = {"observation": "sensors", "gnss_rate": 10, "camera_rate": 20, **SHORT}
+    suite = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=20.0)
+    keywords = {"observation": "measurements", "sensors": suite, **SHORT}
     fly_both(*both("QuadGym/Hover-v0", 5, mode, **keywords), steps=40, seed=12)
 
 
@@ -329,14 +330,14 @@ def test_options_set_the_start_of_one_episode_for_all_or_one_by_one():
     start = {"position": [1.0, 2.0, 3.0], "velocity": [0.1, 0.2, 0.3]}
     env.reset(seed=1, options=start)
     batch = env.flights.batch
-    np.testing.assert_array_equal(batch.read("r"), np.tile(start["position"], (3, 1)))
-    np.testing.assert_array_equal(batch.read("v"), np.tile(start["velocity"], (3, 1)))
+    np.testing.assert_array_equal(batch.record("r"), np.tile(start["position"], (3, 1)))
+    np.testing.assert_array_equal(batch.record("v"), np.tile(start["velocity"], (3, 1)))
     each = np.arange(9.0).reshape(3, 3) / 2.0
     env.reset(options={"position": each, "yaw": np.array([0.1, 0.2, 0.3])})
-    np.testing.assert_array_equal(batch.read("r"), each)
+    np.testing.assert_array_equal(batch.record("r"), each)
     env.step(np.zeros((3, 4)))
     env.step(np.zeros((3, 4)))
-    assert (np.linalg.norm(batch.read("r") - [4.0, 0.0, 1.0], axis=1) < 1.6).all()
+    assert (np.linalg.norm(batch.record("r") - [4.0, 0.0, 1.0], axis=1) < 1.6).all()
 
 
 @pytest.mark.parametrize(

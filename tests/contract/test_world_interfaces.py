@@ -123,12 +123,12 @@ def test_the_privileged_truth_ends_with_wind_and_draws():
     start = observation["policy"].shape[1]
     truth = {f.name: observation["privileged"][:, f.slice.start - start : f.slice.stop - start]
              for f in table if f.slice.start >= start}  # fmt: skip
-    R_BI = quad_gym.rotations.quaternion_to_dcm(batch.read("q"))
-    wind_B = np.einsum("nij,nj->ni", R_BI, batch.read("wind"))
+    R_BI = quad_gym.rotations.quaternion_to_dcm(batch.record("q"))
+    wind_B = np.einsum("nij,nj->ni", R_BI, batch.record("wind"))
     np.testing.assert_allclose(truth["wind"], wind_B, atol=1e-5)
-    mass = (batch.read("mass") - 0.78) / (0.2 * 0.78)
+    mass = (batch.record("mass") - 0.78) / (0.2 * 0.78)
     np.testing.assert_allclose(truth["drawn_mass"][:, 0], mass, atol=1e-6)
-    antenna = (batch.read("primary_antenna_B") - [0.1013, -0.0004, 0.0472]) / 0.005
+    antenna = (batch.record("primary_antenna_B") - [0.1013, -0.0004, 0.0472]) / 0.005
     np.testing.assert_allclose(truth["drawn_primary_antenna_B"], antenna, atol=1e-5)
     assert list(truth)[-1] == "drawn_start_velocity_I"
     for name, values in truth.items():

@@ -80,14 +80,19 @@ def cases():
     found = {}
     for task in ("Hover", "Circle", "Lemniscate", "RandomTrajectory", "Waypoints"):
         for suite in SUITES:
-            found[f"{task}, {suite}"] = {"id": task, "sensors": suite, "randomize": True}
+            found[f"{task}, {suite}"] = {"id": task, "sensors": suite, "randomize_reference": True}
     found["Circle, mixed"] = {"start": "mixed"}
     found["Hover, moving"] = {"id": "Hover", "start": "moving"}
-    for observation in ("truth", "noisy", "sensors"):
+    for observation in ("truth", "noisy", "measurements"):
         found[f"observation {observation}"] = {"observation": observation}
     for suite in SUITES:
         found[f"observation truth, {suite}"] = {
-            **{"observation": "truth", "sensors": suite, "filter_start": "warm", "randomize": True},
+            **{
+                "observation": "truth",
+                "sensors": suite,
+                "filter_start": "warm",
+                "randomize_reference": True,
+            },
             **{"faults": ["rotor_loss"], "world": "fresh_breeze", "action_delay": 0.5},
         }
     for action in ("motor", "wrench", "attitude", "velocity"):
@@ -115,7 +120,7 @@ def cases():
                 magnetometer=quad_gym.MagnetometerParams(latency=0.01)
             ),
             "estimator": "ekf",
-            "observation": "sensors",
+            "observation": "measurements",
         },
         "ekf": {"estimator": "ekf", "sensors": "rtk"},
         "innovations": rtk | {"innovations": True},
@@ -151,7 +156,7 @@ def cases():
         "privileged": rtk | {"privileged": True, "include_std": True},
         "absolute": rtk | {"layout": "absolute"},
         "trajectories": {
-            **{"id": "Trajectory", "trajectory": trajectories(), "randomize": True},
+            **{"id": "Trajectory", "trajectory": trajectories(), "randomize_reference": True},
             **{"sensors": "rtk", "layout": "absolute", "start": "mixed"},
         },
         "many options": {
@@ -179,7 +184,7 @@ def fly(case, flights=FLIGHTS, threads=None):
             parts = observations.values() if isinstance(observations, dict) else (observations,)
             # the columns of "drawn" that there were first
             states = [
-                batch.read(name)[:, :FIRST] if name == "drawn" else batch.read(name)
+                batch.record(name)[:, :FIRST] if name == "drawn" else batch.record(name)
                 for name in STATES
             ]
             for part in (*parts, rewards, *states):

@@ -12,7 +12,7 @@ import pytest
 
 import quad_gym
 from quad_gym.faults.presets import PRESETS
-from quad_gym.records import FilterStatus, Gate, Source
+from quad_gym.records import FilterStatus, GateDecision, Source
 from tests.field_flights import fly, measured_now
 
 UPDATES = int(float(os.environ.get("QUAD_GYM_SOAK_UPDATES", "1e6")))
@@ -62,17 +62,17 @@ def assert_told(batch, failures, nis):
     Returns:
         How many updates were made, how many of them rejected as a whole, the failures and NIS.
     """
-    counted = np.array([batch.read("update_failures"), batch.read("prediction_failures")])
-    status, now = batch.read("filter_status").astype(np.int64), batch.read("nis")
+    counted = np.array([batch.record("update_failures"), batch.record("prediction_failures")])
+    status, now = batch.record("filter_status").astype(np.int64), batch.record("nis")
     np.testing.assert_array_equal(counted[0] > 0.0, status & FilterStatus.UPDATE_FAILED > 0)
     np.testing.assert_array_equal(counted[1] > 0.0, status & FilterStatus.PREDICTION_FAILED > 0)
     assert ((counted - failures) <= 2.0).all()
-    measured, gate = measured_now(batch), batch.read("gate")
-    made, accepted = measured.any(axis=1), (measured & (gate == Gate.ACCEPTED)).any(axis=1)
+    measured, gate = measured_now(batch), batch.record("gate")
+    made, accepted = measured.any(axis=1), (measured & (gate == GateDecision.ACCEPTED)).any(axis=1)
     failed = counted[0] > failures[0]
     known = np.isfinite(now) & np.isfinite(nis)  # of an image processed in steps there is no NIS
     np.testing.assert_array_equal((now != nis)[known], (accepted & ~failed)[known])
-    np.testing.assert_array_equal((measured & (gate == Gate.FAILED)).any(axis=1), failed)
+    np.testing.assert_array_equal((measured & (gate == GateDecision.FAILED)).any(axis=1), failed)
     return made, int((made & ~accepted & ~failed).sum()), counted, now
 
 
@@ -87,7 +87,7 @@ def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fa
     batch = fly(suite, COUNTS[name], faults=fault, **options)
     cases = sum(case[0] == name for case in CASES)
     goal, updates, ticks = UPDATES * SHARES[name] / cases, 0, 0
-    failures, nis = np.zeros((2, batch.count)), batch.read("nis")
+    failures, nis = np.zeros((2, batch.count)), batch.record("nis")
     while updates < goal:
         batch.step()
         ticks += 1
@@ -96,15 +96,15 @@ def test_covariances_stay_positive_definite_and_failures_are_told(name, kind, fa
         tally["wholly left out"] += rejected
         looked_at = np.flatnonzero(made | (ticks % 20 == 0))
         if looked_at.size:
-            assert_positive_definite(batch.read("L", looked_at))
+            assert_positive_definite(batch.record("L", looked_at))
 
         # a crashed vehicle, or one long in the air, begins anew
-        lost = ~(np.abs(batch.read("r")).max(axis=1) < 1e3) | (ticks % 4000 == 0)
+        lost = ~(np.abs(batch.record("r")).max(axis=1) < 1e3) | (ticks % 4000 == 0)
         if lost.any():
             tally["failed updates"] += int(failures[0, lost].sum())
             tally["failed predictions"] += int(failures[1, lost].sum())
             batch.reset(mask=lost)
-            failures, nis = failures * ~lost, batch.read("nis")
+            failures, nis = failures * ~lost, batch.record("nis")
     tally["updates"] += updates
     tally["failed updates"] += int(failures[0].sum())
     tally["failed predictions"] += int(failures[1].sum())

@@ -30,7 +30,7 @@ ALWAYS_FINITE = [field.name for field in FLIGHT_FIELDS if field.name not in NOT_
 
 def assert_records_are_finite(env):
     for name in ALWAYS_FINITE:
-        bad = ~np.isfinite(env.flights.batch.read(name).astype(float))
+        bad = ~np.isfinite(env.flights.batch.record(name).astype(float))
         assert not bad.any(), f"{name} of flights {np.unique(np.nonzero(bad)[0])[:9]}"
 
 
@@ -46,7 +46,8 @@ def total():
 @pytest.mark.parametrize(("task", "action"), COMBINATIONS)
 def test_random_actions_leave_no_number_that_is_not_finite(task, action, total):
     number = COMBINATIONS.index((task, action))
-    rate = {} if task in BENCHMARKS else {"gnss_rate": (200, 10)[number % 2]}  # they have their own
+    suite = quad_gym.sensor_suite("standard").with_rates(gnss=(200.0, 10.0)[number % 2])
+    rate = {} if task in BENCHMARKS else {"sensors": suite}  # they have their own
     needs_camera = task in ("look_around", "outage_dash")  # or has none to switch off
     camera = {} if needs_camera else {"camera": number % 3 != 0}
     env = QuadVectorEnv(

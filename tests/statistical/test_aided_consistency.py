@@ -60,12 +60,12 @@ def test_late_and_gated_flights_are_consistent_after_two_seconds(kind):
     """Mean NEES of 300 flights, of deviation 0.32; NIS of the last ones, of 0.08 and 0.14."""
     batch = fly(aided("consumer", kind, late=True), 300, filter_start="warm")
     steps(batch, 2.0)
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
     assert nees(batch).mean() == pytest.approx(15.0, abs=1.4)
-    nis = batch.read("block_nis")[:, AID_BLOCKS:].mean(axis=0)
+    nis = batch.record("block_nis")[:, AID_BLOCKS:].mean(axis=0)
     assert nis[Aid.BAROMETER] == pytest.approx(1.0, abs=0.35)
     assert nis[Aid.MAGNETOMETER] == pytest.approx(3.0, abs=0.6)
-    assert (batch.read("rejections")[:, AID_BLOCKS:] <= 1).all()
+    assert (batch.record("rejections")[:, AID_BLOCKS:] <= 1).all()
 
 
 def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it():
@@ -76,7 +76,7 @@ def test_a_heading_is_as_wrong_as_claimed_while_maneuvers_tell_it():
     """
     batch = fly(quad_gym.sensor_suite("consumer"), 1200, task="hover", filter_start="cold")
     steps(batch, 1.5)
-    vertical = batch.read("R_hat")[:, :, 2]
+    vertical = batch.record("R_hat")[:, :, 2]
     error = np.einsum("ni,ni->n", vertical, state_errors(batch)[:, 6:9])
     P = batch.covariance()[:, 6:9, 6:9]
     variance = np.einsum("ni,nij,nj->n", vertical, P, vertical)
@@ -89,15 +89,15 @@ def test_slow_errors_and_state_go_together_as_a_warm_filter_claims():
     batch, flights = fly(sensors, 4000, task="hover", filter_start="warm"), 4000
     places = slow_states(sensors)
     vector, errors = places.vectors[Aid.MAGNETOMETER], np.zeros((flights, 9))
-    hat = batch.read("slow_hat")
-    errors[:, :3] = batch.read("gnss_drift") - hat[:, :3]
-    iron = batch.read("aid_vector")[:, Aid.MAGNETOMETER]
+    hat = batch.record("slow_hat")
+    errors[:, :3] = batch.record("gnss_drift") - hat[:, :3]
+    iron = batch.record("aid_vector")[:, Aid.MAGNETOMETER]
     errors[:, vector : vector + 3] = iron - hat[:, vector : vector + 3]
     for aid in Aid:
         k = places.scalars[aid]
-        errors[:, k] = batch.read("aid_scalar")[:, aid] - hat[:, k]
+        errors[:, k] = batch.record("aid_scalar")[:, aid] - hat[:, k]
     L = np.zeros((flights, 24, 24))
-    L[:, :15, :15], L[:, 15:] = batch.read("L"), batch.read("L_slow")
+    L[:, :15, :15], L[:, 15:] = batch.record("L"), batch.record("L_slow")
     joint = np.concatenate([state_errors(batch), errors], axis=1)
     white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0][:, :23]  # the last measures nothing
     np.testing.assert_allclose(np.cov(white.T), np.eye(23), atol=0.1)

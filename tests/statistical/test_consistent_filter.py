@@ -62,14 +62,14 @@ def test_each_correction_has_its_share():
     without_camera = LAB.replace(camera=None)
     report, turned = (
         flown(
-            without_camera.replace(estimator=LAB.estimator.replace(covariance_reset=reset)),
+            without_camera.replace(estimator=LAB.estimator.replace(attitude_reset=reset)),
             flights=1000,
             seconds=5.0,
             matched=True,
         )
         .since(1.0)
         .nees["state"]
-        for reset in ("none", "turn")
+        for reset in (False, True)
     )
     assert report.share_inside < 0.05
     assert 16.0 < report.overall < 21.0
@@ -97,7 +97,7 @@ def test_errors_of_prediction_alone_are_as_claimed(kind):
     batch.switch_sensors(gnss=False, camera=False)
     first = np.sqrt(np.diagonal(batch.covariance()[0]))
     for second in (1, 3, 10):
-        while batch.read("tick")[0] < 200 * second:
+        while batch.record("tick")[0] < 200 * second:
             batch.step()
         errors, P = flight_errors(batch), batch.covariance().mean(axis=0)
         sample, sigma = errors.T @ errors / runs, np.sqrt(np.diagonal(P))

@@ -14,7 +14,7 @@ from scipy import linalg, stats
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import CameraOcclusion, GnssOutage, GnssOutliers, PositionJump
-from quad_gym.records import POSITION_BLOCK, Gate, Source
+from quad_gym.records import POSITION_BLOCK, GateDecision, Source
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.filter_states import set_at_rest
 from tests.unit.alarms import ALARM, alarm_score
@@ -106,7 +106,7 @@ def test_in_an_outage_of_a_minute_uncertainty_grows_as_theory_says(kind):
     P, R_hat = batch.covariance()[some], []
     for k in range(120):
         steps(batch, 0.25)
-        R_hat.append(batch.read("R_hat")[some])
+        R_hat.append(batch.record("R_hat")[some])
         steps(batch, 0.25 if k < 119 else 0.25 - RTK.imu.dt)
     assert batch.active_faults()["gnss_outage"].all()
     R_hat = np.array(R_hat)
@@ -123,7 +123,7 @@ def test_in_an_outage_of_a_minute_uncertainty_grows_as_theory_says(kind):
         d = part.stop - part.start
         score = (nees(batch, part).mean() - d) / np.sqrt(2 * d / COUNT)
         assert abs(score) < alarm_score(6), (part, score)
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
 
 
 @pytest.mark.slow
@@ -150,7 +150,7 @@ def test_after_an_outage_of_a_minute_the_error_is_soon_back_inside_three_sigma(
     inside = np.zeros(COUNT, bool)
     for _ in range(round(RETURN / 0.1)):
         steps(batch, 0.1)
-        fixed = batch.read("gate")[:, POSITION_BLOCK] == Gate.ACCEPTED
+        fixed = batch.record("gate")[:, POSITION_BLOCK] == GateDecision.ACCEPTED
         inside |= fixed & (nees(batch, MOTION) < bound)
     assert inside.all(), np.flatnonzero(~inside)
     at_last = nees(batch, MOTION)
@@ -161,7 +161,7 @@ def test_after_an_outage_of_a_minute_the_error_is_soon_back_inside_three_sigma(
     assert found.max() < 0.1 * np.median(lost) + 3.0 * np.linalg.norm(
         batch.sensors.gnss.position_sigma_I
     ) + 3.0 * np.linalg.norm(batch.sensors.gnss.drift_sigma_I)
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
 
 
 # ---- outliers ----------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def rms_error(suite, faults):
     for _ in range(100):
         steps(batch, 0.1)
         squares.append((state_errors(batch)[:, R] ** 2).sum(axis=1).mean())
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -229,5 +229,5 @@ def test_a_true_jump_does_not_lock_the_filter_out(kind, name):
     errors = np.linalg.norm(state_errors(batch)[:, R], axis=1)
     print(f"{name}, {kind}: {np.median(errors):.4f} m, at most {errors.max():.4f} m")
     assert errors.max() < 0.2
-    assert (batch.read("reopened").sum(axis=1) >= 1.0).all()
-    assert not batch.read("filter_status").any()
+    assert (batch.record("reopened").sum(axis=1) >= 1.0).all()
+    assert not batch.record("filter_status").any()

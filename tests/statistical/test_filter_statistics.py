@@ -111,14 +111,14 @@ def test_a_rolling_vehicle_turns_its_covariance_less_than_it_should():
 
 def nees(batch):
     """Normalized estimation error squared of every flight, the attitude's in error Euler angles."""
-    R_BI, R_hat = attitudes_of_quaternions(batch.read("q")), batch.read("R_hat")
+    R_BI, R_hat = attitudes_of_quaternions(batch.record("q")), batch.record("R_hat")
     errors = np.concatenate(
         [
-            batch.read("r") - batch.read("r_hat"),
-            batch.read("v") - batch.read("v_hat"),
+            batch.record("r") - batch.record("r_hat"),
+            batch.record("v") - batch.record("v_hat"),
             small_euler_angles(R_BI @ R_hat.transpose(0, 2, 1)),
-            batch.read("b_a") - batch.read("b_a_hat"),
-            batch.read("b_g") - batch.read("b_g_hat"),
+            batch.record("b_a") - batch.record("b_a_hat"),
+            batch.record("b_g") - batch.record("b_g_hat"),
         ],
         axis=1,
     )[:, :, np.newaxis]
@@ -129,7 +129,7 @@ def nees_after_five_seconds(sensors):
     batch = circle_batch(sensors)
     for _ in range(1000):
         batch.step()
-    assert (batch.read("filter_status") == 0).all()
+    assert (batch.record("filter_status") == 0).all()
     return nees(batch)
 
 
@@ -162,10 +162,10 @@ def test_a_first_fix_starts_the_filter_with_errors_that_it_expects():
 def errors_of_the_experiment(source):
     """(2001, flights) distances from the reference, from the start to ten seconds."""
     batch = circle_batch(source=source)
-    errors = [batch.read("position_error")]
+    errors = [batch.record("position_error")]
     for _ in range(2000):
         batch.step()
-        errors.append(batch.read("position_error"))
+        errors.append(batch.record("position_error"))
     return np.array(errors)
 
 
@@ -191,11 +191,11 @@ def test_ten_times_the_noise_moves_flights_on_the_estimate_and_none_on_the_truth
                 batch.step()
             paths[source, factor] = batch
     for name in ("r", "v", "q", "w", "rotor_speeds", "voltages"):
-        calm, noisy = (paths[Source.TRUTH, factor].read(name) for factor in (1.0, 10.0))
+        calm, noisy = (paths[Source.TRUTH, factor].record(name) for factor in (1.0, 10.0))
         np.testing.assert_array_equal(calm, noisy, err_msg=name)
-        calm, noisy = (paths[Source.ESTIMATE, factor].read(name) for factor in (1.0, 10.0))
+        calm, noisy = (paths[Source.ESTIMATE, factor].record(name) for factor in (1.0, 10.0))
         assert (calm != noisy).any(axis=1).all(), name
-    estimates = [paths[Source.TRUTH, factor].read("r_hat") for factor in (1.0, 10.0)]
+    estimates = [paths[Source.TRUTH, factor].record("r_hat") for factor in (1.0, 10.0)]
     assert (estimates[0] != estimates[1]).any(axis=1).all()
 
 
@@ -206,5 +206,5 @@ def test_ten_times_the_noise_makes_an_error_about_ten_times_as_large():
         batch = circle_batch(sensors, source=Source.TRUTH, run_filter=True)
         for _ in range(200):
             batch.step()
-        errors.append(np.linalg.norm(batch.read("r_hat") - batch.read("r"), axis=1).mean())
+        errors.append(np.linalg.norm(batch.record("r_hat") - batch.record("r"), axis=1).mean())
     assert 7.0 < errors[1] / errors[0] < 25.0

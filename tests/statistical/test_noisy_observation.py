@@ -27,13 +27,13 @@ def measured_errors(suite):
         batch.step()
         if step < BEGIN * RATE or step % 5:
             continue
-        w, x, y, z = batch.read("q").T
+        w, x, y, z = batch.record("q").T
         to_inertial = Rotation.from_quat(np.stack([x, y, z, w], axis=1))
-        seen = Rotation.from_matrix(batch.read("R_seen"))  # inertial to body
-        errors = [batch.read(f"{name}_seen") - batch.read(name) for name in "rvw"]
+        seen = Rotation.from_matrix(batch.record("R_seen"))  # inertial to body
+        errors = [batch.record(f"{name}_seen") - batch.record(name) for name in "rvw"]
         errors.insert(2, (seen * to_inertial).as_rotvec())
         squares.append([(error**2).mean() for error in errors])
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
     return np.sqrt(np.mean(squares, axis=0))
 
 

@@ -27,7 +27,7 @@ def delayed(suite, kind="ukf"):
 
 def yaw_errors(batch):
     """(n,) degrees."""
-    R_error = attitudes(batch.read("q")) @ batch.read("R_hat").transpose(0, 2, 1)
+    R_error = attitudes(batch.record("q")) @ batch.record("R_hat").transpose(0, 2, 1)
     return np.degrees(np.abs(small_euler_angles(R_error)[:, 2]))
 
 
@@ -46,7 +46,7 @@ def test_a_warm_filter_is_consistent_from_the_first_instant_on(kind, late):
         innovations.add(batch, tick / 200)
         if tick % 10 == 0:
             recorder.add(batch, tick / 200)
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
     assert_consistent(recorder.nees(), innovations.nis(), innovations.whiteness())
 
 
@@ -65,7 +65,7 @@ def test_any_yaw_is_known_to_a_degree_within_ten_seconds(name, camera):
     assert yaw_errors(batch).max() > 3.0
     steps(batch, 10.0)
     assert (yaw_errors(batch) > 1.0).sum() <= 2
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
 
 
 @pytest.mark.slow
@@ -88,5 +88,5 @@ def test_a_vertical_baseline_does_no_harm(camera, start):
         means.append(nees(batch).mean())
     bound = 5 * np.sqrt(2 * 15 / 1000)
     assert np.abs(np.array(means) - 15.0).max() < bound, means
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
     assert np.abs(state_errors(batch)[:, :3]).max() < 0.05

@@ -31,11 +31,11 @@ class Chase(quad_gym.Task):
 
     def terminated(self, view):
         far = np.linalg.norm(view.state.target - view.position, axis=1) > 1.0
-        return far | view.shipped.terminated
+        return far | view.builtin.terminated
 
     def observe(self, view):
-        gap = view.state.target - view.seen.position
+        gap = view.state.target - view.observed.position
         return {
-            "target": np.einsum("nij,nj->ni", view.seen.R_BI, gap),
+            "target": np.einsum("nij,nj->ni", view.observed.R_BI, gap),
             "best": view.state.best.clip(0.0, 5.0),
         }

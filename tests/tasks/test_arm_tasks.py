@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from baselines import PDPolicy
-from baselines.arm_tasks import STEADY_CRASH_COST, TOLD_IN_A_RACE
+from baselines.arm_tasks import CONSTANT_CRASH_COST, RACE_STD
 from baselines.arms import OUTAGE_DASH
 from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
@@ -15,10 +15,10 @@ from baselines.recipes import recipe
 ID = "QuadGym/LookAround-v0"
 
 
-def make(name, count=6, task=ID, **keywords):
-    custom = f"baselines.arm_tasks:{name}"
+def make(name, count=6, env_id=ID, **keywords):
+    own = f"baselines.arm_tasks:{name}"
     env = gymnasium.make_vec(
-        task, num_envs=count, autoreset_mode="Disabled", custom=custom, **keywords
+        env_id, num_envs=count, autoreset_mode="Disabled", task=own, **keywords
     )
     observations, _ = env.reset(seed=3)
     return env, observations
@@ -30,12 +30,12 @@ def part(env, observations, name):
 
 
 def largest_sigma(env):
-    L = env.unwrapped.flights.batch.read("L")
+    L = env.unwrapped.flights.batch.record("L")
     return np.sqrt(np.diagonal(L @ L.transpose(0, 2, 1), axis1=1, axis2=2)[:, :3]).max(axis=1)
 
 
 def test_doubt_is_the_logarithm_of_the_largest_standard_deviation_of_the_position():
-    env, observations = make("Doubting")
+    env, observations = make("WithStd")
     for _ in range(30):
         expected = np.log10(largest_sigma(env) / 0.03)
         found = part(env, observations, "log_sigma")[:, 0]
@@ -45,12 +45,12 @@ def test_doubt_is_the_logarithm_of_the_largest_standard_deviation_of_the_positio
 
 @pytest.mark.parametrize("observation", ["truth", "noisy"])
 def test_a_controller_on_the_truth_has_no_doubt(observation):
-    env, observations = make("Doubting", observation=observation)
+    env, observations = make("WithStd", observation=observation)
     np.testing.assert_array_equal(part(env, observations, "log_sigma"), -1.0)
 
 
 def test_memory_holds_every_tenth_observation_newest_first():
-    env, observations = make("Remembering")
+    env, observations = make("WithStdHistory")
     names = ("position_error", "velocity_error", "up", "heading", "body_rates")
     seen = []
     np.testing.assert_array_equal(part(env, observations, "past"), 0.0)
@@ -65,9 +65,9 @@ def test_memory_holds_every_tenth_observation_newest_first():
             np.testing.assert_allclose(past[:, k], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("name", "told"), [("TOLD_HALF", 0.5), ("TOLD_FOURFOLD", 4.0)])
+@pytest.mark.parametrize(("name", "told"), [("REPORTED_STD_X1_2", 0.5), ("REPORTED_STD_X4", 4.0)])
 def test_a_controller_may_be_told_another_standard_deviation(name, told):
-    (plain, a), (misled, b) = make("Doubting"), make(name)
+    (plain, a), (misled, b) = make("WithStd"), make(name)
     change = part(misled, b, "log_sigma") - part(plain, a, "log_sigma")
     np.testing.assert_allclose(change, np.log10(told), atol=1e-5)
 
@@ -75,13 +75,13 @@ def test_a_controller_may_be_told_another_standard_deviation(name, told):
 def test_a_race_tells_the_standard_deviations_but_those_withheld():
     task, steps = "QuadGym/StaleRace-v0", 30
     plain = gymnasium.make_vec(task, num_envs=6, autoreset_mode="Disabled", include_std=True)
-    told, some = make("ALL_TOLD", task=task), make("ATTITUDE_WITHHELD", task=task)
+    told, some = make("ALL_SHOWN", env_id=task), make("ATTITUDE_MASKED", env_id=task)
     shown, _ = plain.reset(seed=3)
     told, observed, some, partly = *told, *some
     for _ in range(steps):
         np.testing.assert_array_equal(observed, shown)
         withheld = part(some, partly, "attitude_sigma")
-        np.testing.assert_array_equal(withheld, np.float32(TOLD_IN_A_RACE["attitude_sigma"][2]))
+        np.testing.assert_array_equal(withheld, np.float32(RACE_STD["attitude_sigma"][2]))
         others = np.ones(shown.shape[1], bool)
         others[-9:-6] = False  # the third of the five blocks
         np.testing.assert_array_equal(partly[:, others], shown[:, others])
@@ -90,7 +90,7 @@ def test_a_race_tells_the_standard_deviations_but_those_withheld():
 
 
 def test_what_is_recalled_in_a_race_is_every_fifth_observation_newest_first():
-    env, observations = make("RecallingRace", task="QuadGym/StaleRace-v0")
+    env, observations = make("RaceWithHistory", env_id="QuadGym/StaleRace-v0")
     names, seen = ("position_error", "velocity_error", "up", "body_rates"), []
     for step in range(1, 27):
         observations, *_ = env.step(np.full((6, 4), 0.01, np.float32))
@@ -105,7 +105,7 @@ def test_what_is_recalled_in_a_race_is_every_fifth_observation_newest_first():
 
 def test_a_race_seen_without_residuals_is_the_shipped_observation():
     (plain, a), (own, b) = (
-        make(name, task="QuadGym/StaleRace-v0") for name in ("RecallingRace", "SeenRace")
+        make(name, env_id="QuadGym/StaleRace-v0") for name in ("RaceWithHistory", "ObservedRace")
     )
     for _ in range(20):
         for name in ("position_error", "velocity_error", "up", "heading", "body_rates"):
@@ -117,44 +117,46 @@ def test_a_race_seen_without_residuals_is_the_shipped_observation():
 
 
 def test_residuals_of_a_race_are_what_the_model_draws():
-    env, b = make("ResidualRace", task="QuadGym/StaleRace-v0", observation="truth")
+    env, b = make("ResidualRace", env_id="QuadGym/StaleRace-v0", observation="truth")
     batch = env.unwrapped.flights.batch
     for _ in range(30):
         b, *_ = env.step(np.zeros((6, 4), np.float32))
         residual = batch.view.state.residual
         R = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ batch.view.R_BI
-        gap = batch.view.reference_position - batch.read("r") - residual[:, :3]
+        gap = batch.view.reference_position - batch.record("r") - residual[:, :3]
         expected = (R @ gap[:, :, np.newaxis])[:, :, 0]
         np.testing.assert_allclose(part(env, b, "position_error"), expected, atol=1e-4)
     assert np.abs(residual).max() > 1e-3
 
 
 def next_width(env):
-    walls = env.unwrapped.flights.batch.read("obstacle_center")[:, :4, 1]
+    walls = env.unwrapped.flights.batch.record("obstacle_center")[:, :4, 1]
     return np.stack([walls[:, k] - walls[:, k + 1] - 30.0 for k in (0, 2)], axis=1)
 
 
 def test_doubt_says_whether_two_standard_deviations_fit_through_the_gap():
-    env, observations = make("Wary", task="QuadGym/OutageDash-v0")
+    env, observations = make("WithUncertainty", env_id="QuadGym/OutageDash-v0")
     for _ in range(10):
         room = 0.5 * next_width(env) - 0.5
         expected = 0.5 * np.log2(2.0 * largest_sigma(env)[:, np.newaxis] / room)
-        np.testing.assert_allclose(part(env, observations, "doubt"), expected, atol=1e-4)
+        np.testing.assert_allclose(part(env, observations, "uncertainty"), expected, atol=1e-4)
         observations, *_ = env.step(np.zeros((6, 4), np.float32))
-    env, observations = make("Wary", task="QuadGym/OutageDash-v0", observation="truth")
-    np.testing.assert_array_equal(part(env, observations, "doubt"), -4.0)
+    env, observations = make("WithUncertainty", env_id="QuadGym/OutageDash-v0", observation="truth")
+    np.testing.assert_array_equal(part(env, observations, "uncertainty"), -4.0)
 
 
 def test_a_steady_crash_costs_the_same_everywhere():
-    env, _ = make("SteadyWary", task="QuadGym/OutageDash-v0", observation="truth")
+    env, _ = make(
+        "ConstantCrashCostWithUncertainty", env_id="QuadGym/OutageDash-v0", observation="truth"
+    )
     batch, last, action = env.unwrapped.flights.batch, np.zeros((6, 4)), np.zeros((6, 4))
     action[:, :3] = 0.3, 0.0, -0.5  # on, and down to the ground
     for _ in range(60):
         _, reward, over, *_ = env.step(action)
         effort = ((action - last) ** 2).sum(axis=1)
-        paid = 0.5 * np.minimum(-batch.read("v")[:, 0], 5.0)
-        costs = 0.02 * effort + 0.002 * (batch.read("w") ** 2).sum(axis=1)
-        np.testing.assert_allclose(reward, paid - costs - STEADY_CRASH_COST * over, atol=1e-9)
+        paid = 0.5 * np.minimum(-batch.record("v")[:, 0], 5.0)
+        costs = 0.02 * effort + 0.002 * (batch.record("w") ** 2).sum(axis=1)
+        np.testing.assert_allclose(reward, paid - costs - CONSTANT_CRASH_COST * over, atol=1e-9)
         if over.any():
             return
         last = action
@@ -163,10 +165,10 @@ def test_a_steady_crash_costs_the_same_everywhere():
 
 def test_steady_episodes_begin_before_the_first_wall_or_between_two():
     env = gymnasium.make_vec(
-        "QuadGym/OutageDash-v0", num_envs=300, custom="baselines.arm_tasks:Steady"
+        "QuadGym/OutageDash-v0", num_envs=300, task="baselines.arm_tasks:ConstantCrashCost"
     )
     env.reset(seed=0)
-    x = env.unwrapped.flights.batch.read("r")[:, 0]
+    x = env.unwrapped.flights.batch.record("r")[:, 0]
     found, count = np.unique(np.round(x, 6), return_counts=True)
     np.testing.assert_allclose(found, [*np.arange(-54.0, 43.0, 12.0), 60.0])
     assert count.min() > 10
@@ -175,7 +177,7 @@ def test_steady_episodes_begin_before_the_first_wall_or_between_two():
 def test_scaled_observations_are_those_of_the_task_over_their_scales():
     plain = gymnasium.make_vec("QuadGym/OutageDash-v0", num_envs=6)
     seen = plain.reset(seed=3)[0]
-    env, scaled = make("Scaled", task="QuadGym/OutageDash-v0")
+    env, scaled = make("Scaled", env_id="QuadGym/OutageDash-v0")
     scales = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "next_gap": 12.0}
     for _ in range(5):
         for name, scale in scales.items():
@@ -191,9 +193,11 @@ def test_scaled_observations_are_those_of_the_task_over_their_scales():
     assert np.abs(part(plain, seen, "body_rates")).max() > 0.1
 
 
-@pytest.mark.parametrize("name", ["Scaled", "Wary", "Steady", "SteadyWary"])
+@pytest.mark.parametrize(
+    "name", ["Scaled", "WithUncertainty", "ConstantCrashCost", "ConstantCrashCostWithUncertainty"]
+)
 def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
-    env, _ = make(name, count=1, task="QuadGym/OutageDash-v0", include_std=True)
+    env, _ = make(name, count=1, env_id="QuadGym/OutageDash-v0", include_std=True)
     table = {field.name: field for field in env.unwrapped.flights.table}
     scaled = ["position_error", "velocity_error", "body_rates"]
     scaled += ["next_gap", "gap_width", "next_width"]
@@ -235,23 +239,26 @@ def assert_shown(env, observations, want):
 def true_state(env, target):
     """Of flights whose reference stands at targets: errors, vertical, rates; rotated by SciPy."""
     batch = env.unwrapped.flights.batch
-    body = Rotation.from_quat(batch.read("q"), scalar_first=True)
+    body = Rotation.from_quat(batch.record("q"), scalar_first=True)
     into = body.inv().apply
     return {
-        "position_error": into(target - batch.read("r")),
+        "position_error": into(target - batch.record("r")),
         "up": into(np.tile([0.0, 0.0, 1.0], (len(target), 1))),
-        "body_rates": batch.read("w"),
-        "velocity_error": into(-batch.read("v")),
+        "body_rates": batch.record("w"),
+        "velocity_error": into(-batch.record("v")),
     }
 
 
 def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_sees():
-    task = "baselines.arm_tasks:Sure"
-    plain = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", custom=task)
+    task = "baselines.arm_tasks:WithStdCertaintyReward"
+    plain = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", task=task)
     shipped = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", privileged=True)
     both = [env.reset(seed=3)[0] for env in (plain, shipped)]
     env = gymnasium.make_vec(
-        ID, num_envs=6, autoreset_mode="Disabled", custom="baselines.arm_critics:SureForCritic"
+        ID,
+        num_envs=6,
+        autoreset_mode="Disabled",
+        task="baselines.arm_critics:WithStdCertaintyRewardForCritic",
     )
     observations, _ = env.reset(seed=3)
     for _ in range(20):
@@ -268,10 +275,13 @@ def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_
 
 def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails():
     task = "QuadGym/OutageDash-v0"
-    name = "baselines.arm_critics:SteadyWaryForCritic"
-    env = gymnasium.make_vec(task, num_envs=20, autoreset_mode="Disabled", custom=name)
+    name = "baselines.arm_critics:ConstantCrashCostWithUncertaintyForCritic"
+    env = gymnasium.make_vec(task, num_envs=20, autoreset_mode="Disabled", task=name)
     plain = gymnasium.make_vec(
-        task, num_envs=20, autoreset_mode="Disabled", custom="baselines.arm_tasks:SteadyWary"
+        task,
+        num_envs=20,
+        autoreset_mode="Disabled",
+        task="baselines.arm_tasks:ConstantCrashCostWithUncertainty",
     )
     env.reset(seed=3)
     plain.reset(seed=3)
@@ -287,7 +297,7 @@ def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails
         kinds |= set(fails[flying].tolist())
         if over.any():
             break
-        r = batch.read("r")
+        r = batch.record("r")
         gap = np.full((20, 3), np.nan)
         for i, middle in enumerate(batch.view.obstacles):
             walls = [k for k in range(0, len(middle), 2) if middle[k, 0] - 0.7 <= r[i, 0]]
@@ -308,7 +318,7 @@ def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails
 
 
 def test_being_sure_is_paid_for():
-    (plain, _), (paid, _) = make("Doubting"), make("Sure")
+    (plain, _), (paid, _) = make("WithStd"), make("WithStdCertaintyReward")
     for _ in range(40):
         actions = np.zeros((6, 4), np.float32)
         actions[:, 3] = 1.0  # turning, so that markers come and go

@@ -36,12 +36,12 @@ WRONG = {
         (lambda v: 1 / 0, "reward failed, for all flights: ZeroDivisionError"),
         (lambda v: v.altitude, "reward failed.*no attribute 'altitude'"),
         (lambda v: v.positon, r"no attribute 'positon'; did you mean position\?$"),
-        (lambda v: v.seen.positon, r"no attribute 'positon'; did you mean position\?$"),
+        (lambda v: v.observed.positon, r"no attribute 'positon'; did you mean position\?$"),
         (lambda v: v.truth.velocty, r"no attribute 'velocty'; did you mean velocity\?$"),
         (lambda v: v.nis, r"no attribute 'nis'; did you mean view.estimate.nis\?$"),
-        (lambda v: v.seen.gyro, r"no attribute 'gyro'; did you mean view.measured.gyro\?$"),
+        (lambda v: v.observed.gyro, r"no attribute 'gyro'; did you mean view.measured.gyro\?$"),
         (lambda v: v.position.__setitem__(0, 1.0), "reward failed.*read-only"),
-        (lambda v: v.shipped.reward.__iadd__(1.0), "reward failed.*read-only"),
+        (lambda v: v.builtin.reward.__iadd__(1.0), "reward failed.*read-only"),
         (lambda v: setattr(v, "mine", 1.0), "reward failed.*keep your own in view.state"),
         (lambda v: setattr(v.state, "count", 1.0), "reward failed.*read-only"),
         (lambda v: v.state.other, "declares no state 'other'"),
@@ -66,9 +66,9 @@ WRONG = {
         (lambda v: {"observed": np.ones((FLIGHTS, 1)) * 1j}, "observe must return numbers"),
         (lambda v: {"observed": np.full((FLIGHTS, 1), None)}, "observe must return numbers"),
         (lambda v: {"observed": np.ones((1, FLIGHTS))}, "observe must return shape"),
-        (lambda v: v.position, r"cannot read the truth \(view.position\).*view.seen"),
+        (lambda v: v.position, r"cannot read the truth \(view.position\).*view.observed"),
         (lambda v: v.truth.position, r"cannot read the truth \(view.truth\)"),
-        (lambda v: v.shipped.reward, r"cannot read the truth \(view.shipped\)"),
+        (lambda v: v.builtin.reward, r"cannot read the truth \(view.builtin\)"),
         (lambda v: v.position_error, r"cannot read the truth \(view.position_error\)"),
     ],
 }
@@ -94,7 +94,7 @@ class Switch:
 def with_switch(method, wrong, mode):
     switch = Switch(method, wrong)
     task = quad_gym.Task.of(state={"count": 0.0}, **{method: switch})
-    env = QuadVectorEnv(FLIGHTS, "hover", custom=task, autoreset_mode=mode, threads=1)
+    env = QuadVectorEnv(FLIGHTS, base="hover", task=task, autoreset_mode=mode, threads=1)
     env.reset(seed=3)
     return env, switch
 
@@ -145,8 +145,8 @@ def test_a_reset_of_the_flights_that_failed_is_needed():
         def reset(self, view, rng):
             return self.wrong
 
-    env = QuadVectorEnv(3, "hover", custom=Wrong(), autoreset_mode="Disabled")
-    task = env.flights.batch.custom
+    env = QuadVectorEnv(3, base="hover", task=Wrong(), autoreset_mode="Disabled")
+    task = env.flights.batch.own_task
     env.reset(seed=0)
     mask = np.array([False, True, False])
     for wrong, message in (
@@ -198,10 +198,10 @@ def test_a_privileged_task_may_observe_the_truth():
         privileged = True
 
         def observe(self, view):
-            return {"truth": view.position, "reward": view.shipped.reward}
+            return {"truth": view.position, "reward": view.builtin.reward}
 
     for mode in ("SameStep", "NextStep"):
-        env = QuadVectorEnv(2, "hover", custom=Open(), autoreset_mode=mode, max_episode_steps=3)
+        env = QuadVectorEnv(2, base="hover", task=Open(), autoreset_mode=mode, max_episode_steps=3)
         plain = QuadVectorEnv(2, "hover", autoreset_mode=mode, max_episode_steps=3)
         assert_same(env.reset(seed=0)[0][:, :28].copy(), plain.reset(seed=0)[0])
         for _ in range(7):
@@ -210,7 +210,7 @@ def test_a_privileged_task_may_observe_the_truth():
             theirs, their_reward, *_ = plain.step(action)
             np.testing.assert_array_equal(observation[:, :28], theirs)
             np.testing.assert_array_equal(reward, their_reward)
-            position = env.flights.batch.read("r").astype(np.float32)
+            position = env.flights.batch.record("r").astype(np.float32)
             np.testing.assert_array_equal(observation[:, 28:31], position)
             started = over if mode == "SameStep" else env.flights.batch.began
             expected = np.where(started, 0.0, reward).astype(np.float32)
@@ -224,9 +224,9 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
     task = quad_gym.Task.of(
         terminated=lambda view: np.zeros(view.count, bool),
         reward=lambda view: view.position[:, 0],
-        observe=lambda view: view.seen.position,
+        observe=lambda view: view.observed.position,
     )
-    env = QuadVectorEnv(2, "hover", custom=task, autoreset_mode="SameStep")
+    env = QuadVectorEnv(2, base="hover", task=task, autoreset_mode="SameStep")
     env.reset(seed=0)
     env.flights.batch._blocks["v"][0, :, 1] = np.nan
     with np.errstate(invalid="ignore"):
@@ -250,7 +250,7 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
         ),
         ({"observe": lambda v: {"up": v.time}}, "must not return 'up'"),
         (
-            {"observe": lambda v: {"true_position_error": v.seen.position}},
+            {"observe": lambda v: {"true_position_error": v.observed.position}},
             "must not return 'true_position_error'",
         ),
         ({"observe": lambda v: {}, "replaces_observation": True}, "must return something"),
@@ -259,13 +259,13 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
 )
 def test_wrong_declarations_are_refused_when_the_environment_is_made(attributes, message):
     with pytest.raises(ValueError, match=message):
-        gymnasium.make("QuadGym/Hover-v0", custom=quad_gym.Task.of(**attributes))
+        gymnasium.make("QuadGym/Hover-v0", task=quad_gym.Task.of(**attributes))
 
 
 def test_a_wrong_observe_is_refused_when_the_environment_is_made():
     task = quad_gym.Task.of(observe=lambda view: view.position)
     with pytest.raises(TaskError, match=r"observe failed.*cannot read the truth"):
-        gymnasium.make("QuadGym/Hover-v0", custom=task)
+        gymnasium.make("QuadGym/Hover-v0", task=task)
 
 
 def test_a_method_whose_name_is_nearly_right_is_warned_of():
@@ -293,7 +293,7 @@ def test_no_name_is_suggested_of_an_object_of_the_user():
         def __dir__(self):
             raise RuntimeError("nobody may ask")
 
-    env = QuadVectorEnv(2, "hover", custom=quad_gym.Task.of(reward=lambda view: Silent().gain))
+    env = QuadVectorEnv(2, base="hover", task=quad_gym.Task.of(reward=lambda view: Silent().gain))
     env.reset(seed=0)
     with pytest.raises(TaskError, match=r"reward failed.*no attribute 'gain'$") as caught:
         env.step(np.zeros((2, 4)))

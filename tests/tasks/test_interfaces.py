@@ -23,11 +23,11 @@ class Half(quad_gym.Task):
     """Half the reward that ships."""
 
     def reward(self, view):
-        return 0.5 * view.shipped.reward
+        return 0.5 * view.builtin.reward
 
 
 def distance(view):
-    gap = view.features - view.seen.position[:, np.newaxis]
+    gap = view.features - view.observed.position[:, np.newaxis]
     return {"marker": np.linalg.norm(gap, axis=2).min(axis=1)}
 
 
@@ -38,12 +38,12 @@ def registered():
     del gymnasium.registry["Mine/Chase-v0"]
 
 
-@pytest.mark.parametrize("keywords", [{}, {"privileged": True}, {"observation": "sensors"}])
+@pytest.mark.parametrize("keywords", [{}, {"privileged": True}, {"observation": "measurements"}])
 def test_both_checkers_pass(keywords):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(2):
-            env = gymnasium.make("QuadGym/Hover-v0", custom=Chase(), **keywords)
+            env = gymnasium.make("QuadGym/Hover-v0", task=Chase(), **keywords)
             gymnasium_check(env.unwrapped)
             sb3_check(env.unwrapped)
 
@@ -75,16 +75,14 @@ def test_roll_out_sums_the_rewards_of_the_task():
         env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=4, **keywords)
         return roll_out(PDPolicy(env), env, seed=0).returns
 
-    np.testing.assert_allclose(returns(custom=Half()), 0.5 * returns(), rtol=1e-12)
+    np.testing.assert_allclose(returns(task=Half()), 0.5 * returns(), rtol=1e-12)
 
 
 def test_an_ending_of_the_task_is_no_crash():
     def late(view):
         return view.time > 0.5
 
-    env = gymnasium.make_vec(
-        "QuadGym/Hover-v0", num_envs=3, custom=quad_gym.Task.of(terminated=late)
-    )
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=quad_gym.Task.of(terminated=late))
     episodes = roll_out(PDPolicy(env), env, seed=0)
     assert list(episodes.ending) == ["task"] * 3
     assert list(episodes.lengths) == [26] * 3
@@ -97,7 +95,7 @@ def test_pd_control_finds_its_part_of_a_longer_observation(layout, keywords):
     task = quad_gym.Task.of(observe=distance)
     made = {"num_envs": 3, "layout": layout, **keywords}
     plain = gymnasium.make_vec("QuadGym/Circle-v0", **made)
-    longer = gymnasium.make_vec("QuadGym/Circle-v0", custom=task, **made)
+    longer = gymnasium.make_vec("QuadGym/Circle-v0", task=task, **made)
     actions = [
         PDPolicy(env).predict(env.reset(seed=3)[0], deterministic=True)[0]
         for env in (plain, longer)
@@ -107,13 +105,13 @@ def test_pd_control_finds_its_part_of_a_longer_observation(layout, keywords):
 
 def test_pd_control_refuses_an_observation_without_its_part():
     task = quad_gym.Task.of(observe=distance, replaces_observation=True)
-    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=1, custom=task)
+    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=1, task=task)
     with pytest.raises(ValueError, match=r"env must observe body_rates: its task replaces"):
         PDPolicy(env)
 
 
 def test_the_table_of_observations_has_the_part_of_the_task_before_the_privileged_one():
-    env = gymnasium.make("QuadGym/Hover-v0", custom=Chase(), privileged=True)
+    env = gymnasium.make("QuadGym/Hover-v0", task=Chase(), privileged=True)
     table = env.unwrapped.flights.table
     named = {field.name: field for field in table}
     assert [field.slice.start for field in table] == [0] + [f.slice.stop for f in table[:-1]]
@@ -131,7 +129,7 @@ def test_observations_are_held_within_the_bounds_of_the_task():
         observe=lambda view: {"a": np.full((view.count, 2), 7.0), "b": np.full(view.count, -1e9)},
         observes={"a": ObservationSpec(low=0.0, high=0.5)},
     )
-    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, custom=far)
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, task=far)
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(observation[:, 28:], [[0.5, 0.5, -1e6]] * 2)
     assert env.observation_space.contains(observation)
@@ -139,18 +137,18 @@ def test_observations_are_held_within_the_bounds_of_the_task():
 
 def test_a_lone_array_needs_no_name():
     env = gymnasium.make(
-        "QuadGym/Hover-v0", custom=quad_gym.Task.of(observe=lambda view: view.seen.position)
+        "QuadGym/Hover-v0", task=quad_gym.Task.of(observe=lambda view: view.observed.position)
     )
     assert env.unwrapped.flights.table[-1][:2] == ("observed", slice(28, 31))
     observation, _ = env.reset(seed=0)
-    seen = env.unwrapped.flights.batch.read("r_hat")[0].astype(np.float32)
+    seen = env.unwrapped.flights.batch.record("r_hat")[0].astype(np.float32)
     np.testing.assert_array_equal(observation[28:], seen)
 
 
 def test_reward_per_second_multiplies_the_reward_of_the_task():
     task, rewards = quad_gym.Task.of(reward=lambda view: np.full(view.count, 3.0)), []
     for per in ("step", "second"):
-        env = gymnasium.make("QuadGym/Hover-v0", custom=task, reward_per=per, control_rate=40)
+        env = gymnasium.make("QuadGym/Hover-v0", task=task, reward_per=per, control_rate=40)
         env.reset(seed=0)
         rewards.append(env.step(np.zeros(4))[1])
     assert rewards == pytest.approx([3.0, 3.0 / 40.0], rel=1e-15)
@@ -158,15 +156,13 @@ def test_reward_per_second_multiplies_the_reward_of_the_task():
 
 def test_a_task_is_named_by_its_module():
     named = gymnasium.make_vec(
-        "QuadGym/Hover-v0", num_envs=2, custom="tests.tasks.chase:Chase"
+        "QuadGym/Hover-v0", num_envs=2, task="tests.tasks.chase:Chase"
     ).reset(seed=0)
-    assert_same(
-        named, gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, custom=Chase).reset(seed=0)
-    )
+    assert_same(named, gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, task=Chase).reset(seed=0))
 
 
 @pytest.mark.parametrize(
-    ("custom", "message"),
+    ("own", "message"),
     [
         ("tests.tasks.chase", '"module:name"'),
         ("tests.tasks.chase:Nobody", "must name a quad_gym.Task.*Nobody"),
@@ -176,9 +172,9 @@ def test_a_task_is_named_by_its_module():
         (quad_gym.QuadEnv, "must be a quad_gym.Task"),
     ],
 )
-def test_what_is_no_task_is_refused(custom, message):
+def test_what_is_no_task_is_refused(own, message):
     with pytest.raises(ValueError, match=message):
-        gymnasium.make("QuadGym/Hover-v0", custom=custom)
+        gymnasium.make("QuadGym/Hover-v0", task=own)
 
 
 def test_functions_have_to_have_the_names_of_methods():
@@ -194,7 +190,7 @@ def test_the_command_line_flies_and_names_a_task_of_the_working_directory(tmp_pa
         "One = quad_gym.Task.of(reward=lambda view: np.ones(view.count))\n"
     )
     words = "evaluate QuadGym/Hover-v0 --policy pd --observation estimate --episodes 2"
-    words += " --env custom=task_of_mine:One max_episode_steps=5 --output out"
+    words += " --env task=task_of_mine:One max_episode_steps=5 --output out"
     done = console_commands.run(*words.split(), where=tmp_path)
     assert done.returncode == 0, done.stderr
     (case,) = json.loads((tmp_path / "out/summary.json").read_text())["cases"]
@@ -203,7 +199,7 @@ def test_the_command_line_flies_and_names_a_task_of_the_working_directory(tmp_pa
 
 def test_rendering_and_recording_take_a_task():
     pytest.importorskip("pygame")
-    env = gymnasium.make("QuadGym/Hover-v0", custom=Half(), render_mode="rgb_array")
+    env = gymnasium.make("QuadGym/Hover-v0", task=Half(), render_mode="rgb_array")
     env.reset(seed=0)
     reward = env.step(np.zeros(4))[1]
     assert env.render().shape == (480, 640, 3)

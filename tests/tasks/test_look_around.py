@@ -54,8 +54,8 @@ def test_the_reward_is_that_of_its_equation():
     for _ in range(200):
         _, reward, terminated, truncated, _ = env.step(actions(rng, 20) + 0.1)
         view = batch.view
-        e = np.linalg.norm(batch.read("r") - view.reference_position, axis=1)
-        w, x, y, z = batch.read("q").T
+        e = np.linalg.norm(batch.record("r") - view.reference_position, axis=1)
+        w, x, y, z = batch.record("q").T
         forward = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply([1.0, 0.0, 0.0])
         h = (forward * view.reference_heading).sum(axis=1)
         expected = 0.1 * np.exp(-e) + 0.1 * np.exp(-5.0 * e) + 0.15 * h - 2.0 * terminated
@@ -74,8 +74,8 @@ def test_the_direction_of_the_features_is_what_the_source_believes(observation):
     observed, _ = env.reset(seed=5)
     batch = env.unwrapped.flights.batch
     for _ in range(60):
-        gap = WALL.mean(axis=0) - batch.read("r_seen")
-        turned = Rotation.from_matrix(batch.read("R_seen")).apply(gap)
+        gap = WALL.mean(axis=0) - batch.record("r_seen")
+        turned = Rotation.from_matrix(batch.record("R_seen")).apply(gap)
         expected = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         np.testing.assert_allclose(part(env, observed, "features_direction"), expected, atol=1e-6)
         observed, *_ = env.step(actions(rng, 20))
@@ -89,9 +89,9 @@ def test_features_in_view_are_those_within_the_angles_of_the_camera():
     seen = 0
     for _ in range(50):
         env.step(actions(rng, 60))
-        w, x, y, z = batch.read("q").T
+        w, x, y, z = batch.record("q").T
         body = Rotation.from_quat(np.stack([x, y, z, w], axis=1))  # body to inertial
-        eye = batch.read("r") + body.apply(camera.position_B)
+        eye = batch.record("r") + body.apply(camera.position_B)
         for k, point in enumerate(WALL):
             ahead, left, up = body.inv().apply(point - eye).T  # the camera looks along body x
             azimuth, elevation = np.arctan2(left, ahead), np.arctan2(up, ahead)
@@ -121,7 +121,7 @@ def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not
 
 def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_std=True)
-    rule = fly(PDPolicy(env, faces="features_when_unsure"), env, 0, traced=("sigma",))
+    rule = fly(PDPolicy(env, faces="features_when_uncertain"), env, 0, traced=("sigma",))
     assert rule.returns.mean() > facing.returns.mean()
     assert UNSURE < np.nanmax(rule.traces["sigma"]) < 3.0
     assert rule.crashed.mean() < 0.1
@@ -132,14 +132,14 @@ def test_the_features_must_be_observed_to_be_faced():
     with pytest.raises(ValueError, match='must observe features_direction for faces="features"'):
         PDPolicy(circle, faces="features")
     with pytest.raises(ValueError, match="include_std=True"):
-        PDPolicy(make(1), faces="features_when_unsure")
+        PDPolicy(make(1), faces="features_when_uncertain")
     with pytest.raises(ValueError, match="faces must be one of"):
         PDPolicy(circle, faces="north")
 
 
 def test_it_takes_other_weights_sensors_and_tasks():
     for weight in (0.0, 0.3):
-        env = gymnasium.make(ID, custom=LookAround(heading_weight=weight), sensors="indoor")
+        env = gymnasium.make(ID, task=LookAround(heading_weight=weight), sensors="indoor")
         env.reset(seed=0)
         e, view = env.unwrapped, env.unwrapped.flights.batch.view
         _, reward, *_ = env.step(np.zeros(4, np.float32))
@@ -201,4 +201,4 @@ def test_the_policy_that_ships_flies_by_command(observation, tmp_path, capsys):
     flown = tmp_path / "flight.npz"
     words = ["fly", "look_around", "--policy", "pretrained", "--duration", "0.5"]
     assert main([*words, "--observation", observation, "--output", str(flown)]) == 0
-    assert quad_gym.Flight.load(flown).stage.observation == observation
+    assert quad_gym.Flight.load(flown).scene.observation == observation

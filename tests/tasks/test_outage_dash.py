@@ -34,7 +34,7 @@ def part(env, observations, name):
 
 def edges(batch):
     """(n, 10) places of the walls, and of the northern and southern edges of their gaps."""
-    walls = batch.read("obstacle_center")[:, :20]
+    walls = batch.record("obstacle_center")[:, :20]
     assert batch.world.obstacles[0].size == (0.3, 30.0, 12.0)
     return walls[:, ::2, 0], walls[:, ::2, 1] - 15.0, walls[:, 1::2, 1] + 15.0
 
@@ -75,8 +75,8 @@ def test_the_reward_is_that_of_its_equation(keywords):
         action = np.clip(actions(rng, 30) - down, -1.0, 1.0)  # to the ground
         _, reward, terminated, truncated, _ = env.step(action)
         effort = ((action - last) ** 2).sum(axis=1)
-        rates = (batch.read("w") ** 2).sum(axis=1)
-        paid = 5.0 * h * np.minimum(-batch.read("v")[:, 0], 5.0)
+        rates = (batch.record("w") ** 2).sum(axis=1)
+        paid = 5.0 * h * np.minimum(-batch.record("v")[:, 0], 5.0)
         earned += paid
         expected = paid - 0.02 * effort - 0.002 * rates - (50.0 + earned) * terminated
         np.testing.assert_allclose(reward, expected, atol=1e-9)
@@ -97,7 +97,7 @@ def test_the_observation_is_what_the_source_believes(observation):
     for _ in range(300):
         observed, *_ = env.step(policy.predict(observed)[0])
         x, north, south = edges(batch)
-        r, turn = batch.read("r_seen"), Rotation.from_matrix(batch.read("R_seen"))
+        r, turn = batch.record("r_seen"), Rotation.from_matrix(batch.record("R_seen"))
         for i in range(12):
             behind = int((r[i, 0] < x[i] - 0.7).sum())
             middle = np.stack([x[i], 0.5 * (north[i] + south[i]), np.full(10, 4.0)], axis=1)
@@ -114,7 +114,7 @@ def test_the_observation_is_what_the_source_believes(observation):
             )
             widths = [part(env, observed, name)[i, 0] for name in ("gap_width", "next_width")]
             np.testing.assert_allclose(widths, (north - south)[i, behind : behind + 2], atol=1e-5)
-        velocity = turn.apply(batch.read("v_seen"))
+        velocity = turn.apply(batch.record("v_seen"))
         np.testing.assert_allclose(part(env, observed, "velocity_error"), -velocity, atol=1e-5)
         course = np.tile(turn.apply([-1.0, 0.0, 0.0]), (1, 1))
         np.testing.assert_allclose(part(env, observed, "heading"), course, atol=1e-6)
@@ -148,7 +148,7 @@ def test_gaps_are_counted_by_the_true_position(mode):
         observed, _, terminated, truncated, info = env.step(policy.predict(observed)[0])
         over = (terminated | truncated) & ~ended
         x = 48.0 - 12.0 * np.arange(10)
-        behind = (batch.read("r")[:, :1] < x - 0.7).sum(axis=1)
+        behind = (batch.record("r")[:, :1] < x - 0.7).sum(axis=1)
         flying = ~(ended | over)
         counted[flying] = np.maximum(counted, behind)[flying]
         passed = info["gates_passed"]
@@ -173,7 +173,7 @@ def test_the_standard_deviations_tell_that_gnss_is_gone():
         observed, *_ = env.step(policy.predict(observed)[0])
         gone.append(batch.active_faults()["gnss_outage"])
         sigma.append(part(env, observed, "position_sigma")[:, :2].max(axis=1))
-        factor = batch.read("L")
+        factor = batch.record("L")
         np.testing.assert_allclose(
             part(env, observed, "position_sigma"),
             np.sqrt((factor[:, :3] ** 2).sum(axis=2)),
@@ -252,11 +252,11 @@ class KeepsSome(quad_gym.Task):
     keeps = ("up", "body_rates", "nothing of the kind")
 
     def observe(self, view):
-        return {"height": view.seen.position[:, 2]}
+        return {"height": view.observed.position[:, 2]}
 
 
 def test_a_task_that_replaces_the_observation_may_keep_parts_of_it():
-    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, custom=KeepsSome, privileged=True)
+    env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, task=KeepsSome, privileged=True)
     plain = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, privileged=True)
     assert [f.name for f in env.unwrapped.flights.table][:3] == ["up", "body_rates", "height"]
     ours, shipped = env.reset(seed=0)[0], plain.reset(seed=0)[0]
@@ -267,4 +267,4 @@ def test_a_task_that_replaces_the_observation_may_keep_parts_of_it():
     wrong = quad_gym.Task.of(replaces_observation=True, observe=KeepsSome.observe)
     wrong.keeps = "up"
     with pytest.raises(ValueError, match="keeps of Task must hold names, got 'up'"):
-        gymnasium.make("QuadGym/Circle-v0", custom=wrong)
+        gymnasium.make("QuadGym/Circle-v0", task=wrong)

@@ -10,8 +10,10 @@ from tests.contract.comparing import actions_of
 STEPS, FLIGHTS = 120, 5
 
 
-def fly(mode, custom, randomize):
-    env = QuadVectorEnv(FLIGHTS, "circle", autoreset_mode=mode, randomize=randomize, **custom)
+def fly(mode, own, randomize):
+    env = QuadVectorEnv(
+        FLIGHTS, base="circle", autoreset_mode=mode, randomize_reference=randomize, **own
+    )
     actions = np.stack([actions_of(flight, STEPS) for flight in range(FLIGHTS)], axis=1)
     observations, _ = env.reset(seed=3)
     rows, rewards = [observations], []
@@ -22,13 +24,13 @@ def fly(mode, custom, randomize):
     return (
         rows,
         np.array(rewards),
-        {name: env.unwrapped.flights.batch.read(name) for name in "rvqwL"},
+        {name: env.unwrapped.flights.batch.record(name) for name in "rvqwL"},
     )
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_circle_of_ones_own_flies_the_same_episodes(mode):
-    shipped, own = (fly(mode, custom, True) for custom in ({}, {"custom": OwnCircle()}))
+    shipped, own = (fly(mode, own, True) for own in ({}, {"task": OwnCircle()}))
     for one, other in zip(shipped[0], own[0], strict=True):
         assert np.array_equal(one, other)
     assert sum(np.sum(terminated) for terminated in shipped[0][2::4]) > 0, "no episode ended"

@@ -18,9 +18,9 @@ from quad_gym.tasks.rewards import BLOCKS, Constant, Term
 @pytest.mark.parametrize("task", [i for i, task in quad_gym.IDS.items() if task in TASK_DEFAULTS])
 def test_sums_of_pieces_are_the_rewards_that_ship(task, per):
     piece = rewards.RACING if "Waypoints" in task else rewards.TRACKING
-    made = {"num_envs": 6, "reward_per": per, "randomize": True, "max_episode_steps": 120}
+    made = {"num_envs": 6, "reward_per": per, "randomize_reference": True, "max_episode_steps": 120}
     plain = gymnasium.make_vec(task, **made)
-    ours = gymnasium.make_vec(task, custom=quad_gym.Task.of(reward=piece), **made)
+    ours = gymnasium.make_vec(task, task=quad_gym.Task.of(reward=piece), **made)
     observation, _ = plain.reset(seed=3)
     ours.reset(seed=3)
     policy, rng, gates = PDPolicy(plain), np.random.default_rng(5), 0
@@ -34,7 +34,9 @@ def test_sums_of_pieces_are_the_rewards_that_ship(task, per):
 
 
 def view_after(steps=10, **keywords):
-    env = QuadVectorEnv(4, "hover", custom=quad_gym.Task(), autoreset_mode="Disabled", **keywords)
+    env = QuadVectorEnv(
+        4, base="hover", task=quad_gym.Task(), autoreset_mode="Disabled", **keywords
+    )
     env.reset(seed=2)
     rng = np.random.default_rng(2)
     for _ in range(steps):
@@ -72,7 +74,7 @@ def test_each_piece_is_what_it_says():
         (rewards.Heading(), np.einsum("ni,ni->n", view.R_BI[:, 0], view.reference_heading)),
         (rewards.ActionRate(), np.linalg.norm(change, axis=1) ** 2),
         (rewards.BodyRates(), np.linalg.norm(view.body_rates, axis=1) ** 2),
-        (rewards.Gate(), np.zeros(4)),
+        (rewards.GatePassed(), np.zeros(4)),
         (rewards.Crash(), np.zeros(4)),
         (rewards.Visibility(), view.truth.features_in_view.sum(axis=1)),
         (Constant(2.0), np.full(4, 2.0)),
@@ -110,7 +112,7 @@ def test_progress_is_the_speed_toward_the_reference():
 
 def test_a_crash_costs_where_the_vehicle_crashes():
     env = QuadVectorEnv(
-        2, "hover", autoreset_mode="SameStep", custom=quad_gym.Task.of(reward=rewards.Crash())
+        2, base="hover", autoreset_mode="SameStep", task=quad_gym.Task.of(reward=rewards.Crash())
     )
     env.reset(seed=0)
     total, ended = np.zeros(2), np.zeros(2)

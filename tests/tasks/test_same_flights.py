@@ -28,13 +28,13 @@ class Shipped(quad_gym.Task):
     """Says what ships, method by method."""
 
     def reward(self, view):
-        return view.shipped.reward
+        return view.builtin.reward
 
     def terminated(self, view):
         return super().terminated(view)
 
     def truncated(self, view):
-        return view.shipped.truncated
+        return view.builtin.truncated
 
 
 class Repeated(Shipped):
@@ -52,7 +52,7 @@ def actions(flights=FLIGHTS):
 
 def fields_of(env):
     batch = env.flights.batch
-    return {name: batch.read(name) for name in batch._blocks.dtype.names if name != "idle"}
+    return {name: batch.record(name) for name in batch._blocks.dtype.names if name != "idle"}
 
 
 def fly(env, seeds):
@@ -72,9 +72,9 @@ def fly(env, seeds):
 @pytest.mark.parametrize("task", TASK_DEFAULTS)
 def test_a_task_that_changes_nothing_flies_what_ships(task, mode):
     plain = fly(QuadVectorEnv(FLIGHTS, task, autoreset_mode=mode, **SHORT), range(FLIGHTS))
-    for custom in (Empty(), Shipped(), Repeated()):
-        env = QuadVectorEnv(FLIGHTS, task, autoreset_mode=mode, custom=custom, **SHORT)
-        assert_same(fly(env, range(FLIGHTS)), plain, type(custom).__name__)
+    for own in (Empty(), Shipped(), Repeated()):
+        env = QuadVectorEnv(FLIGHTS, base=task, autoreset_mode=mode, task=own, **SHORT)
+        assert_same(fly(env, range(FLIGHTS)), plain, type(own).__name__)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -83,17 +83,17 @@ def test_a_task_that_changes_nothing_flies_what_ships(task, mode):
     [
         {"observation": "noisy", "start": "mixed"},
         {"sensors": "rtk", "innovations": True, "truncate_when_diverged": True},
-        {"observation": "sensors", "privileged": True, "reward_per": "second"},
+        {"observation": "measurements", "privileged": True, "reward_per": "second"},
         {"sensors": "consumer", "randomization": {"mass": quad_gym.Uniform(0.5, 1.0)}},
         {"faults": "rotor_loss", "include_std": True, "filter_start": "warm"},
     ],
     ids=lambda keywords: "+".join(keywords),
 )
 def test_a_task_that_changes_nothing_flies_what_ships_with_options(keywords, mode):
-    made = {"task": "circle", "autoreset_mode": mode, **SHORT, **keywords}
+    made = {"base": "circle", "autoreset_mode": mode, **SHORT, **keywords}
     plain = fly(QuadVectorEnv(5, **made), range(5))
-    for custom in (Empty(), None if "reward_per" in keywords else Shipped()):
-        assert_same(fly(QuadVectorEnv(5, custom=custom, **made), range(5)), plain)
+    for own in (Empty(), None if "reward_per" in keywords else Shipped()):
+        assert_same(fly(QuadVectorEnv(5, task=own, **made), range(5)), plain)
 
 
 def columns(rows):
@@ -101,7 +101,7 @@ def columns(rows):
 
 
 def fly_single(flight, *, wait):
-    env = QuadEnv("hover", custom=Chase(), **SHORT)
+    env = QuadEnv(base="hover", task=Chase(), **SHORT)
     rows, over = [(env.reset(seed=flight)[0], 0.0, False, False)], False
     for action in actions_of(flight, STEPS):
         if over:
@@ -118,7 +118,7 @@ def fly_single(flight, *, wait):
 
 def fly_vector(mode, threads=1, flights=FLIGHTS):
     env = QuadVectorEnv(
-        flights, "hover", autoreset_mode=mode, threads=threads, custom=Chase, **SHORT
+        flights, base="hover", autoreset_mode=mode, threads=threads, task=Chase, **SHORT
     )
     nothing = np.zeros(flights, bool)
     rows = [(env.reset(seed=0)[0], np.zeros(flights), nothing, nothing)]
@@ -143,9 +143,9 @@ def test_neither_the_size_of_the_batch_nor_threads_change_a_flight():
 
 
 def test_stable_baselines_flies_the_same():
-    env = QuadSB3VecEnv(FLIGHTS, "hover", custom=Chase(), **SHORT)
+    env = QuadSB3VecEnv(FLIGHTS, base="hover", task=Chase(), **SHORT)
     env.seed(0)
-    vector = QuadVectorEnv(FLIGHTS, "hover", autoreset_mode="SameStep", custom=Chase(), **SHORT)
+    vector = QuadVectorEnv(FLIGHTS, base="hover", autoreset_mode="SameStep", task=Chase(), **SHORT)
     np.testing.assert_array_equal(env.reset(), vector.reset(seed=0)[0])
     returns = np.zeros(FLIGHTS)
     for action in actions():
@@ -165,7 +165,7 @@ def test_stable_baselines_flies_the_same():
 
 def test_the_endings_say_why():
     env = QuadVectorEnv(
-        FLIGHTS, "hover", custom=Chase(), **SHORT | {"max_episode_steps": 100, "max_tilt": np.pi}
+        FLIGHTS, base="hover", task=Chase(), **SHORT | {"max_episode_steps": 100, "max_tilt": np.pi}
     )
     env.reset(seed=0)
     found = set()
@@ -182,7 +182,7 @@ def test_the_endings_say_why():
     "count", [3, 256]
 )  # NumPy unpickles small arrays and large ones differently
 def test_a_copy_flies_on_as_the_original(count, copied):
-    env = QuadVectorEnv(count, "hover", custom=Chase(), **SHORT)
+    env = QuadVectorEnv(count, base="hover", task=Chase(), **SHORT)
     env.reset(seed=4)
     for action in actions(count)[:15]:
         env.step(action)
@@ -192,7 +192,7 @@ def test_a_copy_flies_on_as_the_original(count, copied):
 
 
 def test_a_snapshot_brings_back_what_the_task_keeps():
-    env = QuadVectorEnv(3, "hover", custom=Chase(), **SHORT)
+    env = QuadVectorEnv(3, base="hover", task=Chase(), **SHORT)
     env.reset(seed=4)
     batch = env.flights.batch
     for action in actions(3)[:12]:
@@ -208,19 +208,19 @@ def test_a_snapshot_brings_back_what_the_task_keeps():
 
 
 def test_options_of_a_reset_come_before_the_start_of_the_task():
-    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, custom=Chase())
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=Chase())
     env.reset(seed=1, options={"position": np.array([4.0, 0.0, 1.0])})
     batch = env.unwrapped.flights.batch
-    np.testing.assert_array_equal(batch.read("r"), np.tile([4.0, 0.0, 1.0], (3, 1)))
-    reference = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, custom=Chase())
+    np.testing.assert_array_equal(batch.record("r"), np.tile([4.0, 0.0, 1.0], (3, 1)))
+    reference = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=Chase())
     reference.reset(seed=1)
     np.testing.assert_array_equal(
-        batch.read("q"), reference.unwrapped.flights.batch.read("q"), strict=True
+        batch.record("q"), reference.unwrapped.flights.batch.record("q"), strict=True
     )
 
 
 def test_a_reset_of_some_leaves_what_the_task_keeps_of_the_others():
-    env = QuadVectorEnv(4, "hover", autoreset_mode="Disabled", custom=Chase())
+    env = QuadVectorEnv(4, base="hover", autoreset_mode="Disabled", task=Chase())
     env.reset(seed=1)
     state, mask = env.flights.batch.view.state, np.array([True, False, True, False])
     before = state.copies()

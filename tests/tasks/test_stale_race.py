@@ -27,23 +27,23 @@ def test_the_reward_is_that_of_its_equation():
     observation, _ = env.reset(seed=0)
     policy, batch = PDPolicy(env), env.unwrapped.flights.batch
     gates, last = np.zeros(16), np.zeros((16, 4))
-    target, before = batch.read("ref_center"), batch.read("r")
+    target, before = batch.record("ref_center"), batch.record("r")
     began, passed_in_all = np.zeros(16, bool), 0
     for _ in range(300):
         actions = policy.predict(observation)[0] + rng.normal(0.0, 0.02, (16, 4))
         actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(actions)
-        far, near = (np.linalg.norm(target - r, axis=1) for r in (before, batch.read("r")))
+        far, near = (np.linalg.norm(target - r, axis=1) for r in (before, batch.record("r")))
         passed = info["gates_passed"] > gates
         crashed = terminated & (info["gates_passed"] < 8)
         change = ((actions - last) ** 2).sum(axis=1)
-        costs = 0.02 * change + 0.002 * (batch.read("w") ** 2).sum(axis=1)
+        costs = 0.02 * change + 0.002 * (batch.record("w") ** 2).sum(axis=1)
         expected = 0.1 * (far - near) * 50.0 - costs + passed - 5.0 * crashed
         np.testing.assert_allclose(reward[~began], expected[~began], atol=1e-6)
         passed_in_all += passed[~began].sum()
         began, gates, last = terminated | truncated, info["gates_passed"], actions
-        last = np.where(began[:, np.newaxis], batch.read("action"), last)
-        target, before = batch.read("ref_center"), batch.read("r")
+        last = np.where(began[:, np.newaxis], batch.record("action"), last)
+        target, before = batch.record("ref_center"), batch.record("r")
     assert passed_in_all > 20
 
 

@@ -46,7 +46,7 @@ def test_they_do_what_they_say():
     observation, _ = wall.reset(seed=0)
     flights = wall.unwrapped.flights
     place = next(field.slice for field in flights.table if field.name == "wall")
-    seen = flights.batch.read("r_seen")[0]
+    seen = flights.batch.record("r_seen")[0]
     level = np.maximum(np.abs(seen[:2] - [6.0, 0.0]) - [2.0, 0.1], 0.0)
     above = max(abs(seen[2] - 1.5) - 1.5, 0.0)
     expected = np.linalg.norm([*level, above])

@@ -23,7 +23,7 @@ class Nothing(quad_gym.Task):
 
 def flown(task="circle", steps=20, **keywords):
     """Flights with a view, and the view after some steps."""
-    env = QuadVectorEnv(FLIGHTS, task, custom=Nothing(), **keywords)
+    env = QuadVectorEnv(FLIGHTS, base=task, task=Nothing(), **keywords)
     env.reset(seed=1)
     rng = np.random.default_rng(0)
     for _ in range(steps):
@@ -70,11 +70,19 @@ def test_every_public_array_of_a_view_is_in_the_table():
     shorts |= {"accel_bias", "gyro_bias", "position_error", "estimation_error"}
     shorts |= {"obstacle_distance"}
     for prefix, group in [("", view)] + [
-        (name, getattr(view, name)) for name in ("truth", "estimate", "seen", "measured", "shipped")
+        (name, getattr(view, name))
+        for name in ("truth", "estimate", "observed", "measured", "builtin")
     ]:
         for name, _ in inspect.getmembers(type(group)):
             own = not (name.startswith("_") or callable(getattr(group, name)))
-            if own and name not in ("truth", "shipped", "estimate", "seen", "measured", "state"):
+            if own and name not in (
+                "truth",
+                "builtin",
+                "estimate",
+                "observed",
+                "measured",
+                "state",
+            ):
                 full = f"{prefix}.{name}".strip(".")
                 assert full in told or (not prefix and name in shorts), full
 
@@ -87,7 +95,7 @@ def test_the_truth_is_that_of_the_records():
         **{"wind": "wind", "position_error": "position_error"},
         **{"estimation_error": "estimation_error"},
     }.items():
-        np.testing.assert_array_equal(getattr(view.truth, name), batch.read(field))
+        np.testing.assert_array_equal(getattr(view.truth, name), batch.record(field))
     R_IB = Rotation.from_quat(view.quaternion, scalar_first=True).as_matrix()
     np.testing.assert_allclose(view.R_BI, R_IB.transpose(0, 2, 1), atol=1e-12)
     np.testing.assert_array_equal(view.truth.forward, view.R_BI[:, 0])
@@ -102,7 +110,7 @@ def test_the_estimate_and_its_covariance_are_those_of_the_filter():
         **{"position": "r_hat", "velocity": "v_hat", "R_BI": "R_hat"},
         **{"accel_bias": "b_a_hat", "gyro_bias": "b_g_hat", "factor": "L"},
     }.items():
-        np.testing.assert_array_equal(getattr(estimate, name), batch.read(field))
+        np.testing.assert_array_equal(getattr(estimate, name), batch.record(field))
     np.testing.assert_allclose(estimate.covariance, P, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose(
         estimate.sigma, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), rtol=1e-12
@@ -114,12 +122,12 @@ def test_the_estimate_and_its_covariance_are_those_of_the_filter():
         np.testing.assert_allclose(block, P[:, rows, rows], rtol=1e-9, atol=1e-18)
         np.testing.assert_array_equal(getattr(estimate, f"{name}_sigma"), estimate.sigma[:, rows])
     error = np.zeros((FLIGHTS, 15))
-    error[:, :3] = batch.read("r") - batch.read("r_hat")
-    error[:, 3:6] = batch.read("v") - batch.read("v_hat")
+    error[:, :3] = batch.record("r") - batch.record("r_hat")
+    error[:, 3:6] = batch.record("v") - batch.record("v_hat")
     turn = Rotation.from_matrix(view.R_BI @ estimate.R_BI.transpose(0, 2, 1))
     error[:, 6:9] = -turn.as_rotvec()  # e for small angles
-    error[:, 9:12] = batch.read("b_a") - batch.read("b_a_hat")
-    error[:, 12:] = batch.read("b_g") - batch.read("b_g_hat")
+    error[:, 9:12] = batch.record("b_a") - batch.record("b_a_hat")
+    error[:, 12:] = batch.record("b_g") - batch.record("b_g_hat")
     expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
     np.testing.assert_allclose(view.truth.nees, expected, rtol=0.02)
 
@@ -154,39 +162,41 @@ def test_the_reference_of_a_circle_is_its_closed_form():
 
 
 def test_what_is_seen_relative_to_the_reference_is_the_shipped_observation():
-    batch, view = flown("lemniscate", randomize=True)
+    batch, view = flown("lemniscate", randomize_reference=True)
     layout = {field.name: field.slice for field in quad_gym.observation_layout()}
     for name in ("position_error", "velocity_error", "up", "heading", "reference_acceleration"):
         shipped = view.observation[:, layout[name]]
-        np.testing.assert_allclose(getattr(view.seen, name), shipped, atol=1e-6)
-    R, gap = batch.read("R_hat"), view.reference_position - batch.read("r_hat")
+        np.testing.assert_allclose(getattr(view.observed, name), shipped, atol=1e-6)
+    R, gap = batch.record("R_hat"), view.reference_position - batch.record("r_hat")
     np.testing.assert_allclose(
-        view.seen.position_error, np.einsum("nij,nj->ni", R, gap), atol=1e-12
+        view.observed.position_error, np.einsum("nij,nj->ni", R, gap), atol=1e-12
     )
     ahead = np.einsum("nij,nkj->nki", R, view.preview - view.reference_position[:, np.newaxis])
-    np.testing.assert_allclose(view.seen.preview, ahead, atol=1e-12)
-    np.testing.assert_array_equal(view.seen.position, batch.read("r_seen"))
-    np.testing.assert_array_equal(view.seen.body_rates, batch.read("w_seen"))
+    np.testing.assert_allclose(view.observed.preview, ahead, atol=1e-12)
+    np.testing.assert_array_equal(view.observed.position, batch.record("r_seen"))
+    np.testing.assert_array_equal(view.observed.body_rates, batch.record("w_seen"))
 
 
 def test_the_features_in_view_are_those_that_the_camera_has_seen():
     seen = np.zeros(2, int)
-    env = QuadVectorEnv(FLIGHTS, "hover", custom=Nothing(), start="hover")
+    env = QuadVectorEnv(FLIGHTS, base="hover", task=Nothing(), start="hover")
     env.reset(seed=1)
     view = env.flights.batch.view
     rng = np.random.default_rng(3)
     for _ in range(40):
         env.step(rng.uniform(-0.8, 0.8, (FLIGHTS, 4)))
-        flying = ~view.began
+        flying = ~view.is_first
         np.testing.assert_array_equal(
-            view.truth.features_in_view[flying], env.flights.batch.read("feature_valid")[flying, :2]
+            view.truth.features_in_view[flying],
+            env.flights.batch.record("feature_valid")[flying, :2],
         )
         seen += np.bincount(view.truth.features_in_view[flying].ravel(), minlength=2)
     assert (seen > 20).all()  # both cases came
 
 
 def test_measurements_that_were_not_taken_are_nan():
-    _, view = flown(sensors="rtk", steps=7, gnss_rate=10, camera_rate=10, start="hover")
+    suite = quad_gym.sensor_suite("rtk").with_rates(gnss=10.0, camera=10.0)
+    _, view = flown(sensors=suite, steps=7, start="hover")
     rows, valid = view.measured.gnss_position, view.measured.gnss_valid
     assert not valid.all()
     assert np.isnan(rows[~valid]).all()
@@ -194,16 +204,16 @@ def test_measurements_that_were_not_taken_are_nan():
     assert view.measured.gnss_valid.all()
     gap = np.linalg.norm(view.measured.gnss_position - view.position, axis=1)
     assert (gap < 0.5).all()  # the antenna is on the vehicle
-    np.testing.assert_array_equal(view.measured.gyro, batch.read("gyro"))
-    np.testing.assert_array_equal(view.measured.accel, batch.read("accel"))
+    np.testing.assert_array_equal(view.measured.gyro, batch.record("gyro"))
+    np.testing.assert_array_equal(view.measured.accel, batch.record("accel"))
     seen = view.measured.features_seen
-    pixels = batch.read("pixels")[:, :2]
+    pixels = batch.record("pixels")[:, :2]
     np.testing.assert_array_equal(view.measured.pixels[seen], pixels[seen])
     assert np.isnan(view.measured.pixels[~seen]).all()
 
 
 def test_gates_and_progress_of_a_course():
-    env = QuadVectorEnv(FLIGHTS, "waypoints", custom=Nothing(), autoreset_mode="Disabled")
+    env = QuadVectorEnv(FLIGHTS, base="waypoints", task=Nothing(), autoreset_mode="Disabled")
     env.reset(seed=2)
     batch = env.flights.batch
     first = batch.view.gates[:, 0]
@@ -216,9 +226,9 @@ def test_gates_and_progress_of_a_course():
     gates, passed = batch.view.gates, np.zeros(FLIGHTS, bool)
     for _ in range(40):
         target = gates[np.arange(FLIGHTS), batch.view.gates_passed]
-        before = np.linalg.norm(target - batch.read("r"), axis=1)
+        before = np.linalg.norm(target - batch.record("r"), axis=1)
         env.step(np.zeros((FLIGHTS, 4)))
-        after = np.linalg.norm(target - batch.read("r"), axis=1)
+        after = np.linalg.norm(target - batch.record("r"), axis=1)
         np.testing.assert_allclose(
             batch.view.truth.progress, (before - after) / 0.02, rtol=1e-9, atol=1e-9
         )
@@ -241,7 +251,7 @@ def test_errors_tell_python_which_names_it_may_suggest():
     for group, misspelt, meant in (
         (view, "positon", "position"),
         (view, "reference_postion", "reference_position"),
-        (view.seen, "velocty", "velocity"),
+        (view.observed, "velocty", "velocity"),
         (view.estimate, "covarance", "covariance"),
     ):
         with pytest.raises(AttributeError) as caught:
@@ -256,20 +266,20 @@ def test_without_a_filter_the_estimate_says_what_is_missing():
         _ = view.estimate.sigma
     with pytest.raises(ValueError, match=r"view.measured needs sensors"):
         _ = view.measured.gyro
-    np.testing.assert_array_equal(view.seen.position, view.position)
+    np.testing.assert_array_equal(view.observed.position, view.position)
 
 
 def test_a_view_is_of_the_episode_that_the_step_belongs_to():
     said = []
 
     def reward(view):
-        said.append((view.step.copy(), view.began.copy()))
+        said.append((view.step.copy(), view.is_first.copy()))
         return view.step * 1.0
 
     task = quad_gym.Task.of(reward=reward)
     for mode, began in (("SameStep", 0), ("NextStep", 1)):
         said.clear()
-        env = QuadVectorEnv(1, "hover", custom=task, max_episode_steps=3, autoreset_mode=mode)
+        env = QuadVectorEnv(1, base="hover", task=task, max_episode_steps=3, autoreset_mode=mode)
         env.reset(seed=0)
         rewards = [float(env.step(np.zeros((1, 4)))[1][0]) for _ in range(5)]
         assert sum(b.sum() for _, b in said) == began
@@ -281,7 +291,7 @@ def test_a_view_is_of_the_episode_that_the_step_belongs_to():
     [
         lambda view: view.position,
         lambda view: view.time[3:],
-        lambda view: view.seen.preview[:2, 1],
+        lambda view: view.observed.preview[:2, 1],
         lambda view: view.R_BI,
         lambda view: view.step,
         lambda view: view.reference_velocity[1:],
@@ -289,7 +299,7 @@ def test_a_view_is_of_the_episode_that_the_step_belongs_to():
     ],
 )
 def test_arrays_that_a_task_keeps_stay_as_they_were(part):
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     view, kept = env.flights.batch.view, []
     for _ in range(4):
@@ -301,7 +311,7 @@ def test_arrays_that_a_task_keeps_stay_as_they_were(part):
 
 
 def test_arrays_of_a_copy_stay_as_they_were():
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     other = copy.deepcopy(env)
     for one in (other, env):
@@ -313,7 +323,7 @@ def test_arrays_of_a_copy_stay_as_they_were():
 
 
 def test_what_nobody_keeps_is_written_to_the_same_memory():
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     places = set()
     for _ in range(4):
@@ -324,7 +334,7 @@ def test_what_nobody_keeps_is_written_to_the_same_memory():
 
 
 def test_restoring_again_and_again_takes_no_more_memory():
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     batch = env.flights.batch
     instant, memory = batch.snapshot(), set()
@@ -340,7 +350,7 @@ def test_restoring_again_and_again_takes_no_more_memory():
 
 
 def test_progress_is_the_same_after_a_snapshot_has_been_restored():
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
     instant, progress = batch.snapshot(), []
@@ -356,14 +366,16 @@ def test_progress_is_the_same_after_a_snapshot_has_been_restored():
 @pytest.mark.parametrize("task", ["circle", "waypoints"])
 def test_a_view_is_of_the_instant_that_has_been_restored(task, mode):
     env = QuadVectorEnv(
-        *(FLIGHTS, task), custom=Nothing(), sensors="rtk", max_episode_steps=20, autoreset_mode=mode
+        FLIGHTS, base=task, task=Nothing(), sensors="rtk", max_episode_steps=20, autoreset_mode=mode
     )
     env.reset(seed=1)
     batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
     names = [f.name for f in every_name() if f.shape and not f.shape.startswith("dict")]
-    of_a_step = ("shipped.", "truth.progress", "gate_passed")
+    of_a_step = ("builtin.", "truth.progress", "gate_passed")
     names = [name for name in names if not name.startswith(of_a_step)]
-    assert {"time", "began", "truth.position", "truth.position_error", "observation"} <= set(names)
+    assert {"time", "is_first", "truth.position", "truth.position_error", "observation"} <= set(
+        names
+    )
 
     def shown():
         return {name: np.array(value_of(batch.view, name)) for name in names}
@@ -387,8 +399,9 @@ def test_a_view_is_of_the_instant_that_has_been_restored(task, mode):
 @pytest.mark.parametrize("count", [1, 5, 8, 9])
 def test_no_array_of_a_view_is_memory_of_the_records(count):
     env = QuadVectorEnv(
-        *(count, "waypoints"),
-        **{"custom": Nothing(), "sensors": "rtk"},
+        count,
+        base="waypoints",
+        **{"task": Nothing(), "sensors": "rtk"},
         randomization={"mass": quad_gym.Uniform(0.7, 0.8)},
     )
     env.reset(seed=1)
@@ -407,13 +420,13 @@ def test_no_array_of_a_view_is_memory_of_the_records(count):
     for name in batch._blocks.dtype.names:  # with what no view of this configuration shows
         for values in (batch.rows(name), batch.columns(name)):
             assert not np.may_share_memory(values, batch._blocks), name
-        np.testing.assert_array_equal(batch.rows(name), batch.read(name), name)
+        np.testing.assert_array_equal(batch.rows(name), batch.record(name), name)
 
 
 def test_the_covariance_has_the_same_bits_in_batches_of_any_size():
     found = {}
     for count in (1, 8, 16):
-        env = QuadVectorEnv(count, "circle", custom=Nothing())
+        env = QuadVectorEnv(count, base="circle", task=Nothing())
         env.reset(seed=list(range(count)))
         for _ in range(5):
             env.step(np.full((count, 4), 0.1))
@@ -430,10 +443,10 @@ def steps_with_right_views(env):
     batch = env.flights.batch
     for _ in range(3):
         env.step(np.full((FLIGHTS, 4), 0.2))
-        np.testing.assert_array_equal(batch.view.position, batch.read("r"))
+        np.testing.assert_array_equal(batch.view.position, batch.record("r"))
         np.testing.assert_array_equal(batch.view.R_BI[:, 0], batch.view.truth.forward)
-        np.testing.assert_array_equal(batch.view.truth.wind, batch.read("wind"))
-        np.testing.assert_array_equal(batch.view.step, batch.read("step"))
+        np.testing.assert_array_equal(batch.view.truth.wind, batch.record("wind"))
+        np.testing.assert_array_equal(batch.view.step, batch.record("step"))
 
 
 def at_once(monkeypatch, owner, method, read):
@@ -457,7 +470,7 @@ def at_once(monkeypatch, owner, method, read):
 
 
 def test_two_threads_may_read_the_same_array_at_once(monkeypatch):
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     batch = env.flights.batch
     env.step(np.zeros((FLIGHTS, 4)))
@@ -471,7 +484,7 @@ def test_two_threads_may_read_the_same_array_at_once(monkeypatch):
 
 
 def test_arrays_of_a_view_cannot_be_deleted_or_made_writable():
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     view = env.flights.batch.view
     env.step(np.zeros((FLIGHTS, 4)))
@@ -501,7 +514,7 @@ class Interrupted(list):
 
 @pytest.mark.parametrize("where", ["_attributes", "_handed_out", "_kept"])
 def test_a_view_is_of_its_instant_after_an_interrupt_while_it_was_read(where):
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     batch = env.flights.batch
     env.step(np.zeros((FLIGHTS, 4)))
@@ -520,7 +533,7 @@ def test_a_view_is_of_its_instant_after_an_interrupt_while_it_was_read(where):
 
 
 def test_a_view_is_of_its_instant_after_an_interrupt_while_the_memory_changed(monkeypatch):
-    env = QuadVectorEnv(FLIGHTS, "circle", custom=Nothing())
+    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
     env.reset(seed=1)
     batch = env.flights.batch
     env.step(np.zeros((FLIGHTS, 4)))

@@ -47,7 +47,7 @@ def fly(flights, actions, fields=TRUTH):
     found = []
     for action in actions:
         flights.step(action)
-        found.append([flights.read(name) for name in fields])
+        found.append([flights.record(name) for name in fields])
     return found
 
 
@@ -120,10 +120,10 @@ def test_a_new_episode_forgets_the_actions_before_it():
     )
     flights.reset(seeds=range(COUNT))
     fly(flights, np.ones((5, COUNT, 4)))
-    assert (flights.read("episode") == 2.0).all()
-    assert not flights.read("past_actions")[:, :4].any()
+    assert (flights.record("episode") == 2.0).all()
+    assert not flights.record("past_actions")[:, :4].any()
     flights.step(np.ones((COUNT, 4)))
-    assert not flights.read("delayed_action").any()
+    assert not flights.record("delayed_action").any()
 
 
 def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
@@ -150,7 +150,7 @@ def test_the_observation_has_the_commanded_action_and_the_reward_its_change():
 
 
 def test_a_vector_environment_flies_as_the_single_one():
-    keywords = {"action_delay": 1.5, "randomize": True}
+    keywords = {"action_delay": 1.5, "randomize_reference": True}
     many = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, **keywords)
     one = gymnasium.make("QuadGym/Circle-v0", **keywords)
     rows, _ = many.reset(seed=7)

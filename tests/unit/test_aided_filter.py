@@ -10,7 +10,7 @@ import quad_gym
 from quad_gym import BarometerParams, MagnetometerParams
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.packing.aids import slow_states
-from quad_gym.records import AID_BLOCKS, Aid, Gate
+from quad_gym.records import AID_BLOCKS, Aid, GateDecision
 from tests.circle_flight import record_circle
 from tests.reference_aids import AidedEKF, AidedUKF
 from tests.reference_ukf import PlainUKF, array_of, rotation_312
@@ -18,7 +18,7 @@ from tests.reference_ukf import PlainUKF, array_of, rotation_312
 LAB = quad_gym.sensor_suite("lab")
 BOTH = {"barometer": BarometerParams(bias_tau=20.0), "magnetometer": MagnetometerParams()}
 DRIFTING = LAB.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=20.0)
-FIELD = LAB.estimator.replace(integration="midpoint", covariance_reset="turn", alpha=0.7)
+FIELD = LAB.estimator.replace(integration="midpoint", attitude_reset=True, alpha=0.7)
 SUITES = {
     "both": LAB.replace(**BOTH),
     "barometer alone": LAB.replace(barometer=BOTH["barometer"], camera=None),
@@ -182,8 +182,8 @@ def test_a_rotated_attitude_leaves_what_is_known_of_the_field_unchanged(kind):
     first, delta = places.vectors[Aid.MAGNETOMETER], places.scalars[Aid.MAGNETOMETER]
     field_B = rotation_312(np.array([[0.0, 0.0, 0.15]]))[0] @ plain.magnetometer.field_I
     found = {}
-    for reset in ("turn", "none"):
-        estimator = plain.estimator.replace(covariance_reset=reset, false_alarm_probability=0.0)
+    for reset in (True, False):
+        estimator = plain.estimator.replace(attitude_reset=reset, false_alarm_probability=0.0)
         suite = plain.replace(estimator=estimator)
         ours = kind(suite)
         ours.initialize(np.zeros(3), heading=0.0, heading_sigma=0.1)
@@ -192,7 +192,7 @@ def test_a_rotated_attitude_leaves_what_is_known_of_the_field_unchanged(kind):
         after = field_derivatives(ours, suite, delta)
         found[reset] = [covariance_of_field(ours, H, first) for H in (before, after)]
     kept, scale = found["none"][0], abs(found["none"][0]).max()
-    assert abs(found["turn"][1] - kept).max() < 1e-6 * scale
+    assert abs(found[True][1] - kept).max() < 1e-6 * scale
     assert abs(found["none"][1] - kept).max() > 0.05 * scale
 
 
@@ -205,17 +205,17 @@ def test_what_is_beyond_the_gate_is_left_out_and_at_last_believed():
     altitude, before = recording.r[0, 2] + 10.0, ours.aid_errors["barometer"][0]
     for _ in range(5):
         ours.update(barometer=altitude)
-        assert ours.gate_decisions[-2] == Gate.REJECTED
+        assert ours.gate_decisions[-2] == GateDecision.REJECTED
         assert ours.aid_errors["barometer"][0] == before
     ours.update(barometer=altitude)  # the filter has doubted itself
-    assert ours.gate_decisions[-2] == Gate.ACCEPTED
+    assert ours.gate_decisions[-2] == GateDecision.ACCEPTED
     assert ours.aid_errors["barometer"][0] > 3.0
     field = recording.R_BI[0] @ suite.magnetometer.field_I + 3e-5
     for _ in range(5):
         ours.update(magnetometer=field)
-        assert ours.gate_decisions[-1] == Gate.REJECTED
+        assert ours.gate_decisions[-1] == GateDecision.REJECTED
     ours.update(magnetometer=field)
-    assert ours.gate_decisions[-1] == Gate.ACCEPTED
+    assert ours.gate_decisions[-1] == GateDecision.ACCEPTED
     assert ours.gate_decisions.shape == (3 + 2,)
     assert AID_BLOCKS + Aid.MAGNETOMETER >= 5
 

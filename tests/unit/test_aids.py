@@ -25,16 +25,19 @@ def field_B(batch, magnetometer, declination_error=0.0, soft_iron=0.0):
     angle = np.pi / 2 - magnetometer.declination - declination_error  # from east toward north
     down = np.full_like(angle, magnetometer.strength * np.sin(magnetometer.inclination))
     field_I = np.stack([level * np.cos(angle), level * np.sin(angle), -down], axis=-1)
-    seen = np.einsum("nij,nj->ni", attitudes(batch.read("q")), field_I)
+    seen = np.einsum("nij,nj->ni", attitudes(batch.record("q")), field_I)
     return seen + np.einsum("nij,nj->ni", soft_iron + np.zeros((batch.count, 3, 3)), seen)
 
 
 def test_a_barometer_measures_height_bias_and_white_noise():
     batch = fly(AIDED, 2000, task="hover")
     steps(batch, 0.02)
-    assert batch.read("aid_valid").all()
-    z, bias = batch.read("aid_measurement")[:, BAROMETER], batch.read("aid_scalar")[:, BAROMETER]
-    noise = z[:, 0] - batch.read("r")[:, 2] - bias
+    assert batch.record("aid_valid").all()
+    z, bias = (
+        batch.record("aid_measurement")[:, BAROMETER],
+        batch.record("aid_scalar")[:, BAROMETER],
+    )
+    noise = z[:, 0] - batch.record("r")[:, 2] - bias
     assert noise.std() == pytest.approx(AIDED.barometer.noise_sigma, rel=0.07)
     assert abs(noise.mean()) < 5.0 * AIDED.barometer.noise_sigma / np.sqrt(2000)
     assert bias.std() == pytest.approx(AIDED.barometer.bias_sigma, rel=0.07)
@@ -44,9 +47,9 @@ def test_a_barometer_measures_height_bias_and_white_noise():
 def test_a_barometers_bias_is_a_gauss_markov_process_of_first_order():
     suite = AIDED.replace(barometer=BarometerParams(bias_tau=0.5, rate=20.0, phase=0.0))
     batch = fly(suite, 4000, task="hover")
-    before = batch.read("aid_scalar")[:, BAROMETER]
+    before = batch.record("aid_scalar")[:, BAROMETER]
     steps(batch, 0.25)
-    after, sigma = batch.read("aid_scalar")[:, BAROMETER], suite.barometer.bias_sigma
+    after, sigma = batch.record("aid_scalar")[:, BAROMETER], suite.barometer.bias_sigma
     assert after.std() == pytest.approx(sigma, rel=0.05)
     assert (before * after).mean() == pytest.approx(sigma**2 * np.exp(-0.5), rel=0.1)
 
@@ -54,21 +57,21 @@ def test_a_barometers_bias_is_a_gauss_markov_process_of_first_order():
 def test_a_magnetometer_measures_the_field_with_its_errors():
     magnetometer = MagnetometerParams(phase=0.0, soft_iron_sigma=0.02, declination_sigma=0.05)
     batch = fly(LAB.replace(magnetometer=magnetometer), 2000, task="hover")
-    declination = batch.read("aid_scalar")[:, MAGNETOMETER]
+    declination = batch.record("aid_scalar")[:, MAGNETOMETER]
     hard_iron, soft_iron = (
-        batch.read("aid_vector")[:, MAGNETOMETER],
-        batch.read("aid_matrix")[:, MAGNETOMETER],
+        batch.record("aid_vector")[:, MAGNETOMETER],
+        batch.record("aid_matrix")[:, MAGNETOMETER],
     )
     expected = field_B(batch, magnetometer, declination, soft_iron) + hard_iron
-    noise = batch.read("aid_measurement")[:, MAGNETOMETER] - expected
+    noise = batch.record("aid_measurement")[:, MAGNETOMETER] - expected
     assert noise.std() == pytest.approx(magnetometer.noise_sigma, rel=0.05)
     assert (abs(noise.mean(axis=0)) < 5.0 * magnetometer.noise_sigma / np.sqrt(2000)).all()
     assert hard_iron.std() == pytest.approx(magnetometer.hard_iron_sigma, rel=0.05)
     assert soft_iron.std() == pytest.approx(0.02, rel=0.05)
     assert declination.std() == pytest.approx(0.05, rel=0.07)
     steps(batch, 0.1)
-    np.testing.assert_array_equal(batch.read("aid_vector")[:, MAGNETOMETER], hard_iron)
-    np.testing.assert_array_equal(batch.read("aid_scalar")[:, MAGNETOMETER], declination)
+    np.testing.assert_array_equal(batch.record("aid_vector")[:, MAGNETOMETER], hard_iron)
+    np.testing.assert_array_equal(batch.record("aid_scalar")[:, MAGNETOMETER], declination)
 
 
 def test_the_default_field_is_the_models_at_the_laboratory():
@@ -86,10 +89,10 @@ def test_sensors_measure_at_their_rates_and_phases(phase):
         magnetometer=MagnetometerParams(rate=50.0, phase=phase),
     )
     batch = fly(suite, 64, task="hover")
-    valid = [batch.read("aid_valid")]
+    valid = [batch.record("aid_valid")]
     for _ in range(40):
         batch.step()
-        valid.append(batch.read("aid_valid"))
+        valid.append(batch.record("aid_valid"))
     valid = np.array(valid) > 0.0  # (ticks, flights, aids)
     for aid, period in ((BAROMETER, 10), (MAGNETOMETER, 4)):
         first = valid[:, :, aid].argmax(axis=0)
@@ -115,12 +118,12 @@ def test_late_measurements_arrive_as_they_were_taken(periods):
     delay, noise, truth = 4 * periods, [], []
     for tick in range(60):
         # both fly on estimates, which differ: what they have in common is the noise
-        noise.append(prompt.read("aid_measurement")[:, BAROMETER, 0] - undisturbed(prompt))
+        noise.append(prompt.record("aid_measurement")[:, BAROMETER, 0] - undisturbed(prompt))
         truth.append(undisturbed(delayed))
         if tick % 4 == 0:
-            assert (delayed.read("aid_valid") == (tick >= delay)).all()
+            assert (delayed.record("aid_valid") == (tick >= delay)).all()
         if tick % 4 == 0 and tick >= delay:
-            arrived = delayed.read("aid_measurement")[:, BAROMETER, 0] - truth[tick - delay]
+            arrived = delayed.record("aid_measurement")[:, BAROMETER, 0] - truth[tick - delay]
             np.testing.assert_allclose(arrived, noise[tick - delay], atol=1e-9)
         prompt.step()
         delayed.step()
@@ -128,7 +131,7 @@ def test_late_measurements_arrive_as_they_were_taken(periods):
 
 def undisturbed(batch):
     """What a barometer without white noise would measure now."""
-    return batch.read("r")[:, 2] + batch.read("aid_scalar")[:, BAROMETER]
+    return batch.record("r")[:, 2] + batch.record("aid_scalar")[:, BAROMETER]
 
 
 def test_a_latency_of_more_than_two_periods_is_refused():
@@ -142,10 +145,10 @@ def test_a_loss_silences_one_sensor_while_it_lasts():
         SensorLoss(sensor="magnetometer", start=0.2, duration=0.2),
     )
     batch = fly(AIDED, 8, task="hover", faults=faults)
-    heard = [batch.read("aid_valid")]
+    heard = [batch.record("aid_valid")]
     for _ in range(100):
         batch.step()
-        heard.append(batch.read("aid_valid"))
+        heard.append(batch.record("aid_valid"))
     heard, due = np.array(heard).all(axis=1)[::4], np.arange(26) * 0.02
     np.testing.assert_array_equal(heard[:, BAROMETER], (due < 0.1 - 1e-9) | (due > 0.3 - 1e-9))
     np.testing.assert_array_equal(heard[:, MAGNETOMETER], (due < 0.2 - 1e-9) | (due > 0.4 - 1e-9))
@@ -157,25 +160,29 @@ def test_sensors_can_be_switched_off_and_on():
     batch = fly(AIDED, 8, task="hover")
     batch.switch_sensors(barometer=False)
     steps(batch, 0.02)
-    assert not batch.read("aid_valid")[:, BAROMETER].any()
-    assert batch.read("aid_valid")[:, MAGNETOMETER].all()
+    assert not batch.record("aid_valid")[:, BAROMETER].any()
+    assert batch.record("aid_valid")[:, MAGNETOMETER].all()
     batch.switch_sensors(barometer=True)
     steps(batch, 0.005)
-    assert batch.read("aid_valid")[:, BAROMETER].all()
+    assert batch.record("aid_valid")[:, BAROMETER].all()
     with pytest.raises(ValueError, match="switch_sensors"):
         fly(LAB, 1, task="hover").switch_sensors(barometer=False)
 
 
 def test_raw_observations_and_info_have_what_was_measured_since_the_last_step():
     env = gymnasium.make(
-        "QuadGym/Hover-v0", sensors=AIDED, observation="sensors", innovations=True, control_rate=50
+        "QuadGym/Hover-v0",
+        sensors=AIDED,
+        observation="measurements",
+        innovations=True,
+        control_rate=50,
     )
     observation, _ = env.reset(seed=3)
     flights = env.unwrapped.flights
     table = {field.name: field.slice for field in flights.table}
     for _ in range(3):
         observation, _, _, _, info = env.step(np.zeros(4, np.float32))
-        measured = flights.batch.read("aid_measurement")[0]
+        measured = flights.batch.record("aid_measurement")[0]
         np.testing.assert_allclose(observation[table["barometer"]], measured[0, :1], rtol=1e-6)
         scaled = measured[1] / AIDED.magnetometer.strength
         np.testing.assert_allclose(observation[table["magnetometer"]], scaled, rtol=1e-6)
@@ -195,7 +202,7 @@ def test_raw_observations_and_info_have_what_was_measured_since_the_last_step():
 def test_suites_without_them_have_neither_memory_nor_states_for_them():
     batch, aided = fly(LAB, 8, task="hover"), fly(AIDED, 8, task="hover")
     assert batch.snapshot().nbytes < aided.snapshot().nbytes
-    assert (batch.read("aid_measurement") == 0.0).all()
+    assert (batch.record("aid_measurement") == 0.0).all()
     assert slow_states(LAB).errors == ()
     assert len(slow_states(AIDED).errors) == 6
     assert slow_states(AIDED).estimated == 5
@@ -225,8 +232,8 @@ def test_estimated_slow_errors_come_near_the_true_ones():
     batch = fly(AIDED, 200, task="hover")
     steps(batch, 3.0)
     place = slow_states(AIDED).scalars[BAROMETER]
-    error = batch.read("slow_hat")[:, place] - batch.read("aid_scalar")[:, BAROMETER]
+    error = batch.record("slow_hat")[:, place] - batch.record("aid_scalar")[:, BAROMETER]
     assert np.sqrt(np.mean(error**2)) < 0.05
-    L = batch.read("L_slow")[:, place]
+    L = batch.record("L_slow")[:, place]
     claimed = np.sqrt((L**2).sum(axis=1))
     assert np.mean((error / claimed) ** 2) == pytest.approx(1.0, abs=0.4)  # 4 sigma

@@ -16,7 +16,7 @@ from quad_gym.analysis.consistency import (
     verdict,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, Gate
+from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, GateDecision
 from tests.unit.alarms import assert_normal
 
 
@@ -78,7 +78,7 @@ def test_a_recorder_sees_the_errors_of_a_batch():
     batch.reset(seeds=range(16))
     recorder = NeesRecorder()
     recorder.add(batch, 0.0)
-    gap = batch.read("r") - batch.read("r_hat")
+    gap = batch.record("r") - batch.record("r_hat")
     P = batch.covariance()[:, :3, :3]
     expected = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(P), gap).mean()
     assert recorder.nees()["position"].mean[0] == pytest.approx(expected)
@@ -93,7 +93,7 @@ def test_a_matched_start_has_errors_as_claimed_and_leaves_the_flights_alone():
     batch.reset(seeds=range(4000))
     before = batch.snapshot()
     start_matched(batch, seed=3)
-    errors, L = flight_errors(batch), batch.read("L")
+    errors, L = flight_errors(batch), batch.record("L")
     white = np.linalg.solve(L, errors[..., np.newaxis])[..., 0]
     assert_normal(white, np.zeros(15), np.eye(15))
     after = batch.snapshot()
@@ -106,7 +106,7 @@ def test_a_matched_start_has_errors_as_claimed_and_leaves_the_flights_alone():
 
 def test_the_defaults_are_the_reports_form():
     report = FilterParams()
-    assert (report.kind, report.integration, report.covariance_reset) == ("ukf", "euler", "none")
+    assert (report.kind, report.integration, report.attitude_reset) == ("ukf", "euler", False)
 
 
 class Measured:
@@ -125,7 +125,7 @@ class Measured:
             "innovation": np.repeat(innovations[:, np.newaxis], MAX_BLOCKS, axis=1),
             "innovation_sigma": np.full((*blocks, 3), 2.0),
             "block_nis": np.repeat(nis[:, np.newaxis], MAX_BLOCKS, axis=1),
-            "gate": np.full(blocks, float(Gate.NONE)),
+            "gate": np.full(blocks, float(GateDecision.NONE)),
         }
 
     def read(self, name):

@@ -71,7 +71,7 @@ def test_a_flight_that_draws_features_is_the_flight_that_has_them(known):
         alone.step()
     for name in ("pixels", "r", "r_hat", "R_hat", "b_a_hat", "L"):
         np.testing.assert_allclose(
-            flights.read(name)[1], alone.read(name)[1], rtol=1e-7, atol=1e-9, err_msg=name
+            flights.record(name)[1], alone.record(name)[1], rtol=1e-7, atol=1e-9, err_msg=name
         )
 
 
@@ -93,15 +93,15 @@ def test_an_error_of_the_map_turns_with_it():
     flights = batch(6, true_sensors=INDOOR.replace(camera=camera))
     for _ in range(10):
         flights.step()
-    seen = flights.read("feature_valid")[:, : len(NOMINAL)] > 0.0
+    seen = flights.record("feature_valid")[:, : len(NOMINAL)] > 0.0
     assert seen.any()
     true = places(flights.drawn(), wrong)
-    R_BI = quaternion_to_dcm(flights.read("q"))
-    v_B = np.einsum("nij,nmj->nmi", R_BI, true - flights.read("r")[:, None])
+    R_BI = quaternion_to_dcm(flights.record("q"))
+    v_B = np.einsum("nij,nmj->nmi", R_BI, true - flights.record("r")[:, None])
     v_C = (v_B - INDOOR.camera.position_B) @ np.array(flights._model["R_CB"][0, ..., 0]).T
     pixels = INDOOR.camera.focal_length * v_C[..., :2] / v_C[..., 2:]
     np.testing.assert_allclose(
-        flights.read("pixels")[:, : len(NOMINAL)][seen], pixels[seen], atol=0.01
+        flights.record("pixels")[:, : len(NOMINAL)][seen], pixels[seen], atol=0.01
     )
     np.testing.assert_allclose(flights.feature_places(), places(flights.drawn()), atol=1e-12)
 
@@ -143,11 +143,11 @@ def test_obstacles_hide_features_where_they_are():
     flights, hid, saw = batch(64, world=world), 0, 0
     for _ in range(60):
         flights.step()
-        R_BI, r = quaternion_to_dcm(flights.read("q")), flights.read("r")
+        R_BI, r = quaternion_to_dcm(flights.record("q")), flights.record("r")
         eyes = r + np.einsum("nji,j->ni", R_BI, np.array(INDOOR.camera.position_B))
-        centers = flights.read("obstacle_center")[:, :2]
+        centers = flights.record("obstacle_center")[:, :2]
         hidden = hidden_points(world.obstacles, centers, eyes, flights.feature_places())
-        seen = flights.read("feature_valid")[:, : len(NOMINAL)] > 0.0
+        seen = flights.record("feature_valid")[:, : len(NOMINAL)] > 0.0
         assert not (seen & hidden).any()
         hid, saw = hid + int(hidden.sum()), saw + int(seen.sum())
     assert hid > 100
@@ -157,9 +157,9 @@ def test_obstacles_hide_features_where_they_are():
 def test_every_interface_flies_the_same_and_a_task_is_told():
     class Told(quad_gym.Task):
         def observe(self, view):
-            return {"nearest": (view.features - view.seen.position[:, None])[:, 0]}
+            return {"nearest": (view.features - view.observed.position[:, None])[:, 0]}
 
-    made = {"sensors": "indoor", "randomization": DRAWS, "privileged": True, "custom": Told()}
+    made = {"sensors": "indoor", "randomization": DRAWS, "privileged": True, "task": Told()}
     together = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, **made)
     alone = gymnasium.make("QuadGym/Hover-v0", **made)
     many, infos = together.reset(seed=[4, 5, 6])
@@ -185,7 +185,7 @@ def test_a_record_has_the_features_of_its_episode():
     flights = batch(3)
     recorder = FlightRecorder(flights, 2)
     recorder.keep()
-    np.testing.assert_array_equal(recorder.flight.stage.features_I, flights.feature_places()[2])
+    np.testing.assert_array_equal(recorder.flight.scene.features_I, flights.feature_places()[2])
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def hovering_in_gusts(count, *, height=HEIGHT, wind=(0.0, WIND, 0.0), dt=0.005):
 def gusts(batch):
     """(n, 3) along the wind (north), across it (west) and up, over their intensities."""
     sigma_u, sigma_w, _, _ = military_scales(HEIGHT, WIND)
-    east, north, up = (batch.read("wind") - batch.world.wind_I).T
+    east, north, up = (batch.record("wind") - batch.world.wind_I).T
     return np.stack([north / sigma_u, -east / sigma_u, up / sigma_w], axis=1)
 
 
@@ -140,7 +140,7 @@ def history():
         if tick in (0, 1, 40, 400, 4000):
             found[tick] = gusts(batch)
         batch.step()
-    np.testing.assert_allclose(batch.read("r"), [[0.0, 0.0, HEIGHT]] * 4000, atol=1e-6)
+    np.testing.assert_allclose(batch.record("r"), [[0.0, 0.0, HEIGHT]] * 4000, atol=1e-6)
     return found
 
 
@@ -196,9 +196,9 @@ def test_the_spectra_are_drydens():
 def test_across_and_along_follow_the_wind():
     still, turned = hovering_in_gusts(8), hovering_in_gusts(8, wind=(-WIND, 0.0, 0.0))
     np.testing.assert_allclose(
-        (turned.read("wind") - turned.world.wind_I)[:, 0], -(still.read("wind")[:, 1] - WIND)
+        (turned.record("wind") - turned.world.wind_I)[:, 0], -(still.record("wind")[:, 1] - WIND)
     )
-    np.testing.assert_allclose(turned.read("wind")[:, 1], still.read("wind")[:, 0])
+    np.testing.assert_allclose(turned.record("wind")[:, 1], still.record("wind")[:, 0])
 
 
 def test_different_flights_and_axes_meet_different_gusts(history):

@@ -11,7 +11,7 @@ from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 from tests.reference_ukf import PlainEKF
 from tests.unit.test_ukf import LAB, assert_equal, compare, estimator
 
-MIDPOINT = {"integration": "midpoint", "covariance_reset": "turn"}
+MIDPOINT = {"integration": "midpoint", "attitude_reset": True}
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ MIDPOINT = {"integration": "midpoint", "covariance_reset": "turn"}
         {},
         {"bearing_noise_at": "predicted"},
         {"integration": "midpoint"},
-        {"covariance_reset": "turn"},
+        {"attitude_reset": True},
         MIDPOINT,
         {"direction_variance_floor": 1e-6, "gravity": 9.81},
     ],
@@ -137,11 +137,11 @@ def test_midpoint_prediction_is_the_linearized_exact_motion(seed, kind):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("turn", ["none", "turn"])
+@pytest.mark.parametrize("turn", [False, True])
 def test_a_reset_turns_the_covariance_as_the_error_angles_turn(turn):
     """By finite differences of the new error angles, after an update with a large correction."""
     sensors = LAB.replace(camera=None).replace(
-        estimator=LAB.estimator.replace(covariance_reset=turn, initial_velocity_variance=1.0)
+        estimator=LAB.estimator.replace(attitude_reset=turn, initial_velocity_variance=1.0)
     )
     for seed in range(5):
         plain = started(sensors.replace(estimator=LAB.estimator), ExtendedKalmanFilter, seed)
@@ -195,7 +195,7 @@ def test_a_batch_flies_the_filter_of_the_friendly_class():
     sensors = LAB.replace(estimator=LAB.estimator.replace(kind="ekf", **MIDPOINT))
     batch = quad_gym.FlightBatch(1, sensors=sensors)
     batch.reset(seeds=[5])
-    read = lambda name: batch.read(name)[0]  # noqa: E731
+    read = lambda name: batch.record(name)[0]  # noqa: E731
     ekf = ExtendedKalmanFilter(sensors)
     ekf.initialize(read("gnss_position"), read("gnss_baseline"))
     for _ in range(50):

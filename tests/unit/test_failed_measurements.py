@@ -13,7 +13,7 @@ from quad_gym.records import (
     WIDTH,
     FilterForm,
     FilterStatus,
-    Gate,
+    GateDecision,
 )
 from tests.circle_flight import record_circle
 from tests.lane_filter import EIGHT, STATE, LaneFilter
@@ -24,7 +24,7 @@ FIELD = LAB.replace(
     estimator=LAB.estimator.replace(
         bearing_noise_at="pinhole",
         integration="midpoint",
-        covariance_reset="turn",
+        attitude_reset=True,
         false_alarm_probability=1e-4,
     ),
 )
@@ -102,8 +102,10 @@ def test_a_failed_update_changes_nothing(how, blocks, sensors, form):
     assert not filters.get("prediction_failures").any()
     if sensors is FIELD:
         taken = [block for name in blocks for block in BLOCKS[name]]
-        assert (filters.get("gate")[BAD, taken] == Gate.FAILED).all()
-        assert (np.delete(filters.get("gate")[:, taken], BAD, axis=0) == Gate.ACCEPTED).all()
+        assert (filters.get("gate")[BAD, taken] == GateDecision.FAILED).all()
+        assert (
+            np.delete(filters.get("gate")[:, taken], BAD, axis=0) == GateDecision.ACCEPTED
+        ).all()
 
     # with a sound measurement the filter goes on as if nothing had been
     if how in ("nan", "infinity"):
@@ -151,5 +153,5 @@ def test_an_environment_tells_of_a_failed_filter_and_begins_anew():
     assert final["ending"][3] == "filter_failed"
     assert final["filter_status"][3] == 3
     assert not info["filter_status"].any()
-    assert not batch.read("update_failures").any()
-    assert not batch.read("prediction_failures").any()
+    assert not batch.record("update_failures").any()
+    assert not batch.record("prediction_failures").any()

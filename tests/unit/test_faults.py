@@ -48,7 +48,7 @@ def both(sensors, faults, count=16, **options):
 
 
 def at(kind, batch, name="fault_active"):
-    return batch.read(name)[:, kind]
+    return batch.record(name)[:, kind]
 
 
 # ---- when --------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ def test_a_fault_that_never_comes_changes_no_bit():
         calm.step()
         faulty.step()
     for name in ("r", "v", "q", "w", "b_a", "b_g", "r_hat", "v_hat", "R_hat", "L", "pixels"):
-        np.testing.assert_array_equal(calm.read(name), faulty.read(name), err_msg=name)
+        np.testing.assert_array_equal(calm.record(name), faulty.record(name), err_msg=name)
     assert not any(active.any() for active in faulty.active_faults().values())
 
 
@@ -124,11 +124,11 @@ def test_a_new_episode_begins_without_the_faults_of_the_last():
     for _ in range(101):
         batch.step()
     assert all(active.all() for active in batch.active_faults().values())
-    assert (batch.read("rotor_gain").min(axis=1) == 0.5).all()
+    assert (batch.record("rotor_gain").min(axis=1) == 0.5).all()
     batch.reset(mask=np.array([True, False, True, False]))
     for active in batch.active_faults().values():
         np.testing.assert_array_equal(active, [False, True, False, True])
-    np.testing.assert_array_equal(batch.read("rotor_gain").min(axis=1), [1.0, 0.5, 1.0, 0.5])
+    np.testing.assert_array_equal(batch.record("rotor_gain").min(axis=1), [1.0, 0.5, 1.0, 0.5])
 
 
 # ---- GNSS --------------------------------------------------------------------------------------
@@ -141,13 +141,15 @@ def test_an_outage_takes_the_fixes_away_and_changes_nothing_else():
         calm.step()
         faulty.step()
         heard, paired = not 20 <= tick < 40, not 20 <= tick < 50
-        assert (faulty.read("position_valid") == heard).all()
-        assert (faulty.read("baseline_valid") == paired).all()
-        assert (faulty.read("position_fresh") == heard).all()
-        assert (faulty.read("baseline_fresh") == paired).all()
-        np.testing.assert_array_equal(calm.read("r"), faulty.read("r"))
+        assert (faulty.record("position_valid") == heard).all()
+        assert (faulty.record("baseline_valid") == paired).all()
+        assert (faulty.record("position_fresh") == heard).all()
+        assert (faulty.record("baseline_fresh") == paired).all()
+        np.testing.assert_array_equal(calm.record("r"), faulty.record("r"))
         if heard:
-            np.testing.assert_array_equal(calm.read("gnss_position"), faulty.read("gnss_position"))
+            np.testing.assert_array_equal(
+                calm.record("gnss_position"), faulty.record("gnss_position")
+            )
 
 
 def offsets(calm, faulty, ticks):
@@ -156,7 +158,7 @@ def offsets(calm, faulty, ticks):
     for _ in range(ticks):
         calm.step()
         faulty.step()
-        found.append((faulty.read("gnss_position") - calm.read("gnss_position")) @ R_IG.T)
+        found.append((faulty.record("gnss_position") - calm.record("gnss_position")) @ R_IG.T)
     return np.array(found)
 
 
@@ -168,7 +170,7 @@ def test_outliers_are_as_frequent_and_as_large_as_said_and_lie_everywhere(name):
     found, told = [], []
     for _ in range(100):
         found.append(offsets(calm, faulty, 1)[0])
-        told.append(faulty.read("outlier") > 0.0)
+        told.append(faulty.record("outlier") > 0.0)
     found, told = np.concatenate(found), np.concatenate(told)
     gnss = suite.gnss
     sigma = np.hypot(gnss.position_sigma_I, gnss.drift_sigma_I)
@@ -206,8 +208,8 @@ def test_an_occlusion_hides_the_same_share_of_features_as_long_as_it_stays():
     for tick in range(1, 51):
         calm.step()
         faulty.step()
-        seen, left = calm.read("feature_valid"), faulty.read("feature_valid")
-        hidden = faulty.read("feature_hidden") * (20 <= tick < 40)
+        seen, left = calm.record("feature_valid"), faulty.record("feature_valid")
+        hidden = faulty.record("feature_hidden") * (20 <= tick < 40)
         np.testing.assert_array_equal(left, seen * (1.0 - hidden))
         if tick == 20:
             first = hidden
@@ -225,10 +227,10 @@ def test_wrong_associations_take_one_seen_feature_for_another(how):
     for _ in range(50):
         calm.step()
         faulty.step()
-        seen = faulty.read("feature_valid") > 0.0
-        np.testing.assert_array_equal(seen, calm.read("feature_valid") > 0.0)
-        right, wrong = calm.read("pixels"), faulty.read("pixels")
-        mistaken = faulty.read("feature_mistaken") > 0.0
+        seen = faulty.record("feature_valid") > 0.0
+        np.testing.assert_array_equal(seen, calm.record("feature_valid") > 0.0)
+        right, wrong = calm.record("pixels"), faulty.record("pixels")
+        mistaken = faulty.record("feature_mistaken") > 0.0
         for i in np.flatnonzero(seen.sum(axis=1) >= 2):
             differs = seen[i] & (right[i] != wrong[i]).any(axis=1)
             np.testing.assert_array_equal(differs, mistaken[i])
@@ -263,7 +265,7 @@ def test_a_bias_step_is_part_of_the_true_bias_while_it_lasts():
     for tick in range(1, 121):
         calm.step()
         faulty.step()
-        gap_a, gap_g = (faulty.read(name) - calm.read(name) for name in ("b_a", "b_g"))
+        gap_a, gap_g = (faulty.record(name) - calm.record(name) for name in ("b_a", "b_g"))
         if tick == 20:
             first = gap_a
             sizes = np.linalg.norm(gap_a, axis=1)
@@ -271,7 +273,7 @@ def test_a_bias_step_is_part_of_the_true_bias_while_it_lasts():
         np.testing.assert_allclose(gap_a, first if 20 <= tick < 80 else 0.0, atol=1e-12)
         wanted = [0.01, 0.0, 0.0] if 40 <= tick < 100 else [0.0, 0.0, 0.0]
         np.testing.assert_allclose(gap_g, np.tile(wanted, (100, 1)), atol=1e-13)
-        sensed = faulty.read("accel") - calm.read("accel")
+        sensed = faulty.record("accel") - calm.record("accel")
         np.testing.assert_allclose(sensed, gap_a, rtol=0.0, atol=1e-12)
 
 
@@ -284,10 +286,10 @@ def test_saturated_samples_end_at_the_ranges(sensors):
         calm.step()
         faulty.step()
         a, w = (9.5, 0.3) if tick >= 20 + (sensors is RTK) else (np.inf, np.inf)
-        np.testing.assert_array_equal(faulty.read("accel"), calm.read("accel").clip(-a, a))
-        np.testing.assert_array_equal(faulty.read("gyro"), calm.read("gyro").clip(-w, w))
-        np.testing.assert_array_equal(faulty.read("w_meas"), calm.read("w_meas").clip(-w, w))
-        clipped += (abs(calm.read("accel")) > a).any() + (abs(calm.read("gyro")) > w).any()
+        np.testing.assert_array_equal(faulty.record("accel"), calm.record("accel").clip(-a, a))
+        np.testing.assert_array_equal(faulty.record("gyro"), calm.record("gyro").clip(-w, w))
+        np.testing.assert_array_equal(faulty.record("w_meas"), calm.record("w_meas").clip(-w, w))
+        clipped += (abs(calm.record("accel")) > a).any() + (abs(calm.record("gyro")) > w).any()
     assert clipped > 50
 
 
@@ -300,17 +302,17 @@ def test_a_position_jump_displaces_the_vehicle_once():
     for _ in range(19):
         calm.step()
         faulty.step()
-    np.testing.assert_array_equal(calm.read("r"), faulty.read("r"))
+    np.testing.assert_array_equal(calm.record("r"), faulty.record("r"))
     calm.step()
     faulty.step()
-    gap = faulty.read("r") - calm.read("r")
-    np.testing.assert_array_equal(calm.read("v"), faulty.read("v"))
+    gap = faulty.record("r") - calm.record("r")
+    np.testing.assert_array_equal(calm.record("v"), faulty.record("v"))
     assert stats.kstest(np.linalg.norm(gap, axis=1), stats.uniform(1.0, 1.0).cdf).pvalue > ALARM
     for component in (gap / np.linalg.norm(gap, axis=1)[:, np.newaxis]).T:
         assert stats.kstest(component, stats.uniform(-1.0, 2.0).cdf).pvalue > ALARM
     calm.step()
     faulty.step()
-    np.testing.assert_allclose(faulty.read("r") - calm.read("r"), gap, atol=5e-3)
+    np.testing.assert_allclose(faulty.record("r") - calm.record("r"), gap, atol=5e-3)
 
 
 @pytest.mark.parametrize("randomization", [None, {"mass": quad_gym.Uniform(0.7, 0.9)}])
@@ -321,12 +323,12 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
     for _ in range(100):
         calm.step()
         faulty.step()
-    np.testing.assert_array_equal(calm.read("w"), faulty.read("w"))
-    speeds, z_I = calm.read("rotor_speeds"), quaternion_to_dcm(calm.read("q"))[:, 2]
+    np.testing.assert_array_equal(calm.record("w"), faulty.record("w"))
+    speeds, z_I = calm.record("rotor_speeds"), quaternion_to_dcm(calm.record("q"))[:, 2]
     calm.step()
     faulty.step()
 
-    vehicle, gain = calm.vehicle, faulty.read("rotor_gain")
+    vehicle, gain = calm.vehicle, faulty.record("rotor_gain")
     which, lost = gain.argmin(axis=1), 1.0 - gain.min(axis=1)
     assert (gain.max(axis=1) == 1.0).all()
     assert stats.kstest(lost, stats.uniform(0.2, 0.8).cdf).pvalue > ALARM
@@ -336,13 +338,13 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
         assert (which == rotor).all()
     each = np.arange(100)
     force = vehicle.thrust_coefficient * speeds[each, which] ** 2 * lost
-    mass = vehicle.mass if randomization is None else calm.read("mass")
+    mass = vehicle.mass if randomization is None else calm.record("mass")
     dv = -(force / mass * DT)[:, np.newaxis] * z_I
-    np.testing.assert_allclose(faulty.read("v") - calm.read("v"), dv, rtol=0.05, atol=2e-3)
+    np.testing.assert_allclose(faulty.record("v") - calm.record("v"), dv, rtol=0.05, atol=2e-3)
     arm = np.array(vehicle.rotor_positions_B)[which]
     torque = np.stack([-arm[:, 1] * force, arm[:, 0] * force], axis=1)
     dw = torque / np.diag(vehicle.inertia)[:2] * DT
-    measured = (faulty.read("w") - calm.read("w"))[:, :2]
+    measured = (faulty.record("w") - calm.record("w"))[:, :2]
     np.testing.assert_allclose(measured, dw, rtol=0.05, atol=5e-3)
 
 
@@ -356,9 +358,9 @@ def test_the_gate_rejects_most_outliers_and_says_so():
         batch.step()
         if tick < 400:
             continue
-        now = batch.read("position_valid") > 0.0
-        wild = batch.read("outlier") > 0.0
-        rejected = batch.read("gate")[:, POSITION_BLOCK] == 2.0
+        now = batch.record("position_valid") > 0.0
+        wild = batch.record("outlier") > 0.0
+        rejected = batch.record("gate")[:, POSITION_BLOCK] == 2.0
         outliers, fixes = outliers + (now & wild).sum(), fixes + (now & ~wild).sum()
         caught, sound = (
             caught + (now & wild & rejected).sum(),

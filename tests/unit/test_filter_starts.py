@@ -111,7 +111,7 @@ def test_flights_and_filters_alone_take_the_same_heading_from_a_field(suite):
     """Kernels start a flight's filter, NumPy one alone: same attitude, position and covariance."""
     batch, kf = fly(suite, 4, task="hover", seed=3), UnscentedKalmanFilter(suite)
     read = {
-        name: batch.read(name)
+        name: batch.record(name)
         for name in ("R_hat", "r_hat", "v_hat", "L", "L_slow", "gnss_position", "aid_measurement")
     }
     states = int(kf._engine.settings["slow_states"][0])

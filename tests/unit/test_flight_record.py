@@ -15,12 +15,16 @@ from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
 from quad_gym.flights.files import table
+from quad_gym.flights.flight_scene import FlightScene
 from quad_gym.flights.record import COLUMNS
-from quad_gym.flights.stage import Stage
 from quad_gym.frames import ecef_to_enu
-from quad_gym.records import FaultKind, Gate
+from quad_gym.records import FaultKind, GateDecision
 from quad_gym.rendering import record_flight
 from quad_gym.rotations import quaternion_to_dcm
+
+
+def at_rates(**rates):
+    return quad_gym.sensor_suite("standard").with_rates(**rates)
 
 
 def recorded(task="circle", steps=12, seed=2, **keywords):
@@ -39,8 +43,8 @@ def assert_same_flights(ours, theirs):
     assert ours.rows.dtype == theirs.rows.dtype
     for column in COLUMNS:
         assert ours[column.name].tobytes() == theirs[column.name].tobytes(), column.name
-    for field in dataclasses.fields(Stage):
-        a, b = getattr(ours.stage, field.name), getattr(theirs.stage, field.name)
+    for field in dataclasses.fields(FlightScene):
+        a, b = getattr(ours.scene, field.name), getattr(theirs.scene, field.name)
         np.testing.assert_array_equal(a, b)
     assert ours.about == theirs.about
 
@@ -67,7 +71,7 @@ def test_estimate_and_reference_are_those_that_the_controller_observed():
         ("last_action", "action"),
     ):
         np.testing.assert_allclose(observed[:, part[name]], flight[column], atol=1e-6)
-    R_hat = quaternion_to_dcm(flight["estimated_attitude"]).reshape(-1, 9)
+    R_hat = quaternion_to_dcm(flight["estimated_quaternion"]).reshape(-1, 9)
     np.testing.assert_allclose(observed[:, part["R_BI"]], R_hat, atol=1e-6)
 
 
@@ -78,9 +82,9 @@ def test_errors_are_distances_between_columns(task):
     _, flight, _ = recorded(task)
     gap = np.linalg.norm(flight["position"] - flight["reference_position"], axis=1)
     np.testing.assert_allclose(gap, flight["position_error"], atol=1e-12)
-    gap = np.linalg.norm(flight["position"] - flight["seen_position"], axis=1)
+    gap = np.linalg.norm(flight["position"] - flight["observed_position"], axis=1)
     np.testing.assert_allclose(gap, flight["estimation_error"], atol=1e-12)
-    start = flight["position"][0] - flight.stage.reference(np.zeros(1))[0]
+    start = flight["position"][0] - flight.scene.reference(np.zeros(1))[0]
     if task != "waypoints":
         assert np.linalg.norm(start) == pytest.approx(flight["position_error"][0])
 
@@ -94,7 +98,7 @@ def test_nees_is_that_of_the_error_and_the_covariance():
         if word is not None:
             error[3 * k : 3 * k + 3] = row[word] - row[f"estimated_{word}"]
     # small angles: R(e) is nearly I - [e x]
-    R = quaternion_to_dcm(row["attitude"]) @ quaternion_to_dcm(row["estimated_attitude"]).T
+    R = quaternion_to_dcm(row["quaternion"]) @ quaternion_to_dcm(row["estimated_quaternion"]).T
     error[6:9] = (R[1, 2] - R[2, 1]) / 2, (R[2, 0] - R[0, 2]) / 2, (R[0, 1] - R[1, 0]) / 2
     assert row["nees"] == pytest.approx(error @ np.linalg.solve(P, error), rel=0.02)
     np.testing.assert_array_equal(P, P.T)
@@ -102,15 +106,15 @@ def test_nees_is_that_of_the_error_and_the_covariance():
 
 
 def test_fixes_are_kept_in_the_inertial_frame_and_only_when_they_come():
-    keywords = {"gnss_rate": 5.0, "control_rate": 50.0, "out_of_bounds": 50.0}
+    keywords = {"sensors": at_rates(gnss=5.0), "control_rate": 50.0, "out_of_bounds": 50.0}
     env, flight, _ = recorded("hover", steps=100, **keywords)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
     np.testing.assert_array_equal(np.flatnonzero(measured), np.arange(0, 101, 10))
     lever = quad_gym.sensor_suite("lab").gnss.primary_antenna_B
-    antenna = flight["position"] + lever @ quaternion_to_dcm(flight["attitude"])
+    antenna = flight["position"] + lever @ quaternion_to_dcm(flight["quaternion"])
     miss = flight["gnss_position"][measured] - antenna[measured]
     assert (abs(miss) < 6 * np.array([0.006, 0.006, 0.012])).all()
-    G = env.flights.batch.read("gnss_position")[0]
+    G = env.flights.batch.record("gnss_position")[0]
     enu = ecef_to_enu(quad_gym.sensor_suite("lab").gnss.reference_antenna_G) @ G
     np.testing.assert_allclose(enu, flight["gnss_position"][-1], atol=1e-9)
 
@@ -119,21 +123,21 @@ def test_what_the_gate_made_of_measurements_is_kept():
     faults = {"faults": GnssOutliers(share=0.5, size=(50.0, 100.0))}
     env, flight, _ = recorded("hover", steps=100, sensors="rtk", **faults)
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
-    np.testing.assert_array_equal(np.isfinite(flight["gnss_gate"][:, 0]), measured)
+    np.testing.assert_array_equal(np.isfinite(flight["gnss_decision"][:, 0]), measured)
     antenna_B = env.flights.batch.sensors.gnss.primary_antenna_B
-    antenna = flight["position"] + antenna_B @ quaternion_to_dcm(flight["attitude"])
+    antenna = flight["position"] + antenna_B @ quaternion_to_dcm(flight["quaternion"])
     # the vehicle moves some centimeters from a fix to the end of its row
     far = np.linalg.norm(flight["gnss_position"] - antenna, axis=1) > 0.3
     assert far.sum() > 5
-    np.testing.assert_array_equal(flight["gnss_gate"][far, 0], Gate.REJECTED)
-    kept = flight["gnss_gate"][measured & ~far, 0][1:]  # the fix of the start is not gated
-    assert (kept == Gate.ACCEPTED).mean() > 0.8
+    np.testing.assert_array_equal(flight["gnss_decision"][far, 0], GateDecision.REJECTED)
+    kept = flight["gnss_decision"][measured & ~far, 0][1:]  # the fix of the start is not gated
+    assert (kept == GateDecision.ACCEPTED).mean() > 0.8
     np.testing.assert_array_equal(
-        np.isfinite(flight["feature_gate"]), np.isfinite(flight["pixels"]).all(axis=2)
+        np.isfinite(flight["feature_decision"]), np.isfinite(flight["pixels"]).all(axis=2)
     )
     lab = recorded("hover")[1]
-    assert (lab["gnss_gate"][:, 0] == Gate.NONE).all()
-    assert np.isnan(lab["gnss_gate"][:, 2]).all()  # its receiver gives no velocity
+    assert (lab["gnss_decision"][:, 0] == GateDecision.NONE).all()
+    assert np.isnan(lab["gnss_decision"][:, 2]).all()  # its receiver gives no velocity
 
 
 def test_velocities_are_kept_where_the_receiver_gives_them():
@@ -179,7 +183,7 @@ def test_a_new_episode_is_a_new_flight_and_the_old_one_lives_on():
 
 def test_long_flights_have_room():
     _, flight, _ = recorded(
-        "hover", steps=600, duration=0.0, out_of_bounds=1e6, ground=-1e6, max_tilt=np.pi
+        "hover", steps=600, duration=0.0, out_of_bounds=1e6, min_height=-1e6, max_tilt=np.pi
     )
     assert len(flight) == 601
     assert (np.diff(flight["time"]) > 0.0).all()
@@ -220,7 +224,7 @@ def test_a_recorded_policy_flies_what_it_flies_unrecorded():
         {"task": "waypoints"},
         {"observation": "truth"},
         {"camera": False},
-        {"gnss_rate": 10.0, "camera_rate": 20.0},
+        {"sensors": at_rates(gnss=10.0, camera=20.0)},
     ],
     ids=str,
 )
@@ -263,7 +267,7 @@ def with_header(**changes):
         (with_header(format="other"), "not a flight"),
         (lambda e: e.pop("header"), "not a flight"),
         (lambda e: e.pop("columns/position"), "columns/position"),
-        (lambda e: e.pop("stage/R_CB"), "R_CB"),
+        (lambda e: e.pop("scene/R_CB"), "R_CB"),
         (lambda e: e.update({"columns/nees": np.zeros(3)}), "column nees"),
         (lambda e: e.update({"columns/time": np.zeros(0)}), "no rows"),
         (lambda e: e.update({"columns/position": np.zeros((13, 3), "f4")}), "float64"),
@@ -316,7 +320,7 @@ def test_an_interrupted_save_leaves_the_old_file(tmp_path):
 
 
 def test_csv_keeps_every_number(tmp_path):
-    _, flight, _ = recorded(gnss_rate=10.0)
+    _, flight, _ = recorded(sensors=at_rates(gnss=10.0))
     with flight.to_csv(tmp_path / "flight.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(flight)
@@ -331,10 +335,10 @@ def test_the_table_names_every_number_once():
     columns = table(flight)
     numbers = sum(int(np.prod(flight[c.name].shape[1:])) for c in COLUMNS)
     assert len(columns) == numbers - 225 + 15  # the covariance has its standard deviations
-    np.testing.assert_array_equal(columns["attitude_w"], flight["attitude"][:, 0])
+    np.testing.assert_array_equal(columns["quaternion_w"], flight["quaternion"][:, 0])
     np.testing.assert_array_equal(columns["rotor_speeds_4"], flight["rotor_speeds"][:, 3])
-    np.testing.assert_array_equal(columns["gnss_gate_velocity"], flight["gnss_gate"][:, 2])
-    np.testing.assert_array_equal(columns["feature_gate_2"], flight["feature_gate"][:, 1])
+    np.testing.assert_array_equal(columns["gnss_decision_velocity"], flight["gnss_decision"][:, 2])
+    np.testing.assert_array_equal(columns["feature_decision_2"], flight["feature_decision"][:, 1])
     np.testing.assert_array_equal(columns["pixels_2_y"], flight["pixels"][:, 1, 1])
     sigma = np.sqrt(flight["covariance"][:, 4, 4])
     np.testing.assert_array_equal(columns["sigma_velocity_y"], sigma)

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.flights.record import FlightRecorder
 from quad_gym.rotations import quaternion_to_dcm
@@ -55,7 +56,7 @@ def test_poses_are_those_of_the_flight_on_its_time_line(read_back):
     entities = read_back(flight)
     for name, position, attitude in (
         ("truth", "position", "attitude"),
-        ("estimate", "estimated_position", "estimated_attitude"),
+        ("estimate", "estimated_position", "estimated_quaternion"),
     ):
         entity = entities[f"/world/{name}"]
         np.testing.assert_allclose(seconds(entity), flight["time"], atol=1e-9)
@@ -89,18 +90,18 @@ def test_the_image_holds_what_was_measured(read_back):
     seen = np.isfinite(flight["pixels"]).all(axis=2)
     assert [len(row) for row in rows] == seen.sum(axis=1).tolist()
     assert seen.any()
-    expected = (flight["pixels"] + flight.stage.half_image)[seen]
+    expected = (flight["pixels"] + flight.scene.half_image)[seen]
     np.testing.assert_allclose(np.concatenate([row for row in rows if row]), expected, rtol=1e-6)
     rays = entities["/world/rays"]["LineStrips3D:strips"].to_pylist()
     assert [len(row) for row in rays] == seen.sum(axis=1).tolist()
     matrix = np.reshape(entities[camera]["Pinhole:image_from_camera"].to_pylist()[0], (3, 3)).T
     ahead = matrix @ (0.1, 0.0, 1.0)  # a tenth off the axis: a tenth of the focal length
-    found = ahead[:2] / ahead[2] - flight.stage.half_image
-    np.testing.assert_allclose(found, [0.1 * flight.stage.focal_length, 0.0], rtol=1e-5)
+    found = ahead[:2] / ahead[2] - flight.scene.half_image
+    np.testing.assert_allclose(found, [0.1 * flight.scene.focal_length, 0.0], rtol=1e-5)
 
 
 def test_fixes_appear_when_they_come(read_back):
-    flight = flown(gnss_rate=10.0)
+    flight = flown(sensors=quad_gym.sensor_suite("standard").with_rates(gnss=10.0))
     entity = read_back(flight)["/world/gnss"]
     measured = np.isfinite(flight["gnss_position"]).all(axis=1)
     assert measured.sum() == 7

@@ -34,8 +34,8 @@ def with_filter(suite, **choices):
     [
         DRIFTING,
         DRIFTING.replace(camera=None),
-        with_filter(DRIFTING, integration="midpoint", covariance_reset="turn", alpha=0.7),
-        with_filter(DRIFTING, covariance_reset="turn"),
+        with_filter(DRIFTING, integration="midpoint", attitude_reset=True, alpha=0.7),
+        with_filter(DRIFTING, attitude_reset=True),
     ],
     ids=["with camera", "GNSS alone", "field filter", "Euler and turn"],
 )
@@ -90,8 +90,8 @@ def test_a_slow_error_in_one_axis_leaves_the_others_without():
     suite = CONSUMER.replace(gnss=CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.0, 0.0)))
     batch = fly(suite, 50, task="hover")
     steps(batch, 5.0)
-    assert not batch.read("filter_status").any()
-    drift = batch.read("gnss_drift_hat")
+    assert not batch.record("filter_status").any()
+    drift = batch.record("gnss_drift_hat")
     assert (abs(drift[:, 1:]) < 1e-5).all()
     assert abs(drift[:, 0]).max() > 0.1
 
@@ -141,12 +141,12 @@ def test_after_a_minute_the_position_is_much_better_than_a_fix():
 def test_the_slow_error_is_estimated_as_well_as_claimed():
     batch = fly(CONSUMER, 300)
     steps(batch, 10.0)
-    error, L = batch.read("gnss_drift") - batch.read("gnss_drift_hat"), batch.read("L_drift")
+    error, L = batch.record("gnss_drift") - batch.record("gnss_drift_hat"), batch.record("L_drift")
     P = L @ L.transpose(0, 2, 1)
     square = np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., np.newaxis])[..., 0])
     assert square.mean() == pytest.approx(3.0, abs=5 * np.sqrt(6 / 300))
     assert (
-        np.square(error).mean(axis=0) < 0.25 * np.square(batch.read("gnss_drift")).mean(axis=0)
+        np.square(error).mean(axis=0) < 0.25 * np.square(batch.record("gnss_drift")).mean(axis=0)
     ).all()
 
 
@@ -164,23 +164,26 @@ def test_the_filter_is_consistent(kind, start, latency):
     for _ in range(3):
         steps(batch, 1.5)
         assert nees(batch).mean() == pytest.approx(15.0, abs=1.6)
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
 
 
 def test_a_warm_start_draws_the_slow_error_of_a_receiver_that_has_run():
     """It has its variance after ten seconds, and goes with the errors as the filter claims."""
     batch = fly(CONSUMER, 4000, task="hover", filter_start="warm")
-    true, error = batch.read("gnss_drift"), batch.read("gnss_drift") - batch.read("gnss_drift_hat")
+    true, error = (
+        batch.record("gnss_drift"),
+        batch.record("gnss_drift") - batch.record("gnss_drift_hat"),
+    )
     expected = np.array(CONSUMER.gnss.drift_sigma_I) * np.sqrt(1 - np.exp(-20.0 / 60.0))
     np.testing.assert_allclose(true.std(axis=0), expected, rtol=0.06)
     L = np.zeros((4000, 18, 18))
-    L[:, :15, :15], L[:, 15:] = batch.read("L"), batch.read("L_drift")
+    L[:, :15, :15], L[:, 15:] = batch.record("L"), batch.record("L_drift")
     joint = np.concatenate([state_errors(batch), error], axis=1)
     white = np.linalg.solve(L, joint[..., np.newaxis])[..., 0]
     np.testing.assert_allclose(np.cov(white.T), np.eye(18), atol=0.1)
     # an estimate is independent of its error
-    correlation = (batch.read("gnss_drift_hat") * error).mean(axis=0) / error.std(axis=0)
-    assert (abs(correlation / batch.read("gnss_drift_hat").std(axis=0)) < 0.08).all()
+    correlation = (batch.record("gnss_drift_hat") * error).mean(axis=0) / error.std(axis=0)
+    assert (abs(correlation / batch.record("gnss_drift_hat").std(axis=0)) < 0.08).all()
 
 
 def test_late_fixes_leave_what_filtering_all_over_again_does():
@@ -192,7 +195,7 @@ def test_late_fixes_leave_what_filtering_all_over_again_does():
     suite = with_filter(
         lab.replace(imu=lab.imu.replace(samples="average"), gnss=gnss),
         integration="midpoint",
-        covariance_reset="turn",
+        attitude_reset=True,
         reuse_first_fix=False,
     )
     batch = fly(suite, 1, task="hover")
@@ -200,17 +203,17 @@ def test_late_fixes_leave_what_filtering_all_over_again_does():
     reference = start_like(batch, plain)
     for tick in range(1, 601):
         batch.step()
-        reference.predict(batch.read("gyro")[0], batch.read("accel")[0])
-        if batch.read("position_valid")[0]:
+        reference.predict(batch.record("gyro")[0], batch.record("accel")[0])
+        if batch.record("position_valid")[0]:
             reference.update(
                 tick - 20,
-                gnss_position_G=batch.read("gnss_position")[0],
-                gnss_baseline_G=batch.read("gnss_baseline")[0],
+                gnss_position_G=batch.record("gnss_position")[0],
+                gnss_baseline_G=batch.record("gnss_baseline")[0],
             )
     sigma = np.sqrt(np.diag(plain.P))
-    assert (abs(batch.read("r_hat")[0] - plain.r) < 0.1 * sigma[:3]).all()
-    assert (abs(batch.read("gnss_drift_hat")[0] - plain.d) < 0.1 * sigma[15:]).all()
-    ours = np.sqrt(np.diag(batch.read("L_drift")[0] @ batch.read("L_drift")[0].T))
+    assert (abs(batch.record("r_hat")[0] - plain.r) < 0.1 * sigma[:3]).all()
+    assert (abs(batch.record("gnss_drift_hat")[0] - plain.d) < 0.1 * sigma[15:]).all()
+    ours = np.sqrt(np.diag(batch.record("L_drift")[0] @ batch.record("L_drift")[0].T))
     np.testing.assert_allclose(ours, sigma[15:], rtol=0.05)
 
 
@@ -224,7 +227,7 @@ def start_like(batch, plain):
         ("b_g", "b_g_hat"),
         ("d", "gnss_drift_hat"),
     ):
-        setattr(plain, name, batch.read(field)[0])
+        setattr(plain, name, batch.record(field)[0])
     plain.P = np.zeros((18, 18))
     plain.P[:15, :15] = batch.covariance()[0]
     plain.P[15:, 15:] = 1e-20 * np.eye(3)
@@ -238,9 +241,9 @@ def test_a_gross_outlier_is_rejected():
     struck = rejected = 0
     for _ in range(1000):
         batch.step()
-        hit = (batch.read("position_valid") > 0.0) & (batch.read("outlier") > 0.0)
+        hit = (batch.record("position_valid") > 0.0) & (batch.record("outlier") > 0.0)
         struck += hit.sum()
-        rejected += (hit & (batch.read("gate")[:, 0] == 2.0)).sum()
+        rejected += (hit & (batch.record("gate")[:, 0] == 2.0)).sum()
     assert struck > 1000
     assert rejected > 0.98 * struck
     steps(sound, 5.0)
@@ -251,11 +254,11 @@ def test_a_gross_outlier_is_rejected():
 def test_a_jump_of_the_fixes_shows_in_the_innovations_and_moves_the_slow_error():
     batch = fly(CONSUMER, 100, task="hover", faults=GnssJump(start=3.0, size=5.0, duration=1e3))
     steps(batch, 3.2)
-    assert (batch.read("block_nis")[:, 0] > 100.0).mean() > 0.9
-    assert (batch.read("gate")[:, 0] == 2.0).all()
+    assert (batch.record("block_nis")[:, 0] > 100.0).mean() > 0.9
+    assert (batch.record("gate")[:, 0] == 2.0).all()
     steps(batch, 3.0)  # the filter doubts its position meanwhile
-    assert (batch.read("doubt_tick") > 3.0 * CONSUMER.imu.rate).all()
-    assert (batch.read("gate")[:, 0] == 1.0).all()
+    assert (batch.record("doubt_tick") > 3.0 * CONSUMER.imu.rate).all()
+    assert (batch.record("gate")[:, 0] == 1.0).all()
     assert nees(batch, slice(0, 3)).mean() < 30.0
 
 
@@ -266,6 +269,10 @@ def test_the_estimate_follows_the_fixes_in_an_environment():
     R_IG = east_north_up(CONSUMER.gnss.reference_antenna_G)
     for _ in range(50):
         env.step(np.zeros((8, 4), np.float32))
-    fix = batch.read("gnss_position") @ R_IG.T - batch.read("r_hat") - batch.read("gnss_drift_hat")
+    fix = (
+        batch.record("gnss_position") @ R_IG.T
+        - batch.record("r_hat")
+        - batch.record("gnss_drift_hat")
+    )
     assert np.abs(fix - [0.0, 0.0, 0.0472]).max() < 5 * 0.4
     env.close()

@@ -23,7 +23,7 @@ def batch(count=1, world=None, ground=None, task=None, **options):
     )
     options = {"sensors": "lab", "source": Source.TRUTH, "control_rate": 200.0} | options
     world = WorldParams(ground=GroundParams(**(ground or {})), **(world or {}))
-    task = TaskParams(max_tilt=math.pi, ground=-1e3, **task)
+    task = TaskParams(max_tilt=math.pi, min_height=-1e3, **task)
     options = {"control": Control.MOTOR, "vehicle": CALM} | options
     return FlightBatch(count, task=task, world=world, **options)
 
@@ -63,15 +63,17 @@ def at_random(flights, rng, height=(0.05, 0.3)):
 
 def points(flights):
     """(n, 8, 3) feet and hubs in I."""
-    R_BI = quaternion_to_dcm(flights.read("q"))
+    R_BI = quaternion_to_dcm(flights.record("q"))
     p_B = np.vstack([GroundParams().feet_B, CALM.rotor_positions_B])
-    return flights.read("r")[:, None] + p_B @ R_BI
+    return flights.record("r")[:, None] + p_B @ R_BI
 
 
 def energy(flights):
-    v, w, J = flights.read("v"), flights.read("w"), np.array(CALM.inertia)
+    v, w, J = flights.record("v"), flights.record("w"), np.array(CALM.inertia)
     turning = 0.5 * np.einsum("ni,ij,nj->n", w, J, w)
-    return 0.5 * CALM.mass * (v**2).sum(1) + turning + CALM.mass * GRAVITY * flights.read("r")[:, 2]
+    return (
+        0.5 * CALM.mass * (v**2).sum(1) + turning + CALM.mass * GRAVITY * flights.record("r")[:, 2]
+    )
 
 
 @pytest.mark.parametrize("wind", [0.0, 3.0])
@@ -79,15 +81,15 @@ def test_a_vehicle_stands_still_for_a_minute(wind):
     world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.3, 0.3, 0.3)}
     flights = batch(3, world=world, run_filter=True, task={"start": "ground"})
     flights.reset(seeds=[1, 2, 3])
-    before = {name: flights.read(name) for name in ("r", "q")}
+    before = {name: flights.record(name) for name in ("r", "q")}
     actions = np.full((3, 4), -0.4)  # the rotors carry a part of the weight
     for _ in range(60 * 200):
         flights.step(actions)
     for name, value in before.items():
-        assert (flights.read(name) == value).all(), name
-    assert (flights.read("v") == 0.0).all()
-    assert (flights.read("footing") == 4.0).all()
-    assert (flights.read("needs_reset") == 0.0).all()
+        assert (flights.record(name) == value).all(), name
+    assert (flights.record("v") == 0.0).all()
+    assert (flights.record("footing") == 4.0).all()
+    assert (flights.record("needs_reset") == 0.0).all()
 
 
 @pytest.mark.parametrize("sensors", ["lab", "standard"])
@@ -97,8 +99,8 @@ def test_the_accelerometer_reads_gravity(sensors):
     f, w = np.zeros((2, 128, 3))
     for _ in range(100):
         flights.step(stopped(flights))
-        f += (flights.read("accel") - flights.read("b_a")) / 100
-        w += (flights.read("gyro") - flights.read("b_g")) / 100
+        f += (flights.record("accel") - flights.record("b_a")) / 100
+        w += (flights.record("gyro") - flights.record("b_g")) / 100
     imu = quad_gym.sensor_suite(sensors).imu
     for mean, density in (
         (f - [0.0, 0.0, GRAVITY], imu.accel_noise_density),
@@ -111,20 +113,20 @@ def test_the_accelerometer_reads_gravity(sensors):
 def test_a_level_fall_ends_at_rest_where_it_touches():
     flights = batch()
     flights.reset(seeds=[0], position=[0.0, 0.0, 0.05], velocity=[0.0, 0.0, 0.0], yaw=0.3)
-    put(flights, q=flights.read("q") * [[1, 0, 0, 1]], w=np.zeros((1, 3)))
-    put(flights, q=flights.read("q") / np.linalg.norm(flights.read("q")))
+    put(flights, q=flights.record("q") * [[1, 0, 0, 1]], w=np.zeros((1, 3)))
+    put(flights, q=flights.record("q") / np.linalg.norm(flights.record("q")))
     resting_rotors(flights)
     ticks = 0
-    while flights.read("footing")[0] == 0.0:
+    while flights.record("footing")[0] == 0.0:
         flights.step(stopped(flights))
         ticks += 1
     fall = math.sqrt(2.0 * 0.05 / GRAVITY)
     assert abs(ticks * TICK - fall) <= TICK
     for _ in range(20):
         flights.step(stopped(flights))
-    assert np.abs(flights.read("v")).max() == 0.0
-    assert abs(flights.read("r")[0, 2]) < 1e-5
-    assert flights.read("crashed")[0] == 0.0
+    assert np.abs(flights.record("v")).max() == 0.0
+    assert abs(flights.record("r")[0, 2]) < 1e-5
+    assert flights.record("crashed")[0] == 0.0
 
 
 def test_contact_never_gains_energy_and_nothing_sinks_in():
@@ -140,17 +142,17 @@ def test_contact_never_gains_energy_and_nothing_sinks_in():
         deepest = min(deepest, (points(flights)[..., 2] - FLOOR).min())
     assert deepest > -0.01  # turned by a tick of some 20 rad/s
     # upright, upside down, or on an edge of both: all have come to rest
-    assert np.linalg.norm(flights.read("v"), axis=1).max() < 0.02
+    assert np.linalg.norm(flights.record("v"), axis=1).max() < 0.02
 
 
 def test_without_friction_horizontal_momentum_stays():
     flights = batch(64, ground={"friction": 0.0, **TOUGH})
     flights.reset(seeds=range(64))
     at_random(flights, np.random.default_rng(1))
-    before = flights.read("v")[:, :2]
+    before = flights.record("v")[:, :2]
     for _ in range(200):
         flights.step(stopped(flights))
-    np.testing.assert_allclose(flights.read("v")[:, :2], before, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(flights.record("v")[:, :2], before, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
@@ -168,11 +170,11 @@ def test_it_slides_to_a_stop_as_coulomb_says(friction):
     )
     speed, slowing = math.hypot(1.0, 0.5), friction * GRAVITY
     ticks = 0
-    while np.linalg.norm(flights.read("v")) > 0.0:
+    while np.linalg.norm(flights.record("v")) > 0.0:
         flights.step(stopped(flights))
         ticks += 1
     assert abs(ticks * TICK - speed / slowing) < 4 * TICK
-    slid = flights.read("r")[0]
+    slid = flights.record("r")[0]
     np.testing.assert_allclose(
         slid[:2], np.array([1.0, 0.5]) * speed / (2.0 * slowing), atol=speed * TICK
     )
@@ -185,10 +187,10 @@ def test_wind_beyond_friction_pushes_it_along():
         world = {"wind_I": (wind, 0.0, 0.0), "linear_drag_B": (0.2, 0.2, 0.0)}
         flights = batch(world=world, ground={"friction": 0.3}, task={"start": "ground"})
         flights.reset(seeds=[0])
-        start = flights.read("r")
+        start = flights.record("r")
         for _ in range(200):
             flights.step(stopped(flights))
-        assert (np.linalg.norm(flights.read("r") - start) > 0.01) == moves
+        assert (np.linalg.norm(flights.record("r") - start) > 0.01) == moves
 
 
 def test_it_lifts_off_when_thrust_exceeds_weight():
@@ -198,11 +200,11 @@ def test_it_lifts_off_when_thrust_exceeds_weight():
     voltage = 1.2 * lab.hover_voltage
     expected = -lab.motor_time_constant * math.log(1.0 - lab.hover_voltage / voltage)
     ticks = 0
-    while flights.read("footing")[0] > 0.0:
+    while flights.record("footing")[0] > 0.0:
         flights.step(np.full((1, 4), 0.2))
         ticks += 1
     assert abs(ticks * TICK - expected) <= 2.0 * TICK
-    assert abs(flights.read("r")[0, 2]) < 1e-3
+    assert abs(flights.record("r")[0, 2]) < 1e-3
 
 
 def test_thrust_on_one_side_tips_it_over():
@@ -217,7 +219,7 @@ def test_thrust_on_one_side_tips_it_over():
         action[0, [1, 2]] = volts / lab.hover_voltage - 1.0
         for _ in range(300):
             flights.step(action)
-        tipped.append(bool(flights.read("needs_reset")[0]))
+        tipped.append(bool(flights.record("needs_reset")[0]))
     assert tipped == [False, True]
 
 
@@ -233,16 +235,16 @@ def test_the_imu_feels_all_that_changes_the_velocity(samples):
     flights = batch(16, sensors=sensors, run_filter=True)
     flights.reset(seeds=range(16), position=[0.0, 0.0, 0.03], velocity=[0.2, 0.0, -0.3])
     resting_rotors(flights)
-    v, gained = flights.read("v"), np.zeros((16, 3))
+    v, gained = flights.record("v"), np.zeros((16, 3))
     for _ in range(100):
-        before = flights.read("q")
+        before = flights.record("q")
         flights.step(stopped(flights))
-        after = flights.read("q")
+        after = flights.record("q")
         middle = before + after if samples == "average" else after
         R_BI = quaternion_to_dcm(middle / np.linalg.norm(middle, axis=1, keepdims=True))
-        f_I = np.einsum("nji,nj->ni", R_BI, flights.read("accel"))
+        f_I = np.einsum("nji,nj->ni", R_BI, flights.record("accel"))
         gained += TICK * (f_I - [0.0, 0.0, GRAVITY])
-    assert (flights.read("v") == 0.0).all()
+    assert (flights.record("v") == 0.0).all()
     # in free flight an instantaneous sample is not the mean over its tick
     np.testing.assert_allclose(gained, -v, atol=1e-8 if samples == "average" else 0.02)
 
@@ -275,13 +277,13 @@ def test_a_hard_landing_is_the_end(start, crashes):
 def test_a_start_in_the_ground_is_lifted_and_one_on_it_stands():
     flights = batch(3, world={"ground_height": -0.3}, task={"start": "ground"})
     flights.reset(seeds=[0, 1, 2])
-    np.testing.assert_allclose(flights.read("r")[:, 2], -0.2, atol=1e-12)
-    assert (flights.read("footing") == 4.0).all()
+    np.testing.assert_allclose(flights.record("r")[:, 2], -0.2, atol=1e-12)
+    assert (flights.record("footing") == 4.0).all()
     flights.reset(seeds=[0, 1, 2], position=[0.0, 0.0, -0.7])
-    np.testing.assert_allclose(flights.read("r")[:, 2], -0.2, atol=1e-12)
+    np.testing.assert_allclose(flights.record("r")[:, 2], -0.2, atol=1e-12)
     flights.reset(seeds=[0, 1, 2], position=[0.0, 0.0, 1.0])
-    assert (flights.read("r")[:, 2] == 1.0).all()
-    assert (flights.read("footing") == 0.0).all()
+    assert (flights.record("r")[:, 2] == 1.0).all()
+    assert (flights.record("footing") == 0.0).all()
 
 
 def test_it_stands_on_ground_of_its_own_center_of_mass():
@@ -291,11 +293,11 @@ def test_it_stands_on_ground_of_its_own_center_of_mass():
         randomization={"center_of_mass_B": quad_gym.Uniform(-0.02, 0.02)},
     )
     flights.reset(seeds=range(16))
-    z, shift = flights.read("r")[:, 2], flights.read("center_of_mass_B")[:, 2]
+    z, shift = flights.record("r")[:, 2], flights.record("center_of_mass_B")[:, 2]
     np.testing.assert_allclose(z, shift, atol=1e-12)
     for _ in range(100):
         flights.step(stopped(flights))
-    assert (flights.read("v") == 0.0).all()
+    assert (flights.record("v") == 0.0).all()
 
 
 def test_a_flight_is_the_same_in_any_batch():
@@ -305,7 +307,7 @@ def test_a_flight_is_the_same_in_any_batch():
         flights.reset(seeds=range(count), position=[0.0, 0.0, 0.3])
         for _ in range(150):
             flights.step(np.full((count, 4), -0.6))
-        found.append([flights.read(name)[0] for name in ("r", "v", "q", "w", "accel", "r_hat")])
+        found.append([flights.record(name)[0] for name in ("r", "v", "q", "w", "accel", "r_hat")])
     for one, other in zip(*found, strict=True):
         assert (one == other).all()
 
@@ -321,7 +323,7 @@ def test_a_snapshot_brings_a_landing_back():
         flights.restore(kept)
         for _ in range(60):
             flights.step(stopped(flights))
-        ends.append(flights.read("L"))
+        ends.append(flights.record("L"))
     assert (ends[0] == ends[1]).all()
 
 
@@ -357,7 +359,7 @@ def test_the_filter_is_consistent_while_the_vehicle_stands(suite):
     flights.reset(seeds=range(256))
     for _ in range(5 * 200):
         flights.step(np.full((256, 4), -0.3))
-    assert (flights.read("footing") == 4.0).all()
+    assert (flights.record("footing") == 4.0).all()
     assert 10.0 < nees(flights).mean() < 15.0 + 5.0 * 0.34
 
 

@@ -44,8 +44,8 @@ def test_no_episode_ends_because_of_where_the_ground_is(kind, height, reference)
     flights = batch(height=height, task=task)
     flights.reset(seeds=range(4))
     assert (stand(flights) == 0.0).all()
-    np.testing.assert_allclose(flights.read("r")[:, 2], height + LEGS, rtol=0.0, atol=1e-9)
-    assert (flights.read("footing") == 4.0).all()
+    np.testing.assert_allclose(flights.record("r")[:, 2], height + LEGS, rtol=0.0, atol=1e-9)
+    assert (flights.record("footing") == 4.0).all()
 
 
 @pytest.mark.parametrize("start", ["ground", "mixed", "hover", "moving"])
@@ -79,11 +79,11 @@ def test_where_a_reference_begins_decides():
 
 
 def test_the_ground_of_a_task_without_ground_that_carries_stays():
-    flights = FlightBatch(1, task=TaskParams(ground=0.3), world=WorldParams(ground_height=-5.0))
-    assert flights._settings["ground"][0] == 0.3
-    assert batch(task={"ground": -7.0})._settings["ground"][0] == -7.0
+    flights = FlightBatch(1, task=TaskParams(min_height=0.3), world=WorldParams(ground_height=-5.0))
+    assert flights._settings["min_height"][0] == 0.3
+    assert batch(task={"min_height": -7.0})._settings["min_height"][0] == -7.0
     assert math.isclose(
-        batch(height=-3.0, task={"out_of_bounds": 9.0})._settings["ground"][0], -3.5
+        batch(height=-3.0, task={"out_of_bounds": 9.0})._settings["min_height"][0], -3.5
     )
 
 
@@ -94,9 +94,9 @@ def test_starts_on_the_ground_are_on_it_with_any_draws(pad, moving):
     task = {"pad": pad, "out_of_bounds": 10.0}
     flights = batch(16, height=-2.0, task=task, randomization=draws)
     flights.reset(seeds=range(16))
-    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(flights.record("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
     flights.reset(seeds=range(16), velocity=[0.1, 0.0, 0.0])
-    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(flights.record("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("pad", [True, False])
@@ -109,21 +109,21 @@ def test_a_drawn_height_is_on_top_of_the_ground(pad, start):
     )
     flights.reset(seeds=range(64))
     level.reset(seeds=range(64))
-    drawn = flights.read("drawn")[:, COLUMNS["start_position_I"]][:, 2]
+    drawn = flights.record("drawn")[:, COLUMNS["start_position_I"]][:, 2]
     np.testing.assert_allclose(
-        flights.read("r")[:, 2], level.read("r")[:, 2] + drawn, rtol=0.0, atol=1e-12
+        flights.record("r")[:, 2], level.record("r")[:, 2] + drawn, rtol=0.0, atol=1e-12
     )
-    assert (level.read("r")[:, 2] == -2.0 + LEGS).sum() > 20
-    assert (flights.read("footing") == 0.0).all()
+    assert (level.record("r")[:, 2] == -2.0 + LEGS).sum() > 20
+    assert (flights.record("footing") == 0.0).all()
     flights.reset(seeds=range(64), position=[0.0, 0.0, -1.0])
-    assert (flights.read("r")[:, 2] == -1.0).all()
+    assert (flights.record("r")[:, 2] == -1.0).all()
 
 
 def test_a_drawn_height_below_the_ground_is_lifted_onto_it():
     draws = {"start_position_I": (None, None, Uniform(-0.5, -0.1))}
     flights = batch(height=-2.0, task={"out_of_bounds": 10.0}, randomization=draws)
     flights.reset(seeds=range(4))
-    np.testing.assert_allclose(flights.read("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(flights.record("r")[:, 2], -2.0 + LEGS, rtol=0.0, atol=1e-12)
 
 
 def test_only_flights_that_begin_are_put_onto_the_ground():
@@ -132,7 +132,7 @@ def test_only_flights_that_begin_are_put_onto_the_ground():
     chosen = np.arange(16) % 2 == 0
     flights.reset(mask=chosen)
     np.testing.assert_allclose(
-        flights.read("r")[:, 2], np.where(chosen, -2.0 + LEGS, 1.0), rtol=0.0, atol=1e-12
+        flights.record("r")[:, 2], np.where(chosen, -2.0 + LEGS, 1.0), rtol=0.0, atol=1e-12
     )
 
 

@@ -40,8 +40,8 @@ def test_landings_under_thrust_come_to_rest():
     actions = level(flights, shares, rng.uniform(1e-4, 6e-3, len(shares)), down)
     for _ in range(100):
         flights.step(actions)
-    assert (flights.read("v") == 0.0).all()
-    assert (flights.read("w") == 0.0).all()
+    assert (flights.record("v") == 0.0).all()
+    assert (flights.record("w") == 0.0).all()
     assert np.abs(feet(flights)).max() < STILL_GAP
 
 
@@ -56,7 +56,7 @@ def test_sliding_under_thrust_keeps_its_height(friction):
         flights.step(actions)
     assert np.abs(feet(flights)).max() < 1e-4
     slower = friction * (1.0 - shares) * CALM.gravity * 0.5
-    np.testing.assert_allclose(flights.read("v")[:, 0], 1.0 - slower, atol=5e-3)
+    np.testing.assert_allclose(flights.record("v")[:, 0], 1.0 - slower, atol=5e-3)
 
 
 def test_rest_in_wind_and_drag_is_no_gain_either():
@@ -69,7 +69,7 @@ def test_rest_in_wind_and_drag_is_no_gain_either():
         for _ in range(100):
             flights.step(actions)
         assert np.abs(feet(flights)).max() < STILL_GAP
-        assert (np.abs(flights.read("v")[:, 0]) > 1.0).all() == (wind[0] > 0.0)
+        assert (np.abs(flights.record("v")[:, 0]) > 1.0).all() == (wind[0] > 0.0)
 
 
 def test_who_tumbles_under_thrust_does_not_sink_in():
@@ -82,7 +82,7 @@ def test_who_tumbles_under_thrust_does_not_sink_in():
     for _ in range(2 * 200):
         flights.step(actions)
         deepest = np.minimum(deepest, (points(flights)[..., 2] - FLOOR).min(axis=1))
-    assert math.isfinite(flights.read("v").sum())
+    assert math.isfinite(flights.record("v").sum())
     assert deepest.min() > -0.02
 
 
@@ -98,10 +98,10 @@ def test_feet_below_the_plane_come_to_rest(tilt):
     put(flights, q=np.column_stack([np.full(64, math.cos(half)), aside, np.zeros(64)]))
     for _ in range(4 * 200):  # who leans on a foot below the plane settles slowly
         flights.step(actions)
-    assert (flights.read("v") == 0.0).all()
-    assert (flights.read("w") == 0.0).all()
+    assert (flights.record("v") == 0.0).all()
+    assert (flights.record("w") == 0.0).all()
     assert feet(flights).max() < STILL_GAP
-    before = flights.read("r")
+    before = flights.record("r")
     for _ in range(100):
         flights.step(actions)
-    assert (flights.read("r") == before).all()
+    assert (flights.record("r") == before).all()

@@ -73,7 +73,7 @@ def fly(flights, actions, fields):
     for action in actions:
         flights.step(np.broadcast_to(action, (flights.count, 4)))
         for values, name in zip(found, fields, strict=True):
-            values.append(flights.read(name))
+            values.append(flights.record(name))
     return [np.array(values) for values in found]
 
 
@@ -121,8 +121,8 @@ def test_regression_on_the_true_force_recovers_scale_and_alignment(lever):
         excess = force - [0.0, 0.0, vehicle.gravity]
         accel_errors[k] = np.linalg.lstsq(excess, accel[:, k] - force, rcond=None)[0].T
         gyro_errors[k] = np.linalg.lstsq(w[:, k], gyro[:, k] - w[:, k], rcond=None)[0].T
-    np.testing.assert_allclose(accel_errors, flights.read("accel_error"), atol=2e-6)
-    np.testing.assert_allclose(gyro_errors, flights.read("gyro_error"), atol=2e-6)
+    np.testing.assert_allclose(accel_errors, flights.record("accel_error"), atol=2e-6)
+    np.testing.assert_allclose(gyro_errors, flights.record("gyro_error"), atol=2e-6)
     diagonal = np.eye(3, dtype=bool)
     for errors, name in ((accel_errors, "accel"), (gyro_errors, "gyro")):
         for kind, entries in (
@@ -139,7 +139,7 @@ def test_averaged_samples_err_in_what_differs_from_rest():
     plain, erring = batch(STANDARD), batch(with_imu(STANDARD, **ERRORS))
     names = ("accel", "gyro", "w_meas", "r", "q")
     without, found = (fly(b, shaking(64, 20), names) for b in (plain, erring))
-    D_a, D_g = erring.read("accel_error"), erring.read("gyro_error")
+    D_a, D_g = erring.record("accel_error"), erring.record("gyro_error")
     excess = without[0] - [0.0, 0.0, VehicleParams().gravity]
     np.testing.assert_allclose(
         found[0] - without[0], np.einsum("kij,tkj->tki", D_a, excess), atol=1e-12
@@ -154,11 +154,11 @@ def test_averaged_samples_err_in_what_differs_from_rest():
 
 def test_errors_last_an_episode():
     flights = batch(with_imu(STANDARD, **ERRORS), 8)
-    first = flights.read("accel_error")
+    first = flights.record("accel_error")
     flights.step(np.zeros((8, 4)))
-    np.testing.assert_array_equal(flights.read("accel_error"), first)
+    np.testing.assert_array_equal(flights.record("accel_error"), first)
     flights.reset()
-    assert not np.isclose(flights.read("accel_error"), first).any()
+    assert not np.isclose(flights.record("accel_error"), first).any()
 
 
 @pytest.mark.parametrize("suite", [LAB, STANDARD], ids=["instant", "average"])
@@ -216,7 +216,7 @@ def test_baselines_of_an_episode_share_a_turn_about_body_z():
     actions = shaking(count, 10)
     (without, q), (found, _) = (fly(b, actions, ("gnss_baseline", "q")) for b in (plain, turned))
     R_IG = quad_gym.frames.ecef_to_enu(LAB.gnss.reference_antenna_G)
-    error = turned.read("heading_error")
+    error = turned.record("heading_error")
     for t in range(10):
         R_BI = quaternion_to_dcm(q[t])
         before = np.einsum("kij,jl,kl->ki", R_BI, R_IG, without[t])
@@ -244,7 +244,7 @@ def seen_by_projection(flights, camera, ground=None):
     """Which features a camera sees, by NumPy."""
     R_CB = euler_to_dcm(camera.attitude)
     features, expected = np.array(camera.features_I), []
-    for r, q in zip(flights.read("r"), flights.read("q"), strict=True):
+    for r, q in zip(flights.record("r"), flights.record("q"), strict=True):
         R_BI = quaternion_to_dcm(q)
         center = r + R_BI.T @ camera.position_B
         v_C = (R_CB @ R_BI @ (features - center).T).T
@@ -262,7 +262,7 @@ def seen_by_projection(flights, camera, ground=None):
 def test_features_beyond_the_range_are_not_seen():
     suite = with_camera(max_range=5.5)
     flights = batch(suite, 200, randomization={"start_yaw": quad_gym.Uniform(-3.0, 3.0)})
-    found = flights.read("feature_valid")[:, :12] > 0.0
+    found = flights.record("feature_valid")[:, :12] > 0.0
     np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera))
     unlimited = seen_by_projection(flights, suite.camera.replace(max_range=math.inf))
     assert 0.1 < found.sum() / unlimited.sum() < 0.9
@@ -273,7 +273,7 @@ def test_the_ground_hides_what_is_below_it_and_everything_from_below(ground):
     """Features are at 0 and 1 m, cameras about 1 m high."""
     suite = with_camera(ground_hides=True)
     flights = batch(suite, 200, world=WorldParams(ground_height=ground))
-    found = flights.read("feature_valid")[:, :12] > 0.0
+    found = flights.record("feature_valid")[:, :12] > 0.0
     np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera, ground))
     above = seen_by_projection(flights, suite.camera)
     assert found.any() == (ground < 1.0)
@@ -283,7 +283,7 @@ def test_the_ground_hides_what_is_below_it_and_everything_from_below(ground):
 def test_a_feature_on_the_ground_is_seen():
     suite = with_camera(ground_hides=True)
     flights = batch(suite, 50, world=WorldParams(ground_height=0.0))
-    found = flights.read("feature_valid")[:, :12] > 0.0
+    found = flights.record("feature_valid")[:, :12] > 0.0
     np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera))
 
 
@@ -293,9 +293,9 @@ def test_blur_grows_with_the_body_rate(rate):
     spin = {"start_body_rates": [None, None, quad_gym.Uniform(rate, rate)]}
     sharp, blurred = with_camera(), with_camera(exposure=0.004)
     plain, found = (batch(s, 400, randomization=spin) for s in (sharp, blurred))
-    seen = found.read("feature_valid") > 0.0
-    np.testing.assert_array_equal(seen, plain.read("feature_valid") > 0.0)
-    shift = (found.read("pixels") - plain.read("pixels"))[seen].ravel()
+    seen = found.record("feature_valid") > 0.0
+    np.testing.assert_array_equal(seen, plain.record("feature_valid") > 0.0)
+    shift = (found.record("pixels") - plain.record("pixels"))[seen].ravel()
     smear = sharp.camera.focal_length * rate * 0.004
     if rate == 0.0:
         assert not shift.any()

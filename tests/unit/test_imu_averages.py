@@ -141,18 +141,18 @@ def test_a_batch_samples_the_tick_that_it_flew():
         batch.step()
         for lane in range(8):
             gyro, accel = imu.measure(state_of(batch, lane), since=before[lane])
-            np.testing.assert_allclose(batch.read("gyro")[lane], gyro, rtol=0.0, atol=1e-10)
-            np.testing.assert_allclose(batch.read("accel")[lane], accel, rtol=0.0, atol=1e-10)
-        np.testing.assert_allclose(batch.read("w_meas"), batch.read("w"), rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(batch.record("gyro")[lane], gyro, rtol=0.0, atol=1e-10)
+            np.testing.assert_allclose(batch.record("accel")[lane], accel, rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(batch.record("w_meas"), batch.record("w"), rtol=0.0, atol=1e-12)
 
 
 def state_of(batch, lane):
     return {
-        "position": batch.read("r")[lane],
-        "velocity": batch.read("v")[lane],
-        "R_BI": quaternion_to_dcm(batch.read("q")[lane]),
-        "body_rates": batch.read("w")[lane],
-        "rotor_speeds": batch.read("rotor_speeds")[lane],
+        "position": batch.record("r")[lane],
+        "velocity": batch.record("v")[lane],
+        "R_BI": quaternion_to_dcm(batch.record("q")[lane]),
+        "body_rates": batch.record("w")[lane],
+        "rotor_speeds": batch.record("rotor_speeds")[lane],
     }
 
 
@@ -160,17 +160,20 @@ def test_inner_loops_read_the_gyro_now_and_the_filter_the_mean():
     batch = FlightBatch(8, sensors=AVERAGE)
     batch.reset(seeds=range(8))
     for _ in range(50):
-        start = batch.read("w")
+        start = batch.record("w")
         batch.step()
-        bias = batch.read("b_g")
-        noise = batch.read("w_meas") - batch.read("w") - bias
+        bias = batch.record("b_g")
+        noise = batch.record("w_meas") - batch.record("w") - bias
         np.testing.assert_allclose(
-            batch.read("w_seen"), batch.read("w_meas") - batch.read("b_g_hat"), rtol=0.0, atol=0.0
+            batch.record("w_seen"),
+            batch.record("w_meas") - batch.record("b_g_hat"),
+            rtol=0.0,
+            atol=0.0,
         )
         # the same noise in both; the mean rate is near the middle of the tick's ends
-        middle = 0.5 * (start + batch.read("w"))
-        spread = abs(batch.read("w") - start).max()
-        assert abs(batch.read("gyro") - bias - noise - middle).max() < 0.3 * spread + 1e-6
+        middle = 0.5 * (start + batch.record("w"))
+        spread = abs(batch.record("w") - start).max()
+        assert abs(batch.record("gyro") - bias - noise - middle).max() < 0.3 * spread + 1e-6
 
 
 def test_the_estimate_follows_without_a_bias_of_half_a_tick():
@@ -183,7 +186,7 @@ def test_the_estimate_follows_without_a_bias_of_half_a_tick():
         worst = 0.0
         for _ in range(100):
             batch.step()
-            worst = max(worst, abs((batch.read("v_hat") - batch.read("v"))[:, 2].mean()))
+            worst = max(worst, abs((batch.record("v_hat") - batch.record("v"))[:, 2].mean()))
         lags[suite.imu.samples] = worst
     assert lags["average"] < 0.5 * lags["instant"]
 

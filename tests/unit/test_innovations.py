@@ -13,7 +13,7 @@ from quad_gym.records import (
     POSITION_BLOCK,
     FilterForm,
     FilterStatus,
-    Gate,
+    GateDecision,
 )
 from tests.circle_flight import record_circle
 from tests.field_flights import fly, measured_now, state_errors, steps
@@ -31,7 +31,7 @@ GATED = LAB.replace(
 RECORDING = record_circle(CONSISTENT, 400, 11)
 FIX = slice(0, 3)
 FIELD = GATED.replace(
-    estimator=GATED.estimator.replace(integration="midpoint", covariance_reset="turn")
+    estimator=GATED.estimator.replace(integration="midpoint", attitude_reset=True)
 )
 
 
@@ -83,7 +83,7 @@ def test_the_nis_of_each_block_is_that_of_a_plain_filter(across):
             ukf.update(*fix)
         blocks = [POSITION_BLOCK, BASELINE_BLOCK, *(FEATURE_BLOCKS + seen)]
         np.testing.assert_allclose(ours.block_nis[blocks], plain.nis, rtol=1e-4, atol=1e-4)
-        assert (ours.gate_decisions[blocks] == Gate.ACCEPTED).all()
+        assert (ours.gate_decisions[blocks] == GateDecision.ACCEPTED).all()
         for ukf in (ours, plain):
             ukf.predict(RECORDING.gyro[k], RECORDING.accel[k])
 
@@ -95,7 +95,7 @@ def test_without_a_measurement_there_is_no_nis():
     ukf.update(RECORDING.gnss_position[0])
     assert np.isfinite(ukf.block_nis[POSITION_BLOCK])
     assert np.isnan(ukf.block_nis[BASELINE_BLOCK:]).all()
-    assert ukf.gate_decisions[BASELINE_BLOCK] == Gate.NONE
+    assert ukf.gate_decisions[BASELINE_BLOCK] == GateDecision.NONE
 
 
 @pytest.mark.parametrize("wrong", ["gnss_position_G", "gnss_baseline_G", "pixels"])
@@ -122,8 +122,8 @@ def test_a_rejected_block_is_as_good_as_not_measured(wrong):
         "gnss_baseline_G": BASELINE_BLOCK,
         "pixels": FEATURE_BLOCKS,
     }[wrong]
-    assert gated.gate_decisions[block] == Gate.REJECTED
-    assert (gated.gate_decisions == Gate.REJECTED).sum() == 1
+    assert gated.gate_decisions[block] == GateDecision.REJECTED
+    assert (gated.gate_decisions == GateDecision.REJECTED).sum() == 1
     assert gated.status == FilterStatus(0)
     np.testing.assert_allclose(gated.position, without.position, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(gated.R_BI, without.R_BI, rtol=0.0, atol=1e-9)
@@ -214,11 +214,11 @@ def test_a_sound_measurement_is_rejected_as_seldom_as_documented():
     batch = fly(suite, 400, task="hover")
     steps(batch, 5.0)  # until the start's larger uncertainty is over
     blocks = measured_now(batch).shape[1]  # of GNSS and camera, before those of other sensors
-    before, taken = batch.read("rejections").sum(axis=0)[:blocks], 0
+    before, taken = batch.record("rejections").sum(axis=0)[:blocks], 0
     for _ in range(1000):
         batch.step()
         taken = taken + measured_now(batch).sum(axis=0)
-    share = (batch.read("rejections").sum(axis=0)[:blocks] - before) / np.maximum(taken, 1)
+    share = (batch.record("rejections").sum(axis=0)[:blocks] - before) / np.maximum(taken, 1)
     assert taken[BASELINE_BLOCK] == 400 * 50
     # independent in time, so a binomial's sigma is 0.0007
     assert 0.006 < share[BASELINE_BLOCK] < 0.014
@@ -231,8 +231,8 @@ def test_innovations_have_the_size_that_the_filter_expects():
     for _ in range(400):
         batch.step()
         now = measured_now(batch)[:, POSITION_BLOCK]
-        scores.append((batch.read("innovation") / batch.read("innovation_sigma"))[now, 0])
-        nis.append(batch.read("block_nis")[now, 0])
+        scores.append((batch.record("innovation") / batch.record("innovation_sigma"))[now, 0])
+        nis.append(batch.record("block_nis")[now, 0])
     scores, nis = np.concatenate(scores), np.concatenate(nis)
     assert scores.shape == (400 * 20, 3)
     np.testing.assert_allclose(scores.std(axis=0), 1.0, atol=0.06)
@@ -259,8 +259,8 @@ def test_a_jump_does_not_lock_the_filter_out_for_ever(name):
     steps(batch, 3.0)
     errors = np.linalg.norm(state_errors(batch)[:, FIX], axis=1)
     assert errors.max() < 1.0
-    np.testing.assert_array_equal(batch.read("reopened")[:, 0], 1.0)
-    assert not batch.read("filter_status").any()
+    np.testing.assert_array_equal(batch.record("reopened")[:, 0], 1.0)
+    assert not batch.record("filter_status").any()
     sigma = np.sqrt(np.einsum("nii->ni", batch.covariance()))[:, FIX]
     assert (abs(state_errors(batch)[:, FIX]) < 5 * sigma).all()
 
@@ -274,7 +274,7 @@ def test_a_wrong_heading_does_not_lock_the_baseline_out_for_ever():
     shifted(batch, R_hat=lambda R: np.einsum("nijl,jk->nikl", R, turn))
     steps(batch, 10.0)
     yaw = np.degrees(abs(state_errors(batch)[:, 8]))
-    assert (batch.read("reopened")[:, 1] >= 1.0).all()
+    assert (batch.record("reopened")[:, 1] >= 1.0).all()
     assert np.quantile(yaw, 0.99) < 5.0
 
 
@@ -286,8 +286,8 @@ def test_one_wrong_feature_stays_out_while_the_others_agree():
     batch.restore(flights)
     batch._model["features"][0, 1] += 0.5  # the filter's map is wrong by half a meter
     steps(batch, 2.0)
-    more = batch.read("rejections") - before.transpose(0, 2, 1).reshape(-1, before.shape[1])[:50]
-    seen = batch.read("gate")[:, FEATURE_BLOCKS + 1] > 0
+    more = batch.record("rejections") - before.transpose(0, 2, 1).reshape(-1, before.shape[1])[:50]
+    seen = batch.record("gate")[:, FEATURE_BLOCKS + 1] > 0
     assert seen.any()
     assert (more[seen, FEATURE_BLOCKS + 1] > 10).all()
     assert more[:, POSITION_BLOCK].max() <= 2

@@ -46,7 +46,7 @@ def corrected_lab(kind="ukf", quiet=False, **latencies):
         **latencies,
         kind=kind,
         integration="midpoint",
-        covariance_reset="turn",
+        attitude_reset=True,
         bearing_noise_at="pinhole",
         reuse_first_fix=False,
     )
@@ -66,8 +66,11 @@ def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
     waits = {"gnss": round(gnss / DT), "camera": round(camera / DT)}
     history, fixes, images = [], 0, 0
     for tick in range(150):
-        taken = {name: prompt.read(name) for name in ("gnss_position", "gnss_baseline", "pixels")}
-        taken["gnss_velocity"], taken["valid"] = prompt.read("gnss_velocity"), measured_now(prompt)
+        taken = {name: prompt.record(name) for name in ("gnss_position", "gnss_baseline", "pixels")}
+        taken["gnss_velocity"], taken["valid"] = (
+            prompt.record("gnss_velocity"),
+            measured_now(prompt),
+        )
         history.append(taken)
         valid = measured_now(delayed)
         for wait, blocks in ((waits["gnss"], slice(0, 3)), (waits["camera"], slice(3, None))):
@@ -76,9 +79,9 @@ def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
         arrived = np.flatnonzero(valid[:, 0])
         then = history[max(tick - waits["gnss"], 0)]
         for name in ("gnss_position", "gnss_baseline", "gnss_velocity"):
-            np.testing.assert_array_equal(delayed.read(name)[arrived], then[name][arrived])
+            np.testing.assert_array_equal(delayed.record(name)[arrived], then[name][arrived])
         seen, then = valid[:, 3:], history[max(tick - waits["camera"], 0)]
-        np.testing.assert_array_equal(delayed.read("pixels")[seen], then["pixels"][seen])
+        np.testing.assert_array_equal(delayed.record("pixels")[seen], then["pixels"][seen])
         fixes, images = fixes + arrived.size, images + seen.any(axis=1).sum()
         prompt.step()
         delayed.step()
@@ -88,7 +91,7 @@ def test_a_measurement_arrives_after_its_latency_as_it_was_taken(gnss, camera):
 
 def test_sensors_are_observed_when_their_measurements_arrive():
     suite = late(RTK.replace(gnss=RTK.gnss.replace(phase=0.0)), gnss=0.05)
-    env = QuadEnv("hover", observation="sensors", sensors=suite, control_rate=200.0)
+    env = QuadEnv("hover", observation="measurements", sensors=suite, control_rate=200.0)
     env.reset(seed=0)
     table = {field.name: field.slice for field in env.flights.table}
     arrivals, positions = [], []
@@ -114,10 +117,10 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
     references = []
     for i in range(count):
         f = plain(suite)
-        f.r, f.v, f.R = (batch.read(name)[i] for name in ("r_hat", "v_hat", "R_hat"))
+        f.r, f.v, f.R = (batch.record(name)[i] for name in ("r_hat", "v_hat", "R_hat"))
         f.b_a, f.b_g, f.P = (
-            batch.read("b_a_hat")[i],
-            batch.read("b_g_hat")[i],
+            batch.record("b_a_hat")[i],
+            batch.record("b_g_hat")[i],
             batch.covariance()[i],
         )
         references.append(Rewinding(f))
@@ -127,16 +130,16 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
         batch.step()
         valid, P = measured_now(batch), batch.covariance()
         for i, reference in enumerate(references):
-            reference.predict(batch.read("gyro")[i], batch.read("accel")[i])
+            reference.predict(batch.record("gyro")[i], batch.record("accel")[i])
             if valid[i, 0]:
                 fix = {
-                    f"gnss_{name}_G": batch.read(f"gnss_{name}")[i]
+                    f"gnss_{name}_G": batch.record(f"gnss_{name}")[i]
                     for name in ("position", "baseline")
                 }
                 reference.update(reference.tick - waits[0], **fix)
             if valid[i, 3:].any():
                 seen = valid[i, 3:5, np.newaxis]
-                pixels = np.where(seen, batch.read("pixels")[i, :2], np.nan)
+                pixels = np.where(seen, batch.record("pixels")[i, :2], np.nan)
                 reference.update(reference.tick - waits[1], pixels=pixels)
             if valid[i].any():
                 arrivals += 1
@@ -147,17 +150,17 @@ def deviations_from_the_reference(suite, plain, seconds=1.0):
 
 def distance(batch, i, plain, P):
     sigma = np.sqrt(np.diag(plain.P))
-    turn = batch.read("R_hat")[i] @ plain.R.T
+    turn = batch.record("R_hat")[i] @ plain.R.T
     angles = (
         np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]]) / 2
     )
     x = np.concatenate(
         [
-            batch.read("r_hat")[i] - plain.r,
-            batch.read("v_hat")[i] - plain.v,
+            batch.record("r_hat")[i] - plain.r,
+            batch.record("v_hat")[i] - plain.v,
             angles,
-            batch.read("b_a_hat")[i] - plain.b_a,
-            batch.read("b_g_hat")[i] - plain.b_g,
+            batch.record("b_a_hat")[i] - plain.b_a,
+            batch.record("b_g_hat")[i] - plain.b_g,
         ]
     )
     off = np.abs(P - plain.P) / np.outer(sigma, sigma)
@@ -216,7 +219,7 @@ def test_nees_is_right_at_the_longest_latency_of_any_rate(rates):
         steps(batch, 0.5)
         means.append(nees(batch).mean())
     assert np.abs(np.array(means) - 15.0).max() < 5 * np.sqrt(2 * 15 / 400), means
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
 
 
 def test_taken_as_fresh_it_is_another():
@@ -247,8 +250,8 @@ def test_nees_stays_right_and_ignoring_the_latency_does_not(name, kind):
     bound = 5 * np.sqrt(2 * 15 / 400)
     assert np.abs(np.array(means["informed"]) - 15.0).max() < bound, means
     assert min(means["ignorant"][-4:]) > 15.0 + 2 * bound, means
-    assert not informed.read("filter_status").any()
-    assert (informed.read("rejections").sum(axis=1) > 0).mean() < 0.05
+    assert not informed.record("filter_status").any()
+    assert (informed.record("rejections").sum(axis=1) > 0).mean() < 0.05
 
 
 # ---- what must not change --------------------------------------------------------------------
@@ -266,8 +269,8 @@ def test_a_late_measurement_that_fails_leaves_the_estimate_bit_for_bit():
     for start in (bad, none):
         batch.restore(start)
         steps(batch, 9 * DT)
-        after.append({name: batch.read(name) for name in ESTIMATE})
-        status = batch.read("filter_status")
+        after.append({name: batch.record(name) for name in ESTIMATE})
+        status = batch.record("filter_status")
         expected = np.zeros(10, int)
         if start is bad:
             expected[[0, 2, 4, 6]] = FilterStatus.UPDATE_FAILED
@@ -287,7 +290,7 @@ def test_an_undone_update_leaves_no_corrections_behind():
     steps(batch, 9 * DT)
     failed = np.isin(np.arange(10), [0, 2, 4, 6])
     for name in ("corrected", "corrected_variance"):
-        np.testing.assert_array_equal((batch.read(name) == 0.0).all(axis=1), failed)
+        np.testing.assert_array_equal((batch.record(name) == 0.0).all(axis=1), failed)
 
 
 def test_a_failure_before_does_not_stop_late_measurements():
@@ -300,8 +303,8 @@ def test_a_failure_before_does_not_stop_late_measurements():
     for start in (clean, marked):
         batch.restore(start)
         steps(batch, 9 * DT)
-        after.append({name: batch.read(name) for name in ESTIMATE})
-    assert (batch.read("filter_status") == FilterStatus.UPDATE_FAILED).all()
+        after.append({name: batch.record(name) for name in ESTIMATE})
+    assert (batch.record("filter_status") == FilterStatus.UPDATE_FAILED).all()
     for name in ESTIMATE:
         np.testing.assert_array_equal(after[0][name], after[1][name])
 
@@ -349,9 +352,9 @@ def test_an_episode_begins_with_nothing_under_way():
     for _ in range(2):
         for _ in range(24):
             batch.step()
-            assert not batch.read("position_valid").any()
+            assert not batch.record("position_valid").any()
         batch.step()
-        assert batch.read("position_valid").all()
+        assert batch.record("position_valid").all()
         steps(batch, 0.7)
         batch.reset()
 

@@ -57,7 +57,7 @@ def test_true_sensors_may_err_and_sit_and_wait_otherwise():
     batch = FlightBatch(8, sensors=RTK, true_sensors=true)
     batch.reset(seeds=range(8))
     batch.step()
-    assert np.isfinite(batch.read("r_hat")).all()
+    assert np.isfinite(batch.record("r_hat")).all()
 
 
 # ---- numbers that are none -----------------------------------------------------------------------
@@ -134,7 +134,7 @@ def test_rotors_too_fast_for_the_integration_are_refused(substeps):
     for _ in range(400):
         batch.step()
     top = VEHICLE.motor_speed_per_volt * VEHICLE.max_voltage
-    assert (abs(batch.read("rotor_speeds")) < 2.0 * top).all()
+    assert (abs(batch.record("rotor_speeds")) < 2.0 * top).all()
     QuadEnv("hover", randomization={"motor_time_constant": Uniform(slow, 0.1)}, substeps=substeps)
 
 
@@ -247,9 +247,8 @@ MAKERS = {
 def test_keywords_that_do_not_belong_there_are_refused(maker):
     make = MAKERS[maker]
     for kind in (TypeError, ValueError):
-        refused(
-            "gyro_rate is not a keyword .* did you mean gnss_rate?", make, kind=kind, gyro_rate=1
-        )
+        message = "contrl_rate is not a keyword .* did you mean control_rate?"
+        refused(message, make, kind=kind, contrl_rate=1)
         refused("observations .* did you mean observation?", make, kind=kind, observations="truth")
         refused("xyzzy is not a keyword .* it takes observation", make, kind=kind, xyzzy=1)
     refused("gate_count belongs to the task waypoints", make, gate_count=3)
@@ -268,7 +267,7 @@ def test_faults_of_sensors_need_sensors(maker, observation):
         refused(message, make, observation=observation, faults=faults)
     make(observation=observation, faults=(RotorLoss(), PositionJump()))
     make(observation=observation, faults="gnss_outage", innovations=True)
-    make(observation="sensors", faults="gnss_outage")
+    make(observation="measurements", faults="gnss_outage")
 
 
 # ---- policies ------------------------------------------------------------------------------------

@@ -141,7 +141,9 @@ def circling(world, **options):
         source=Source.TRUTH,
         world=world,
         threads=1,
-        task=quad_gym.TaskParams(kind="circle", start="hover", randomize=True, duration=0.0),
+        task=quad_gym.TaskParams(
+            kind="circle", start="hover", randomize_reference=True, duration=0.0
+        ),
         **options,
     )
     batch.reset(seeds=range(8))
@@ -153,10 +155,10 @@ def test_the_kernels_find_the_same_distances_inside_and_outside():
     for _ in range(400):
         batch.step()
         distance, vector = nearest_obstacle(
-            CROSSED.obstacles, centers(CROSSED.obstacles, 8), batch.read("r")
+            CROSSED.obstacles, centers(CROSSED.obstacles, 8), batch.record("r")
         )
-        np.testing.assert_allclose(batch.read("obstacle_distance"), distance, atol=1e-12)
-        np.testing.assert_allclose(batch.read("obstacle_vector"), vector, atol=1e-9)
+        np.testing.assert_allclose(batch.record("obstacle_distance"), distance, atol=1e-12)
+        np.testing.assert_allclose(batch.record("obstacle_vector"), vector, atol=1e-9)
         inside += (distance < 0.0).sum()
     assert inside > 20
 
@@ -169,10 +171,10 @@ def test_a_collision_is_found_at_its_tick_and_judged_at_the_end_of_its_step():
     for tick in range(1, 801):
         ticks.step()
         places = centers(world.obstacles, 8)
-        distance, _ = nearest_obstacle(world.obstacles, places, ticks.read("r"))
+        distance, _ = nearest_obstacle(world.obstacles, places, ticks.record("r"))
         reached = distance <= world.vehicle_radius
         first = np.where(reached & np.isinf(first), tick, first)
-        np.testing.assert_array_equal(ticks.read("collided") > 0.0, np.isfinite(first))
+        np.testing.assert_array_equal(ticks.record("collided") > 0.0, np.isfinite(first))
         if tick % 8 == 0:
             steps.step()
             hit = steps.result("ending") == Ending.COLLISION
@@ -189,8 +191,8 @@ def test_contact_is_contact_to_the_last_bit(gap, touches):
     world = WorldParams(obstacles=(wall,), vehicle_radius=0.5 - gap)
     batch = FlightBatch(1, source=Source.TRUTH, world=world, threads=1)
     batch.reset(seeds=[0])
-    assert batch.read("obstacle_distance")[0] == 0.5
-    assert bool(batch.read("collided")[0]) is touches
+    assert batch.record("obstacle_distance")[0] == 0.5
+    assert bool(batch.record("collided")[0]) is touches
 
 
 def test_leaving_the_geofence_ends_an_episode():
@@ -199,12 +201,12 @@ def test_leaving_the_geofence_ends_an_episode():
     outside = np.zeros(8, bool)
     for _ in range(600):
         batch.step()
-        r = batch.read("r")
+        r = batch.record("r")
         outside |= ((r < low) | (r > high)).any(axis=1)
         np.testing.assert_array_equal(batch.result("terminated") > 0.0, outside)
         np.testing.assert_array_equal(batch.result("ending") == Ending.LEFT_GEOFENCE, outside)
     assert outside.any()
-    assert np.isinf(batch.read("obstacle_distance")).all()
+    assert np.isinf(batch.record("obstacle_distance")).all()
 
 
 def test_obstacles_hide_features_and_change_nothing_else():
@@ -216,18 +218,18 @@ def test_obstacles_hide_features_and_change_nothing_else():
     for step in range(400):
         free.step()
         hidden.step()
-        np.testing.assert_array_equal(free.read("r"), hidden.read("r"))
+        np.testing.assert_array_equal(free.record("r"), hidden.record("r"))
         if step % 8:
             continue
-        seen, kept = (b.read("feature_valid")[:, : len(features)] > 0.0 for b in (free, hidden))
-        R_BI = quad_gym.rotations.quaternion_to_dcm(free.read("q"))
-        eyes = free.read("r") + np.einsum("nij,i->nj", R_BI, free.sensors.camera.position_B)
+        seen, kept = (b.record("feature_valid")[:, : len(features)] > 0.0 for b in (free, hidden))
+        R_BI = quad_gym.rotations.quaternion_to_dcm(free.record("q"))
+        eyes = free.record("r") + np.einsum("nij,i->nj", R_BI, free.sensors.camera.position_B)
         for k, point in enumerate(features):
             line = eyes + share * (point - eyes)
             crossed = np.any([is_inside(o, line).any(axis=0) for o in world.obstacles], axis=0)
             np.testing.assert_array_equal(kept[:, k], seen[:, k] & ~crossed)
             behind += (seen[:, k] & crossed).sum()
-        pixels, those = (b.read("pixels")[:, : len(features)] for b in (free, hidden))
+        pixels, those = (b.record("pixels")[:, : len(features)] for b in (free, hidden))
         np.testing.assert_array_equal(those[kept], pixels[kept])
     assert behind > 50
 
@@ -242,8 +244,8 @@ def test_late_images_lack_what_was_hidden_when_they_were_taken():
     for _ in range(400):
         now.step()
         then.step()
-        taken.append(now.read("feature_valid"))
-        arrived.append(then.read("feature_valid"))
+        taken.append(now.record("feature_valid"))
+        arrived.append(then.record("feature_valid"))
     np.testing.assert_array_equal(arrived[7:], taken[:-7])
     assert 0.2 < np.mean(np.array(taken)[4::5, :, 0] > 0.0) < 0.9
 
@@ -263,7 +265,7 @@ def test_shifts_are_uniform_within_their_reach_and_shared_by_those_that_follow()
     batch = FlightBatch(2000, source=Source.TRUTH, world=SHIFTED, threads=1)
     batch.reset(seeds=range(2000))
     nominal = np.array([o.center_I for o in SHIFTED.obstacles])
-    shift = batch.read("obstacle_center")[:, :3] - nominal
+    shift = batch.record("obstacle_center")[:, :3] - nominal
     own = shift[:, 1] - shift[:, 0]
     for values, reach in (
         (shift[:, 0, 0], 0.5),
@@ -280,20 +282,20 @@ def test_shifts_are_uniform_within_their_reach_and_shared_by_those_that_follow()
     again = FlightBatch(3, source=Source.TRUTH, world=SHIFTED, threads=1)
     again.reset(seeds=range(3))
     np.testing.assert_array_equal(
-        again.read("obstacle_center"), batch.read("obstacle_center", np.arange(3))
+        again.record("obstacle_center"), batch.record("obstacle_center", np.arange(3))
     )
 
 
 def test_a_new_episode_has_new_places_and_has_touched_nothing():
     batch = FlightBatch(4, source=Source.TRUTH, world=SHIFTED, threads=1)
     batch.reset(seeds=range(4))
-    before = batch.read("obstacle_center")
+    before = batch.record("obstacle_center")
     batch._blocks["collided"] = 1.0
     batch.reset(mask=np.array([True, False, True, False]))
-    after = batch.read("obstacle_center")
+    after = batch.record("obstacle_center")
     moved = (before != after).any(axis=(1, 2))
     np.testing.assert_array_equal(moved, [True, False, True, False])
-    np.testing.assert_array_equal(batch.read("collided"), [0.0, 1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(batch.record("collided"), [0.0, 1.0, 0.0, 1.0])
 
 
 # ---- what is refused ----------------------------------------------------------------------------

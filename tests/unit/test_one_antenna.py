@@ -74,10 +74,10 @@ def test_flights_start_as_well_as_their_covariance_says(start):
     batch = fly(CONSUMER, 2000, task="hover", start=start)
     errors = np.zeros((2000, 19))
     errors[:, :15] = state_errors(batch)
-    errors[:, 15:18] = batch.read("aid_vector")[:, Aid.MAGNETOMETER]
-    errors[:, 18] = batch.read("aid_scalar")[:, Aid.MAGNETOMETER]
+    errors[:, 15:18] = batch.record("aid_vector")[:, Aid.MAGNETOMETER]
+    errors[:, 18] = batch.record("aid_scalar")[:, Aid.MAGNETOMETER]
     factors = np.zeros((2000, 24, 24))
-    factors[:, :15, :15], factors[:, 15:] = batch.read("L"), batch.read("L_slow")
+    factors[:, :15, :15], factors[:, 15:] = batch.record("L"), batch.record("L_slow")
     heading = abs(errors[:, 8])
     assert 0.03 < heading.mean() < 0.08
     mean = nees_of(errors, factors).mean()
@@ -93,9 +93,9 @@ def test_the_sample_that_starts_a_filter_counts_once():
     )
     for start, valid in (("cold", 0.0), ("warm", 1.0)):
         batch = fly(suite, 16, filter_start=start)
-        assert (batch.read("aid_valid")[:, Aid.MAGNETOMETER] == valid).all()
-        assert (batch.read("aid_valid")[:, Aid.BAROMETER] == 1.0).all()
-        nis = batch.read("block_nis")[:, AID_BLOCKS + Aid.MAGNETOMETER]
+        assert (batch.record("aid_valid")[:, Aid.MAGNETOMETER] == valid).all()
+        assert (batch.record("aid_valid")[:, Aid.BAROMETER] == 1.0).all()
+        nis = batch.record("block_nis")[:, AID_BLOCKS + Aid.MAGNETOMETER]
         assert np.isfinite(nis).all() == (start == "warm")
 
 
@@ -103,11 +103,11 @@ def test_there_is_no_baseline_ever():
     batch = fly(CONSUMER, 16)
     for _ in range(30):
         steps(batch, 0.05)
-        assert not batch.read("baseline_valid").any()
-        assert not batch.read("baseline_fresh").any()
-        assert not batch.read("gnss_baseline").any()
-    assert np.isnan(batch.read("block_nis")[:, BASELINE_BLOCK]).all()
-    assert np.isfinite(batch.read("block_nis")[:, 0]).all()
+        assert not batch.record("baseline_valid").any()
+        assert not batch.record("baseline_fresh").any()
+        assert not batch.record("gnss_baseline").any()
+    assert np.isnan(batch.record("block_nis")[:, BASELINE_BLOCK]).all()
+    assert np.isfinite(batch.record("block_nis")[:, 0]).all()
 
 
 def test_without_a_magnetometer_the_mark_of_the_start_tells_the_heading():
@@ -116,7 +116,7 @@ def test_without_a_magnetometer_the_mark_of_the_start_tells_the_heading():
     heading = state_errors(batch)[:, 8]
     sigma = alone.initial_pose.heading_sigma
     assert np.sqrt((heading**2).mean()) == pytest.approx(sigma, rel=0.15)
-    np.testing.assert_allclose(np.linalg.norm(batch.read("L")[:, 8], axis=1), sigma, rtol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(batch.record("L")[:, 8], axis=1), sigma, rtol=1e-3)
 
 
 def test_a_receiver_with_one_antenna_measures_no_baseline():

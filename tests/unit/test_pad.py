@@ -31,13 +31,13 @@ def stopped(count):
 def test_a_vehicle_stands_still_for_a_minute():
     flights = batch(run_filter=True)
     flights.reset(seeds=[1, 2, 3])
-    start = {name: flights.read(name) for name in ("r", "q", "v", "w")}
+    start = {name: flights.record(name) for name in ("r", "q", "v", "w")}
     for _ in range(60 * 200):
         flights.step(stopped(3))
     for name, value in start.items():
-        assert (flights.read(name) == value).all(), name
-    assert (flights.read("on_pad") == 1.0).all()
-    assert (flights.read("needs_reset") == 0.0).all()
+        assert (flights.record(name) == value).all(), name
+    assert (flights.record("on_pad") == 1.0).all()
+    assert (flights.record("needs_reset") == 0.0).all()
 
 
 @pytest.mark.parametrize("sensors", ["lab", "standard"])
@@ -48,8 +48,8 @@ def test_the_accelerometer_feels_the_pad(sensors):
     gyro = np.zeros((256, 3))
     for _ in range(100):
         flights.step(stopped(256))
-        means += (flights.read("accel") - flights.read("b_a")) / 100
-        gyro += (flights.read("gyro") - flights.read("b_g")) / 100
+        means += (flights.record("accel") - flights.record("b_a")) / 100
+        gyro += (flights.record("gyro") - flights.record("b_g")) / 100
     suite = quad_gym.sensor_suite(sensors)
     sigma = suite.imu.accel_noise_density * np.sqrt(suite.imu.rate)
     error = (means - [0.0, 0.0, GRAVITY]) / (sigma / np.sqrt(100))
@@ -68,15 +68,15 @@ def test_it_lifts_off_when_thrust_exceeds_weight(action):
     voltage = min(hover * (1.0 + action), LAB.max_voltage)
     expected = -LAB.motor_time_constant * np.log(1.0 - hover / voltage)
     ticks = 0
-    while flights.read("on_pad")[0]:
+    while flights.record("on_pad")[0]:
         flights.step(np.full((1, 4), action))
         ticks += 1
     assert abs(ticks / 200.0 - expected) <= 1.0 / 200.0 + 1e-9
-    assert flights.read("v")[0, 2] == 0.0
+    assert flights.record("v")[0, 2] == 0.0
     heights = []
     for _ in range(50):
         flights.step(np.full((1, 4), action))
-        heights.append(flights.read("r")[0, 2])
+        heights.append(flights.record("r")[0, 2])
     assert (np.diff(heights) > 0.0).all()
     assert heights[0] > 0.0
 
@@ -86,7 +86,7 @@ def test_thrust_below_the_weight_does_not_lift_it():
     flights.reset(seeds=[0])
     for _ in range(2000):
         flights.step(np.full((1, 4), -1e-6))
-    assert flights.read("on_pad")[0] == 1.0
+    assert flights.record("on_pad")[0] == 1.0
 
 
 def test_without_a_pad_it_falls_as_free_bodies_do():
@@ -95,22 +95,22 @@ def test_without_a_pad_it_falls_as_free_bodies_do():
     for _ in range(20):
         flights.step(stopped(1))
     # drag of the disc at 1 m/s is below 1 % of the weight
-    assert flights.read("v")[0, 2] == pytest.approx(-GRAVITY * 0.1, rel=0.01)
-    assert flights.read("r")[0, 2] == pytest.approx(-GRAVITY * 0.1**2 / 2, rel=0.01)
+    assert flights.record("v")[0, 2] == pytest.approx(-GRAVITY * 0.1, rel=0.01)
+    assert flights.record("r")[0, 2] == pytest.approx(-GRAVITY * 0.1**2 / 2, rel=0.01)
 
 
 def test_a_start_with_a_velocity_is_not_on_the_pad():
     flights = batch(2)
     flights.reset(seeds=[0, 1], velocity=[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    assert flights.read("on_pad").tolist() == [1.0, 0.0]
+    assert flights.record("on_pad").tolist() == [1.0, 0.0]
 
 
 def test_a_hovering_start_is_not_on_the_pad():
     flights = batch(64, task={"start": "mixed"})
     flights.reset(seeds=range(64))
-    on_ground = flights.read("r")[:, 2] == 0.0
+    on_ground = flights.record("r")[:, 2] == 0.0
     assert 10 < on_ground.sum() < 54
-    assert (flights.read("on_pad") == on_ground).all()
+    assert (flights.record("on_pad") == on_ground).all()
 
 
 def test_wind_does_not_move_it():
@@ -120,7 +120,7 @@ def test_wind_does_not_move_it():
     still.reset(seeds=[0])
     for _ in range(200):
         still.step(stopped(1))
-    assert (still.read("v") == 0.0).all()
+    assert (still.record("v") == 0.0).all()
 
 
 def test_an_environment_has_a_pad_and_the_reports_has_not():
@@ -130,7 +130,7 @@ def test_an_environment_has_a_pad_and_the_reports_has_not():
         env.reset(seed=0)
         for _ in range(5):
             env.step(np.zeros((2, 4)))  # hover thrust, once the rotors have spun up
-        height = env.unwrapped.flights.batch.read("r")[:, 2]
+        height = env.unwrapped.flights.batch.record("r")[:, 2]
         assert (height == 0.0).all() if pad else (height < -0.03).all()
 
 
@@ -177,7 +177,7 @@ class FromAbove(quad_gym.Task):
 
 
 def test_a_task_that_says_where_vehicles_start_may_have_its_pad_out_of_bounds():
-    env = QuadEnv("hover", height=2.0, start="ground", custom=FromAbove())
+    env = QuadEnv(base="hover", height=2.0, start="ground", task=FromAbove())
     env.reset(seed=1)
     assert not env.step(np.zeros(4))[2]
 

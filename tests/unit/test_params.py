@@ -7,6 +7,7 @@ import pytest
 
 import quad_gym
 from quad_gym.packing.flight import params_record
+from quad_gym.params.clocks import Clocks
 from quad_gym.records import MAX_FEATURES, MAX_GATES
 
 CLASSES = [
@@ -22,7 +23,7 @@ CLASSES = [
     quad_gym.SensorSuite,
     quad_gym.PDGains,
     quad_gym.ActionParams,
-    quad_gym.Clocks,
+    Clocks,
     quad_gym.TaskParams,
     quad_gym.WorldParams,
     quad_gym.Wall,
@@ -133,7 +134,7 @@ BAD_VALUES = {
     ("FilterParams", "direction_variance_floor"): NOT_POSITIVE,
     ("FilterParams", "kind"): ["UKF", "particle", None],
     ("FilterParams", "integration"): ["heun", None, 2],
-    ("FilterParams", "covariance_reset"): ["rotate", True, None],
+    ("FilterParams", "attitude_reset"): ["turn", 1, None],
     ("FilterParams", "bearing_noise_at"): ["sideways", None, 1],
     ("FilterParams", "initial_velocity_variance"): NOT_POSITIVE,
     ("FilterParams", "initial_covariance_scale"): NOT_POSITIVE,
@@ -173,7 +174,7 @@ BAD_VALUES = {
     ("TaskParams", "height"): NOT_POSITIVE,
     ("TaskParams", "duration"): BELOW_ZERO,
     ("TaskParams", "out_of_bounds"): NOT_POSITIVE,
-    ("TaskParams", "ground"): NO_NUMBERS,
+    ("TaskParams", "min_height"): NO_NUMBERS,
     ("TaskParams", "max_tilt"): [*NOT_POSITIVE, 3.2],
     ("TaskParams", "max_speed"): NOT_POSITIVE,
     ("TaskParams", "max_acceleration"): NOT_POSITIVE,
@@ -239,7 +240,7 @@ def test_parameters_are_values_that_compare_and_hash(kind):
 def test_a_value_that_is_invalid_is_refused_by_the_name_of_its_field(kind, name):
     for bad in BAD_VALUES[kind, name]:
         with pytest.raises(ValueError, match=rf"\b{name}\b"):
-            getattr(quad_gym, kind)(**{name: bad})
+            (Clocks if kind == "Clocks" else getattr(quad_gym, kind))(**{name: bad})
 
 
 def test_every_field_but_flags_is_tried():
@@ -304,7 +305,7 @@ def test_sensors_take_other_rates():
     suite = quad_gym.sensor_suite("lab").with_rates(gnss=10.0, camera=20.0)
     assert (suite.imu.rate, suite.gnss.rate, suite.camera.rate) == (200.0, 10.0, 20.0)
     assert suite.with_rates() == suite
-    clocks = quad_gym.Clocks.of(suite, control_rate=50.0)
+    clocks = Clocks.of(suite, control_rate=50.0)
     assert [clocks.ticks_between(n) for n in ("control", "gnss", "camera")] == [4, 20, 10]
 
 

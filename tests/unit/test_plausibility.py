@@ -144,7 +144,7 @@ def test_a_log_without_gnss_starts_from_a_position_and_a_heading():
     table = Recorded(flight, suite).table()
     with pytest.raises(ValueError, match=r"--start-position 0 0 0 --heading 0"):
         replay(table, sensors=suite)
-    x_I = quaternion_to_dcm(flight["attitude"][0])[0]  # the first row of R_BI
+    x_I = quaternion_to_dcm(flight["quaternion"][0])[0]  # the first row of R_BI
     yaw = math.atan2(x_I[1], x_I[0])
     result = replay(table, sensors=suite, start={"position": flight["position"][0], "heading": yaw})
     assert result.problems == ()

@@ -117,7 +117,7 @@ def test_bounds_hold_to_the_last_bit(low, width, sigma, kind):
         given = Uniform(low, high, offset=True)
     batch = FlightBatch(16, source=Source.TRUTH, randomization={"wind_up": given}, threads=1)
     batch.reset(seeds=range(16))
-    values = batch.read("wind_up")
+    values = batch.record("wind_up")
     assert (given.support[0] <= values).all()
     assert (values <= given.support[1]).all()
 
@@ -132,8 +132,8 @@ def test_a_parameter_does_not_depend_on_which_others_are_drawn():
     )
     few.reset(seeds=range(12))
     many.reset(seeds=range(12))
-    np.testing.assert_array_equal(few.read("mass"), many.read("mass"))
-    assert len(np.unique(many.read("inertia"))) == 36
+    np.testing.assert_array_equal(few.record("mass"), many.record("mass"))
+    assert len(np.unique(many.record("inertia"))) == 36
 
 
 def test_a_component_without_a_distribution_stays():
@@ -141,7 +141,7 @@ def test_a_component_without_a_distribution_stays():
         5, source=Source.TRUTH, randomization={"lever_arm_B": (None, Uniform(0.1, 0.2), None)}
     )
     batch.reset(seeds=range(5))
-    lever_arm = batch.read("lever_arm_B")
+    lever_arm = batch.record("lever_arm_B")
     np.testing.assert_array_equal(lever_arm[:, [0, 2]], 0.0)
     assert len(np.unique(lever_arm[:, 1])) == 5
 
@@ -219,7 +219,7 @@ SEEN = ("r", "v", "q", "w", "rotor_speeds", "charge", "wind", "accel", "gyro", "
 def assert_alike(left, right, flight=0):
     for name in SEEN:
         np.testing.assert_allclose(
-            left.read(name)[flight], right.read(name)[0], rtol=1e-7, atol=1e-8, err_msg=name
+            left.record(name)[flight], right.record(name)[0], rtol=1e-7, atol=1e-8, err_msg=name
         )
 
 
@@ -231,7 +231,7 @@ TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startsw
 @pytest.mark.parametrize("name", TOLD)
 def test_a_flight_that_draws_a_parameter_is_the_flight_that_has_it(name):
     batch = flown(seeds=(2, 3), world=WORLD, randomization={name: some_distribution(name)})
-    value = np.atleast_1d(batch.read(name)[1])
+    value = np.atleast_1d(batch.record(name)[1])
     nominal = nominal_values(LAB, SUITE, WORLD)[COLUMNS[name]]
     assert (value != nominal).any()
     vehicle, sensors, world = told(name, value)
@@ -240,7 +240,7 @@ def test_a_flight_that_draws_a_parameter_is_the_flight_that_has_it(name):
     if name in ("max_voltage", "battery_resistance"):
         return  # limits that this vehicle does not reach: see the next test
     unaware = flown(world=WORLD)
-    changed = [n for n in SEEN if (batch.read(n)[1] != unaware.read(n)[0]).any()]
+    changed = [n for n in SEEN if (batch.record(n)[1] != unaware.record(n)[0]).any()]
     assert changed, "the draw changes nothing"
 
 
@@ -251,14 +251,14 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
     given = Uniform(0.01, 0.05) if name == "battery_resistance" else some_distribution(name)
     drawing = FlightBatch(2, **heavy, world=WORLD, randomization={name: given})
     drawing.reset(seeds=(2, 3))
-    vehicle, _, world = told(name, np.atleast_1d(drawing.read(name)[1]))
+    vehicle, _, world = told(name, np.atleast_1d(drawing.record(name)[1]))
     telling = FlightBatch(1, **heavy, world=world, true_vehicle=vehicle.replace(mass=6.0))
     telling.reset(seeds=[3])
     for _ in range(100):
         drawing.step(np.ones((2, 4)))
         telling.step(np.ones((1, 4)))
-    first, second = drawing.read("voltages")
-    np.testing.assert_allclose(second, telling.read("voltages")[0], rtol=1e-9)
+    first, second = drawing.record("voltages")
+    np.testing.assert_allclose(second, telling.record("voltages")[0], rtol=1e-9)
     assert (first != second).all()
 
 
@@ -269,7 +269,7 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
 def test_what_is_known_is_what_filter_and_controller_believe(name):
     given = Randomization({name: some_distribution(name)}, known=True)
     batch = flown(seeds=(2, 3), world=WORLD, randomization=given)
-    vehicle, sensors, world = told(name, np.atleast_1d(batch.read(name)[1]))
+    vehicle, sensors, world = told(name, np.atleast_1d(batch.record(name)[1]))
     assert_alike(batch, flown(vehicle=vehicle, sensors=sensors, world=world), flight=1)
 
 
@@ -284,10 +284,10 @@ def test_each_rotor_has_its_efficiency():
     batch = FlightBatch(1, **still, randomization={"rotor_efficiency": Uniform(0.8, 1.0)})
     plain.reset(seeds=[1])
     batch.reset(seeds=[1])
-    start_v = plain.read("v")[0]
-    efficiency, W = batch.read("rotor_efficiency")[0], batch.read("rotor_speeds")[0]
+    start_v = plain.record("v")[0]
+    efficiency, W = batch.record("rotor_efficiency")[0], batch.record("rotor_speeds")[0]
     batch.step(np.zeros((1, 4)))
-    v, w, R = batch.read("v")[0], batch.read("w")[0], batch.read("R_seen")[0]
+    v, w, R = batch.record("v")[0], batch.record("w")[0], batch.record("R_seen")[0]
     forces = efficiency * LAB.thrust_coefficient * W**2
     torque = LAB.effectiveness[1:] @ forces
     np.testing.assert_allclose(w, 0.005 * np.linalg.solve(np.array(LAB.inertia), torque), rtol=2e-3)
@@ -298,16 +298,16 @@ def test_each_rotor_has_its_efficiency():
 def test_a_camera_turned_in_its_mount_sees_what_a_turned_camera_sees():
     batch = flown(ticks=0, randomization={"camera_rotation": Uniform(-0.1, 0.1),
                                           "pixel_sigma": Uniform(1e-9, 1e-9)})  # fmt: skip
-    turn = euler_to_dcm(batch.read("camera_rotation")[0])
+    turn = euler_to_dcm(batch.record("camera_rotation")[0])
     camera = SUITE.camera
-    R_BI = quad_gym.rotations.quaternion_to_dcm(batch.read("q"))[0]
+    R_BI = quad_gym.rotations.quaternion_to_dcm(batch.record("q"))[0]
     for i, X in enumerate(camera.features_I):
-        if batch.read("feature_valid")[0, i] == 0.0:
+        if batch.record("feature_valid")[0, i] == 0.0:
             continue
-        in_B = R_BI @ (np.array(X) - batch.read("r")[0]) - camera.position_B
+        in_B = R_BI @ (np.array(X) - batch.record("r")[0]) - camera.position_B
         in_C = turn @ euler_to_dcm(camera.attitude) @ in_B
         expected = camera.focal_length * in_C[:2] / in_C[2]
-        np.testing.assert_allclose(batch.read("pixels")[0, i], expected, atol=1e-6)
+        np.testing.assert_allclose(batch.record("pixels")[0, i], expected, atol=1e-6)
 
 
 def test_the_start_is_spread_as_told():
@@ -322,14 +322,14 @@ def test_the_start_is_spread_as_told():
     plain, spread = flown(0, range(20)), flown(0, range(20), randomization=given)
     drawn = spread.drawn()
     np.testing.assert_allclose(
-        spread.read("r"), plain.read("r") + drawn["start_position_I"], atol=1e-12
+        spread.record("r"), plain.record("r") + drawn["start_position_I"], atol=1e-12
     )
     np.testing.assert_allclose(
-        spread.read("v"), plain.read("v") + drawn["start_velocity_I"], atol=1e-12
+        spread.record("v"), plain.record("v") + drawn["start_velocity_I"], atol=1e-12
     )
-    np.testing.assert_array_equal(spread.read("w"), drawn["start_body_rates"])
+    np.testing.assert_array_equal(spread.record("w"), drawn["start_body_rates"])
     eulers = [
-        quad_gym.rotations.dcm_to_euler(quad_gym.rotations.quaternion_to_dcm(b.read("q")))
+        quad_gym.rotations.dcm_to_euler(quad_gym.rotations.quaternion_to_dcm(b.record("q")))
         for b in (plain, spread)
     ]
     change = np.stack([drawn[f"start_{n}"] for n in ("roll", "pitch", "yaw")], axis=1)
@@ -340,19 +340,19 @@ def test_the_start_is_spread_as_told():
 def test_a_start_that_the_caller_gives_stays():
     batch = FlightBatch(3, randomization={"start_position_I": Uniform(1.0, 2.0)})
     batch.reset(seeds=range(3), position=(0.5, 0.6, 0.7))
-    np.testing.assert_array_equal(batch.read("r"), [[0.5, 0.6, 0.7]] * 3)
+    np.testing.assert_array_equal(batch.record("r"), [[0.5, 0.6, 0.7]] * 3)
 
 
 def test_a_snapshot_keeps_what_was_drawn():
     keywords = {"world": WORLD, "randomization": {"mass": Uniform(0.6, 0.9)}}
     batch = flown(20, range(11), **keywords)
-    instant, mass = batch.snapshot(), batch.read("mass")
+    instant, mass = batch.snapshot(), batch.record("mass")
     for _ in range(20):
         batch.step()
     future = batch.snapshot()
     fresh = flown(1, range(50, 61), **keywords)
     fresh.restore(instant)
-    np.testing.assert_array_equal(fresh.read("mass"), mass)
+    np.testing.assert_array_equal(fresh.record("mass"), mass)
     for _ in range(20):
         fresh.step()
     assert fresh.snapshot().tobytes() == future.tobytes()

@@ -80,4 +80,4 @@ def test_a_distribution_that_is_invalid_is_refused(make, message):
 def test_what_is_not_drawn_cannot_be_read():
     batch = FlightBatch(1, randomization={"mass": Uniform(0.6, 0.9)})
     with pytest.raises(ValueError, match="one of the drawn mass"):
-        batch.read("inertia")
+        batch.record("inertia")

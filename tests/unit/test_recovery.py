@@ -37,7 +37,7 @@ def beyond(batch, deviations):
 @pytest.mark.parametrize("fault", [STEP, AccelBiasStep(start=3.0, size=0.5)], ids=["gyro", "accel"])
 def test_ten_seconds_after_a_bias_step_the_filter_is_back_or_says_that_it_is_lost(fault):
     batch = flown("rtk", fault, 13.0)
-    wrong, lost = beyond(batch, 6.0), batch.read("lost") > 0.0
+    wrong, lost = beyond(batch, 6.0), batch.record("diverged") > 0.0
     assert wrong.mean() <= 0.01, wrong.mean()
     assert not (wrong & ~lost).any()
 
@@ -46,7 +46,7 @@ def test_soon_after_a_bias_step_the_filter_says_that_it_is_lost():
     batch = flown("rtk", STEP, 3.25)
     assert beyond(batch, 6.0).mean() > 0.9
     steps(batch, 0.75)
-    wrong, lost = beyond(batch, 6.0), batch.read("lost") > 0.0
+    wrong, lost = beyond(batch, 6.0), batch.record("diverged") > 0.0
     assert lost.mean() > 0.95
     assert (wrong & ~lost).mean() <= 0.01
 
@@ -73,7 +73,7 @@ def test_a_camera_alone_finds_a_small_gyro_step_by_corrections_that_go_one_way()
     told = np.zeros(128, bool)
     for _ in range(40):
         steps(batch, 0.2)
-        told |= batch.read("lost") > 0.0
+        told |= batch.record("diverged") > 0.0
     assert told.mean() > 0.95
     steps(batch, 5.0)
     assert beyond(batch, 6.0).mean() <= 0.01
@@ -95,8 +95,8 @@ def test_a_filter_without_a_gate_says_that_a_gyro_has_changed_and_leaves_its_est
         )
         batch.reset(seeds=range(32))
         steps(batch, 3.0)
-        found.append(np.sqrt(np.einsum("nij,nij->ni", batch.read("L"), batch.read("L"))))
-        assert (batch.read("lost") > 0.0).mean() == (1.0 if start == 0.5 else 0.0)
+        found.append(np.sqrt(np.einsum("nij,nij->ni", batch.record("L"), batch.record("L"))))
+        assert (batch.record("diverged") > 0.0).mean() == (1.0 if start == 0.5 else 0.0)
     np.testing.assert_allclose(*found, rtol=0.2)  # inflated ones are four times as large
 
 
@@ -104,7 +104,7 @@ def test_corrections_of_a_right_filter_have_the_variance_that_they_are_given():
     """Their sums over 3 s in deviations, 6 x 256 of them, are standard normal."""
     batch = fly(quad_gym.sensor_suite("rtk"), FLIGHTS, start="hover", filter_start="warm")
     steps(batch, 6.0)
-    scaled = batch.read("corrected") / np.sqrt(batch.read("corrected_variance"))
+    scaled = batch.record("corrected") / np.sqrt(batch.record("corrected_variance"))
     assert 0.9 < (scaled**2).mean() < 1.1  # 2.8 deviations of the mean of so many
     assert np.abs(scaled).max() < 5.0
 
@@ -119,7 +119,7 @@ def test_whether_a_flight_is_lost_does_not_depend_on_the_other_flights():
         found = []
         for _ in range(600):
             batch.step()
-            found.append(batch.read("lost"))
+            found.append(batch.record("diverged"))
         return np.array(found)
 
     together = lost(0, 8)
@@ -138,9 +138,9 @@ def test_without_inflated_biases_the_step_would_outlast_the_test():
 @pytest.mark.parametrize("speed", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_a_ramp_of_gnss_loses_no_flight_that_sees_markers(speed):
     batch = flown("rtk", GnssRamp(start=3.0, speed=speed), 23.0)
-    assert batch.read("rejections")[:, 0].min() > 50
+    assert batch.record("rejections")[:, 0].min() > 50
     assert np.linalg.norm(state_errors(batch)[:, :3], axis=1).max() < 0.05
-    assert not (batch.read("lost") > 0.0).any()
+    assert not (batch.record("diverged") > 0.0).any()
 
 
 @pytest.mark.parametrize("name", ["rtk", "indoor", "consumer"])
@@ -150,7 +150,7 @@ def test_a_sound_filter_hardly_ever_takes_itself_for_lost(name):
     alarms = np.zeros(FLIGHTS, bool)
     for _ in range(40):
         steps(batch, 0.25)
-        alarms |= batch.read("lost") > 0.0
+        alarms |= batch.record("diverged") > 0.0
     assert alarms.sum() <= 2, alarms.sum()
 
 

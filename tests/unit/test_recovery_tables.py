@@ -65,7 +65,7 @@ def test_flights_are_right_and_far_off_as_a_plain_computation_says():
     square = nees(batch, slice(0, 9))
     np.testing.assert_array_equal(found.right[-1], square < stats.chi2.ppf(RIGHT, 9))
     assert 0.0 < found.share(found.right, 1.5) < 1.0
-    np.testing.assert_array_equal(found.told[-1], batch.read("lost") > 0.0)
+    np.testing.assert_array_equal(found.told[-1], batch.record("diverged") > 0.0)
     assert found.time.tolist() == pytest.approx([0.5, 1.0, 1.5])
     with pytest.raises(ValueError, match="at least twice every"):
         follow_recovery(batch, seeds=range(64), duration=0.1, every=0.1)

@@ -11,6 +11,7 @@ from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.task.episode import draw_reference
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.packing.flight import settings_record
+from quad_gym.params.clocks import Clocks
 from quad_gym.records import (
     FLIGHT,
     FLIGHT_BLOCK,
@@ -58,7 +59,7 @@ def drawn(count, seed=1, **task):
     sensors = quad_gym.SensorSuite()
     settings = settings_record(
         quad_gym.TaskParams(**task),
-        quad_gym.Clocks(),
+        Clocks(),
         sensors,
         source=Source.TRUTH,
         control=Control.PD,
@@ -123,7 +124,7 @@ def test_the_reports_circle_in_closed_form():
 
 
 def test_hover_stays_in_place_and_looks_at_the_origin():
-    flights = drawn(16, kind="hover", randomize=True)
+    flights = drawn(16, kind="hover", randomize_reference=True)
     position, velocity, acceleration, heading = evaluated(flights, [0.0, 7.0])
     np.testing.assert_array_equal(velocity, 0.0)
     np.testing.assert_array_equal(acceleration, 0.0)
@@ -177,7 +178,7 @@ def test_random_trajectories_differ_from_one_another():
 
 
 def test_a_randomized_circle_keeps_its_center_and_varies_the_rest():
-    flights = drawn(2_000, randomize=True, height=1.2)
+    flights = drawn(2_000, randomize_reference=True, height=1.2)
     position, velocity, _, heading = (x[:, 0] for x in evaluated(flights, 0.0))
     radius = np.linalg.norm(position[:, :2], axis=1)
     assert 2.0 <= radius.min() < 2.1

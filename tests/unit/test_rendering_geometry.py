@@ -135,8 +135,8 @@ def test_an_ellipsoid_around_the_eye_has_no_outline():
 def test_the_fixed_view_shows_reference_features_and_start(task):
     flight = a_flight(task)
     view = fixed_view(flight, 640, 367)
-    times = np.linspace(0.0, flight.stage.reference_period or 1.0, 50)
-    things = [flight.stage.reference(times), flight.stage.features_I, flight.stage.gates_I]
+    times = np.linspace(0.0, flight.scene.reference_period or 1.0, 50)
+    things = [flight.scene.reference(times), flight.scene.features_I, flight.scene.gates_I]
     pixels, _ = view.project(np.concatenate([*things, flight["position"][:1]]))
     assert (pixels > (0.0, 0.0)).all()
     assert (pixels < (640.0, 367.0)).all()
@@ -168,7 +168,7 @@ def test_features_are_drawn_where_the_camera_measures_them():
     for place, R_BI in poses(200, 1):
         measured = camera.measure(place, R_BI)
         seen = np.isfinite(measured).all(axis=1)
-        predicted = flight.stage.project_features(place, R_BI)
+        predicted = flight.scene.project_features(place, R_BI)
         np.testing.assert_allclose(predicted[seen], measured[seen], atol=1e-4)
         compared += seen.sum()
     assert compared > 100
@@ -179,39 +179,39 @@ def test_the_frustum_holds_exactly_what_the_camera_sees():
     camera = Camera(CameraParams(), np.random.default_rng(0))
     for place, R_BI in poses(100, 2):
         seen = np.isfinite(camera.measure(place, R_BI)).all(axis=1)
-        apex, *corners = flight.stage.frustum_corners(place, R_BI, 1.0)
+        apex, *corners = flight.scene.frustum_corners(place, R_BI, 1.0)
         # inside: on the inner side of the four planes through the apex and two corners
         rays = np.array(corners) - apex
         normals = np.cross(rays, np.roll(rays, -1, axis=0))
         axis = rays.mean(axis=0)
         normals *= np.sign(normals @ axis)[:, np.newaxis]
-        inside = ((flight.stage.features_I - apex) @ normals.T > 0.0).all(axis=1)
+        inside = ((flight.scene.features_I - apex) @ normals.T > 0.0).all(axis=1)
         np.testing.assert_array_equal(inside, seen)
 
 
 def test_the_inset_shows_the_image_upright_and_to_scale():
-    stage = a_flight().stage
-    box = inset_box(stage, right=632.0, top=8.0, width=160.0)
+    scene = a_flight().scene
+    box = inset_box(scene, right=632.0, top=8.0, width=160.0)
     assert (box.left, box.width, box.height) == (472.0, 160.0, 90.0)
-    half = stage.half_image
-    corners = place_in_inset(np.array([[0.0, 0.0], half, -half]), stage, box)
+    half = scene.half_image
+    corners = place_in_inset(np.array([[0.0, 0.0], half, -half]), scene, box)
     np.testing.assert_allclose(corners, [[552.0, 53.0], [472.0, 8.0], [632.0, 98.0]])
     # a feature to the right of the vehicle is on the right, a higher one is higher
     place = np.array([0.0, 0.0, 1.0])  # level, looking east
     ahead, right, higher = ([3.0, 0.0, -1.0], [3.0, -0.5, -1.0], [3.0, 0.0, -0.5])
     for point, expected in ((right, (1, 0)), (higher, (0, -1))):
         both = np.array([ahead, point])
-        X_C = (both - place - stage.camera_B) @ stage.R_CB.T
-        pixels = stage.focal_length * X_C[:, :2] / X_C[:, 2:]
-        first, second = place_in_inset(pixels, stage, box)
+        X_C = (both - place - scene.camera_B) @ scene.R_CB.T
+        pixels = scene.focal_length * X_C[:, :2] / X_C[:, 2:]
+        first, second = place_in_inset(pixels, scene, box)
         step = np.where(abs(second - first) > 4.0, np.sign(second - first), 0.0)
         np.testing.assert_array_equal(step, expected)
 
 
 def test_the_rays_of_the_measured_pixels_point_at_the_features():
     flight = a_flight("hover", seed=4, steps=80, sensors=sensor_suite("lab"))
-    row, stage = flight.rows[-1], flight.stage
-    predicted = stage.project_features(row["position"], quaternion_to_dcm(row["attitude"]))
+    row, scene = flight.rows[-1], flight.scene
+    predicted = scene.project_features(row["position"], quaternion_to_dcm(row["quaternion"]))
     seen = np.isfinite(row["pixels"]).all(axis=1)
     assert seen.any()
     assert (abs(row["pixels"] - predicted)[seen] < 6 * 20.0).all()  # pixel noise of 20

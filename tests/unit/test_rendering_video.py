@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+import quad_gym
 from quad_gym.faults import GnssOutliers
-from quad_gym.records import Gate
+from quad_gym.records import GateDecision
 from quad_gym.rendering import Renderer, record_flight, record_video, save_video, tile
 from quad_gym.rendering import canvas as colors
 from quad_gym.rendering.geometry import fixed_view
@@ -38,7 +39,7 @@ def color_near(frame, at, radius, color):
 def test_features_and_reference_are_drawn_where_the_view_projects_them(flight):
     frame = Renderer("fixed", (640, 480)).draw(flight)
     view = fixed_view(flight, 640, round(0.765 * 480))
-    for feature in flight.stage.features_I:
+    for feature in flight.scene.features_I:
         assert color_near(frame, view.project(feature)[0], 3, colors.INK)
     assert color_near(frame, view.project(flight["position"][-1])[0], 25, colors.BLUE)
     start = record_flight(Still(), "QuadGym/Circle-v0", max_episode_steps=1)  # 1 m below it
@@ -49,15 +50,16 @@ def test_features_and_reference_are_drawn_where_the_view_projects_them(flight):
 
 def test_the_inset_is_drawn_where_the_camera_measured(flight):
     frame = Renderer("fixed", (640, 480)).draw(flight)
-    box = inset_box(flight.stage, 632.0, 8.0, 0.27 * 640)
+    box = inset_box(flight.scene, 632.0, 8.0, 0.27 * 640)
     seen = flight["pixels"][-1][np.isfinite(flight["pixels"][-1]).all(axis=1)]
     assert len(seen)
     for pixel in seen:
-        assert color_near(frame, place_in_inset(pixel, flight.stage, box), 2, colors.INK)
+        assert color_near(frame, place_in_inset(pixel, flight.scene, box), 2, colors.INK)
 
 
 def test_an_image_is_shown_until_the_next_one_is_due():
-    options = {"camera_rate": 10.0, "max_episode_steps": 30}
+    suite = quad_gym.sensor_suite("standard").with_rates(camera=10.0)
+    options = {"sensors": suite, "max_episode_steps": 30}
     flight = record_flight(Still(), "QuadGym/Hover-v0", seed=2, **options)
     images = np.flatnonzero(np.isfinite(flight["pixels"]).all(axis=(1, 2)))
     np.testing.assert_array_equal(images, np.arange(0, 31, 5))
@@ -72,7 +74,10 @@ def test_what_the_gate_rejects_is_gray():
     flight = record_flight(Still(), "QuadGym/Hover-v0", seed=1, **options)
     view = fixed_view(flight, 640, round(0.765 * 480))
     measured = np.flatnonzero(np.isfinite(flight["gnss_position"][:, 0]))
-    assert flight["gnss_gate"][measured[[2, -1]], 0].tolist() == [Gate.ACCEPTED, Gate.REJECTED]
+    assert flight["gnss_decision"][measured[[2, -1]], 0].tolist() == [
+        GateDecision.ACCEPTED,
+        GateDecision.REJECTED,
+    ]
     for k, is_purple in ((measured[2], True), (measured[-1], False)):
         frame = Renderer("fixed", (640, 480)).draw(flight.until(flight["time"][k]))
         at = view.project(flight["gnss_position"][k])[0]

@@ -210,7 +210,7 @@ def test_frames_of_positions_and_bodies_are_equivalent(table):
     for given, body in ((ecef, "flu"), (frd, "frd")):
         result = replay(given, sensors=suite, body=body)
         np.testing.assert_allclose(result.position, first.position, atol=1e-6)
-        np.testing.assert_allclose(result.attitude, first.attitude, atol=1e-6)
+        np.testing.assert_allclose(result.quaternion, first.quaternion, atol=1e-6)
 
 
 def test_a_log_from_elsewhere_has_its_origin_at_the_first_fix(table):

@@ -51,7 +51,9 @@ def test_what_is_recorded_is_the_error_of_the_estimate():
     assert errors.shape == (21, 4, SIZE)
     assert velocities.shape == (21, 4, 3)
     batch = env.unwrapped.flights.batch
-    np.testing.assert_allclose(errors[-1, :, :3], batch.read("r_hat") - batch.read("r"), atol=1e-12)
+    np.testing.assert_allclose(
+        errors[-1, :, :3], batch.record("r_hat") - batch.record("r"), atol=1e-12
+    )
     truth = gymnasium.make_vec(
         "QuadGym/StaleRace-v0", num_envs=4, duration=0.4, observation="truth"
     )

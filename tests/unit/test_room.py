@@ -73,9 +73,9 @@ def test_flights_touch_nothing_beyond_their_room(name, monkeypatch):
     assert full.snapshot().dtype == FLIGHT_BLOCK
     for field in FLIGHT_BLOCK.names:
         if field in kept:
-            np.testing.assert_array_equal(small.read(field), full.read(field), err_msg=field)
+            np.testing.assert_array_equal(small.record(field), full.record(field), err_msg=field)
         else:
-            assert (full.read(field) == 7).all(), field
+            assert (full.record(field) == 7).all(), field
 
 
 def test_the_parts_make_the_record():
@@ -101,8 +101,8 @@ def test_what_is_not_used_takes_no_memory():
 
 def test_fields_without_room_read_as_nothing():
     batch = flown(TRUTH)
-    assert batch.read("L").shape == (11, 15, 15)
-    assert (batch.read("L") == 0.0).all()
-    assert np.isnan(batch.read("block_nis")).all()
-    assert batch.read("filter_status").dtype == batch.read("late_valid").astype("u8").dtype
-    assert batch.read("r_hat", np.array([3, 5])).shape == (2, 3)
+    assert batch.record("L").shape == (11, 15, 15)
+    assert (batch.record("L") == 0.0).all()
+    assert np.isnan(batch.record("block_nis")).all()
+    assert batch.record("filter_status").dtype == batch.record("late_valid").astype("u8").dtype
+    assert batch.record("r_hat", np.array([3, 5])).shape == (2, 3)

@@ -44,7 +44,7 @@ def test_a_suite_of_the_field_is_consistent_by_its_settings(name):
 def test_errors_at_a_level_start_are_as_claimed(suite):
     """All 15 together: the position depends on the attitude: the antenna's is measured."""
     batch = fly(suite, 4000)
-    errors, L = state_errors(batch), batch.read("L")
+    errors, L = state_errors(batch), batch.record("L")
     assert_normal(np.linalg.solve(L, errors[..., np.newaxis])[..., 0], np.zeros(15), np.eye(15))
 
 
@@ -71,8 +71,8 @@ def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
     squares = []
     for _ in range(40):
         batch.step()
-        measured = batch.read("velocity_valid") > 0.0
-        squares.append(batch.read("block_nis")[measured, VELOCITY_BLOCK])
+        measured = batch.record("velocity_valid") > 0.0
+        squares.append(batch.record("block_nis")[measured, VELOCITY_BLOCK])
     nis = np.concatenate(squares)
     assert len(nis) > 3000
     assert ALARM < stats.chi2.cdf(nis.sum(), 3 * len(nis)) < 1.0 - ALARM
@@ -83,10 +83,10 @@ def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
 
 def ticks_of_fixes(suite, count, ticks):
     batch = fly(suite, count, task="hover")
-    rows = [batch.read("position_valid")]
+    rows = [batch.record("position_valid")]
     for _ in range(ticks):
         batch.step()
-        rows.append(batch.read("position_valid"))
+        rows.append(batch.record("position_valid"))
     return np.array(rows) > 0.0
 
 
@@ -98,9 +98,9 @@ def test_sensors_measure_at_their_phase_and_rate():
     fixes, images = [], []
     for tick in range(1, 101):
         batch.step()
-        if batch.read("position_valid").all():
+        if batch.record("position_valid").all():
             fixes.append(tick)
-        if batch.read("feature_valid").any():
+        if batch.record("feature_valid").any():
             images.append(tick)
     assert fixes == list(range(5, 101, 20))
     assert images == list(range(2, 101, 4))
@@ -130,11 +130,11 @@ def test_a_phase_outside_of_the_period_is_refused(phase):
 def test_the_slow_error_grows_as_a_gauss_markov_process():
     gnss = CONSUMER.gnss.replace(drift_sigma_I=(0.6, 0.3, 1.0), drift_tau=2.0, phase=0.0)
     batch = fly(CONSUMER.replace(gnss=gnss), 4000, task="hover")
-    np.testing.assert_array_equal(batch.read("gnss_drift"), 0.0)
+    np.testing.assert_array_equal(batch.record("gnss_drift"), 0.0)
     steps(batch, 1.0)
-    early = batch.read("gnss_drift")
+    early = batch.record("gnss_drift")
     steps(batch, 1.5)
-    late = batch.read("gnss_drift")
+    late = batch.record("gnss_drift")
     variance = np.square([0.6, 0.3, 1.0])
     v_1, v_2 = (variance * -np.expm1(-2.0 * t / 2.0) for t in (1.0, 2.5))
     between = v_1 * np.exp(-1.5 / 2.0)
@@ -149,7 +149,7 @@ def test_until_the_first_fix_the_slow_error_has_grown_for_as_long_as_it_takes():
     for after in (0.05, 0.15):
         steps(batch, 0.05 if after < 0.1 else 0.1)
         expected = 0.6 * np.sqrt(-np.expm1(-2.0 * after / 60.0))
-        np.testing.assert_allclose(batch.read("gnss_drift").std(axis=0), expected, rtol=0.06)
+        np.testing.assert_allclose(batch.record("gnss_drift").std(axis=0), expected, rtol=0.06)
 
 
 def test_a_receiver_measures_white_noise_and_the_slow_error():
@@ -171,19 +171,19 @@ def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
     gnss = RTK.gnss.replace(rate=200.0, phase=0.0, primary_antenna_B=(0.3, 0.0, 0.1))
     batch = fly(RTK.replace(gnss=gnss), 500, task="hover")
     steps(batch, 0.2)
-    R_BI = attitudes(batch.read("q"))
-    lever = np.cross(batch.read("w"), gnss.primary_antenna_B)
-    truth = batch.read("v") + np.einsum("nji,nj->ni", R_BI, lever)
+    R_BI = attitudes(batch.record("q"))
+    lever = np.cross(batch.record("w"), gnss.primary_antenna_B)
+    truth = batch.record("v") + np.einsum("nji,nj->ni", R_BI, lever)
     assert np.abs(lever).max() > 0.05
-    measured = batch.read("gnss_velocity") @ east_north_up(gnss.reference_antenna_G).T
+    measured = batch.record("gnss_velocity") @ east_north_up(gnss.reference_antenna_G).T
     assert_normal(measured - truth, np.zeros(3), np.eye(3) * gnss.velocity_sigma**2)
 
 
 def test_velocity_is_measured_by_suites_that_have_it_only():
-    assert fly("rtk", 2, task="hover").read("velocity_valid").shape == (2,)
+    assert fly("rtk", 2, task="hover").record("velocity_valid").shape == (2,)
     lab = fly("lab", 2, task="hover")
     steps(lab, 0.1)
-    assert not lab.read("velocity_valid").any()
+    assert not lab.record("velocity_valid").any()
     ukf = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("lab"))
     ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="velocity"):
@@ -202,9 +202,9 @@ def test_velocity_updates_the_friendly_filter():
 
 def test_no_rate_can_be_given_for_a_sensor_that_is_not_there():
     with pytest.raises(ValueError, match="gnss_rate must not be given without GNSS"):
-        quad_gym.QuadEnv("hover", sensors="indoor", gnss_rate=10.0)
+        quad_gym.sensor_suite("indoor").with_rates(gnss=10.0)
     with pytest.raises(ValueError, match="camera_rate must not be given without a camera"):
-        quad_gym.QuadEnv("hover", sensors="consumer", camera_rate=25.0)
+        CONSUMER.with_rates(camera=25.0)
 
 
 # ---- flying without GNSS ---------------------------------------------------------------------
@@ -212,12 +212,12 @@ def test_no_rate_can_be_given_for_a_sensor_that_is_not_there():
 
 def test_indoors_the_filter_starts_from_its_mark_and_never_has_a_fix():
     batch = fly("indoor", 2000, task="hover")
-    off = batch.read("r_hat") - batch.read("r")
+    off = batch.record("r_hat") - batch.record("r")
     assert_normal(off, np.zeros(3), np.eye(3) * 0.05**2)
     for _ in range(50):
         batch.step()
-        assert not batch.read("position_valid").any()
-        assert not batch.read("baseline_valid").any()
+        assert not batch.record("position_valid").any()
+        assert not batch.record("baseline_valid").any()
 
 
 def test_the_friendly_filter_takes_no_fix_without_gnss():
@@ -237,7 +237,7 @@ def test_without_gnss_a_rate_for_it_is_refused():
 
 
 def test_sensors_are_observed_as_they_measure():
-    env = quad_gym.QuadEnv("hover", observation="sensors", sensors="indoor")
+    env = quad_gym.QuadEnv("hover", observation="measurements", sensors="indoor")
     observation, _ = env.reset(seed=3)
     table = {field.name: field.slice for field in env.flights.table}
     assert observation[table["gnss_position_valid"]] == 0.0
@@ -245,7 +245,7 @@ def test_sensors_are_observed_as_they_measure():
 
 
 def test_velocity_is_observed_with_the_position_by_suites_that_have_it():
-    env = quad_gym.QuadEnv("hover", observation="sensors", sensors=RTK, control_rate=100.0)
+    env = quad_gym.QuadEnv("hover", observation="measurements", sensors=RTK, control_rate=100.0)
     env.reset(seed=3)
     table = {field.name: field.slice for field in env.flights.table}
     assert table["gnss_velocity_valid"].start == table["gnss_velocity"].stop
@@ -255,11 +255,11 @@ def test_velocity_is_observed_with_the_position_by_suites_that_have_it():
         observation = env.step(np.zeros(4, np.float32))[0]
         seen, fresh = observation[table["gnss_velocity"]], observation[table["gnss_velocity_valid"]]
         assert fresh == observation[table["gnss_position_valid"]]
-        measured = R_IG @ env.flights.batch.read("gnss_velocity")[0]
+        measured = R_IG @ env.flights.batch.record("gnss_velocity")[0]
         np.testing.assert_allclose(seen, fresh * measured, atol=1e-6)
         fixes += int(fresh[0])
     assert fixes == 5
-    without = quad_gym.QuadEnv("hover", observation="sensors", sensors="lab")
+    without = quad_gym.QuadEnv("hover", observation="measurements", sensors="lab")
     assert "gnss_velocity" not in {field.name for field in without.flights.table}
 
 
@@ -309,15 +309,15 @@ def test_fixes_come_from_the_true_antenna_with_its_true_noise():
     )
     batch = fly(RTK, 4000, task="hover", true_sensors=true)
     R_IG = east_north_up(RTK.gnss.reference_antenna_G)
-    R_BI = attitudes(batch.read("q"))
-    antenna = batch.read("r") + np.array(true.gnss.primary_antenna_B) @ R_BI
-    fixes = batch.read("gnss_position") @ R_IG.T - antenna
+    R_BI = attitudes(batch.record("q"))
+    antenna = batch.record("r") + np.array(true.gnss.primary_antenna_B) @ R_BI
+    fixes = batch.record("gnss_position") @ R_IG.T - antenna
     assert_normal(fixes, np.zeros(3), np.diag(np.square([0.1, 0.2, 0.3])))
-    lever = np.cross(batch.read("w"), true.gnss.primary_antenna_B)
-    truth = batch.read("v") + np.einsum("nji,nj->ni", R_BI, lever)
-    assert_normal(batch.read("gnss_velocity") @ R_IG.T - truth, np.zeros(3), np.eye(3) * 0.4**2)
+    lever = np.cross(batch.record("w"), true.gnss.primary_antenna_B)
+    truth = batch.record("v") + np.einsum("nji,nj->ni", R_BI, lever)
+    assert_normal(batch.record("gnss_velocity") @ R_IG.T - truth, np.zeros(3), np.eye(3) * 0.4**2)
     baseline = np.array(true.gnss.baseline_B) @ R_BI
-    measured = batch.read("gnss_baseline") @ R_IG.T
+    measured = batch.record("gnss_baseline") @ R_IG.T
     size = np.linalg.norm(true.gnss.baseline_B)
     np.testing.assert_allclose(np.linalg.norm(measured, axis=1), size, rtol=1e-9)
     angles = np.linalg.norm(np.cross(measured, baseline), axis=1) / size**2

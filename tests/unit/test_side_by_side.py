@@ -99,7 +99,7 @@ def test_a_course_shows_progress_in_place_of_the_error_and_when_gnss_fails(writt
     [("LookAround", None), ("StaleRace", ("gates", 8)), ("OutageDash", ("gaps", 10))],
 )
 def test_no_words_cross_others(task, course, monkeypatch):
-    label = "trained on estimate + standard deviation, paid for being sure"
+    label = "trained on estimate + standard deviation, reward for certainty"
     film = SideBySide([side_of(task, 25, label, crashed=True, course=course)])
     places = []
     write = Canvas.text
@@ -123,7 +123,7 @@ def test_no_words_cross_others(task, course, monkeypatch):
 def test_long_labels_break_after_commas_or_else_between_words():
     canvas = Canvas(320, 240)
     assert _wrapped(canvas, "short", 19, 300.0) == ["short"]
-    words = "estimate and standard deviation, paid for being sure"
+    words = "estimate and standard deviation, reward for certainty"
     assert _wrapped(canvas, words, 19, 300.0) == [
         "estimate and standard deviation,",
         "paid for being sure",

@@ -33,7 +33,7 @@ def hovering(**keywords):
 
 def silent(batch):
     """(n,) whether a flight is neither right nor told."""
-    return (nees(batch, slice(0, 9)) > RIGHT) & ~(batch.read("lost") > 0.0)
+    return (nees(batch, slice(0, 9)) > RIGHT) & ~(batch.record("diverged") > 0.0)
 
 
 def share_silent(batch, times, every):
@@ -66,9 +66,9 @@ def test_watching_changes_no_bit_of_a_flight(suite):
     for batch in (plain, watching):
         steps(batch, 1.0)
     for name in ("r", "q", "r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat", "L"):
-        np.testing.assert_array_equal(plain.read(name), watching.read(name))
-    assert np.isnan(plain.read("block_nis")).all()
-    assert np.isfinite(watching.read("block_nis")[:, 0]).all()
+        np.testing.assert_array_equal(plain.record(name), watching.record(name))
+    assert np.isnan(plain.record("block_nis")).all()
+    assert np.isfinite(watching.record("block_nis")[:, 0]).all()
 
 
 def test_flights_that_end_when_lost_watch():
@@ -76,13 +76,13 @@ def test_flights_that_end_when_lost_watch():
     batch = FlightBatch(2, task=task)
     batch.reset(seeds=[0, 1])
     steps(batch, 0.1)
-    assert np.isfinite(batch.read("block_nis")[:, 0]).all()
+    assert np.isfinite(batch.record("block_nis")[:, 0]).all()
 
 
 def test_flights_on_the_truth_have_no_filter_that_watches():
     batch = hovering(source=Source.TRUTH, faults="rotor_loss")
     steps(batch, 0.1)
-    assert np.isnan(batch.read("block_nis")).all()
+    assert np.isnan(batch.record("block_nis")).all()
 
 
 # ---- without a gate ------------------------------------------------------------------------------
@@ -98,9 +98,9 @@ def test_a_filter_that_mends_nothing_is_lost_for_about_as_long_as_it_is_wrong(ta
     lost, wrong = [], []
     for _ in range(90):
         steps(batch, 1.0)
-        lost.append(batch.read("lost") > 0.0)
+        lost.append(batch.record("diverged") > 0.0)
         wrong.append(nees(batch, slice(0, 9)) > RIGHT)
-        held = (batch.read("doubt_tick") - batch.read("tick")) * imu.dt
+        held = (batch.record("doubt_tick") - batch.record("tick")) * imu.dt
         assert held.max() < 60.0  # not P/Q of biases that hardly change, 1e5 s
     assert np.mean(lost[1:4]) == 1.0
     assert np.mean(np.array(wrong) & ~np.array(lost)) <= 0.02
@@ -121,11 +121,11 @@ def test_corrections_of_the_drift_have_the_variance_that_they_are_given():
     """Their sums over a second in deviations, 3 x 256 of them, are standard normal."""
     batch = fly(quad_gym.sensor_suite("consumer"), 256, start="hover", filter_start="warm")
     steps(batch, 5.0)
-    scaled = batch.read("drift_corrected") / np.sqrt(batch.read("drift_corrected_variance"))
+    scaled = batch.record("drift_corrected") / np.sqrt(batch.record("drift_corrected_variance"))
     assert 0.85 < (scaled**2).mean() < 1.15  # 2.9 deviations of the mean of so many
     # what drives the drift, 2 sigma^2/T in a second, adds up with weights exp(-2 t/1.5 s)
     driven = 0.6 * math.sqrt(2.0 / 60.0 * 1.5 / 2.0)
-    level = np.sqrt(batch.read("drift_corrected_variance"))[:, :2]
+    level = np.sqrt(batch.record("drift_corrected_variance"))[:, :2]
     assert np.median(level) == pytest.approx(driven, rel=0.05)
 
 

@@ -32,7 +32,9 @@ def assert_same_flights(batch, other, flights=None, others=None):
     here = slice(None) if flights is None else flights
     there = slice(None) if others is None else others
     for name in FLIGHT.names:
-        np.testing.assert_array_equal(batch.read(name)[here], other.read(name)[there], err_msg=name)
+        np.testing.assert_array_equal(
+            batch.record(name)[here], other.record(name)[there], err_msg=name
+        )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def test_a_flight_does_not_depend_on_the_number_of_threads(hundred, threads):
 
 
 def test_flights_of_different_seeds_differ_and_a_seed_repeats_itself(hundred):
-    assert len(np.unique(hundred.read("gyro"), axis=0)) == 100
+    assert len(np.unique(hundred.record("gyro"), axis=0)) == 100
     again = new_batch(100)
     again.reset(seeds=[0] * 100)
     for _ in range(3):
@@ -66,7 +68,7 @@ def test_flights_of_different_seeds_differ_and_a_seed_repeats_itself(hundred):
     again.reset(seeds=SEEDS)
     for _ in range(60):
         again.step()
-    np.testing.assert_array_equal(again.read("r_hat"), hundred.read("r_hat"))
+    np.testing.assert_array_equal(again.record("r_hat"), hundred.record("r_hat"))
 
 
 @pytest.mark.parametrize("source", list(Source))
@@ -76,14 +78,14 @@ def test_a_snapshot_in_mid_flight_comes_back_bit_for_bit(source):
     path = []
     for _ in range(40):
         batch.step()
-        path.append(batch.read("r"))
+        path.append(batch.record("r"))
     after = batch.snapshot()
     batch.reset(seeds=list(range(11)))
     batch.step()
     batch.restore(kept)
     for position in path:
         batch.step()
-        np.testing.assert_array_equal(batch.read("r"), position)
+        np.testing.assert_array_equal(batch.record("r"), position)
     assert batch.snapshot().tobytes() == after.tobytes()
 
     elsewhere = new_batch(11, source=source)
@@ -111,17 +113,19 @@ def test_a_masked_reset_begins_the_chosen_flights_alone(hundred):
     fresh = new_batch(100)
     fresh.reset(seeds=[9] * 100)
     for name in ("r", "q", "r_hat", "L", "key", "instant", "tick", "gyro", "b_a", "episode"):
-        np.testing.assert_array_equal(batch.read(name)[mask], fresh.read(name)[mask], err_msg=name)
+        np.testing.assert_array_equal(
+            batch.record(name)[mask], fresh.record(name)[mask], err_msg=name
+        )
 
 
 def test_a_reset_without_seeds_goes_on_with_the_stream():
     batch = fly(SEEDS[:5], steps=0)
-    first = batch.read("b_a")
+    first = batch.record("b_a")
     batch.reset()
-    assert (batch.read("b_a") != first).all()
-    np.testing.assert_array_equal(batch.read("episode"), 2.0)
+    assert (batch.record("b_a") != first).all()
+    np.testing.assert_array_equal(batch.record("episode"), 2.0)
     batch.reset(seeds=SEEDS[:5])
-    np.testing.assert_array_equal(batch.read("b_a"), first)
+    np.testing.assert_array_equal(batch.record("b_a"), first)
 
 
 def test_a_batch_flies_on_the_motors_it_is_told():
@@ -130,12 +134,12 @@ def test_a_batch_flies_on_the_motors_it_is_told():
     batch.reset(seeds=[1, 1])
     for _ in range(20):
         batch.step(np.array([[-1.0] * 4, [1.0] * 4]))
-    voltages = batch.read("voltages")
+    voltages = batch.record("voltages")
     assert (voltages[0] == 0.0).all()
     assert (voltages[1] == voltages[1, 0]).all()
-    assert batch.read("v")[0, 2] < -0.5 < 0.5 < batch.read("v")[1, 2]
+    assert batch.record("v")[0, 2] < -0.5 < 0.5 < batch.record("v")[1, 2]
     batch.step()  # keeps the present actions
-    np.testing.assert_array_equal(batch.read("voltages"), voltages)
+    np.testing.assert_array_equal(batch.record("voltages"), voltages)
 
 
 @pytest.mark.parametrize(
@@ -210,15 +214,15 @@ def test_a_snapshot_of_another_kind_is_refused():
 
 def test_every_field_is_readable_and_what_is_read_is_the_callers_own(hundred):
     for name in FLIGHT.names:
-        values = hundred.read(name)
+        values = hundred.record(name)
         assert values.shape == (100, *FLIGHT[name].shape)
         before = values.copy()
         values[...] = 7
-        np.testing.assert_array_equal(hundred.read(name), before)
+        np.testing.assert_array_equal(hundred.record(name), before)
     for name in RESULTS:
         assert hundred.result(name).shape == (100,)
     with pytest.raises(ValueError, match="altitude"):
-        hundred.read("altitude")
+        hundred.record("altitude")
 
 
 @pytest.mark.parametrize("count", [1, 8, 9, 20])
@@ -228,7 +232,7 @@ def test_the_lanes_that_pad_the_last_block_are_idle(count):
 
 
 def test_the_covariance_is_that_of_the_factor(hundred):
-    P, L = hundred.covariance(), hundred.read("L")
+    P, L = hundred.covariance(), hundred.record("L")
     assert P.shape == (100, 15, 15)
     np.testing.assert_allclose(P[42], L[42] @ L[42].T, rtol=1e-13, atol=1e-25)
     assert (np.linalg.eigvalsh(P)[:, 0] > 0.0).all()
@@ -237,8 +241,8 @@ def test_the_covariance_is_that_of_the_factor(hundred):
 
 def test_results_are_those_of_the_records(hundred):
     for name in ("position_error", "estimation_error", "reward"):
-        np.testing.assert_array_equal(hundred.result(name), hundred.read(name))
-    gap = np.linalg.norm(hundred.read("r_hat") - hundred.read("r"), axis=1)
+        np.testing.assert_array_equal(hundred.result(name), hundred.record(name))
+    gap = np.linalg.norm(hundred.record("r_hat") - hundred.record("r"), axis=1)
     np.testing.assert_allclose(hundred.result("estimation_error"), gap, rtol=1e-12)
 
 
@@ -264,7 +268,7 @@ def test_more_substeps_change_a_flight_by_the_error_of_runge_kutta_alone():
         states = []
         for _ in range(200):
             batch.step()
-            states.append(np.concatenate([batch.read(name)[0] for name in ("r", "v", "q")]))
+            states.append(np.concatenate([batch.record(name)[0] for name in ("r", "v", "q")]))
         return np.array(states)
 
     best = path(32)
@@ -282,8 +286,8 @@ def test_an_episode_ends_at_its_time_limit_and_the_next_step_begins_another():
         batch.step()
         np.testing.assert_array_equal(batch.result("truncated"), float(k == 10))
     batch.step()
-    np.testing.assert_array_equal(batch.read("tick"), 0.0)
-    np.testing.assert_array_equal(batch.read("episode"), 2.0)
+    np.testing.assert_array_equal(batch.record("tick"), 0.0)
+    np.testing.assert_array_equal(batch.record("episode"), 2.0)
     np.testing.assert_array_equal(batch.result("truncated"), 0.0)
 
 
@@ -297,16 +301,16 @@ def test_sensors_that_are_switched_off_measure_nothing_until_they_are_back():
         return batch
 
     batch = flown((None, None))
-    assert batch.read("position_valid").all()
-    assert batch.read("feature_valid")[:, :2].any()
+    assert batch.record("position_valid").all()
+    assert batch.record("feature_valid")[:, :2].any()
     batch = flown((False, None), (None, False))
-    assert not batch.read("position_valid").any()
-    assert not batch.read("feature_valid").any()
+    assert not batch.record("position_valid").any()
+    assert not batch.record("feature_valid").any()
     batch = flown((False, False), (True, None))
-    assert batch.read("position_valid").all()
-    assert not batch.read("feature_valid").any()
+    assert batch.record("position_valid").all()
+    assert not batch.record("feature_valid").any()
     batch.reset(seeds=[0, 1])
-    assert batch.read("feature_valid")[:, :2].any()
+    assert batch.record("feature_valid")[:, :2].any()
     same = flown((True, True), (True, None), (None, None))
     assert same.snapshot().tobytes() == flown(*[(None, None)] * 3).snapshot().tobytes()
     with pytest.raises(ValueError, match="gnss"):
@@ -331,8 +335,8 @@ def test_faults_that_are_switched_are_those_that_come_by_themselves():
 
     scheduled, switched = flown(0.25, {}), flown(90.0, {49: True, 99: False})
     for name in ("r", "b_a", "r_hat", "L", "fault_count"):
-        np.testing.assert_array_equal(switched.read(name), scheduled.read(name), err_msg=name)
-    assert not np.array_equal(flown(90.0, {}).read("r_hat"), scheduled.read("r_hat"))
+        np.testing.assert_array_equal(switched.record(name), scheduled.record(name), err_msg=name)
+    assert not np.array_equal(flown(90.0, {}).record("r_hat"), scheduled.record("r_hat"))
     assert flown(90.0, {110: True}).active_faults()["gnss_outage"].all()
     with pytest.raises(ValueError, match="active"):
         scheduled.switch_faults(1)

@@ -155,10 +155,10 @@ def wrapped(angle):
 
 def reference_of(batch, task):
     """What the reference has drawn, by name; where it begins, and where the vehicle looks then."""
-    center, point = batch.read("ref_center"), batch.read("ref_heading_point")
-    cosines, sines = batch.read("ref_cos"), batch.read("ref_sin")
+    center, point = batch.record("ref_center"), batch.record("ref_heading_point")
+    cosines, sines = batch.record("ref_cos"), batch.record("ref_sin")
     place, ahead = center + cosines.sum(axis=1), point
-    drawn = {"rate": batch.read("ref_omega")}
+    drawn = {"rate": batch.record("ref_omega")}
     if task == "hover":
         drawn |= {"phase": angle_of(center), "radius": np.hypot(*center.T[:2])}
         ahead = -center
@@ -177,10 +177,10 @@ def reference_of(batch, task):
                 drawn[f"odd cos {k}, {i}"] = cosines[:, k, i]
                 drawn[f"odd sin {k}, {i}"] = sines[:, k, i]
     elif task == "trajectory":
-        drawn = {"phase": batch.read("path_share"), "turn": angle_of(batch.read("path_turn"))}
-        place, ahead = batch.read("path_r"), batch.read("path_x")
+        drawn = {"phase": batch.record("path_share"), "turn": angle_of(batch.record("path_turn"))}
+        place, ahead = batch.record("path_r"), batch.record("path_x")
     else:
-        gates = batch.read("gates")
+        gates = batch.record("gates")
         azimuth = np.arctan2(gates[..., 1], gates[..., 0])
         drawn |= {"heading": angle_of(point), "azimuth": azimuth[:, 0]}
         for k in range(5):
@@ -195,22 +195,22 @@ def reference_of(batch, task):
 def quantities_of(batch, task):
     """All that an episode draws when it begins, each by itself, by name: (COUNT,)."""
     drawn, place, heading = reference_of(batch, task)
-    R = Rotation.from_quat(batch.read("q")[:, [1, 2, 3, 0]]).as_matrix()  # body to inertial
+    R = Rotation.from_quat(batch.record("q")[:, [1, 2, 3, 0]]).as_matrix()  # body to inertial
     drawn |= {f"tilt {i}": R[:, 2, i] for i in range(2)}
     drawn["yaw"] = wrapped(angle_of(R[:, :, 0]) - heading)
     vectors = {
-        "start": batch.read("r") - place,
-        "velocity": batch.read("v"),
-        "accelerometer bias": batch.read("b_a"),
-        "gyro bias": batch.read("b_g"),
-        "gyro noise": batch.read("gyro") - batch.read("b_g"),
-        "mass": batch.read("mass")[:, np.newaxis],
-        "wind": np.stack([batch.read("wind_east"), batch.read("wind_up")], axis=1),
-        "outage and jump begin": batch.read("fault_from")[:, [OUTAGE, JUMP]],
-        "outage lasts": (batch.read("fault_until") - batch.read("fault_from"))[:, [OUTAGE]],
-        "jump": batch.read("fault_vector")[:, JUMP],
+        "start": batch.record("r") - place,
+        "velocity": batch.record("v"),
+        "accelerometer bias": batch.record("b_a"),
+        "gyro bias": batch.record("b_g"),
+        "gyro noise": batch.record("gyro") - batch.record("b_g"),
+        "mass": batch.record("mass")[:, np.newaxis],
+        "wind": np.stack([batch.record("wind_east"), batch.record("wind_up")], axis=1),
+        "outage and jump begin": batch.record("fault_from")[:, [OUTAGE, JUMP]],
+        "outage lasts": (batch.record("fault_until") - batch.record("fault_from"))[:, [OUTAGE]],
+        "jump": batch.record("fault_vector")[:, JUMP],
         "first measurements": np.stack(
-            [batch.read("gnss_wait"), batch.read("camera_wait")], axis=1
+            [batch.record("gnss_wait"), batch.record("camera_wait")], axis=1
         ),
     }
     for name, values in vectors.items():
@@ -250,7 +250,7 @@ def test_what_an_episode_begins_with_is_independent(task):
     batch = FlightBatch(
         COUNT,
         sensors="consumer",
-        task=TaskParams(kind=task, randomize=True, start="hover", radius=3.0),
+        task=TaskParams(kind=task, randomize_reference=True, start="hover", radius=3.0),
         randomization={
             "mass": Uniform(0.8, 1.2, relative=True),
             "wind_east": Normal(0.0, 1.0),
@@ -273,11 +273,13 @@ def test_what_an_episode_begins_with_is_independent(task):
 def test_what_an_episode_draws_does_not_depend_on_the_length_of_the_last_one():
     found = []
     for steps in (0, 1, 37):
-        batch = FlightBatch(9, task=TaskParams(kind="waypoints", randomize=True, start="hover"))
+        batch = FlightBatch(
+            9, task=TaskParams(kind="waypoints", randomize_reference=True, start="hover")
+        )
         batch.reset(seeds=range(9))
         for _ in range(steps):
             batch.step()
         batch.reset()
-        np.testing.assert_array_equal(batch.read("instant"), np.uint64(2 * 2**32))
-        found.append([batch.read(name).tobytes() for name in ("r", "gates", "b_a", "gyro", "q")])
+        np.testing.assert_array_equal(batch.record("instant"), np.uint64(2 * 2**32))
+        found.append([batch.record(name).tobytes() for name in ("r", "gates", "b_a", "gyro", "q")])
     assert found[0] == found[1] == found[2]

@@ -103,8 +103,8 @@ def test_the_filter_equals_the_plain_filter_over_many_cycles(cycles):
         },
         {"gravity": 9.81},
         {"integration": "midpoint"},
-        {"covariance_reset": "turn"},
-        {"integration": "midpoint", "covariance_reset": "turn", "alpha": 0.7},
+        {"attitude_reset": True},
+        {"integration": "midpoint", "attitude_reset": True, "alpha": 0.7},
     ],
     ids=str,
 )

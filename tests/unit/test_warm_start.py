@@ -30,15 +30,15 @@ def unmeasured(name):
 
 
 def whitened_errors(batch):
-    return np.linalg.solve(batch.read("L"), state_errors(batch)[..., np.newaxis])[..., 0]
+    return np.linalg.solve(batch.record("L"), state_errors(batch)[..., np.newaxis])[..., 0]
 
 
 def biases(batch):
-    return np.hstack([batch.read("b_a"), batch.read("b_g")])
+    return np.hstack([batch.record("b_a"), batch.record("b_g")])
 
 
 def estimated_biases(batch):
-    return np.hstack([batch.read("b_a_hat"), batch.read("b_g_hat")])
+    return np.hstack([batch.record("b_a_hat"), batch.record("b_g_hat")])
 
 
 # ---- the errors of the start -----------------------------------------------------------------
@@ -57,7 +57,7 @@ def test_with_any_yaw_they_are_too_and_the_covariance_looks_the_way_of_the_vehic
     batch = fly(suite, 4000, task="hover", filter_start="warm", randomization=anywhere)
     assert_normal(whitened_errors(batch), np.zeros(15), np.eye(15))
 
-    ahead = attitudes(batch.read("q"))[:, 0]
+    ahead = attitudes(batch.record("q"))[:, 0]
     azimuth = np.arctan2(ahead[:, 1], ahead[:, 0])
     assert azimuth.min() < -3.0 < 3.0 < azimuth.max()
     c, s = np.cos(azimuth), np.sin(azimuth)
@@ -120,7 +120,7 @@ def test_nees_is_right_from_the_first_instant_on(name):
         means.append(nees(batch).mean())
     deviation = np.sqrt(2 * 15 / 500)
     assert np.abs(np.array(means) - 15.0).max() < 5 * deviation, means
-    assert not batch.read("filter_status").any()
+    assert not batch.record("filter_status").any()
 
 
 # ---- what does not change --------------------------------------------------------------------
@@ -141,7 +141,7 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
         "corrected_long_variance",
         "corrected_tick",
         "nis_ratio",
-        "lost",
+        "diverged",
         "accepted_tick",
         "fit_tick",
         "doubt_tick",
@@ -151,18 +151,18 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
     for field in FLIGHT_FIELDS:
         if field.name not in estimates | seen | fixes:
             np.testing.assert_array_equal(
-                warm.read(field.name), cold.read(field.name), err_msg=field.name
+                warm.record(field.name), cold.record(field.name), err_msg=field.name
             )
-    assert (warm.read("r_hat") != cold.read("r_hat")).all()
+    assert (warm.record("r_hat") != cold.record("r_hat")).all()
 
 
 def test_a_first_fix_is_a_measurement_of_a_filter_that_it_did_not_start():
     rtk = quad_gym.sensor_suite("rtk").simplified()
     suite = rtk.replace(gnss=rtk.gnss.replace(phase=0.0), camera=None)
-    assert not fly(suite, 3).read("position_valid").any()
+    assert not fly(suite, 3).record("position_valid").any()
     warm = fly(suite, 3, filter_start="warm")
-    assert warm.read("position_valid").all()
-    assert (warm.read("nis_dimension") == 9.0).all()
+    assert warm.record("position_valid").all()
+    assert (warm.record("nis_dimension") == 9.0).all()
 
 
 def test_without_a_filter_there_is_nothing_to_warm():
@@ -225,8 +225,8 @@ def test_every_episode_starts_warm_anew():
     )
     env.reset(seed=0)
     batch = env.flights.batch
-    first = batch.read("r_hat") - batch.read("r")
+    first = batch.record("r_hat") - batch.record("r")
     for _ in range(5):
         env.step(np.zeros((2, 4), np.float32))
-    assert (batch.read("episode") == 2.0).all()
-    assert (batch.read("r_hat") - batch.read("r") != first).all()
+    assert (batch.record("episode") == 2.0).all()
+    assert (batch.record("r_hat") - batch.record("r") != first).all()

@@ -116,7 +116,7 @@ def motors_only(world, *, vehicle=LAB, voltage=0.0, speed=0.0, velocity=(0, 0, 0
             pad=False,
             duration=0.0,
             out_of_bounds=1e9,
-            ground=-1e9,
+            min_height=-1e9,
         ),
         world=world,
         **more,
@@ -140,11 +140,11 @@ def test_a_falling_vehicle_reaches_terminal_velocity_in_an_updraft():
     V = np.sqrt(vehicle.mass * vehicle.gravity / k)
     batch, off = motors_only(WorldParams(wind_I=(0.0, 0.0, updraft)), vehicle=vehicle)
     for t in (0.5, 1.0, 5.0):
-        done = float(batch.read("tick")[0]) / 200
+        done = float(batch.record("tick")[0]) / 200
         flown(batch, off, t - done)
         expected = updraft - V * np.tanh(vehicle.gravity * t / V + np.arctanh(updraft / V))
-        np.testing.assert_allclose(batch.read("v")[0], [0.0, 0.0, expected], atol=1e-7)
-    assert batch.read("v")[0, 2] == pytest.approx(updraft - V, abs=1e-2)
+        np.testing.assert_allclose(batch.record("v")[0], [0.0, 0.0, expected], atol=1e-7)
+    assert batch.record("v")[0, 2] == pytest.approx(updraft - V, abs=1e-2)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
@@ -164,9 +164,9 @@ def test_a_hovering_vehicle_drifts_off_with_the_wind(yaw, by_rotor_speed):
         yaw=yaw,
     )
     flown(batch, action, 2.0)
-    R_BI = quaternion_to_dcm(batch.read("q"))[0]
+    R_BI = quaternion_to_dcm(batch.record("q"))[0]
     expected = R_BI.T @ ((R_BI @ wind) * -np.expm1(-D * 2.0 / LAB.mass))
-    np.testing.assert_allclose(batch.read("v")[0], expected, rtol=1e-9)
+    np.testing.assert_allclose(batch.record("v")[0], expected, rtol=1e-9)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -180,9 +180,9 @@ def test_a_flight_in_a_wind_is_the_calm_flight_carried_along(seed):
         flown(*motors_only(WorldParams(wind_I=air, **drag), velocity=velocity + air, **keywords), 1)
         for air in (np.zeros(3), wind)
     )
-    np.testing.assert_allclose(blown.read("v"), calm.read("v") + wind, atol=1e-10)
-    np.testing.assert_allclose(blown.read("r"), calm.read("r") + wind, atol=1e-10)
-    np.testing.assert_allclose(blown.read("q"), calm.read("q"), atol=1e-10)
+    np.testing.assert_allclose(blown.record("v"), calm.record("v") + wind, atol=1e-10)
+    np.testing.assert_allclose(blown.record("r"), calm.record("r") + wind, atol=1e-10)
+    np.testing.assert_allclose(blown.record("q"), calm.record("q"), atol=1e-10)
 
 
 def test_air_forces_take_energy_in_still_air():
@@ -191,7 +191,7 @@ def test_air_forces_take_energy_in_still_air():
     energies = []
     for _ in range(50):
         flown(batch, off, 0.02)
-        v, z = batch.read("v")[0], batch.read("r")[0, 2]
+        v, z = batch.record("v")[0], batch.record("r")[0, 2]
         energies.append(0.5 * LAB.mass * v @ v + LAB.mass * LAB.gravity * z)
     assert (np.diff(energies) < 0.0).all()
 
@@ -216,20 +216,20 @@ def test_the_accelerometer_feels_what_the_air_does():
         batch.step()
     lever = np.array([0.1, -0.2, 0.05])
     for i in range(8):
-        R_BI, w = quaternion_to_dcm(batch.read("q"))[i], batch.read("w")[i]
+        R_BI, w = quaternion_to_dcm(batch.record("q"))[i], batch.record("w")[i]
         state = {
-            "position": batch.read("r")[i],
-            "velocity": batch.read("v")[i],
+            "position": batch.record("r")[i],
+            "velocity": batch.record("v")[i],
             "R_BI": R_BI,
             "body_rates": w,
-            "rotor_speeds": batch.read("rotor_speeds")[i],
+            "rotor_speeds": batch.record("rotor_speeds")[i],
         }
-        now = world.replace(wind_I=batch.read("wind")[i], gust_wind_speed=0.0)
+        now = world.replace(wind_I=batch.record("wind")[i], gust_wind_speed=0.0)
         rates = state_derivative(state, np.zeros(4), NO_FORCE, LAB, now)
         a = R_BI @ (rates["velocity"] + [0.0, 0.0, LAB.gravity])
         a = a + np.cross(rates["body_rates"], lever) + np.cross(w, np.cross(w, lever))
-        np.testing.assert_allclose(batch.read("accel")[i], a, atol=1e-10)
-        np.testing.assert_allclose(batch.read("gyro")[i], w, atol=1e-12)
+        np.testing.assert_allclose(batch.record("accel")[i], a, atol=1e-10)
+        np.testing.assert_allclose(batch.record("gyro")[i], w, atol=1e-12)
 
 
 # ---- battery -------------------------------------------------------------------------------------
@@ -250,13 +250,13 @@ def test_the_battery_gives_what_it_has_and_no_more():
     batch, _ = motors_only(WorldParams(battery=battery))
     taken = 0.0
     for _ in range(200):
-        charge, speeds = batch.read("charge")[0], batch.read("rotor_speeds")[0]
+        charge, speeds = batch.record("charge")[0], batch.record("rotor_speeds")[0]
         assert charge == pytest.approx(1.0 - taken / battery.energy, rel=1e-12)
         voltage, power = battery_law(charge, speeds, battery)
         batch.step(np.ones((1, 4)))
         asked = 2.0 * LAB.hover_voltage
         expected = min(asked, voltage)
-        np.testing.assert_allclose(batch.read("voltages")[0], expected, rtol=1e-12)
+        np.testing.assert_allclose(batch.record("voltages")[0], expected, rtol=1e-12)
         taken += 0.005 * power
     assert taken > 0.0
 
@@ -271,7 +271,7 @@ def test_rotors_settle_where_the_loaded_battery_holds_them():
         return 200.0 * battery_law(1.0, np.full(4, speed), battery)[0] - speed
 
     settled = brentq(excess, 600.0, 2400.0)
-    np.testing.assert_allclose(batch.read("rotor_speeds")[0], settled, rtol=1e-6)
+    np.testing.assert_allclose(batch.record("rotor_speeds")[0], settled, rtol=1e-6)
     assert settled < 2200.0
 
 
@@ -282,15 +282,15 @@ def test_an_empty_battery_cuts_off():
         speed=HOVER_SPEED,
     )
     flown(batch, action, 2.0)
-    assert batch.read("charge")[0] == 0.0
-    np.testing.assert_array_equal(batch.read("voltages"), 0.0)
+    assert batch.record("charge")[0] == 0.0
+    np.testing.assert_array_equal(batch.record("voltages"), 0.0)
 
 
 def test_the_true_vehicles_largest_voltage_holds_whatever_the_controller_believes():
     weak = LAB.replace(max_voltage=4.0)
     batch, _ = motors_only("calm", true_vehicle=weak)
     batch.step(np.ones((1, 4)))
-    np.testing.assert_array_equal(batch.read("voltages"), 4.0)
+    np.testing.assert_array_equal(batch.record("voltages"), 4.0)
 
 
 # ---- off is off ----------------------------------------------------------------------------------
@@ -317,17 +317,17 @@ def test_air_that_does_nothing_changes_nothing_but_rounding():
         vehicle=vehicle, world=WorldParams(wind_I=(5.0, 0.0, 0.0), gust_wind_speed=5.0)
     )
     for name in ("b_a", "b_g", "key", "instant"):  # random draws are those of the calm flight
-        np.testing.assert_array_equal(blown.read(name), plain.read(name))
+        np.testing.assert_array_equal(blown.record(name), plain.record(name))
     for name in ("r", "v", "q", "w", "r_hat", "accel", "pixels"):
-        np.testing.assert_allclose(blown.read(name), plain.read(name), rtol=1e-6, atol=1e-7)
-    assert np.ptp(blown.read("wind")[:, 0]) > 0.1
+        np.testing.assert_allclose(blown.record(name), plain.record(name), rtol=1e-6, atol=1e-7)
+    assert np.ptp(blown.record("wind")[:, 0]) > 0.1
 
 
 def test_presets_are_known_by_name_and_fly():
     for name in ("calm", "breeze", "fresh_breeze"):
         batch = states_after(world=name)
         assert batch.world == quad_gym.world_params(name)
-        assert np.isfinite(batch.read("r")).all()
+        assert np.isfinite(batch.record("r")).all()
     with pytest.raises(ValueError, match="world must be one of calm"):
         FlightBatch(1, world="storm")
     with pytest.raises(ValueError, match="world must be a WorldParams"):

@@ -80,7 +80,7 @@ def rows_to_compare(envs: int, threads: int, suite: str) -> list[Row]:
     """What is compared: the interfaces at 50 Hz, and the vector interface at 200 Hz."""
     rows: list[Row] = []
     for rate, interfaces in ((50, ("vector", "sb3", "single")), (200, ("vector",))):
-        for observation in ("estimate", "truth", "sensors"):
+        for observation in ("estimate", "truth", "measurements"):
             for interface in interfaces:
                 count, most = (1, 1) if interface == "single" else (envs, threads)
                 options = {"observation": observation, "control_rate": rate, "sensors": suite}

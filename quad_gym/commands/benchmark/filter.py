@@ -25,8 +25,8 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
     recorded = []
     for _ in range(ticks):
         names = ("gyro", "accel", "gnss_position", "gnss_baseline", "pixels")
-        gyro, accel, position, baseline, pixels = (batch.read(name)[flight] for name in names)
-        features = int(batch.read("feature_valid")[flight].sum())
+        gyro, accel, position, baseline, pixels = (batch.record(name)[flight] for name in names)
+        features = int(batch.record("feature_valid")[flight].sum())
         recorded.append(Measured(gyro, accel, position, baseline, pixels[:features]))
         batch.step()
     return recorded
@@ -45,10 +45,10 @@ def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
     for measurements, sensors in ((6, with_camera.replace(camera=None)), (12, with_camera)):
         features = (measurements - 6) // 3
         batch = hovering(count, sensors=sensors)
-        seeing = np.flatnonzero(batch.read("feature_valid").sum(axis=1) == features)
+        seeing = np.flatnonzero(batch.record("feature_valid").sum(axis=1) == features)
         blocks = aligned_zeros(count // WIDTH, FLIGHT_BLOCK)
         for name in FLIGHT_BLOCK.names or ():  # the flights that see all features, over and over
-            values = batch.read(name)[np.resize(seeing, count)]
+            values = batch.record(name)[np.resize(seeing, count)]
             lanes = values.reshape(-1, WIDTH, *values.shape[1:])
             blocks[name] = np.moveaxis(lanes, 1, -1)
         update, predict = Staged(batch, Stage.UPDATE, features), Staged(batch, Stage.PREDICT)

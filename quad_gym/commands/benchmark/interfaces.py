@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 
 import quad_gym
+from quad_gym import sensor_suite
 from quad_gym.analysis.reports import text_table
 from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 
@@ -32,7 +33,7 @@ def time_batch(interface: str, count: int, effort: Effort, threads: int, **optio
         batch = env.unwrapped.flights.batch
         env.reset(seed=0)
     actions, steps = random_actions(count), 0
-    began = batch.read("episode").sum()
+    began = batch.record("episode").sum()
 
     def step() -> None:
         nonlocal steps
@@ -40,7 +41,7 @@ def time_batch(interface: str, count: int, effort: Effort, threads: int, **optio
         steps += count
 
     timing = measure(step, effort).per(count)
-    resets = float((batch.read("episode").sum() - began) / steps)
+    resets = float((batch.record("episode").sum() - began) / steps)
     env.close()
     return interface_row(interface, count, threads, timing, resets, options)
 
@@ -53,6 +54,10 @@ def time_single(effort: Effort, **options: Any) -> Row:
         env, [a[0] for a in itertools.islice(random_actions(1), 16)], effort
     )
     return interface_row("single", 1, 1, timing, resets, options)
+
+
+SLOW = sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
+"""Sensors at low rates; 30 Hz does not divide 200 Hz."""
 
 
 def time_plain_env(env: Any, actions: list[Any], effort: Effort) -> tuple[Timing, float]:
@@ -84,10 +89,11 @@ def interface_row(
     named.pop("threads", None)
     observation, rate = named.pop("observation", "estimate"), named.pop("control_rate", 50)
     suite = named.pop("sensors", "standard")
+    suite = "standard, GNSS 10 Hz, camera 25 Hz" if suite is SLOW else suite
     extra = "".join(f", {key}={value:g}" for key, value in named.items())
     label = f"{interface}, {observation}, {rate} Hz, {suite}{extra}"
     what = {"interface": interface, "envs": count, "threads": threads, "reset_share": resets}
-    return report(label, timing, **what, suite=suite, options=options)
+    return report(label, timing, **what, suite=suite, options=options | {"sensors": suite})
 
 
 def time_others(envs: int, effort: Effort) -> list[Row]:
@@ -131,10 +137,9 @@ def time_interfaces(envs: int, cores: int, effort: Effort) -> list[Row]:
         effort: How long to measure.
     """
     rows: list[Row] = []
-    slow = {"gnss_rate": 10.0, "camera_rate": 25.0}  # 30 Hz does not divide 200 Hz
-    more: tuple[dict[str, Any], ...] = (slow, {"sensors": "lab"}, {"sensors": "rtk"})
+    more = ({"sensors": SLOW}, {"sensors": "lab"}, {"sensors": "rtk"})
     for rate in (200, 50):
-        for observation in ("estimate", "truth", "noisy", "sensors"):
+        for observation in ("estimate", "truth", "noisy", "measurements"):
             what = {"observation": observation, "control_rate": rate}
             for threads in dict.fromkeys((1, cores)):
                 rows.append(time_batch("vector", envs, effort, threads, **what))

@@ -57,8 +57,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
         )
     },
     "midpoint integration": filter_form(integration="midpoint"),
-    "covariance turns at its reset": filter_form(covariance_reset="turn"),
-    "pixel noise as projected": filter_form(bearing_noise_at="pinhole"),
+    "covariance turns at its reset": filter_form(attitude_reset=True),
+    "pixel noise of a pinhole camera": filter_form(bearing_noise_at="pinhole"),
     "images in steps at the start": filter_form(recursive_update_threshold=0.01),
     "innovations kept": {"innovations": True},
     "gate": filter_form(false_alarm_probability=1e-4),

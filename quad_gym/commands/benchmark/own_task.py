@@ -55,7 +55,7 @@ class OwnCircle(Task):
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
         """Errors, directions, rates, reference and action, in the body frame."""
-        seen = view.seen
+        seen = view.observed
         return {
             "position_error": seen.position_error,
             "velocity_error": seen.velocity_error,
@@ -82,8 +82,8 @@ def time_own_task(effort: Effort, threads: int) -> list[Row]:
             "threads": threads,
         }
         envs, steps = [], []
-        for custom in (None, OwnCircle()):
-            more: dict[str, Any] = {} if custom is None else {"custom": custom}
+        for own_task in (None, OwnCircle()):
+            more: dict[str, Any] = {} if own_task is None else {"task": own_task}
             env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **options, **more)
             env.reset(seed=0)
             envs.append(env)

@@ -151,7 +151,7 @@ def _aid(aid: Aid) -> Callable[[Any], bool]:
 
 
 def _raw(s: Any) -> bool:
-    return bool(s["run_filter"] and s["layout"] == Layout.SENSORS)
+    return bool(s["run_filter"] and s["layout"] == Layout.MEASUREMENTS)
 
 
 def _pad(s: Any) -> bool:

@@ -58,7 +58,7 @@ def drifts_suddenly(flight):
 
     Less than the latter does no harm.
     """
-    square, limit = 0.0 * flight.tick, select(flight.lost > 0.0, _LIKELY, _SUDDEN)
+    square, limit = 0.0 * flight.tick, select(flight.diverged > 0.0, _LIKELY, _SUDDEN)
     for i in range(3):
         own = variance_of(flight, R + i)
         total, variance = flight.drift_corrected[i], flight.drift_corrected_variance[i]

@@ -150,10 +150,10 @@ def follow_ratio(flight, p, nis, freedoms, mask):
     measured = mask & (freedoms > 0.0)
     mean = flight.nis_ratio + _RATIO_MEMORY * (ratio - flight.nis_ratio)
     flight.nis_ratio = select(measured, mean, flight.nis_ratio)
-    limit = select(flight.lost > 0.0, FOUND_RATIO, LOST_RATIO)
+    limit = select(flight.diverged > 0.0, FOUND_RATIO, LOST_RATIO)
     in_doubt = (flight.tick - flight.doubt_tick) * p.dt < DOUBT_TIME
     lost = (flight.nis_ratio > limit) | in_doubt
-    flight.lost = select(mask, select(lost, 1.0, 0.0), flight.lost)
+    flight.diverged = select(mask, select(lost, 1.0, 0.0), flight.diverged)
 
 
 @kernel
@@ -183,7 +183,7 @@ def begin_recovery(flight, mask):
             drift = flight.innovation_drift[group, i]
             flight.innovation_drift[group, i] = select(mask, 0.0, drift)
     flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
-    flight.lost = select(mask, 0.0, flight.lost)
+    flight.diverged = select(mask, 0.0, flight.diverged)
     flight.doubt_tick = select(mask, -1e9, flight.doubt_tick)
     flight.fit_tick = select(mask, -1e9, flight.fit_tick)
 

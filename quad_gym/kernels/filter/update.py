@@ -50,13 +50,13 @@ from quad_gym.kernels.measurements.blocks import count, expect
 from quad_gym.kernels.measurements.rows import columns_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import FEATURE_BLOCKS, FilterForm, FilterStatus, Gate
+from quad_gym.records import FEATURE_BLOCKS, FilterForm, FilterStatus, GateDecision
 
 _EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
 _GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _GRADUAL = int(FilterForm.GRADUAL)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
-_UNSURE = float(Gate.UNSURE)
+_UNSURE = float(GateDecision.UNSURE)
 
 
 @kernel

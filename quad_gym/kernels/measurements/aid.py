@@ -40,7 +40,7 @@ from quad_gym.records import (
     Aid,
     FaultKind,
     FilterForm,
-    Gate,
+    GateDecision,
 )
 
 ACTS = len(Act)
@@ -48,7 +48,7 @@ _EXPECT, _JUDGE, _ALIGN = int(Act.EXPECT), int(Act.JUDGE), int(Act.ALIGN)
 _FIRST = int(Stage[Aid(0).name])
 _NUMBERS = tuple(map(float, AID_FREEDOMS))
 _LOSS = int(FaultKind[f"{Aid(0).name}_LOSS"])
-_REJECTED = float(Gate.REJECTED)
+_REJECTED = float(GateDecision.REJECTED)
 _GATE = int(FilterForm.GATE)
 
 for _aid in Aid:  # aid number k has the stage and the fault of number k after the first

@@ -136,7 +136,7 @@ def _center(flight, p, work, settings, k):
             noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
             # a pixel does not move along the optical axis c: less c c^T, across u
             across = add_scaled(R_CB[2], -dot(R_CB[2], u_B), u_B)
-            less = scale(-p.noise_projected * sigma * sigma, across)
+            less = scale(-p.noise_pinhole * sigma * sigma, across)
             put_noise(work, k, has, add_outer(noise, less, across))
             k += 3
 

@@ -29,11 +29,11 @@ from quad_gym.kernels.maths.linalg import (
     unit_or,
 )
 from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import FilterForm, Gate
+from quad_gym.records import FilterForm, GateDecision
 
 _GATE = int(FilterForm.GATE)
-_REJECTED, _ACCEPTED = float(Gate.REJECTED), float(Gate.ACCEPTED)
-_FAILED, _UNSURE = float(Gate.FAILED), float(Gate.UNSURE)
+_REJECTED, _ACCEPTED = float(GateDecision.REJECTED), float(GateDecision.ACCEPTED)
+_FAILED, _UNSURE = float(GateDecision.FAILED), float(GateDecision.UNSURE)
 
 
 @kernel

@@ -105,7 +105,7 @@ def draw_reference(flight, settings, stream, mask):
     u_period, u_sense = uniform_pair(stream, DRAW_COURSE + 1)
     zero = 0.0 * u_phase
     radius, period, phase, sense = zero + settings.radius, zero + settings.period, zero, zero + 1.0
-    if settings.randomize:
+    if settings.randomize_reference:
         phase = 2.0 * math.pi * u_phase
         radius = radius * (0.5 + 0.75 * u_radius)
         period = period * (0.8 + 0.7 * u_period)

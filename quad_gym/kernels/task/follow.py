@@ -38,7 +38,7 @@ def draw_path(flight, settings, stream, mask):
     chosen, share, turn = zero, zero, zero
     for k in range(1, settings.path_count):
         chosen = select(u_path * settings.path_count >= 1.0 * k, 1.0 * k, chosen)
-    if settings.randomize:
+    if settings.randomize_reference:
         share, turn = u_share, 2.0 * math.pi * u_turn
     s, c = sin_cos(turn)
     flight.path = select(mask, chosen, flight.path)

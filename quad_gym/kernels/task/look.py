@@ -26,7 +26,7 @@ def look(flight, model, settings, mask):
     """Set what the controller sees from its source, where `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
-    if settings.source == Source.ESTIMATE or settings.source == Source.SENSORS:
+    if settings.source == Source.ESTIMATE or settings.source == Source.MEASUREMENTS:
         r, v, R_BI = load3(flight.r_hat), load3(flight.v_hat), load33(flight.R_hat)
         w_B = load3(flight.w_meas)
         if settings.source == Source.ESTIMATE:
@@ -54,7 +54,7 @@ def look_within(flight, model, settings):
         w_B = load3(flight.w)
         if source == Source.ESTIMATE:
             w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
-        elif source == Source.SENSORS:
+        elif source == Source.MEASUREMENTS:
             w_B = load3(flight.w_meas)
         elif source == Source.NOISY:
             _, n_w = six_normals(stream_of(flight), DRAW_NOISY + 3)

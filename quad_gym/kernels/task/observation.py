@@ -191,7 +191,7 @@ def observe(flight, p, settings, row):
         settings: What the batch does.
         row: (MAX_OBSERVATION,), receives it.
     """
-    if settings.layout == Layout.SENSORS:
+    if settings.layout == Layout.MEASUREMENTS:
         k = _put_sensors(flight, p, settings, row)
     elif settings.layout == Layout.ABSOLUTE:
         k = _put_absolute(flight, p, settings, row)

@@ -14,7 +14,7 @@ NEAR_WEIGHT, FINE_WEIGHT, HEADING_WEIGHT, ACTION_COST, RATE_COST = 1.0, 0.5, 0.1
 PROGRESS_WEIGHT, GATE_BONUS = 1.0, 1.0
 """Reward of a course: per meter toward the next gate, and per gate passed."""
 
-_FILTER_LOST = float(Ending.FILTER_LOST)
+_FILTER_DIVERGED = float(Ending.FILTER_DIVERGED)
 _TIME_LIMIT, _FILTER_FAILED = float(Ending.TIME_LIMIT), float(Ending.FILTER_FAILED)
 _ON_THE_GROUND, _TIPPED_OVER = float(Ending.BELOW_MIN_HEIGHT), float(Ending.TIPPED_OVER)
 _OUT_OF_BOUNDS, _LAST_GATE = float(Ending.OUT_OF_BOUNDS), float(Ending.LAST_GATE)
@@ -73,15 +73,15 @@ def judge(flight, p, settings, active):
     sound = is_finite(error + dot(w_B, w_B) + R_BI[2][2])
     lost = (error > settings.out_of_bounds) | logical_not(sound)
     tipped = R_BI[2][2] < settings.least_up
-    grounded = flight.r[2] < settings.ground
+    grounded = flight.r[2] < settings.min_height
     terminated = active & (finished | lost | tipped | grounded)
     failed = logical_not(flight.filter_status == 0)
     over = (settings.max_steps > 0.0) & (flight.step >= settings.max_steps)
-    ended = (settings.truncate_when_diverged > 0.0) & (flight.lost > 0.0)
+    ended = (settings.truncate_when_diverged > 0.0) & (flight.diverged > 0.0)
     truncated = active & (over | failed | ended) & logical_not(terminated)
 
     ending = select(over, _TIME_LIMIT, 0.0)
-    ending = select(ended, _FILTER_LOST, ending)
+    ending = select(ended, _FILTER_DIVERGED, ending)
     ending = select(failed, _FILTER_FAILED, ending)
     ending = select(grounded, _ON_THE_GROUND, ending)
     ending = select(tipped, _TIPPED_OVER, ending)

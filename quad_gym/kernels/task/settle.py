@@ -31,9 +31,9 @@ class Verdict(IntEnum):
 _REWARD, _EPISODE_RETURN = int(Result.REWARD), int(Result.EPISODE_RETURN)
 _TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
 _ENDING, _EPISODE_STEPS = int(Result.ENDING), int(Result.EPISODE_STEPS)
-_FILTER_STATUS, _FILTER_LOST = int(Result.FILTER_STATUS), int(Result.FILTER_LOST)
+_FILTER_STATUS, _FILTER_DIVERGED = int(Result.FILTER_STATUS), int(Result.FILTER_DIVERGED)
 _TASK, _TIME_LIMIT = float(Ending.TASK), float(Ending.TIME_LIMIT)
-_FAILED, _LOST = float(Ending.FILTER_FAILED), float(Ending.FILTER_LOST)
+_FAILED, _LOST = float(Ending.FILTER_FAILED), float(Ending.FILTER_DIVERGED)
 
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESULTS, _RESULT_PITCH, _SETTINGS = int(Call.RESULTS), int(Call.RESULT_PITCH), int(Call.SETTINGS)
@@ -103,7 +103,7 @@ def _write_endings(call, verdict, settings):
     terminating, truncating = _bytes_at(terminates, count), _bytes_at(truncates, count)
     terminated, truncated = _result(call, _TERMINATED), _result(call, _TRUNCATED)
     ending, began = _result(call, _ENDING), _bytes_at(verdict[_BEGAN], count)
-    status, lost = _result(call, _FILTER_STATUS), _result(call, _FILTER_LOST)
+    status, lost = _result(call, _FILTER_STATUS), _result(call, _FILTER_DIVERGED)
     steps = _result(call, _EPISODE_STEPS)
     for flight in range(count):
         crashed, done = terminated[flight] > 0.0, terminated[flight] + truncated[flight] > 0.0

@@ -13,7 +13,7 @@ Truths = NDArray[np.bool_]
 _JUDGED = ("reward", "terminated", "truncated", "ending")
 
 
-class Shipped(Group):
+class Builtin(Group):
     """What the id's task says of the step; nothing of flights that have begun an episode since."""
 
     __slots__ = ("_begun",)

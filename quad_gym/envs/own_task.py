@@ -1,4 +1,4 @@
-"""From the keyword `custom` to flights with a user's task."""
+"""From the keyword `task` to flights with a user's task."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,14 +16,14 @@ Table = tuple[ObservationField, ...]
 
 
 def with_task(
-    custom: Any, make: "partial[FlightBatch]", table: Table
+    given: Any, make: "partial[FlightBatch]", table: Table
 ) -> "tuple[partial[FlightBatch], Table]":
     """What makes the flights, and the table of their observation, with a user's task.
 
     What `observe` returns is found by asking it once, of a flight of its own.
 
     Args:
-        custom: See `resolve_task`.
+        given: See `resolve_task`.
         make: Makes the flights without it.
         table: Of their observation.
 
@@ -31,9 +31,11 @@ def with_task(
         ValueError: If it is no task, or a part of its observation has a shipped name.
         TaskError: If its `reset` or `observe` fail.
     """
-    task = resolve_task(custom)
+    task = resolve_task(given)
     split = policy_size(table)
-    under: Callable[..., TaskBatch] = partial(TaskBatch, **make.keywords, custom=task, split=split)
+    under: Callable[..., TaskBatch] = partial(
+        TaskBatch, **make.keywords, own_task=task, split=split
+    )
     if not task.has("observe"):
         return under, table  # type: ignore[return-value]
     first = under(1, threads=1)

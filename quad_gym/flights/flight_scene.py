@@ -1,4 +1,4 @@
-"""`Stage`: where a flight takes place and what flies; what a picture needs besides the rows."""
+"""`FlightScene`: place and vehicle of a flight, which a picture needs besides the rows."""
 
 import functools
 from dataclasses import dataclass, field
@@ -12,13 +12,13 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Stage:
+class FlightScene:
     """What stays as it is during a flight."""
 
     task: str
     """kind of task"""
     observation: str
-    """what the controller saw: "truth", "estimate", "noisy" or "sensors" """
+    """what the controller saw: "truth", "estimate", "noisy" or "measurements" """
     control_rate: float
     """rows per second [Hz]"""
     rotor_positions_B: Floats

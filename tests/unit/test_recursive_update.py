@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.records import Gate
+from quad_gym.records import GateDecision
 from quad_gym.sensors import Camera
 from tests.field_flights import fly, state_errors
 from tests.filter_states import set_at_rest
@@ -14,7 +14,7 @@ from tests.unit.alarms import ALARM
 INDOOR = quad_gym.sensor_suite("indoor").simplified()
 
 
-def with_gradual(above, kind="ukf"):
+def with_recursive(above, kind="ukf"):
     camera = INDOOR.camera.replace(phase=0.0)
     estimator = INDOOR.estimator.replace(recursive_update_threshold=above, kind=kind)
     return INDOOR.replace(camera=camera, estimator=estimator)
@@ -22,7 +22,7 @@ def with_gradual(above, kind="ukf"):
 
 def started(above, sigma, gate=0.0):
     """A filter before its first image, with an attitude known to `sigma`, and what it sees."""
-    suite = with_gradual(above)
+    suite = with_recursive(above)
     suite = suite.replace(estimator=suite.estimator.replace(false_alarm_probability=gate))
     ukf = quad_gym.UnscentedKalmanFilter(suite)
     P = np.diag(np.repeat([0.05, 0.03, sigma, 0.2, 0.01], 3) ** 2)
@@ -60,7 +60,7 @@ def test_a_feature_that_the_gate_refuses_is_left_out_of_every_step():
     without[seen[0]] = np.nan
     wrong.update(pixels=corrupt)
     clean.update(pixels=without)
-    assert (wrong.gate_decisions == Gate.REJECTED).sum() == 1
+    assert (wrong.gate_decisions == GateDecision.REJECTED).sum() == 1
     np.testing.assert_allclose(wrong.position, clean.position, atol=1e-6)
     np.testing.assert_allclose(wrong.covariance, clean.covariance, rtol=1e-4, atol=1e-12)
 
@@ -69,11 +69,11 @@ def test_a_feature_that_the_gate_refuses_is_left_out_of_every_step():
 def test_a_rough_start_is_consistent_after_the_first_image_in_steps_only(kind):
     sums = {}
     for above in (0.01, None):
-        batch = fly(with_gradual(above, kind), 2000, task="hover")
-        errors, L = state_errors(batch), batch.read("L")
+        batch = fly(with_recursive(above, kind), 2000, task="hover")
+        errors, L = state_errors(batch), batch.record("L")
         white = np.linalg.solve(L, errors[..., np.newaxis])[..., 0]
         sums[above] = (white**2).sum()
-        assert (batch.read("feature_valid").sum(axis=1) > 0).mean() > 0.99
+        assert (batch.record("feature_valid").sum(axis=1) > 0).mean() > 0.99
     expected = stats.chi2(15 * 2000)
     assert expected.cdf(sums[0.01]) < 1.0 - ALARM
     assert expected.cdf(sums[0.01]) > ALARM

@@ -1,0 +1,35 @@
+"""Arms of a study of which standard deviations matter to a policy.
+
+    quad-gym study stale_race --arms-file baselines/arms_masked.py
+
+All fly StaleRace with the pretrained policy, which was trained with all fifteen in its observation.
+Nothing is trained. A masked standard deviation is shown as its constant median.
+"""
+
+from baselines.arms import Arm
+
+_BLOCKS = {
+    "POSITION": "the position's",
+    "VELOCITY": "the velocity's",
+    "ATTITUDE": "the attitude's",
+    "ACCEL_BIAS": "the accelerometer bias's",
+    "GYRO_BIAS": "the gyro bias's",
+}
+
+
+def _flown(task: str, label: str) -> Arm:
+    return Arm(
+        name=task.lower(),
+        label=label,
+        policy="pretrained",
+        environment={"task": f"baselines.arm_tasks:{task}"},
+    )
+
+
+ARMS = (
+    _flown("ALL_SHOWN", "all 15 standard deviations"),
+    *(_flown(f"{name}_MASKED", f"all but {label}") for name, label in _BLOCKS.items()),
+    *(_flown(f"ONLY_{name}", f"only {label}") for name, label in _BLOCKS.items()),
+    _flown("NONE_SHOWN", "none"),
+)
+"""Those of `QuadGym/StaleRace-v0`."""

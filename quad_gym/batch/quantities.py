@@ -1,0 +1,246 @@
+"""Quantities of flights by their public names, and where the records of flights have them.
+
+Records and kernels have the symbols of the report (`r`, `v_hat`, `b_a`). A `Flight`, the view of a
+task, the estimators and `FlightBatch.read` have words, the same everywhere. `QUANTITIES` is the
+only table of both.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params import checks as check
+from quad_gym.records import HEADING_ALONG, HEADING_VELOCITY, Aid
+from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
+
+if TYPE_CHECKING:
+    from quad_gym.batch.flight_batch import FlightBatch
+
+Floats = NDArray[np.float64]
+Flights = NDArray[np.intp] | None
+Computed = Callable[["FlightBatch", Flights], NDArray[Any]]
+
+
+class Quantity(NamedTuple):
+    """One quantity of a batch of flights."""
+
+    of: str | Computed
+    """the field of the records, or a function that computes it"""
+    shape: tuple[int | str, ...]
+    """for one flight; a word: as many as there are of these"""
+    unit: str
+    frame: str
+    """I: inertial (east, north, up), B: body, C: image; "-": none"""
+    meaning: str
+    kind: type = float
+    filtered: bool = False
+    """whether only flights have it in which a filter, and so sensors, run"""
+
+
+def read(batch: "FlightBatch", name: str, flights: Flights) -> NDArray[Any]:
+    """A quantity of flights as a new array (n, ...); see `FlightBatch.read`.
+
+    Raises:
+        ValueError: If there is no such quantity, or no filter runs that would estimate it.
+    """
+    quantity = QUANTITIES.get(name) if isinstance(name, str) else None
+    if quantity is None:
+        drawn = batch.randomization.names
+        known = (*QUANTITIES, *drawn)
+        meant = check.did_you_mean(name, known) or f": one of {', '.join(known)}"
+        raise ValueError(f"name must be a quantity of flights, got {name!r}{meant}")
+    if quantity.filtered and not batch.run_filter:
+        raise ValueError(f"{name} needs a filter, and none runs in these flights")
+    of = quantity.of
+    values = batch.record(of, flights) if isinstance(of, str) else of(batch, flights)
+    if quantity.kind is bool:
+        return np.asarray(values > 0.0)
+    return values if quantity.kind is float else values.astype(np.int64)
+
+
+# ---- what follows from the records ------------------------------------------------------------
+
+
+def _of_rows(turn: Callable[[Floats], Floats], values: Floats, shape: tuple[int, ...]) -> Floats:
+    """Attitudes in another form, NaN where a flight has none or has left the finite numbers."""
+    flat = values.reshape(len(values), -1)
+    good = np.isfinite(flat).all(axis=1) & flat.any(axis=1)
+    found = np.full((len(values), *shape), np.nan)
+    if good.any():
+        found[good] = turn(values[good])
+    return found
+
+
+def _quaternions(field: str) -> Computed:
+    """Quaternions of a field of matrices."""
+    return lambda batch, flights: _of_rows(dcm_to_quaternion, batch.record(field, flights), (4,))
+
+
+def _true_R_BI(batch: "FlightBatch", flights: Flights) -> Floats:
+    return _of_rows(quaternion_to_dcm, batch.record("q", flights), (3, 3))
+
+
+def _time(batch: "FlightBatch", flights: Flights) -> Floats:
+    return np.asarray(batch.record("tick", flights) * batch.sensors.imu.dt)
+
+
+def _estimated_rates(batch: "FlightBatch", flights: Flights) -> Floats:
+    return np.asarray(batch.record("w_meas", flights) - batch.record("b_g_hat", flights))
+
+
+def _gates(batch: "FlightBatch", flights: Flights) -> Floats:
+    count = batch.task.gate_count if batch.task.kind == "waypoints" else 0
+    return np.ascontiguousarray(batch.record("gates", flights)[:, :count])
+
+
+def _obstacles(batch: "FlightBatch", flights: Flights) -> Floats:
+    count = len(batch.world.obstacles)
+    return np.ascontiguousarray(batch.record("obstacle_center", flights)[:, :count])
+
+
+def _obstacle_distance(batch: "FlightBatch", flights: Flights) -> Floats:
+    found = batch.record("obstacle_distance", flights)
+    return found if batch.world.obstacles else np.full_like(found, np.inf)
+
+
+def _features(batch: "FlightBatch", flights: Flights) -> Floats:
+    places = batch.feature_places()
+    return np.array(places if flights is None else places[flights])
+
+
+def _reference(which: int) -> Computed:
+    """Position, velocity, acceleration or heading of the reference at the present instant."""
+
+    def of(batch: "FlightBatch", flights: Flights) -> Floats:
+        if batch.task.kind == "trajectory":
+            return batch.record(f"path_{'rvax'[which]}", flights)
+        return _series(batch, flights)[which]
+
+    return of
+
+
+def _series(batch: "FlightBatch", flights: Flights) -> tuple[Floats, Floats, Floats, Floats]:
+    """(r*, v*, a*, x*) of a reference that is a finite Fourier series, (n, 3) each."""
+    cosines, sines = batch.record("ref_cos", flights), batch.record("ref_sin", flights)
+    rate = batch.record("ref_omega", flights)[:, np.newaxis] * np.arange(1, 1 + cosines.shape[1])
+    angle, rate = rate * _time(batch, flights)[:, np.newaxis], rate[..., np.newaxis]
+    c, s = np.cos(angle)[..., np.newaxis], np.sin(angle)[..., np.newaxis]
+    swing = cosines * c + sines * s
+    r_ref = batch.record("ref_center", flights) + swing.sum(axis=1)
+    v_ref = (rate * (sines * c - cosines * s)).sum(axis=1)
+    a_ref = -(rate**2 * swing).sum(axis=1)
+    point = batch.record("ref_heading_point", flights)
+    rule = batch.record("ref_heading_rule", flights)[:, np.newaxis]
+    along = np.where(rule == HEADING_VELOCITY, v_ref, point - r_ref)
+    level = np.where(rule == HEADING_ALONG, point, along) * (1.0, 1.0, 0.0)
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    x_ref = np.where(length > 1e-30, level / np.maximum(length, 1e-30), (1.0, 0.0, 0.0))
+    return r_ref, v_ref, a_ref, x_ref
+
+
+def _measured(batch: "FlightBatch", flights: Flights, flag: str) -> NDArray[np.bool_]:
+    """A mask of measurements since the last step, or at the start of the episode."""
+    fresh = batch.record(f"{flag}_fresh", flights) + batch.record(f"{flag}_valid", flights)
+    return np.asarray(fresh > 0.0)
+
+
+def _gnss(field: str, flag: str) -> Computed:
+    """A vector that GNSS measures, turned from G to I."""
+
+    def of(batch: "FlightBatch", flights: Flights) -> Floats:
+        measured, gnss = _measured(batch, flights, flag), batch.sensors.gnss
+        if field == "gnss_velocity" and (gnss is None or gnss.velocity_sigma is None):
+            measured[:] = False
+        turned = batch.record(field, flights) @ batch.R_IG.T
+        return np.where(measured[:, np.newaxis], turned, np.nan)
+
+    return of
+
+
+def _pixels(batch: "FlightBatch", flights: Flights) -> Floats:
+    count = 0 if batch.sensors.camera is None else len(batch.sensors.camera.features_I)
+    measured = _measured(batch, flights, "feature")[:, :count, np.newaxis]
+    return np.where(measured, batch.record("pixels", flights)[:, :count], np.nan)
+
+
+def _aid(aid: Aid) -> Computed:
+    """The measurement of an aiding sensor."""
+
+    def of(batch: "FlightBatch", flights: Flights) -> Floats:
+        measured = _measured(batch, flights, "aid")[:, aid, np.newaxis]
+        found = np.where(measured, batch.record("aid_measurement", flights)[:, aid], np.nan)
+        return found[:, 0] if aid == Aid.BAROMETER else found
+
+    return of
+
+
+# fmt: off
+QUANTITIES = {
+    "time": Quantity(_time, (), "s", "-", "since the start of the episode"),
+    "step": Quantity("step", (), "-", "-", "control steps since the start of the episode", int),
+    # the truth
+    "position": Quantity("r", (3,), "m", "I", "of the center of mass"),
+    "velocity": Quantity("v", (3,), "m/s", "I", "of the center of mass"),
+    "quaternion": Quantity("q", (4,), "-", "B to I", "attitude, unit quaternion (w, x, y, z)"),
+    "R_BI": Quantity(_true_R_BI, (3, 3), "-", "I to B", "attitude, v_B = R_BI v_I"),
+    "body_rates": Quantity("w", (3,), "rad/s", "B", "angular rate"),
+    "rotor_speeds": Quantity("rotor_speeds", (4,), "rad/s", "-", "of the four rotors"),
+    "accel_bias": Quantity("b_a", (3,), "m/s^2", "B", "of the accelerometer"),
+    "gyro_bias": Quantity("b_g", (3,), "rad/s", "B", "of the gyro"),
+    "gnss_drift": Quantity("gnss_drift", (3,), "m", "I", "time-correlated error of GNSS positions"),
+    "disturbance": Quantity("disturbance", (3,), "N", "I", "external force on the body"),
+    "wind": Quantity("wind", (3,), "m/s", "I", "velocity of the air"),
+    "faults": Quantity("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`", int),
+    # the filter's estimate
+    "estimated_position": Quantity("r_hat", (3,), "m", "I", "estimate of `position`", filtered=True),
+    "estimated_velocity": Quantity("v_hat", (3,), "m/s", "I", "estimate of `velocity`", filtered=True),
+    "estimated_quaternion": Quantity(_quaternions("R_hat"), (4,), "-", "B to I", "estimate of `quaternion`", filtered=True),
+    "estimated_R_BI": Quantity("R_hat", (3, 3), "-", "I to B", "estimate of `R_BI`", filtered=True),
+    "estimated_body_rates": Quantity(_estimated_rates, (3,), "rad/s", "B", "measured rates minus the estimated bias", filtered=True),
+    "estimated_accel_bias": Quantity("b_a_hat", (3,), "m/s^2", "B", "estimate of `accel_bias`", filtered=True),
+    "estimated_gyro_bias": Quantity("b_g_hat", (3,), "rad/s", "B", "estimate of `gyro_bias`", filtered=True),
+    "estimated_gnss_drift": Quantity("gnss_drift_hat", (3,), "m", "I", "estimate of `gnss_drift`", filtered=True),
+    "filter_status": Quantity("filter_status", (), "bits", "-", "numerical failures so far, see `FilterStatus`", int),
+    "filter_diverged": Quantity("diverged", (), "-", "-", "the covariance does not explain the last innovations", bool),
+    "nis": Quantity("nis", (), "-", "-", "normalized innovation squared of the last update", filtered=True),
+    "nis_dimension": Quantity("nis_dimension", (), "-", "-", "measurements in the last update", int, filtered=True),
+    # the state that the controller observes: the truth, the estimate, or the truth with noise
+    "observed_position": Quantity("r_seen", (3,), "m", "I", "position from the controller's source"),
+    "observed_velocity": Quantity("v_seen", (3,), "m/s", "I", "velocity from the controller's source"),
+    "observed_quaternion": Quantity(_quaternions("R_seen"), (4,), "-", "B to I", "attitude from the controller's source"),
+    "observed_R_BI": Quantity("R_seen", (3, 3), "-", "I to B", "attitude from the controller's source"),
+    "observed_body_rates": Quantity("w_seen", (3,), "rad/s", "B", "angular rate from the controller's source"),
+    # the last measurements since the last step, NaN where there was none
+    "gyro": Quantity("gyro", (3,), "rad/s", "B", "angular rate", filtered=True),
+    "accel": Quantity("accel", (3,), "m/s^2", "B", "specific force", filtered=True),
+    "gnss_position": Quantity(_gnss("gnss_position", "position"), (3,), "m", "I", "primary antenna", filtered=True),
+    "gnss_baseline": Quantity(_gnss("gnss_baseline", "baseline"), (3,), "m", "I", "primary to secondary antenna", filtered=True),
+    "gnss_velocity": Quantity(_gnss("gnss_velocity", "position"), (3,), "m/s", "I", "of the primary antenna, where the receiver gives it", filtered=True),
+    "pixels": Quantity(_pixels, ("features", 2), "pixels", "C", "features, from the image's center", filtered=True),
+    "barometer": Quantity(_aid(Aid.BAROMETER), (), "m", "-", "altitude", filtered=True),
+    "magnetometer": Quantity(_aid(Aid.MAGNETOMETER), (3,), "T", "B", "magnetic field", filtered=True),
+    # the task
+    "action": Quantity("action", (4,), "-", "-", "the present action, in [-1, 1]"),
+    "last_action": Quantity("last_action", (4,), "-", "-", "the action before it"),
+    "reference_position": Quantity(_reference(0), (3,), "m", "I", "of the reference; on a course, the next gate"),
+    "reference_velocity": Quantity(_reference(1), (3,), "m/s", "I", "of the reference"),
+    "reference_acceleration": Quantity(_reference(2), (3,), "m/s^2", "I", "of the reference"),
+    "reference_heading": Quantity(_reference(3), (3,), "-", "I", "horizontal direction in which body x is to point"),
+    "gates": Quantity(_gates, ("gates", 3), "m", "I", "centers of the course's gates, in order"),
+    "gates_passed": Quantity("gate_next", (), "-", "-", "gates passed in this episode", int),
+    "reward": Quantity("reward", (), "-", "-", "of the last step"),
+    "terminated": Quantity("terminated", (), "-", "-", "the last step ended the episode by a crash or at the goal", bool),
+    "truncated": Quantity("truncated", (), "-", "-", "the last step ended the episode by its time limit or a failed filter", bool),
+    "ending": Quantity("ending", (), "-", "-", "why the episode ended, see `Ending`", int),
+    "position_error": Quantity("position_error", (), "m", "-", "distance of the true position from the reference"),
+    "estimation_error": Quantity("estimation_error", (), "m", "-", "distance of the observed from the true position"),
+    # the surroundings
+    "features": Quantity(_features, ("features", 3), "m", "I", "features of the camera, where the filter assumes them"),
+    "obstacles": Quantity(_obstacles, ("obstacles", 3), "m", "I", "centers of the world's obstacles"),
+    "obstacle_distance": Quantity(_obstacle_distance, (), "m", "-", "from the nearest obstacle's surface, negative inside, infinite without obstacles"),
+    "on_ground": Quantity("footing", (), "-", "-", "the ground pushes a foot, in a world whose ground carries vehicles", bool),
+}
+"""Every quantity that `FlightBatch.read` returns, by its name."""
+# fmt: on
