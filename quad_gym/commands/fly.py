@@ -282,12 +282,12 @@ def open_window(args: Args) -> Window:
     """A window to watch in.
 
     Raises:
-        OSError: If there is no screen.
+        OSError: If there is no display.
     """
     try:
-        return Window(args.size, f"quad_gym: {IDS[args.env_id]}", watched=True)
+        return Window(args.size, f"quad_gym: {IDS[args.env_id]}")
     except RuntimeError as error:
-        raise OSError(f"{error}; --output writes a video instead") from None
+        raise OSError(f"{error}; without a display, --output writes a video instead") from None
 
 
 def write(flight: Flight, path: Path, args: Args) -> list[Path]:

@@ -1,4 +1,7 @@
-"""Rendering, the same for all interfaces of an environment; imports nothing until it is used."""
+"""Rendering, the same for all interfaces of an environment; imports nothing until it is used.
+
+Pygame is imported with the first picture: environments with a render mode can be made without it.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -34,7 +37,6 @@ def rendering_of(
 
     Raises:
         ValueError: If an argument is invalid.
-        ImportError: If it is to render and pygame is not installed.
     """
     given: dict[str, Any] = {"view": render_view, "size": render_size, "flights": render_flights}
     given = {name: value for name, value in given.items() if value is not None}

@@ -12,7 +12,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.flights.record import Flight, FlightRecorder
 from quad_gym.params import checks as check
 from quad_gym.rendering.canvas import load_pygame
-from quad_gym.rendering.renderer import Renderer, tile
+from quad_gym.rendering.renderer import VIEWS, Renderer, checked_size, tile
 
 RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
 """What Gymnasium's `render_mode` may be, besides None."""
@@ -20,7 +20,7 @@ WINDOW_RATE = 50.0
 """The most pictures a second that a window shows [Hz]."""
 
 _INVISIBLE = ("offscreen", "dummy")
-"""Drivers that SDL falls back on where there is no display, and on which nobody sees a window."""
+"""Drivers that SDL falls back on where there is no display: their windows cannot be seen."""
 
 
 class Window:
@@ -29,26 +29,24 @@ class Window:
     Args:
         size: Width and height [pixels].
         title: Of the window.
-        watched: Whether it is there to be watched, so that one that nobody can see is refused.
 
     Raises:
-        RuntimeError: If there is no screen to open a window on.
+        RuntimeError: If there is no display to open a window on. A driver without a display, such
+            as "dummy", is used only if the environment variable SDL_VIDEODRIVER names it.
+        ImportError: If pygame is not installed.
     """
 
-    def __init__(self, size: tuple[int, int], title: str, *, watched: bool = False) -> None:
+    def __init__(self, size: tuple[int, int], title: str) -> None:
         self._pygame = load_pygame()
         try:
             self._pygame.display.init()
             driver = self._pygame.display.get_driver()
-            if watched and driver in _INVISIBLE and "SDL_VIDEODRIVER" not in os.environ:
-                raise self._pygame.error(f"no display was found, only the driver {driver!r}")
+            if driver in _INVISIBLE and "SDL_VIDEODRIVER" not in os.environ:
+                raise self._pygame.error("no display was found")
             self._screen = self._pygame.display.set_mode(size)
         except self._pygame.error as error:
             self._pygame.display.quit()
-            raise RuntimeError(
-                f"cannot open a window ({error}); where there is no screen, use "
-                'render_mode="rgb_array"'
-            ) from None
+            raise RuntimeError(f"cannot open a window: {error}") from None
         self._pygame.display.set_caption(title)
         self._due = time.monotonic()
         self.closed = False
@@ -86,7 +84,8 @@ class Window:
 class Rendering:
     """What an environment needs to render: it keeps its flights and draws them when asked.
 
-    It reads the batch and never changes it.
+    It reads the batch and never changes it. Pygame is imported with the first picture, so that
+    environments can be made without it: Stable-Baselines3 asks for "rgb_array" by default.
 
     Args:
         batch: The environment's flights.
@@ -97,7 +96,6 @@ class Rendering:
 
     Raises:
         ValueError: If an argument is invalid.
-        ImportError: If pygame is not installed.
     """
 
     def __init__(
@@ -117,7 +115,8 @@ class Rendering:
         self._recorders = [
             FlightRecorder(batch, check.whole("render_flights", i, least=0)) for i in chosen
         ]
-        self._renderers = [Renderer(view, size) for _ in self._recorders]
+        self._look = check.choice("render_view", view, VIEWS), checked_size(size)
+        self._renderers: list[Renderer] = []
         self.frame_rate = batch.clocks.control_rate
         self._frames: list[tuple[NDArray[np.uint8], ...]] = []
         self._window: Window | None = None
@@ -145,7 +144,10 @@ class Rendering:
 
         Raises:
             ValueError: If there is no flight yet.
+            ImportError: If pygame is not installed.
         """
+        if not self._renderers:
+            self._renderers = [Renderer(*self._look) for _ in self._recorders]
         pairs = zip(self._renderers, self._recorders, strict=True)
         return tuple(renderer.draw(recorder.flight) for renderer, recorder in pairs)
 
@@ -178,9 +180,18 @@ class Rendering:
         seconds, self._waiting = self._waiting, 0.0
         picture = tile(list(self.frames()))
         if self._window is None:
-            self._window = Window((picture.shape[1], picture.shape[0]), self._title)
+            self._window = self._open((picture.shape[1], picture.shape[0]))
         self._window.pressed_keys()
         self._window.show(picture, seconds)
+
+    def _open(self, size: tuple[int, int]) -> Window:
+        try:
+            return Window(size, self._title)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f'{error}. Without a display, use render_mode="rgb_array" for pictures, or set '
+                "SDL_VIDEODRIVER=dummy to run without a visible window."
+            ) from None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_window": None}  # a copy opens its own

@@ -128,10 +128,10 @@ def test_wrong_options_are_one_line_and_write_nothing(tmp_path, options, message
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_screen_the_window_is_a_clear_error(tmp_path):
+def test_without_a_display_the_window_is_a_clear_error(tmp_path):
     done = fly("hover", cwd=tmp_path, SDL_VIDEODRIVER="x11")
     assert done.returncode == 2
-    assert "--output writes a video instead" in done.stderr
+    assert "without a display, --output writes a video instead" in done.stderr
 
 
 def test_keys_change_the_flight_while_one_watches():

@@ -60,7 +60,8 @@ def test_what_stands_by_is_drawn_without_a_camera():
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_gymnasiums_checker_is_content(env_id):
+def test_gymnasiums_checker_is_content(env_id, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # it opens a window, too
     check_env(gymnasium.make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=False)
 
 
@@ -260,6 +261,7 @@ assert "pygame" not in sys.modules
 before = dict(os.environ)
 env = gymnasium.make("QuadGym/Hover-v0", render_mode="rgb_array")
 env.reset(seed=0), env.step(np.zeros(4, np.float32))
+assert "pygame" not in sys.modules
 assert env.render().shape == (480, 640, 3)
 env.close(), env.close()
 import pygame
@@ -271,19 +273,30 @@ assert dict(os.environ) == before
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
-def test_a_missing_pygame_gives_the_install_hint():
+def test_without_pygame_environments_that_ask_for_pictures_fly_and_render_gives_the_hint():
+    """Stable-Baselines3 asks for "rgb_array" wherever it makes an environment from an id."""
     done = run_python(
         """
 import sys
 sys.modules["pygame"] = None
-import gymnasium, quad_gym
+import gymnasium, numpy as np, quad_gym
+made = dict(render_mode="rgb_array", observation="truth")
+env = gymnasium.make("QuadGym/Hover-v0", **made)
+vector = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, **made)
+env.reset(seed=0), env.step(np.zeros(4)), vector.reset(seed=0), vector.step(np.zeros((2, 4)))
 try:
-    gymnasium.make("QuadGym/Hover-v0", render_mode="rgb_array")
-except ImportError as error:
+    gymnasium.make("QuadGym/Hover-v0", render_mode="rgb_array", render_view="side")
+except ValueError as error:
     print(error)
+for e in (env, vector):
+    try:
+        e.render()
+    except ImportError as error:
+        print(error)
 """
     )
-    assert 'pip install "quad-gym[render]"' in done.stdout, done.stderr
+    assert "render_view must be one of" in done.stdout, done.stderr
+    assert done.stdout.count('pip install "quad-gym[render]"') == 2
 
 
 def test_a_window_shows_the_flight_and_closes_twice():
@@ -305,35 +318,24 @@ assert not pygame.display.get_init()
     assert done.returncode == 0, done.stderr
 
 
-def test_a_window_without_a_screen_is_a_clear_error():
-    done = run_python(
-        """
+OPEN_A_WINDOW = """
 from quad_gym.envs.single import QuadEnv
 env = QuadEnv("hover", observation="truth", render_mode="human")
 try:
     env.reset(seed=0)
 except RuntimeError as error:
     print(error)
-""",
-        SDL_VIDEODRIVER="x11",
-    )
-    assert "cannot open a window" in done.stdout, done.stderr
+"""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
-def test_no_window_is_opened_where_nobody_sees_it():
+@pytest.mark.parametrize("variables", [{}, {"SDL_VIDEODRIVER": "x11"}])
+def test_a_window_without_a_display_is_an_error_that_says_what_to_do(variables):
     """SDL falls back on a driver without a display, silently, and a flight would go on for ever."""
-    done = run_python(
-        """
-from quad_gym.rendering.live import Window
-try:
-    Window((320, 240), "unseen")
-    Window((320, 240), "unseen", watched=True)
-except RuntimeError as error:
-    print(error)
-"""
-    )
-    assert "cannot open a window" in done.stdout, done.stderr
+    done = run_python(OPEN_A_WINDOW, **variables)
+    assert "cannot open a window: " in done.stdout, done.stderr
+    assert 'render_mode="rgb_array"' in done.stdout
+    assert "SDL_VIDEODRIVER=dummy" in done.stdout
 
 
 def test_environments_that_render_can_be_copied():
