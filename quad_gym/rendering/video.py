@@ -191,6 +191,9 @@ def write_frames(
 ) -> None:
     """Write pictures (height, width, 3) of one size as a video, by the file's ending.
 
+    The file gets its name when it is complete: where writing is interrupted, there is none, and a
+    file that was there before stays as it is.
+
     Args:
         frames: The pictures.
         path: Of the file; missing folders are made.
@@ -198,10 +201,15 @@ def write_frames(
         lossless: Of WebP: keep every pixel. Where most of the picture rests that takes less room.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".mp4":
-        _write_mp4(iter(frames), path, fps)
-    else:
-        _write_animation(frames, path, fps, lossless)
+    unfinished = path.with_name(f"{path.stem}.part{path.suffix}")
+    try:
+        if path.suffix.lower() == ".mp4":
+            _write_mp4(iter(frames), unfinished, fps)
+        else:
+            _write_animation(frames, unfinished, fps, lossless)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:

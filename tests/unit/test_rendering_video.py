@@ -184,6 +184,25 @@ def test_animations_have_the_frames_of_the_flight(flight, tmp_path, ending):
     assert abs(last - Renderer("fixed", (320, 240)).draw(flight)).mean() < 6.0
 
 
+@pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
+def test_an_interrupted_video_leaves_what_was_there_before(flight, tmp_path, ending):
+    def interrupted(times):
+        for k, time in enumerate(times):
+            if k == 3:
+                raise KeyboardInterrupt
+            yield time
+
+    file = tmp_path / f"hover.{ending}"
+    for before in (None, b"an earlier video"):
+        if before is not None:
+            file.write_bytes(before)
+        with pytest.raises(KeyboardInterrupt):
+            save_video(flight, file, size=(320, 240), fps=10.0, progress=interrupted)
+        assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == (
+            {} if before is None else {file.name: before}
+        )
+
+
 def test_a_policy_is_flown_and_filmed_in_one_call(tmp_path):
     flown = record_video(
         Still(),
