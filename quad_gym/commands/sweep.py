@@ -3,9 +3,11 @@
     quad-gym sweep sweep.toml
     quad-gym sweep sweep.toml --executor slurm --options slurm_partition=long mem_gb=4
     quad-gym sweep --engine compiled --env sensors=standard,rtk --set gamma=0.97,0.99 --seeds 5
+    quad-gym sweep sweep.toml --steps 300000 --n-envs 64 256 --output results/sweep/short
     quad-gym sweep sweep.toml --dry-run
 
-Values separated by commas are tried one by one, as are lists in the file. Each training is a folder
+Several values are tried one by one: with key=value they are separated by commas, in the file they
+are lists. Each training is a folder
 of what quad-gym train writes. Trainings run as processes of this machine, as jobs of Slurm (through
 submitit) or as tasks of Ray. One that dies starts again from its checkpoint; a sweep that was
 stopped, or killed, continues when it is started again; two sweeps in one folder share the work. The
@@ -49,10 +51,14 @@ class Args:
     """how to learn; if not given, ppo"""
     engine: Literal["sb3", "compiled"] | None = None
     """what trains; if not given, sb3"""
+    steps: tuple[int, ...] = ()
+    """environment steps of a training; if not given, the recipe's"""
+    n_envs: tuple[int, ...] = ()
+    """flights at a time; if not given, the recipe's"""
     set: Keywords = field(default_factory=dict)
     """parameters of the algorithm in place of the recipe's, such as gamma=0.97,0.99"""
     recipe: Keywords = field(default_factory=dict)
-    """fields of the recipe, such as steps=300000 n_envs=64,256"""
+    """other fields of the recipe, such as reward_scale=0.1,0.2"""
     seeds: int | None = None
     """training seeds; if not given, 1"""
     evaluations: int | None = None
@@ -104,6 +110,9 @@ def _given(args: Args, found: dict[str, Any]) -> dict[str, Any]:
     for name in ("env_ids", "arms", "algorithm"):
         if values := getattr(args, name):
             found[name] = list(values)
+    for name in ("steps", "n_envs"):
+        if values := getattr(args, name):
+            found[name] = list(values) if len(values) > 1 else values[0]
     for name in ("engine", "seeds", "evaluations", "episodes"):
         if (value := getattr(args, name)) is not None:
             found[name] = value

@@ -18,8 +18,10 @@ from quad_gym.commands.options import known_id
 from quad_gym.params import checks as check
 
 RECORD = "training.json"
-_ALONE = {"algorithm": "algorithm", "parameters": "set", "flights": None, "policy": None}
-"""Fields of a recipe that `recipe` does not take, with what to give instead."""
+_SINGLE = ("algorithm", "steps", "n_envs")
+"""Fields of a recipe that are keys by themselves."""
+_ELSEWHERE = {**{name: name for name in _SINGLE}, "parameters": "set"}
+"""Fields of a recipe that `recipe` does not take, with the keys to use instead."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,10 @@ class Spec:
     arms: list[str] = field(default_factory=list)
     """names of arms of a study; none: environments as `env` has them"""
     algorithm: Any = "ppo"
+    steps: Any = None
+    """environment steps; None: the recipe's"""
+    n_envs: Any = None
+    """flights at a time; None: the recipe's"""
     engine: str = "sb3"
     seeds: Any = 1
     """a number of them from 0 on, or a list"""
@@ -41,7 +47,7 @@ class Spec:
     set: Mapping[str, Any] = field(default_factory=dict)
     """parameters of the algorithm"""
     recipe: Mapping[str, Any] = field(default_factory=dict)
-    """fields of the recipe"""
+    """other fields of the recipe"""
 
 
 NAMES = tuple(f.name for f in fields(Spec))
@@ -157,10 +163,12 @@ def _products(spec: Spec) -> Iterator[dict[tuple[str, str], Any]]:
     for table in TABLES:
         for key, value in getattr(spec, table).items():
             axes[table, key] = value if isinstance(value, list) else [value]
-    axes["", "algorithm"] = spec.algorithm if isinstance(spec.algorithm, list) else [spec.algorithm]
+    for key in _SINGLE:
+        if (value := getattr(spec, key)) is not None:
+            axes["", key] = value if isinstance(value, list) else [value]
     for (table, key), values in axes.items():
         if not values:
-            raise ValueError(f"{table}.{key} must have at least one value")
+            raise ValueError(f"{f'{table}.{key}' if table else key} must have at least one value")
     for combination in itertools.product(*axes.values()):
         yield dict(zip(axes, combination, strict=True))
 
@@ -177,10 +185,14 @@ def _plan(
     arm = arm or Arm(name="none", label="none")
     if arm.policy is not None:
         raise ValueError(f"arms must be trained, got {arm.name}, whose policy is {arm.policy}")
-    chosen: Recipe = recipe(env_id, tables[""]["algorithm"])
+    chosen: Recipe = recipe(env_id, tables[""].pop("algorithm"))
+    others = [f.name for f in fields(Recipe) if f.name not in (*_ELSEWHERE, "flights", "policy")]
     for name in tables["recipe"]:
-        check.choice("recipe", name, [f.name for f in fields(Recipe) if f.name not in _ALONE])
+        if name in _ELSEWHERE:
+            raise ValueError(f"recipe must not hold {name}: use {_ELSEWHERE[name]} instead")
+        check.choice("recipe", name, others)
     chosen = chosen.replace(
+        **tables[""],
         **tables["recipe"],
         parameters={**chosen.parameters, **arm.parameters, **tables["set"]},
     )
@@ -210,7 +222,8 @@ def _name(spec: Spec, env_id: str, arm: str | None, axes: Mapping[tuple[str, str
     words += [
         f"{key}={_word(value)}"
         for (table, key), value in axes.items()
-        if table and isinstance(getattr(spec, table)[key], list)
+        if key != "algorithm"
+        and isinstance(getattr(spec, table)[key] if table else getattr(spec, key), list)
     ]
     return ",".join(words)
 

@@ -25,7 +25,8 @@ evaluations = 40
 episodes = 4
 env = {duration = 1.0, observation = "truth"}
 set = {n_steps = 16, batch_size = 128, n_epochs = 1, gamma = [0.97, 0.9, 0.8]}
-recipe = {steps = 40960, n_envs = 16}
+steps = 40960
+n_envs = 16
 """
 
 
@@ -93,6 +94,19 @@ def test_options_replace_what_the_file_has(tmp_path):
     assert not (tmp_path / "results").exists()
 
 
+def test_steps_and_flights_are_options_as_those_of_train(tmp_path):
+    (tmp_path / "mine.toml").write_text("steps = 40960\nn_envs = 16")
+    options = ("mine.toml", "--dry-run", "--steps", "1000", "--n-envs", "8", "4")
+    done = console_commands.run("sweep", *options, where=tmp_path)
+    assert done.returncode == 0, done.stderr
+    *folders, last = done.stdout.splitlines()
+    runs = "results/sweep/mine/runs/circle,ppo"
+    assert folders == [f"{runs},n_envs=8/seed_0", f"{runs},n_envs=4/seed_0"]
+    assert last == "2 trainings, 2,000 steps."
+    plans = [t.plan.recipe for t in expand({"steps": 1000, "n_envs": [8, 4]}, {}, tmp_path)]
+    assert [(recipe.steps, recipe.n_envs) for recipe in plans] == [(1000, 8), (1000, 4)]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -109,7 +123,11 @@ def test_options_replace_what_the_file_has(tmp_path):
         ('algorithm = ["alphago"]', "algorithm must be one of ppo"),
         ("episodes = 1.5", "episodes must be a whole number"),
         ("set = {gamma = []}", "set.gamma must have at least one value"),
-        ("recipe = {parameters = {gamma = 1}}", "recipe must be one of steps"),
+        ("recipe = {parameters = {gamma = 1}}", "recipe must not hold parameters: use set instead"),
+        ("recipe = {steps = 1000}", "recipe must not hold steps: use steps instead"),
+        ("recipe = {policy = {}}", "recipe must be one of learning_rate"),
+        ("steps = 0", "Recipe.steps must be at least 1, got 0"),
+        ("n_envs = []", "n_envs must have at least one value"),
         ('engine = "compiled"\nset = {gama = 0.9}', "circle,compiled_ppo: "),
         ('engine = "compiled"\nenv = {radius = -1}', "radius must be greater than 0"),
         ("env = {threads = 1}", "--env must leave threads to --threads"),
