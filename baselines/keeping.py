@@ -120,7 +120,7 @@ class RunKeeper(ABC):
     def begin(self, steps: int) -> None:
         """Start clock and bar of a training that has done `steps` steps; all is compiled now."""
         if not self._quiet:
-            from tqdm import tqdm
+            from tqdm.auto import tqdm
 
             total = self._plan.recipe.steps
             self._bar = tqdm(total=total, initial=steps, unit=" steps", unit_scale=True)

@@ -92,19 +92,33 @@ class CompiledPPO:
         self._seen: NDArray[np.float32] | None = None
         self._returns, self._finished = np.zeros(env.num_envs), deque[float](maxlen=_EPISODES)
 
-    def learn(self, steps: int, watch: Callable[["CompiledPPO"], bool] | None = None) -> None:
+    def learn(
+        self,
+        steps: int,
+        watch: Callable[["CompiledPPO"], bool] | None = None,
+        *,
+        quiet: bool = False,
+    ) -> None:
         """Train until `steps` environment steps have been made in all.
 
         Args:
             steps: Over all flights; the last rollout is completed.
             watch: Called before every rollout, where nothing is half done; False ends the training.
+            quiet: Whether to leave out the progress bar.
         """
+        from tqdm.auto import tqdm
+
         self.prepare()
         first, last = self.recipe.learning_rate
-        while self.num_timesteps < steps and (watch is None or watch(self)):
-            self._roll_out()
-            remaining = 1.0 - self.num_timesteps / steps
-            self.losses = self.learner.learn(last + (first - last) * remaining, self._rng)
+        begun = min(self.num_timesteps, steps)
+        look: dict[str, Any] = {"unit": " steps", "unit_scale": True, "disable": quiet}
+        with tqdm(total=steps, initial=begun, **look) as bar:
+            while self.num_timesteps < steps and (watch is None or watch(self)):
+                self._roll_out()
+                remaining = 1.0 - self.num_timesteps / steps
+                self.losses = self.learner.learn(last + (first - last) * remaining, self._rng)
+                bar.set_postfix_str(f"return {self.training_return:.1f}", refresh=False)
+                bar.update(min(self.num_timesteps, steps) - bar.n)
 
     def prepare(self) -> None:
         """Begin the first episodes, and compile what is not compiled yet."""

@@ -107,7 +107,7 @@ def run(
     with keeper:
         model.prepare()
         keeper.begin(model.num_timesteps)
-        model.learn(plan.recipe.steps, watch)
+        model.learn(plan.recipe.steps, watch, quiet=True)  # the keeper has a bar
         keeper.finish(model, model.num_timesteps)
     if keeper.events is not None:
         keeper.events.close()
