@@ -3,7 +3,6 @@ PYTHON ?= python3
 JOBS ?= 2
 VENV := .venv
 OLDEST := .venv-oldest
-CLIENTS := .venv-clients
 BIN := $(VENV)/bin
 # pip compiles to bytecode one file after the other, and the tests of all packages
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
@@ -62,14 +61,8 @@ $(OLDEST)/.tester: pyproject.toml constraints-oldest.txt
 		--editable ".[train,plot,render]" pytest hypothesis
 	touch $@
 
-test-clients: $(CLIENTS)/.tester  ## examples of docs/libraries.md: RLlib, TorchRL, Minari and others
-	$(CLIENTS)/bin/python -m pytest -q tests/clients "tests/contract/test_documentation.py::test_programs_run[libraries.md]"
-
-$(CLIENTS)/.tester: pyproject.toml constraints-clients.txt
-	$(PYTHON) -m venv $(CLIENTS)
-	$(CLIENTS)/bin/python -m pip install --quiet --constraint constraints-clients.txt \
-		--editable ".[clients]" pytest hypothesis
-	touch $@
+test-clients:  ## each client of docs/libraries.md in an environment of its own; CLIENTS="torchrl minari": these
+	$(PYTHON) tests/clients/run.py $(CLIENTS)
 
 test-slow: $(VENV)/.sweeper  ## the slow tests: statistics, soak, many processes
 	$(BIN)/python -m pytest -m slow
@@ -102,4 +95,4 @@ wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they ho
 	$(BIN)/check-wheel-contents dist/*.whl
 
 clean:
-	rm -rf $(VENV) $(OLDEST) $(CLIENTS) build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLDEST) .venv-clients build dist results docs/_build docs/generated docs/tutorials .mypy_cache .pytest_cache .ruff_cache .hypothesis

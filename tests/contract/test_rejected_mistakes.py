@@ -269,6 +269,11 @@ def test_an_unknown_task_is_refused():
         QuadEnv("loop")
 
 
+def test_an_unknown_keyword_is_refused_in_the_words_that_torchrl_looks_for():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+        gymnasium.make("QuadGym/Hover-v0", frameskip=1)
+
+
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("mode", ["Sometimes", None, 1])
 def test_an_unknown_autoreset_mode_is_refused(env_id, mode):

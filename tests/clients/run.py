@@ -1,0 +1,72 @@
+"""Test each client of docs/libraries.md in an environment of its own, installed as the page says.
+
+    python tests/clients/run.py                # all of them
+    python tests/clients/run.py torchrl minari
+
+What the line `pip install ...` in a section of the page names is installed into .venv-clients/NAME,
+with the versions of constraints-clients.txt. Then the client's tests run, and the programs of the
+page. An environment is used again until that line, the constraints or pyproject.toml change.
+"""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "libraries.md"
+CONSTRAINTS = ROOT / "constraints-clients.txt"
+SECTION = re.compile(r"^## (.+?)\n(.*?)(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+INSTALL = re.compile(r"^pip install (.+)$", re.MULTILINE)
+PROGRAMS = "tests/contract/test_documentation.py::test_programs_run[libraries.md]"
+
+
+def clients():
+    """What the page installs, by the names of its sections in lower case."""
+    sections = SECTION.findall(PAGE.read_text(encoding="utf-8"))
+    found = {name.lower(): INSTALL.search(text) for name, text in sections}
+    return {name: shlex.split(line[1], comments=True) for name, line in found.items() if line}
+
+
+def installed(name, packages):
+    """The Python of a client's environment, which is made where it is missing or out of date."""
+    folder = ROOT / ".venv-clients" / name
+    python, stamp = folder / "bin" / "python", folder / "installed.txt"
+    files = (CONSTRAINTS, ROOT / "pyproject.toml")
+    wanted = "\n".join([*packages, *(file.read_text(encoding="utf-8") for file in files)])
+    if not stamp.exists() or stamp.read_text(encoding="utf-8") != wanted:
+        subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)
+        pip = [python, "-m", "pip", "install", "--quiet", "--no-compile", "-c", CONSTRAINTS]
+        subprocess.run([*pip, *packages, "pytest", "hypothesis"], cwd=ROOT, check=True)
+        stamp.write_text(wanted, encoding="utf-8")
+    return python
+
+
+def passes(name, packages):
+    """Whether a client can be installed and passes its tests."""
+    print(f"==== {name}: pip install {shlex.join(packages)}", flush=True)
+    try:
+        python = installed(name, packages)
+        for tests in (f"tests/clients/test_{name.replace('-', '_')}.py", PROGRAMS):
+            # where the client cannot be imported, nothing is collected, which fails
+            subprocess.run([python, "-m", "pytest", "-q", tests], cwd=ROOT, check=True)
+    except subprocess.CalledProcessError as error:
+        print(f"==== {name} failed: {error}", flush=True)
+        return False
+    return True
+
+
+def main(names):
+    """Test some clients, or all; return the exit code."""
+    known = clients()
+    if unknown := set(names) - set(known):
+        print(f"clients must be of {', '.join(known)}, got {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    failed = [name for name in names or known if not passes(name, known[name])]
+    print(f"==== failed: {', '.join(failed)}" if failed else "==== all clients passed")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
