@@ -1,6 +1,7 @@
 """The records of many flights in memory: how they are read, kept and brought back."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,6 +147,23 @@ class FlightMemory:
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset
 
+    def copied_record(self, flight: int) -> NDArray[np.uint64]:
+        """The whole record of one flight at the present instant, for `with_records`."""
+        block, lane = divmod(flight, WIDTH)
+        return _lanes(self._blocks[block : block + 1])[0, :, lane].copy()
+
+    def with_records(self, records: Sequence[NDArray[np.uint64]]) -> Self:
+        """Flights with copied records, to `read` from: not to be stepped or reset."""
+        found = object.__new__(type(self))
+        found.__dict__.update(self.__dict__)
+        found.count = len(records)
+        found._blocks = aligned_zeros(-(-found.count // WIDTH), self._room.dtype)
+        lanes = _lanes(found._blocks)
+        for flight, record in enumerate(records):
+            block, lane = divmod(flight, WIDTH)
+            lanes[block, :, lane] = record
+        return found
+
     # ---- switching ----------------------------------------------------------------------------
 
     def switch_sensors(
@@ -192,3 +210,8 @@ class FlightMemory:
             if active:
                 self._blocks["fault_from"][:, fault.kind] = tick
             self._blocks["fault_until"][:, fault.kind] = np.inf if active else tick
+
+
+def _lanes(blocks: NDArray[Any]) -> NDArray[np.uint64]:
+    """The memory of blocks as words of eight bytes, which all fields have: (blocks, n, WIDTH)."""
+    return blocks.view(np.uint64).reshape(len(blocks), -1, WIDTH)

@@ -211,6 +211,8 @@ class FlightRecorder:
         features = 0 if camera is None else len(camera.features_I)
         self._rows = np.zeros(256, row_dtype(features))
         self._count = 0
+        self._copies: list[NDArray[np.uint64]] = []
+        """instants after the rows: copying a record takes a hundredth of the time of a row"""
         self._scene: FlightScene | None = None
         self._model = params_record(batch.vehicle, batch.sensors)[0]
 
@@ -223,58 +225,31 @@ class FlightRecorder:
         """
         if self._scene is None:
             raise ValueError("there is no flight yet: reset the environment first")
+        self._fill_rows(self._scene)
         return Flight(self._rows[: self._count], self._scene, self._about)
 
     def keep(self) -> None:
         """Keep the present instant; the first of an episode begins a new flight."""
-        tick = self._read("tick")
+        tick = self._batch.record("tick", self._which)[0]
         if tick == 0.0 or self._scene is None:
             self._rows, self._count = np.zeros_like(self._rows), 0  # earlier flights live on
             self._scene = self._scene_of_episode()
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._fill(self._rows[self._count])
-        self._count += 1
+            self._copies = []
+        self._copies.append(self._batch.copied_record(int(self._which[0])))
+
+    def _fill_rows(self, scene: FlightScene) -> None:
+        """Make rows of the copies."""
+        if not self._copies:
+            return
+        batch, self._copies = self._batch.with_records(self._copies), []
+        for k in range(batch.count):
+            if self._count == len(self._rows):
+                self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+            _fill(self._rows[self._count], batch, np.array([k]), scene)
+            self._count += 1
 
     def _read(self, name: str) -> Any:
         return self._batch.record(name, self._which)[0]
-
-    def _fill(self, row: Any) -> None:
-        runs = self._batch.run_filter
-        for name in _READ:
-            if runs or name not in _WITH_FILTER:
-                row[name] = self._batch.read(name, self._which)[0]
-        assert self._scene is not None
-        row["reference_position"] = self._scene.reference(row["time"])[0]
-        if self._scene.task == "waypoints":
-            row["reference_position"] = self._read("ref_center")
-        if runs:
-            self._fill_covariance(row)
-            self._fill_decisions(row)
-        else:
-            for name in _WITH_FILTER:
-                row[name] = np.nan
-
-    def _fill_covariance(self, row: Any) -> None:
-        factor, R_hat = self._read("L"), self._read("R_hat")
-        row["covariance"] = factor @ factor.T
-        words = ("position", "velocity", "accel_bias", "gyro_bias")
-        truth = {word: row[word] for word in words}
-        estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
-        try:
-            truth["R_BI"] = quaternion_to_dcm(row["quaternion"])
-            row["nees"] = nees(state_error(truth, estimate), row["covariance"])
-        except ValueError:  # a state that is not finite, or a singular covariance: nothing to say
-            row["nees"] = np.nan
-
-    def _fill_decisions(self, row: Any) -> None:
-        """Decisions of the filter's gate, NaN where nothing was measured."""
-        gate = self._read("gate")
-        for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
-            row["gnss_decision"][block] = np.nan if np.isnan(row[name]).all() else gate[block]
-        seen = np.isfinite(row["pixels"]).all(axis=1)
-        decisions = gate[FEATURE_BLOCKS:AID_BLOCKS][: len(seen)]
-        row["feature_decision"] = np.where(seen, decisions, np.nan)
 
     def _scene_of_episode(self) -> FlightScene:
         batch, model = self._batch, self._model
@@ -331,3 +306,48 @@ class FlightRecorder:
             "trajectory_closed": trajectory.closed,
             "trajectory_phase": phase,
         }
+
+
+def _fill(row: Any, batch: FlightBatch, which: NDArray[np.intp], scene: FlightScene) -> None:
+    """Fill a row with the present instant of one flight.
+
+    Args:
+        row: Record with the fields of `COLUMNS`.
+        batch: The flights.
+        which: (1,) which of them.
+        scene: Of its episode.
+    """
+    for name in _READ:
+        if batch.run_filter or name not in _WITH_FILTER:
+            row[name] = batch.read(name, which)[0]
+    row["reference_position"] = scene.reference(row["time"])[0]
+    if scene.task == "waypoints":
+        row["reference_position"] = batch.record("ref_center", which)[0]
+    if batch.run_filter:
+        factor, R_hat, gate = (batch.record(name, which)[0] for name in ("L", "R_hat", "gate"))
+        _fill_covariance(row, factor, R_hat)
+        _fill_decisions(row, gate)
+    else:
+        for name in _WITH_FILTER:
+            row[name] = np.nan
+
+
+def _fill_covariance(row: Any, factor: Floats, R_hat: Floats) -> None:
+    row["covariance"] = factor @ factor.T
+    words = ("position", "velocity", "accel_bias", "gyro_bias")
+    truth = {word: row[word] for word in words}
+    estimate = {word: row[f"estimated_{word}"] for word in words} | {"R_BI": R_hat}
+    try:
+        truth["R_BI"] = quaternion_to_dcm(row["quaternion"])
+        row["nees"] = nees(state_error(truth, estimate), row["covariance"])
+    except ValueError:  # a state that is not finite, or a singular covariance: nothing to say
+        row["nees"] = np.nan
+
+
+def _fill_decisions(row: Any, gate: Floats) -> None:
+    """Decisions of the filter's gate, NaN where nothing was measured."""
+    for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
+        row["gnss_decision"][block] = np.nan if np.isnan(row[name]).all() else gate[block]
+    seen = np.isfinite(row["pixels"]).all(axis=1)
+    decisions = gate[FEATURE_BLOCKS:AID_BLOCKS][: len(seen)]
+    row["feature_decision"] = np.where(seen, decisions, np.nan)

@@ -13,6 +13,7 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym import Flight, FlightRecorder
 from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, GnssOutliers
 from quad_gym.flights.files import table
 from quad_gym.flights.flight_scene import FlightScene
@@ -187,6 +188,34 @@ def test_long_flights_have_room():
     )
     assert len(flight) == 601
     assert (np.diff(flight["time"]) > 0.0).all()
+
+
+def test_rows_are_the_same_whether_they_are_asked_for_at_once_or_at_the_end():
+    """An episode ends on the way, so that the copies of another one are dropped."""
+    env = QuadVectorEnv(11, "circle", autoreset_mode="SameStep", max_episode_steps=9)
+    at_once, at_the_end = (FlightRecorder(env.flights.batch, 10) for _ in range(2))
+    env.reset(seed=1)
+    for action in np.random.default_rng(0).uniform(-0.3, 0.3, (30, 11, 4)):
+        for recorder in (at_once, at_the_end):
+            recorder.keep()
+        assert np.isfinite(at_once.flight["position"]).all()
+        env.step(action)
+    assert len(at_the_end.flight) == 3
+    assert_same_flights(at_once.flight, at_the_end.flight)
+
+
+def test_nothing_is_drawn_or_computed_for_pictures_that_nobody_asks_for(monkeypatch):
+    """Stable-Baselines3 asks for "rgb_array" in training, and never renders."""
+    monkeypatch.setattr("quad_gym.flights.record._fill", None)
+    monkeypatch.setattr("quad_gym.rendering.live.Renderer", None)
+    for render_mode in (None, "rgb_array"):
+        env = QuadEnv("hover", render_mode=render_mode, max_episode_steps=5)
+        for _ in range(2):
+            env.reset(seed=0)
+            for _ in range(5):
+                env.step(np.zeros(4))
+    with pytest.raises(TypeError):
+        env.render()
 
 
 def test_a_flight_that_is_not_there_is_refused():
