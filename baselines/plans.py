@@ -12,6 +12,7 @@ from baselines.seeds import MAX_SEED, first_seed
 from quad_gym.analysis.reports import as_json
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
+from quad_gym.params.suites import contents_of_suite_files
 
 if TYPE_CHECKING:
     from baselines.scaled_reward import ScaledReward
@@ -106,6 +107,8 @@ def description(plan: Plan) -> dict[str, Any]:
     del found["threads"]  # changes no result
     if not plan.learning:
         del found["learning"]
+    given = (plan.environment.get("sensors"), plan.learning.get("sensors"))
+    found |= as_json(contents_of_suite_files(*given))
     found["first_flights"] = {
         "training": first_seed("training", plan.seed, plan.recipe.n_envs),
         "validation": first_seed("validation", plan.seed, plan.episodes),

@@ -1,6 +1,7 @@
 """The numbers that a suite's filter is computed with, as JSON or a header of C."""
 
 import json
+import re
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ def filter_header(suite: SensorSuite, name: str) -> str:
         name: Of the suite, for the comment and the guard.
     """
     found = filter_numbers(suite)
-    guard = f"QUAD_GYM_FILTER_{name.upper()}_H"
+    guard = f"QUAD_GYM_FILTER_{re.sub(r'[^A-Z0-9]', '_', name.upper())}_H"
     lines = [
         f'/* The filter of the sensor suite "{name}"; quad_gym {quad_gym.__version__}.',
         " * SI units; I: inertial, east, north, up; B: body, x ahead, y left, z up; C: camera.",

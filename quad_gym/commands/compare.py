@@ -54,7 +54,7 @@ from quad_gym.commands.options import (
 from quad_gym.commands.train import require_model
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params import checks as check
-from quad_gym.params.suites import sensor_suite
+from quad_gym.params.suites import sensor_suite, suite_label
 
 QUICK_SEEDS, QUICK_EPISODES = 1, 200
 GRACE = 60.0
@@ -115,6 +115,9 @@ def configure(args: Args) -> Setting:
     require_at_least(args, seeds=1, episodes=2, seed=0, jobs=1)
     for source in args.train_on:
         check.choice("--train-on", source, SOURCES)
+    labels = [suite_label(suite) for suite in args.sensors]
+    if len(set(labels)) < len(labels):
+        raise ValueError(f"--sensors must have different names, got {' '.join(labels)}")
     leave(args.env, {"observation": "--train-on", "sensors": "--sensors", "threads": "--jobs"})
     chosen = recipe(args.env_id, args.algorithm)
     if args.steps is not None:

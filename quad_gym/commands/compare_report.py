@@ -20,6 +20,7 @@ from quad_gym.analysis.intervals import mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import text_table
 from quad_gym.commands.compare_flights import Floats, Flown
+from quad_gym.params.suites import contents_of_suite_files, suite_label
 
 NAMES = {
     "PD": "PD, tuned",
@@ -57,7 +58,7 @@ class Setting:
     def run_folder(self, key: Any) -> Path:
         """Where a training, or PD, is kept."""
         suite, source, seed = key
-        place = self.folder / "runs" / suite / source
+        place = self.folder / "runs" / suite_label(suite) / source
         return place if seed is None else place / f"seed_{seed}"
 
     def description(self) -> dict[str, Any]:
@@ -73,6 +74,7 @@ class Setting:
             "episodes": self.episodes,
             "first_episode": self.first_episode,
             "environment": self.environment,
+            **contents_of_suite_files(*self.suites),
         }
 
 
@@ -226,7 +228,7 @@ def write_figures(comparison: Comparison) -> dict[str, list[Path]]:
     setting = comparison.setting
     figures: dict[str, Any] = {}
     for suite in setting.suites:
-        sources = rows_of(comparison)
+        sources, label = rows_of(comparison), suite_label(suite)
         curves = {
             NAMES[s]: [
                 (x[1:] / 1e6, y[1:])
@@ -236,9 +238,9 @@ def write_figures(comparison: Comparison) -> dict[str, list[Path]]:
         }
         level = {"PD, tuned, on the estimate": comparison.cell(suite, "PD", "estimate").errors[0]}
         title = f"Evaluated on what is trained on, sensors {suite}"
-        figures[f"learning_{suite}"] = learning_figure(curves, level, title)
+        figures[f"learning_{label}"] = learning_figure(curves, level, title)
         cells = [[comparison.cell(suite, s, on) for on in ("truth", "estimate")] for s in sources]
-        figures[f"matrix_{suite}"] = matrix_figure(
+        figures[f"matrix_{label}"] = matrix_figure(
             np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells]),
             [[cell.text() for cell in row] for row in cells],
             [NAMES[s] for s in sources],
@@ -246,11 +248,11 @@ def write_figures(comparison: Comparison) -> dict[str, list[Path]]:
             f"Mean position error [mm], sensors {suite}",
         )
         first = {NAMES[s]: comparison.flights(suite, s, "estimate")[0] for s in sources}
-        figures[f"errors_{suite}"] = error_over_time_figure(
+        figures[f"errors_{label}"] = error_over_time_figure(
             {name: (f.time, f.percentiles) for name, f in first.items()},
             f"Flown on the estimate, first training seed, sensors {suite}",
         )
-        figures[f"paths_{suite}"] = paths_figure(
+        figures[f"paths_{label}"] = paths_figure(
             {name: f.trace for name, f in first.items()},
             f"From above, flown on the estimate, sensors {suite}",
         )
@@ -296,7 +298,7 @@ def write_page(
         parts.append(f"<h2>Sensors {html.escape(suite)}</h2>{_table(comparison, suite)}")
         for name, files in figures.items():
             kind, _, of = name.partition("_")
-            if of == suite:
+            if of == suite_label(suite):
                 data = base64.b64encode(files[0].read_bytes()).decode()
                 parts.append(
                     f'<figure><img alt="{html.escape(_CAPTIONS[kind])}" '

@@ -44,7 +44,7 @@ from quad_gym.commands.options import (
 )
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.faults.presets import felt_without_sensors
-from quad_gym.params.suites import sensor_suite
+from quad_gym.params.suites import contents_of_suite_files, sensor_suite
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 
 
@@ -236,6 +236,7 @@ def write(
             for (name, observation), episodes in results.items()
         ],
         "units": {"errors": "m", "rates": "share of episodes"},
+        **contents_of_suite_files(args.sensors),
         "arguments": replace(args, policy=tuple(dict.fromkeys(name for name, _ in results))),
         "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
     }

@@ -99,9 +99,10 @@ def configure(args: Args) -> tuple[str, Path]:
 def _name(args: Args) -> str:
     """The stem of the file if none is given."""
     from quad_gym import IDS
+    from quad_gym.params.suites import suite_label
 
     if args.policy == "filter":
-        return f"filter_{args.sensors}"
+        return f"filter_{suite_label(args.sensors)}"
     if args.policy == "pretrained":
         return IDS.get(full_id(args.env_id or ""), "policy")
     path = Path(args.policy).with_suffix("")
@@ -134,10 +135,10 @@ def export_policy(args: Args, kind: str, file: Path) -> str:
 def export_filter(args: Args, kind: str, file: Path) -> str:
     """Write the numbers of a filter; returns what to tell."""
     from baselines.exporting.filter_numbers import filter_header, filter_json
-    from quad_gym.params.suites import sensor_suite
+    from quad_gym.params.suites import sensor_suite, suite_label
 
-    suite = sensor_suite(args.sensors)
-    text = filter_json(suite) if kind == "json" else filter_header(suite, args.sensors)
+    suite, name = sensor_suite(args.sensors), suite_label(args.sensors)
+    text = filter_json(suite) if kind == "json" else filter_header(suite, name)
     file.write_text(text, encoding="utf-8")
     return f'The numbers of the {suite.estimator.kind.upper()} of the suite "{args.sensors}".'
 

@@ -309,19 +309,21 @@ Seed = Annotated[int, tyro.conf.arg(name="seed")]
 FilterStart = tyro.conf.arg(name="filter-start")
 """How the filter starts, as the keyword of environments."""
 
-SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {', '.join(ALL_SUITES)}")]
-"""The name of a sensor suite."""
+_OR_FILE = f"{', '.join(ALL_SUITES)}, or a file of SensorSuite.save (.toml)"
+
+SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {_OR_FILE}")]
+"""The name of a sensor suite, or its file."""
 
 OwnSuite = Annotated[
     str | None,
     tyro.conf.arg(
-        help=f"sensor suite: {', '.join(ALL_SUITES)}; if not given, the task's own, which for most "
-        "is standard"
+        help=f"sensor suite: {_OR_FILE}; if not given, the task's own, which for most is standard"
     ),
 ]
 """The name of a sensor suite, or None for the task's own."""
 
 SuiteNames = Annotated[
-    tuple[str, ...], tyro.conf.arg(help=f"sensor suites, of {', '.join(SUITES)}")
+    tuple[str, ...],
+    tyro.conf.arg(help=f"sensor suites, of {', '.join(SUITES)}, or files of suites (.toml)"),
 ]
 """Names of sensor suites."""

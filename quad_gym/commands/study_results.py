@@ -25,6 +25,7 @@ from quad_gym.analysis.reports import as_json
 from quad_gym.commands.study_flights import Flown
 from quad_gym.commands.study_tasks import ALWAYS, StudiedTask
 from quad_gym.kernels.compiling.digest import flights_digest
+from quad_gym.params.suites import contents_of_suite_files
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +72,8 @@ class Study:
         policy = Path(self.policy_of(arm, seed))
         trained = hashlib.sha256(policy.read_bytes()).hexdigest() if policy.is_file() else ""
         flight = [self.env_id, about, self.episodes, self.first_episode, arm.policy, trained]
-        given = as_json([*flight, self.about.traced, flights_digest()])
+        files = contents_of_suite_files(about.get("sensors"))
+        given = as_json([*flight, self.about.traced, flights_digest(), *files.values()])
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:12]
 
     def steps(self) -> str:

@@ -7,6 +7,7 @@ laboratory's numbers from the Aerial Robotics course (ASE 479W, The University o
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from quad_gym.params import checks as check
 from quad_gym.params.aids import AidParams
@@ -17,6 +18,7 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
+from quad_gym.params.suite_files import SUFFIX, text_of
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
 AID_PARAMS: dict[str, type[AidParams]] = {
@@ -122,6 +124,25 @@ class SensorSuite(Checked):
                 check.ticks(f"{params.__name__}.rate", sensor.rate, self.imu.rate)
                 label = f"{params.__name__}.latency"
                 delay_ticks(label, sensor.latency, sensor.rate, self.imu.rate)
+
+    def save(self, file: str | Path) -> Path:
+        """Write the suite to a file, to edit it, and to read it with `quad_gym.sensor_suite`.
+
+        Args:
+            file: A path that ends with ".toml"; replaced if it is there.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: If the path ends otherwise.
+            OSError: If it cannot be written.
+        """
+        path = Path(file)
+        if path.suffix != SUFFIX:
+            raise ValueError(f"file must end with {SUFFIX}, got {str(file)!r}")
+        path.write_text(text_of(self), encoding="utf-8")
+        return path
 
     @property
     def aids(self) -> dict[Aid, AidParams]:

@@ -31,6 +31,8 @@ the body rates is the gyro's noise together with the error of its estimated bias
 """
 
 import math
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +44,7 @@ from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
 from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
+from quad_gym.params.suite_files import SUFFIX, read_suite
 
 _MILLI_G = 9.80665e-3
 _DEG_PER_HOUR = math.radians(1.0) / 3600.0
@@ -281,6 +284,46 @@ ALL_SUITES = tuple(_ALL)
 """The same, and those that belong to one task."""
 
 
-def sensor_suite(name: str) -> SensorSuite:
-    """The sensor suite called `name`: one of ALL_SUITES; "lab" is the report's to the letter."""
-    return _ALL[check.choice("sensors", name, ALL_SUITES)]
+def sensor_suite(name: str | Path) -> SensorSuite:
+    """A built-in sensor suite, or the suite in a file.
+
+    Args:
+        name: One of ALL_SUITES, where "lab" is exactly the report's; or a file that ends with
+            ".toml", as `SensorSuite.save` writes it, see `quad_gym.params.suite_files`.
+
+    Raises:
+        ValueError: If there is no such suite, or a name or value in the file is invalid.
+        OSError: If the file cannot be read.
+    """
+    if is_suite_file(name):
+        return read_suite(Path(name), SensorSuite, _base)  # type: ignore[no-any-return]
+    if not isinstance(name, str) or name not in _ALL:
+        raise ValueError(
+            f"sensors must be one of {', '.join(ALL_SUITES)}, or a file of a suite (.toml), got "
+            f"{name!r}{check.did_you_mean(name, ALL_SUITES)}"
+        )
+    return _ALL[name]
+
+
+def is_suite_file(name: Any) -> bool:
+    """True for the name of a file of a suite."""
+    return isinstance(name, str | Path) and Path(name).suffix == SUFFIX
+
+
+def suite_label(name: str) -> str:
+    """The name of a suite in titles and names of files: for a file, without folder and ending."""
+    return Path(name).stem if is_suite_file(name) else name
+
+
+def contents_of_suite_files(*names: Any) -> dict[str, Any]:
+    """Suites in files, as an entry of a record of results: a file may change later.
+
+    Args:
+        names: Values of the keyword `sensors`; those that are no files have no entry.
+    """
+    found = {str(name): sensor_suite(name) for name in names if is_suite_file(name)}
+    return {"suite_files": found} if found else {}
+
+
+def _base(name: Any) -> SensorSuite:
+    return _ALL[check.choice("base", name, ALL_SUITES)]

@@ -1,0 +1,117 @@
+"""Sensor suites as TOML: a table for each sensor, with the fields of its parameters by name.
+
+    base = "consumer"  # optional: the file changes this suite
+    camera = "none"    # no camera; "none" stands for None
+
+    [gnss]
+    primary_antenna_B = [0.0, 0.0, 0.12]
+
+Units are SI, angles in rad. Without `base` all tables are required; fields that a table leaves out
+have the defaults of its class, which are the laboratory's.
+"""
+
+import dataclasses
+import json
+import tomllib
+import types
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from quad_gym.params import checks as check
+
+SUFFIX = ".toml"
+"""Ending of the names of such files."""
+
+_NONE = "none"
+_HEAD = "# Sensor suite of quad_gym; units are SI, angles in rad.\n\n"
+
+
+def text_of(suite: Any) -> str:
+    """A suite as TOML, exactly: floating-point numbers have all their digits."""
+    values = {field.name: getattr(suite, field.name) for field in dataclasses.fields(suite)}
+    tables = {name: v for name, v in values.items() if dataclasses.is_dataclass(v)}
+    parts = [_lines({name: v for name, v in values.items() if name not in tables})]
+    for name, table in tables.items():
+        fields = {field.name: getattr(table, field.name) for field in dataclasses.fields(table)}
+        parts.append(f"[{name}]\n{_lines(fields)}")
+    return _HEAD + "\n".join(part for part in parts if part)
+
+
+def read_suite(file: Path, kind: type, base_of: Callable[[Any], Any]) -> Any:
+    """The suite in a file.
+
+    Args:
+        file: A path.
+        kind: `SensorSuite`.
+        base_of: From the value of `base` to a suite.
+
+    Raises:
+        ValueError: If the file is no TOML, or a name or value in it is invalid.
+        OSError: If it cannot be read.
+    """
+    try:
+        given = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} must be a file of TOML: {error}") from None
+    try:
+        base = base_of(given.pop("base")) if "base" in given else None
+        if base is None:
+            _require_tables(kind, given)
+        return _built(kind, given, base, "")
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def _require_tables(kind: type, given: Mapping[str, Any]) -> None:
+    """Refuse a file without a base that leaves out a table whose default is not None."""
+    for field in dataclasses.fields(kind):
+        if field.default is not None and field.name not in given:
+            raise ValueError(f'there must be a table [{field.name}], or base = "NAME" of a suite')
+
+
+def _built(kind: Any, given: Mapping[str, Any], base: Any, where: str) -> Any:
+    """An instance of a dataclass, from `base` if there is one, with the given fields."""
+    hints, names = typing.get_type_hints(kind), [f.name for f in dataclasses.fields(kind)]
+    changes: dict[str, Any] = {}
+    for name, value in given.items():
+        if name not in names:
+            meant = check.did_you_mean(name, names) or f"; it has {', '.join(names)}"
+            raise ValueError(f"{where}{name} is not a field of {kind.__name__}{meant}")
+        inner, optional = _type_of(hints[name])
+        if optional and value == _NONE:
+            changes[name] = None
+        elif dataclasses.is_dataclass(inner):
+            if not isinstance(value, dict):
+                raise ValueError(f"{where}{name} must be a table, got {value!r}")
+            changes[name] = _built(inner, value, getattr(base, name, None), f"{where}{name}.")
+        else:
+            changes[name] = value
+    return kind(**changes) if base is None else base.replace(**changes)
+
+
+def _type_of(hint: Any) -> tuple[Any, bool]:
+    """The type of a field, and True if it may also be None."""
+    if isinstance(hint, types.UnionType):
+        (inner,) = (part for part in hint.__args__ if part is not types.NoneType)
+        return inner, True
+    return hint, False
+
+
+def _lines(values: Mapping[str, Any]) -> str:
+    return "".join(f"{name} = {_text(value)}\n" for name, value in values.items())
+
+
+def _text(value: Any) -> str:
+    """A value as TOML writes it."""
+    if value is None or isinstance(value, str):
+        return json.dumps(_NONE if value is None else value)
+    if isinstance(value, bool | int):
+        return str(value).lower()
+    if isinstance(value, float):
+        return repr(float(value))
+    parts = [_text(part) for part in value]
+    if parts and parts[0].startswith("["):  # a matrix: a line for each row
+        return "[\n" + "".join(f"  {row},\n" for row in parts) + "]"
+    return f"[{', '.join(parts)}]"

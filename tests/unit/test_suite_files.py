@@ -1,0 +1,187 @@
+"""Sensor suites in files: the same after reading, from a base, with errors that say where."""
+
+import dataclasses
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quad_gym
+from baselines.plans import Plan, description
+from quad_gym.commands.compare import Args, configure
+from quad_gym.commands.main import main
+from quad_gym.params.suites import ALL_SUITES
+
+
+def read(tmp_path, text):
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    return quad_gym.sensor_suite(str(file))
+
+
+@pytest.mark.parametrize("name", ALL_SUITES)
+def test_a_suite_is_the_same_after_saving_and_reading(name, tmp_path):
+    suite = quad_gym.sensor_suite(name)
+    file = suite.save(tmp_path / "mine.toml")
+    assert quad_gym.sensor_suite(file) == suite
+    assert quad_gym.sensor_suite(str(file)) == suite
+
+
+def test_numbers_that_are_hard_to_write_are_the_same_after_reading(tmp_path):
+    suite = quad_gym.sensor_suite("rtk")
+    rng = np.random.default_rng(0)
+    suite = suite.replace(
+        imu=suite.imu.replace(
+            accel_noise_density=math.pi * 1e-13,
+            gyro_noise_density=np.float64(1 / 3),
+            lever_arm_B=rng.normal(size=3),
+            accel_bias_tau=1e15,
+        ),
+        camera=suite.camera.replace(
+            max_range=np.float64("inf"), phase=0.1, features_I=rng.normal(size=(5, 3))
+        ),
+        estimator=suite.estimator.replace(initial_tilt_sigma=None, kappa=-1, beta=0),
+    )
+    suite.save(tmp_path / "mine.toml")
+    assert quad_gym.sensor_suite(str(tmp_path / "mine.toml")) == suite
+
+
+def test_every_field_is_in_the_file_by_name(tmp_path):
+    suite = quad_gym.sensor_suite("consumer")
+    text = suite.save(tmp_path / "mine.toml").read_text()
+    for part in (suite.imu, suite.gnss, suite.barometer, suite.magnetometer, suite.estimator):
+        for field in dataclasses.fields(part):
+            assert f"\n{field.name} = " in text
+    assert 'camera = "none"' in text
+    assert 'secondary_antenna_B = "none"' in text
+
+
+def test_a_base_gives_what_the_file_leaves_out(tmp_path):
+    base = quad_gym.sensor_suite("consumer")
+    mine = read(
+        tmp_path,
+        'base = "consumer"\nmagnetometer = "none"\n[gnss]\nvelocity_sigma = 0.4\n'
+        "primary_antenna_B = [0, 0, 0.1]\n[imu]\nrate = 100",
+    )
+    assert mine == base.replace(
+        magnetometer=None,
+        gnss=base.gnss.replace(velocity_sigma=0.4, primary_antenna_B=(0.0, 0.0, 0.1)),
+        imu=base.imu.replace(rate=100.0),
+    )
+
+
+def test_a_table_that_the_base_lacks_has_the_defaults_of_its_class(tmp_path):
+    mine = read(tmp_path, 'base = "rtk"\n[barometer]\nnoise_sigma = 0.3')
+    assert mine.barometer == quad_gym.BarometerParams(noise_sigma=0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[imu", "must be a file of TOML: "),
+        ('base = "consumr"', "base must be one of .* got 'consumr'; did you mean consumer?"),
+        ("base = 3", "base must be one of"),
+        ('base = "rtk"\n[imus]\nrate = 1', "imus is not a field of SensorSuite; did you mean imu?"),
+        ('base = "rtk"\n[imu]\nrat = 1', "imu.rat is not a field of ImuParams; did you mean rate?"),
+        ('base = "rtk"\n[imu]\nzzz = 1', "imu.zzz is not a field of ImuParams; it has rate, lever"),
+        ('base = "rtk"\nimu = 3', "imu must be a table, got 3"),
+        ('base = "rtk"\nimu = "none"', "imu must be a table, got 'none'"),
+        ('base = "rtk"\n[imu]\nrate = -1', "ImuParams.rate must be greater than 0, got -1"),
+        ('base = "rtk"\n[imu]\nrate = "x"', "ImuParams.rate must be a number, got 'x'"),
+        ('base = "rtk"\n[imu]\nrate = "none"', "ImuParams.rate must be a number, got 'none'"),
+        ('base = "rtk"\n[imu]\nrate = 2020-01-01', "ImuParams.rate must be a number"),
+        ('base = "rtk"\n[imu]\nrate = nan', "ImuParams.rate must be finite"),
+        ('base = "rtk"\n[imu.rate]\nx = 1', "ImuParams.rate must be a number"),
+        ('base = "rtk"\n[imu]\nlever_arm_B = [1, 2]', r"lever_arm_B must have shape \(3\)"),
+        ('base = "rtk"\n[imu]\nlever_arm_B = 1', r"lever_arm_B must have shape \(3\)"),
+        ('base = "rtk"\n[gnss]\nrate = 7', "GnssParams.rate must divide the IMU rate"),
+        ('base = "rtk"\n[camera]\nfeatures_I = []', "CameraParams.features_I must hold at least"),
+        ("[imu]\nrate = 200", r"there must be a table \[gnss\], or base = "),
+        ("", r"there must be a table \[imu\]"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_file_and_field(text, message, tmp_path):
+    with pytest.raises(ValueError, match=f"mine.toml:? .*{message}"):
+        read(tmp_path, text)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    (tmp_path / "mine.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"mine.toml must be a file of TOML"):
+        quad_gym.sensor_suite(str(tmp_path / "mine.toml"))
+
+
+def test_a_missing_file_and_another_ending_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.toml"):
+        quad_gym.sensor_suite(str(tmp_path / "none.toml"))
+    with pytest.raises(ValueError, match=r"file must end with .toml, got 'mine.txt'"):
+        quad_gym.sensor_suite("rtk").save("mine.txt")
+    with pytest.raises(ValueError, match=r"or a file of a suite \(.toml\), got 'consumr'; did you"):
+        quad_gym.sensor_suite("consumr")
+
+
+def test_an_environment_flies_with_a_suite_in_a_file(tmp_path):
+    file = quad_gym.sensor_suite("standard").save(tmp_path / "mine.toml")
+    observations = []
+    for sensors in ("standard", str(file)):
+        env = gymnasium.make("QuadGym/Hover-v0", sensors=sensors)
+        env.reset(seed=3)
+        observations.append(env.step(env.action_space.low)[0])
+    np.testing.assert_array_equal(*observations)
+
+
+# ---- commands -----------------------------------------------------------------------------------
+
+
+def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    quad_gym.sensor_suite("rtk").save("folder/my-suite.toml")
+    for name in ("rtk", "folder/my-suite.toml"):
+        main(["export", "filter", "--sensors", name])
+    numbers = [
+        (tmp_path / "results/export" / file).read_text().split("*/", 1)[1].split("\n", 3)[3]
+        for file in ("filter_rtk.h", "filter_my-suite.h")
+    ]
+    assert numbers[0].replace("FILTER_RTK", "FILTER_MY_SUITE") == numbers[1]
+    header = (tmp_path / "results/export/filter_my-suite.h").read_text()
+    assert "#define QUAD_GYM_FILTER_MY_SUITE_H\n" in header
+    for name, message in (
+        ("none.toml", "there is no none.toml"),
+        ("wrong.toml", "wrong.toml: imus is not a field of SensorSuite; did you mean imu?"),
+    ):
+        (tmp_path / "wrong.toml").write_text('base = "rtk"\n[imus]\n')
+        with pytest.raises(SystemExit) as ended:
+            main(["export", "filter", "--sensors", name, "--overwrite"])
+        assert ended.value.code == 2
+        assert message in capsys.readouterr().err
+
+
+def test_the_record_of_a_training_has_the_contents_of_the_file(tmp_path):
+    file = quad_gym.sensor_suite("rtk").save(tmp_path / "mine.toml")
+    plan = Plan(environment={"sensors": str(file)})
+    before = description(plan)
+    assert before["environment"] == {"sensors": str(file)}
+    assert before["suite_files"][str(file)]["imu"]["rate"] == 200.0
+    quad_gym.sensor_suite("consumer").save(file)
+    assert description(plan) != before
+    assert "suite_files" not in description(Plan(environment={"sensors": "rtk"}))
+
+
+def test_a_comparison_refuses_two_files_of_one_name(tmp_path):
+    files = []
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        files.append(str(quad_gym.sensor_suite("rtk").save(tmp_path / folder / "mine.toml")))
+    with pytest.raises(ValueError, match="--sensors must have different names, got mine mine"):
+        configure(Args(sensors=tuple(files), engine="compiled", output=tmp_path / "out"))
+
+
+def test_a_comparison_keeps_its_files_in_its_folder(tmp_path):
+    file = str(quad_gym.sensor_suite("rtk").save(tmp_path / "mine.toml"))
+    setting = configure(Args(sensors=(file,), engine="compiled", output=tmp_path / "out"))
+    assert setting.run_folder((file, "PD", None)) == tmp_path / "out" / "runs" / "mine" / "PD"
+    quad_gym.sensor_suite("consumer").save(file)
+    with pytest.raises(ValueError, match=r"another comparison \(different: suite_files\)"):
+        configure(Args(sensors=(file,), engine="compiled", output=tmp_path / "out"))
