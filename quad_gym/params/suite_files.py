@@ -1,4 +1,4 @@
-"""Sensor suites as TOML: a table for each sensor, with the fields of its parameters by name.
+"""Sensor suites as TOML: a table for each sensor, with the fields of its parameters by name::
 
     base = "consumer"  # optional: the file changes this suite
     camera = "none"    # no camera; "none" stands for None
