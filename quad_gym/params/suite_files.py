@@ -1,4 +1,6 @@
-"""Sensor suites as TOML: a table for each sensor, with the fields of its parameters by name::
+"""Sensor suites as TOML files.
+
+A table for each sensor has the fields of its parameters by name::
 
     base = "consumer"  # optional: the file changes this suite
     camera = "none"    # no camera; "none" stands for None
