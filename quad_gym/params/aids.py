@@ -1,4 +1,4 @@
-"""What the parameters of aiding sensors share: rate, phase, latency, noise and slow errors."""
+"""Parameters that all aiding sensors share: rate, phase, latency, noise, time-correlated errors."""
 
 import math
 from dataclasses import dataclass
@@ -10,30 +10,30 @@ from quad_gym.records import Aid
 
 
 class SlowError(NamedTuple):
-    """An error that changes slowly or not at all, which the filter has among its states."""
+    """A time-correlated or constant error, which the filter estimates in augmented states."""
 
     sigma: float
-    """stationary standard deviation"""
+    """stationary standard deviation, in the unit of the measurement"""
     tau: float = math.inf
-    """correlation time [s]; infinite: it is constant in a flight"""
+    """correlation time [s]; infinite: the error is constant during a flight"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AidParams(Checked):
-    """An aiding sensor: one beside IMU, GNSS and camera."""
+    """An aiding sensor other than IMU, GNSS and camera."""
 
     rate: float = 50.0
-    """[Hz]; a whole division of the IMU's"""
+    """measurement rate [Hz]; the IMU rate must be a whole multiple of it"""
     phase: float | None = None
-    """when the first measurement after the start comes, as a share of the period in [0, 1), in
-    whole ticks; None: at random in each episode"""
+    """time of the first measurement after the start as a fraction of the measurement period, in [0,
+    1), rounded to whole ticks; None: drawn at random in each episode"""
     latency: float = 0.0
-    """from when a measurement is taken to when it reaches the filter, with its time stamp, in whole
-    ticks; at most MAX_UNDER_WAY periods [s]"""
+    """delay from a measurement to its arrival at the filter, which receives it with its time stamp
+    [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods"""
 
     aid: ClassVar[Aid]
     raw: ClassVar[tuple[str, str, float]]
-    """unit, frame and bound of what it measures in raw observations"""
+    """unit, frame and bound of the measurement in raw observations"""
 
     def __post_init__(self) -> None:
         self._check(check.positive, "rate")
@@ -42,43 +42,43 @@ class AidParams(Checked):
 
     @property
     def white_sigma(self) -> float:
-        """Standard deviation of each number's white noise."""
+        """Standard deviation of the white noise of each component."""
         raise NotImplementedError
 
     @property
     def slow_vector(self) -> SlowError | None:
-        """The slow error of three numbers, if the sensor has one; each number's."""
+        """Time-correlated error of each of three components; None: no such error."""
         return None
 
     @property
     def slow_scalar(self) -> SlowError | None:
-        """The slow error of one number, if the sensor has one."""
+        """Time-correlated error of a single component; None: no such error."""
         return None
 
     @property
     def believed_vector(self) -> SlowError | None:
-        """What a filter takes `slow_vector` for, with what it does not model."""
+        """`slow_vector` as the filter assumes it, increased by errors without a model."""
         return self.slow_vector
 
     @property
     def matrix_sigma(self) -> float:
-        """Standard deviation of each error of scale and alignment."""
+        """Standard deviation of each scale and alignment error."""
         return 0.0
 
     @property
     def scale(self) -> float:
-        """What counts as one in observations."""
+        """Divisor that normalizes the measurement in observations."""
         return 1.0
 
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """Three more numbers that its kernel reads."""
+        """Three further parameters of the sensor's kernel."""
         return (0.0, 0.0, 0.0)
 
     def simplified(self) -> "AidParams":
-        """A copy without latency and without what a filter does not model."""
+        """Return a copy without latency and without errors that the filter does not model."""
         return self.replace(latency=0.0)  # type: ignore[no-any-return]
 
     def scaled_noise(self, factor: float) -> "AidParams":
-        """A copy whose white noise is `factor` times as large."""
+        """Return a copy with the white noise multiplied by `factor`."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""The barometer: altitude by static pressure, and its errors."""
+"""The barometer: altitude from static pressure, and its errors."""
 
 from dataclasses import dataclass
 
@@ -9,17 +9,17 @@ from quad_gym.records import Aid
 
 @dataclass(frozen=True, kw_only=True)
 class BarometerParams(AidParams):
-    """A barometer: the height of the vehicle in I, with white noise and a slow bias."""
+    """A barometer: height of the vehicle in I, with white noise and a time-correlated bias."""
 
     noise_sigma: float = 0.1
-    """standard deviation of white noise [m]; the air of the rotors, more than the sensor's own
-    noise of some centimeters; our judgment"""
+    """standard deviation of the white noise [m]; dominated by the airflow of the rotors, as the
+    sensor's own noise is some centimeters; engineering judgment"""
     bias_sigma: float = 0.7
-    """stationary standard deviation of the bias, a Gauss-Markov process of first order [m]; Bosch
+    """stationary standard deviation of the bias, a first-order Gauss-Markov process [m]; Bosch
     BMP388 data sheet: relative accuracy +-8 Pa, equivalent to +-0.66 m"""
     bias_tau: float = 300.0
-    """its correlation time [s]: weather and the sensor's temperature change within minutes; our
-    judgment. The filter estimates the bias, as one more state"""
+    """correlation time of the bias [s]: weather and sensor temperature change within minutes;
+    engineering judgment. The filter estimates the bias as an augmented state"""
 
     aid = Aid.BAROMETER
     raw = ("m", "I", 1000.0)
@@ -30,14 +30,14 @@ class BarometerParams(AidParams):
 
     @property
     def white_sigma(self) -> float:
-        """Standard deviation of white noise [m]."""
+        """Standard deviation of the white noise [m]."""
         return self.noise_sigma
 
     @property
     def slow_scalar(self) -> SlowError:
-        """The bias of the altitude [m]."""
+        """Bias of the altitude [m]."""
         return SlowError(self.bias_sigma, self.bias_tau)
 
     def scaled_noise(self, factor: float) -> "BarometerParams":
-        """A copy whose white noise is `factor` times as large."""
+        """Return a copy with the white noise multiplied by `factor`."""
         return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

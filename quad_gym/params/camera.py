@@ -1,4 +1,4 @@
-"""The camera: where it is, what it sees, and its errors."""
+"""The camera: mounting, intrinsics, features and errors."""
 
 import math
 from dataclasses import dataclass
@@ -12,38 +12,42 @@ from quad_gym.records import MAX_FEATURES
 
 @dataclass(frozen=True, kw_only=True)
 class CameraParams(Checked):
-    """A pinhole camera that sees known features."""
+    """A pinhole camera that measures the image coordinates of known features."""
 
     rate: float = 200.0
-    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
+    """frame rate [Hz]; the IMU rate must be a whole multiple of it; laboratory: an image at every
+    tick"""
     position_B: Vector = (0.1159, -0.0004, -0.0435)
     """(3,) projection center in B [m]; laboratory vehicle"""
     attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
-    """(3,) Euler angles of R_CB, camera z along the optical axis [rad]; laboratory"""
+    """(3,) Euler angles of R_CB (roll, pitch and yaw in the 3-1-2 sequence), with the camera's z
+    axis along the optical axis [rad]; laboratory"""
     pixel_size: float = 2e-6
     """[m]; laboratory"""
     focal_length: float = 1657.72
-    """[pixels]; laboratory"""
+    """focal length [pixels]; laboratory"""
     image_size: Vector = (3840.0, 2160.0)
-    """(2,) width and height, with the origin of coordinates at the center [pixels]; laboratory"""
+    """(2,) width and height of the image, with the origin of image coordinates at its center
+    [pixels]; laboratory"""
     pixel_sigma: float = 20.0
-    """standard deviation per axis [pixels]; laboratory"""
+    """standard deviation of each image coordinate of a feature [pixels]; laboratory"""
     features_I: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.7))
-    """(n, 3) known points in I, at most MAX_FEATURES [m]; laboratory"""
+    """(n, 3) positions of the known features in I, at most MAX_FEATURES of them [m]; laboratory"""
     phase: float | None = 0.0
-    """when the first image after the start comes, as a share of the period in [0, 1), in whole
-    ticks; None: at random in each episode"""
+    """time of the first image after the start as a fraction of the frame period, in [0, 1), rounded
+    to whole ticks; None: drawn at random in each episode"""
     latency: float = 0.0
-    """from when an image is taken to when its features reach the filter, with its time stamp, in
-    whole ticks; at most MAX_UNDER_WAY periods [s]"""
+    """delay from an image to the arrival of its features at the filter, which receives them with
+    the time stamp of the image [s]; rounded to whole ticks, at most MAX_UNDER_WAY frame periods"""
     max_range: float = math.inf
-    """distance beyond which a feature is too small to be found [m]"""
+    """distance beyond which a feature is too small to be detected [m]"""
     exposure: float = 0.0
-    """time over which an image is exposed: turning at w smears a feature over `focal_length w
-    exposure` pixels, in which it is found anywhere; the filter knows how fast it turns [s]"""
+    """exposure time of an image [s]: a body rate w smears a feature over `focal_length w exposure`
+    pixels, and the measured position is uniformly distributed along the smear; the filter inflates
+    the pixel noise in proportion to the measured body rate"""
     ground_hides: bool = False
-    """whether the ground (`WorldParams.ground_height`) hides features below it, and all of them
-    from a camera below it"""
+    """True: the ground (`WorldParams.ground_height`) occludes features below it, and all features
+    if the camera is below it"""
 
     def __post_init__(self) -> None:
         self._check(check.number, "latency", least=0.0)
@@ -70,10 +74,10 @@ class CameraParams(Checked):
 
     @property
     def limited(self) -> bool:
-        """Whether range, blur or ground limit what is seen."""
+        """True if range, motion blur or the ground limit the features that are visible."""
         return self.max_range < math.inf or self.exposure > 0.0 or self.ground_hides
 
     @property
     def blur(self) -> float:
-        """Standard deviation of a place in a smear, per body rate [pixels/(rad/s)]."""
+        """Standard deviation of the motion blur per body rate [pixels/(rad/s)]."""
         return self.focal_length * self.exposure / math.sqrt(12.0)

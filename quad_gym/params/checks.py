@@ -245,5 +245,5 @@ class Checked:
             self._set(name, rule(label, getattr(self, name), **options))
 
     def replace(self, **changes: Any) -> Any:
-        """A copy with some fields changed, checked anew."""
+        """Return a copy with some fields changed; all values are checked again."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]

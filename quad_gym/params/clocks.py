@@ -1,4 +1,4 @@
-"""Clocks: how often each part of a flight acts."""
+"""Clocks: the rates of simulation, sensors and control."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,21 @@ from quad_gym.params.sensors import SensorSuite
 
 @dataclass(frozen=True, kw_only=True)
 class Clocks(Checked):
-    """How often each part acts. A tick is an IMU sample; all periods are whole multiples of it."""
+    """Rates of simulation, sensors and control.
+
+    A tick is one IMU sample, and every period is a whole number of ticks.
+    """
 
     imu_rate: float = 200.0
-    """[Hz]"""
+    """rate of IMU samples, which sets the tick [Hz]"""
     control_rate: float = 200.0
-    """[Hz] at which a new action is taken"""
+    """rate of new actions [Hz]"""
     gnss_rate: float = 200.0
-    """[Hz]"""
+    """rate of GNSS measurements [Hz]"""
     camera_rate: float = 200.0
-    """[Hz]"""
+    """frame rate of the camera [Hz]"""
     substeps: int = 1
-    """Runge-Kutta steps in a tick"""
+    """Runge-Kutta steps per tick"""
 
     def __post_init__(self) -> None:
         self._check(check.positive, "imu_rate", most=1e6)
@@ -30,7 +33,7 @@ class Clocks(Checked):
 
     @classmethod
     def of(cls, sensors: SensorSuite, control_rate: float, substeps: int = 1) -> "Clocks":
-        """The clocks of a sensor suite, with a control rate [Hz]."""
+        """Return the clocks of a sensor suite and a control rate [Hz]."""
         camera = sensors.camera
         return cls(
             imu_rate=sensors.imu.rate,
@@ -41,5 +44,5 @@ class Clocks(Checked):
         )
 
     def ticks_between(self, name: str) -> int:
-        """Ticks between two events of the clock `name`, such as "control"."""
+        """Return the number of ticks between two events of the clock `name`, such as "control"."""
         return check.ticks(f"{name}_rate", getattr(self, f"{name}_rate"), self.imu_rate)

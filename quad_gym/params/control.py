@@ -1,4 +1,4 @@
-"""Control: gains of the PD baseline, and what an action means to the inner loops."""
+"""Control: gains of the PD controller, and scales and inner loops behind the actions."""
 
 import math
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ class PDGains(Checked):
     """Gains of the PD controller of position and attitude."""
 
     position: float = 5.0
-    """k [N/m]; laboratory"""
+    """proportional gain k of the position loop [N/m]; laboratory"""
     velocity: float = 3.1
-    """kd [N s/m]; laboratory"""
+    """derivative gain kd of the position loop [N s/m]; laboratory"""
     attitude: Vector = (1.0, 0.95, 0.21)
-    """(3,) diagonal of K [N m]; laboratory"""
+    """(3,) diagonal of the proportional gain K of the attitude loop [N m]; laboratory"""
     body_rates: Vector = (0.25, 0.25, 0.12)
-    """(3,) diagonal of Kd [N m s]; laboratory"""
+    """(3,) diagonal of the derivative gain Kd of the attitude loop [N m s]; laboratory"""
 
     def __post_init__(self) -> None:
         self._check(check.number, "position", "velocity", least=0.0)
@@ -29,20 +29,20 @@ class PDGains(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class ActionParams(Checked):
-    """Scaling of actions and bandwidths of the inner loops that carry them out at every tick."""
+    """Scales of the actions, and bandwidths of the inner loops that track them at every tick."""
 
     rate_scale: Vector = (6.0, 6.0, 3.0)
     """(3,) body rates at full action [rad/s]"""
     tilt_scale: float = math.radians(45.0)
-    """roll and pitch at full action [rad]"""
+    """roll and pitch angles at full action [rad]"""
     velocity_scale: float = 5.0
-    """each component of the velocity at full action [m/s]"""
+    """velocity along each axis at full action [m/s]"""
     rate_bandwidth: float = 14.0
-    """k_w: torque J k_w (w* - w) + w x J w [1/s]"""
+    """bandwidth k_w of the body-rate loop [1/s]: torque J k_w (w* - w) + w x J w"""
     attitude_bandwidth: float = 7.0
-    """k_a: body rates k_a (e3 x z*) [1/s]"""
+    """bandwidth k_a of the attitude loop [1/s]: desired body rates k_a (e3 x z*)"""
     velocity_bandwidth: float = 4.0
-    """k_v: acceleration k_v (v* - v) [1/s]"""
+    """bandwidth k_v of the velocity loop [1/s]: desired acceleration k_v (v* - v)"""
 
     def __post_init__(self) -> None:
         self._check(
@@ -66,8 +66,8 @@ class ActionParams(Checked):
 
 _GAINS = {
     "lab": PDGains(),
-    # by random search for small errors on Hover, Circle, Lemniscate and RandomTrajectory, each
-    # relative to that of the laboratory's gains, on the estimate at 50 Hz with thrust and rates
+    # random search for small errors on Hover, Circle, Lemniscate and RandomTrajectory, relative to
+    # the errors with the laboratory's gains; on the estimate, at 50 Hz, with thrust and body rates
     "tuned": PDGains(
         position=10.6, velocity=3.44, attitude=(1.29, 1.29, 0.138), body_rates=(0.25, 0.25, 0.12)
     ),
@@ -75,5 +75,5 @@ _GAINS = {
 
 
 def pd_gains(name: str) -> PDGains:
-    """PD gains by name: "lab", the report's, or "tuned", for small errors on all tracking tasks."""
+    """Return PD gains: "lab", the report's, or "tuned", for small errors on all tracking tasks."""
     return _GAINS[check.choice("gains", name, tuple(_GAINS))]

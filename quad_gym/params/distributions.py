@@ -1,4 +1,4 @@
-"""Distributions that a parameter can be drawn from, and how the kernel reads them."""
+"""Distributions of randomized parameters, and the form in which the kernel reads them."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
 
 
 class Affine(NamedTuple):
-    """A distribution as the kernel reads it; u is uniform on (0, 1)."""
+    """A distribution in the form that the kernel reads; u is uniform on (0, 1)."""
 
     kind: int
     """UNIFORM: a + b u; LOG_UNIFORM: a e^(b u); NORMAL: a + b Phi^-1(c + d u)"""
@@ -24,12 +24,12 @@ class Affine(NamedTuple):
 
 @dataclass(frozen=True)
 class Distribution(Checked):
-    """How a parameter is drawn: as it is, or in relation to its nominal value."""
+    """Distribution of a parameter, absolute or relative to its nominal value."""
 
     relative: bool = field(default=False, kw_only=True)
-    """the draw is multiplied by the nominal value"""
+    """True: the draw is multiplied by the nominal value"""
     offset: bool = field(default=False, kw_only=True)
-    """the draw is added to the nominal value"""
+    """True: the draw is added to the nominal value"""
 
     def __post_init__(self) -> None:
         self._check(check.flag, "relative", "offset")
@@ -38,16 +38,16 @@ class Distribution(Checked):
 
     @property
     def support(self) -> tuple[float, float]:
-        """The least and the largest draw."""
+        """Smallest and largest possible draw."""
         raise NotImplementedError
 
     def placed(self, factor: float, shift: float) -> Affine:
-        """The distribution of `factor` times the draw plus `shift`."""
+        """Return the distribution of `factor` times the draw plus `shift`."""
         raise NotImplementedError
 
     @property
     def center_and_spread(self) -> tuple[float, float]:
-        """The middle of the draws and a scale of their deviation from it."""
+        """Center of the distribution, and half of its range."""
         low, high = self.support
         return 0.5 * (low + high), 0.5 * (high - low)
 
@@ -60,7 +60,7 @@ class Distribution(Checked):
 
 @dataclass(frozen=True)
 class Uniform(Distribution):
-    """Uniform on [low, high]."""
+    """Uniform distribution on [low, high]."""
 
     low: float
     high: float
@@ -72,17 +72,17 @@ class Uniform(Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """The bounds."""
+        """Bounds of the distribution."""
         return self.low, self.high
 
     def placed(self, factor: float, shift: float) -> Affine:
-        """Uniform between the moved bounds."""
+        """Return the uniform distribution between the transformed bounds."""
         return Affine(UNIFORM, factor * self.low + shift, factor * (self.high - self.low))
 
 
 @dataclass(frozen=True)
 class LogUniform(Distribution):
-    """Its logarithm is uniform: for scales that are known to a factor, on [low, high] above 0."""
+    """Log-uniform distribution on [low, high], above 0: for scales that are known to a factor."""
 
     low: float
     high: float
@@ -92,21 +92,21 @@ class LogUniform(Distribution):
         self._check(check.positive, "low", "high")
         self._check_order(self.low, self.high)
         if self.offset:
-            raise ValueError("LogUniform.offset must be False: a logarithm is relative")
+            raise ValueError("LogUniform.offset must be False: log-uniform draws are factors")
 
     @property
     def support(self) -> tuple[float, float]:
-        """The bounds."""
+        """Bounds of the distribution."""
         return self.low, self.high
 
     def placed(self, factor: float, shift: float) -> Affine:
-        """Log-uniform between the multiplied bounds."""
+        """Return the log-uniform distribution between the multiplied bounds."""
         return Affine(LOG_UNIFORM, factor * self.low, math.log(self.high / self.low))
 
 
 @dataclass(frozen=True)
 class Normal(Distribution):
-    """Normal with mean and standard deviation, truncated to [low, high]."""
+    """Normal distribution with mean and standard deviation `sigma`, truncated to [low, high]."""
 
     mean: float
     sigma: float
@@ -125,13 +125,13 @@ class Normal(Distribution):
         self._check_order(self.low, self.high)
         if self._probabilities[1] < 1e-6:
             raise ValueError(
-                "Normal.low and Normal.high must leave a probability of 1e-6 at least, got "
+                "Normal.low and Normal.high must enclose a probability of at least 1e-6, got "
                 f"[{self.low:g}, {self.high:g}] for mean {self.mean:g} and sigma {self.sigma:g}"
             )
 
     @property
     def _probabilities(self) -> tuple[float, float]:
-        """Of lying below `low`, and between the bounds."""
+        """Probability of a draw below `low`, and of one between the bounds."""
         below, under = (
             0.5 * math.erfc((self.mean - bound) / (self.sigma * math.sqrt(2.0)))
             for bound in (self.low, self.high)
@@ -140,7 +140,7 @@ class Normal(Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """The bounds."""
+        """Bounds of the truncated distribution."""
         return self.low, self.high
 
     @property
@@ -149,6 +149,6 @@ class Normal(Distribution):
         return self.mean, self.sigma
 
     def placed(self, factor: float, shift: float) -> Affine:
-        """The moved normal with the same truncated tails."""
+        """Return the transformed normal distribution with the same truncated tails."""
         below, between = self._probabilities
         return Affine(NORMAL, factor * self.mean + shift, factor * self.sigma, below, between)

@@ -10,71 +10,79 @@ from quad_gym.params.gravity import GRAVITY
 
 @dataclass(frozen=True, kw_only=True)
 class FilterParams(Checked):
-    """The Kalman filter's own choices; the defaults are the report's form."""
+    """Form and tuning of the Kalman filter; the defaults are the laboratory report's filter."""
 
     kind: str = "ukf"
-    """"ukf", the report's unscented filter, or "ekf", an error-state extended one with the same
-    state, models and noise; the fields of the unscented transform do not concern it"""
+    """"ukf", the unscented filter of the report, or "ekf", an error-state extended Kalman filter
+    with the same state, models and noise, which has no use for the parameters of the unscented
+    transform"""
     integration: str = "euler"
-    """how the prediction carries the estimate over a tick: "euler", as if the sample of its start
-    held (report), or "midpoint", turning the attitude exactly and the force with the attitude
-    halfway, which belongs to `ImuParams.samples` "average\""""
+    """integration of the prediction over a tick: "euler" holds the sample at the start of the tick
+    (report); "midpoint" integrates the attitude exactly and rotates the specific force with the
+    attitude halfway through the tick, as `ImuParams.samples="average"` requires"""
     attitude_reset: bool = False
-    """whether the covariance is transformed, S^-1 P S^-T, when the mean error angles are added to
-    the attitude, as error angles then refer to another attitude; the report's filter leaves it as
-    it is. This distinguishes the two forms of the filter and is not a tuning parameter: in the
-    other suites it moves the NEES by less than its sampling error, and errors by 1 % at most"""
+    """True: transform the covariance, S^-1 P S^-T, when the mean error angles are added to the
+    attitude, because error angles then refer to the new attitude; False: leave the covariance as it
+    is (report). The choice distinguishes the two forms of the filter and is not a tuning parameter:
+    with suites other than "lab" it changes the NEES by less than its sampling error, and errors by
+    at most 1 %"""
     alpha: float = 1e-3
-    """spread of the sigma points; laboratory"""
+    """alpha of the unscented transform, the spread of the sigma points; laboratory"""
     beta: float = 2.0
-    """weight of the central point's excess, 2 for Gaussians; laboratory"""
+    """beta of the unscented transform, the additional covariance weight of the central sigma point;
+    2 for Gaussian distributions; laboratory"""
     kappa: float = 0.0
-    """secondary scaling; laboratory"""
+    """kappa of the unscented transform, its secondary scaling parameter; laboratory"""
     direction_variance_floor: float = 1e-8
-    """added to the diagonal of a direction's covariance, of rank 2 [-]; report section 3.1"""
+    """variance added to the diagonal of a direction's noise covariance, which has rank 2 without it
+    [-]; report section 3.1"""
     bearing_noise_at: str = "measured"
-    """how a feature's noise covariance of rank 2 lies: across its "measured" direction (report) or
-    across the "predicted" one, as the baseline's does. The first takes the angle between the two,
-    tens of milliradians in the first second, for information that it trusts to 0.1 mrad.
-    "pinhole": across the predicted one, and less toward the image's center, as pixels far out
-    subtend smaller angles there; the report takes the noise for equal about both axes"""
+    """direction u at which the bearing noise of a feature, sigma^2 (I - u u^T), is evaluated: the
+    "measured" direction (report) or the "predicted" one, as for the baseline. With the first, the
+    filter interprets the angle between the two, tens of milliradians in the first second, as
+    information with 0.1 mrad accuracy. "pinhole": the predicted direction, with less noise in the
+    radial direction of the image, along which pixels far from its center subtend smaller angles;
+    the report assumes equal noise about both axes"""
     initial_velocity_variance: float = 1e-3
-    """[m^2/s^2]; laboratory"""
+    """initial variance of each velocity component [m^2/s^2]; laboratory"""
     initial_covariance_scale: float = 2.0
-    """factor on the first fix's covariance; laboratory"""
+    """factor on the covariance of the first fix, from which the filter starts; laboratory"""
     initial_tilt_sigma: float | None = None
-    """how level the start is, per axis [rad]: the filter starts level, looking as the baseline
-    says; None: the attitude solves Wahba's problem for the baseline and the vertical, with the
-    baseline's noise about every axis, as in the laboratory"""
+    """initial standard deviation of roll and pitch of a filter that starts level, with the heading
+    of the baseline [rad]; None: the initial attitude solves Wahba's problem for the baseline and
+    the vertical, with the baseline's noise about every axis (laboratory)"""
     reuse_first_fix: bool = True
-    """whether the fix that starts the filter is also its first measurement, as in the laboratory;
-    that counts it twice, so suites other than "lab" do not"""
+    """True: the fix that starts the filter is also its first measurement (laboratory). The fix is
+    then counted twice, so suites other than "lab" have False"""
     recursive_update_threshold: float | None = None
-    """deviation of a feature's predicted direction above which images are processed in steps, each
-    about the estimate that the one before has left [rad]; None: always whole (report). The
-    derivatives of pixels are off by the square of that error, more than a precise camera's noise at
-    a rough start or after an outage. Without a gate, features beyond `max_direction_sigma` are
-    then left out where there is GNSS, as by a gate"""
+    """standard deviation of a feature's predicted direction above which an image is processed in
+    several steps, each linearized about the estimate that the step before has left [rad]; None:
+    always in a single update (report). The linearization error of pixels grows with the square of
+    the direction error, and exceeds a precise camera's noise at an uncertain start or after an
+    outage. Without an innovation gate, features beyond `max_direction_sigma` are then ignored where
+    there is GNSS, as a gate would"""
     false_alarm_probability: float = 0.0
-    """probability that a valid measurement is rejected: a position, baseline, velocity or feature
-    whose normalized innovation squared exceeds the chi-square quantile of this alarm level is left
-    out of the update (Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to
-    Tracking and Navigation, section 5.4); 0: everything is taken"""
+    """probability that the innovation gate rejects a valid measurement: a position, baseline,
+    velocity or feature, or a measurement of an aiding sensor, is left out of the update if its
+    normalized innovation squared exceeds the chi-square quantile of this probability (Y.
+    Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
+    Navigation, section 5.4); 0: no gate"""
     max_rejections: int = 10
-    """positions, baselines, velocities or images rejected in a row after which the filter doubts
-    itself instead: it adds the square of the innovation to the covariance of what the sensor
-    measures, and takes the next one"""
+    """number of consecutive rejections of a sensor's measurements after which the estimate is
+    assumed to be wrong instead: the variances of the states that the sensor measures are raised to
+    the square of the innovation (not increased by it), and the next measurement is accepted"""
     max_direction_sigma: float = 0.2
-    """[rad] a gating filter leaves out features whose direction it predicts more vaguely than that,
-    as after a long outage: what its model neglects, half the square, is ten times the noise of a
-    good camera then. GNSS has to bring such a filter home; one without GNSS takes all features, as
-    it has nothing else"""
+    """standard deviation of a feature's predicted direction above which a filter with an innovation
+    gate ignores the feature, as after a long outage [rad]; half the square of this angle, which a
+    linear model neglects, is then ten times the noise of a good camera. GNSS has to reduce the
+    uncertainty first; a filter without GNSS uses all features"""
     delay_compensation: str = "retrodict"
     """processing of delayed measurements: "retrodict" takes the estimate back to the time stamp
     over the IMU samples since then, updates it there, and propagates it forward again; "none"
     ignores the time stamp"""
     gravity: float = GRAVITY
-    """[m/s^2] that a filter which works by itself subtracts; in flights it is the vehicle's"""
+    """gravitational acceleration in the prediction of a filter on its own [m/s^2]; in flights the
+    vehicle's value is used"""
 
     def __post_init__(self) -> None:
         self._check(

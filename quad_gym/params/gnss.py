@@ -1,4 +1,4 @@
-"""GNSS: positions, the baseline between two antennas if there are two, velocities, and errors."""
+"""GNSS: positions, velocities, the baseline between two antennas, and their errors."""
 
 import math
 from dataclasses import dataclass
@@ -9,53 +9,57 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
 
 LEAST_DRIFT = 1e-6
-"""Slow error that a filter assumes in an axis that has none beside one that has [m]: its covariance
-stays regular."""
+"""Position drift that a filter assumes in an axis without drift if another axis has some [m], so
+that its covariance stays regular."""
 
 HEADING_MEMORY = 60.0
-"""For how long of a flight a filter takes the constant error of a baseline for new [s]."""
+"""Time over which a filter does not average out the constant heading error of a baseline [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GnssParams(Checked):
-    """GNSS: position of the primary antenna, and the baseline to the secondary one if there is one.
+    """GNSS: position of the primary antenna and, with a second antenna, the baseline between them.
 
-    With one antenna the filter starts with the heading that a magnetometer tells, or else with that
-    of the mark of `InitialPoseParams`.
+    With one antenna, the initial heading of the filter is measured by the magnetometer or, without
+    one, given by `InitialPoseParams`.
     """
 
     rate: float = 200.0
-    """[Hz]; a whole division of the IMU's; the laboratory measures at every tick"""
+    """measurement rate [Hz]; the IMU rate must be a whole multiple of it; laboratory: a measurement
+    at every tick"""
     primary_antenna_B: Vector = (0.1013, -0.0004, 0.0472)
-    """(3,) in B [m]; laboratory vehicle"""
+    """(3,) position of the primary antenna in B [m]; laboratory vehicle"""
     secondary_antenna_B: Vector | None = (-0.0887, -0.0004, 0.0472)
-    """(3,) in B [m]; laboratory vehicle. None: one antenna, and no baseline"""
+    """(3,) position of the secondary antenna in B [m]; laboratory vehicle. None: one antenna, and
+    no baseline"""
     reference_antenna_G: Vector = (-742080.456, -5462030.875, 3198338.956)
-    """(3,) origin of the east-north-up frame I, in ECEF [m]; laboratory"""
+    """(3,) position of the reference antenna, the origin of the east-north-up frame I, in ECEF [m];
+    laboratory"""
     position_sigma_I: Vector = (0.006, 0.006, 0.012)
-    """(3,) standard deviation east, north, up [m]; laboratory (RTK)"""
+    """(3,) standard deviation of the white position noise east, north, up [m]; laboratory (RTK)"""
     baseline_sigma: float = 0.05
-    """standard deviation of the baseline's direction [rad]; laboratory"""
+    """standard deviation of the white noise of the baseline's direction [rad]; laboratory"""
     heading_error_sigma: float = 0.0
-    """standard deviation of an error that the baseline has in common with all others of its
-    episode: a turn about the body z axis, as unequal antennas, their mounting, or a compass among
-    iron cause it [rad]"""
+    """standard deviation of the heading error that all baselines of an episode have in common, a
+    rotation about the body z axis [rad]; causes are unequal antennas, their mounting or, for a
+    compass, iron nearby"""
     velocity_sigma: float | None = None
-    """standard deviation of the velocity by Doppler shifts, per axis [m/s]; None: not measured, as
-    in the laboratory"""
+    """standard deviation of the velocity from Doppler shifts, per axis [m/s]; None: velocity is not
+    measured (laboratory)"""
     phase: float | None = 0.0
-    """when the first measurement after the start comes, as a share of the period in [0, 1), in
-    whole ticks; None: at random in each episode"""
+    """time of the first measurement after the start as a fraction of the measurement period, in [0,
+    1), rounded to whole ticks; None: drawn at random in each episode"""
     drift_sigma_I: Vector = (0.0, 0.0, 0.0)
-    """(3,) slow position error east, north, up, beside the white one: stationary standard deviation
-    of a first-order Gauss-Markov process that is zero at the start of an episode, for positions are
-    relative to the place of the start [m]"""
+    """(3,) stationary standard deviation of the time-correlated position error (drift) east, north,
+    up, in addition to the white noise [m]. The drift is a first-order Gauss-Markov process that is
+    zero at the start of an episode, because positions are relative to the place of the start"""
     drift_tau: float = 60.0
-    """its correlation time [s]; the filter estimates the slow error, as three more states"""
+    """correlation time of the position drift [s]; the filter estimates the drift in three augmented
+    states"""
     latency: float = 0.0
-    """from when a measurement is taken to when it reaches the filter, with its time stamp, in whole
-    ticks; at most MAX_UNDER_WAY periods [s]. Receivers take about 0.1 s: the autopilot PX4 assumes
-    0.11 s (parameter EKF2_GPS_DELAY)"""
+    """delay from a measurement to its arrival at the filter, which receives it with its time stamp
+    [s]; rounded to whole ticks, at most MAX_UNDER_WAY measurement periods. Receivers take about 0.1
+    s: the autopilot PX4 assumes 0.11 s (parameter EKF2_GPS_DELAY)"""
 
     def __post_init__(self) -> None:
         self._check(check.number, "latency", least=0.0)
@@ -96,7 +100,7 @@ class GnssParams(Checked):
 
     @property
     def has_baseline(self) -> bool:
-        """Whether there are two antennas."""
+        """True with two antennas."""
         return self.secondary_antenna_B is not None
 
     @property
@@ -106,10 +110,10 @@ class GnssParams(Checked):
 
     @property
     def baseline_B(self) -> np.ndarray:
-        """(3,) from the primary to the secondary antenna, in B [m].
+        """Baseline (3,) from the primary to the secondary antenna, in B [m].
 
         Raises:
-            ValueError: If there is one antenna.
+            ValueError: With one antenna.
         """
         if self.secondary_antenna_B is None:
             raise ValueError("GnssParams.secondary_antenna_B must be given for a baseline")
@@ -117,26 +121,27 @@ class GnssParams(Checked):
 
     @property
     def drifts(self) -> bool:
-        """Whether positions have a slow error."""
+        """True if positions have a time-correlated error."""
         return any(self.drift_sigma_I)
 
     @property
     def heading_errs(self) -> bool:
-        """Whether baselines have a constant error, which the filter counts as white noise."""
+        """True if baselines have a constant error, which the filter models as white noise."""
         return self.has_baseline and self.heading_error_sigma > 0.0
 
     @property
     def first_baseline_sigma(self) -> float:
-        """Standard deviation of the direction of one baseline [rad]."""
+        """Standard deviation of a single baseline's direction, all errors included [rad]."""
         return math.hypot(self.baseline_sigma, self.heading_error_sigma)
 
     @property
     def believed_baseline_sigma(self) -> float:
-        """Standard deviation of the direction of a baseline that the filter takes for white [rad].
+        """Standard deviation that the filter assumes for the white noise of a baseline [rad].
 
-        Averages of white noise shrink, a constant error stays. It is counted so often as there are
-        measurements in `HEADING_MEMORY`: the heading is then hardly better known after that time
-        than after the first baseline, unless something else tells it.
+        Averaging reduces white noise, but not a constant error. The constant error is therefore
+        multiplied by the square root of the number of measurements in `HEADING_MEMORY`: after that
+        time the heading is hardly more certain than after the first baseline, unless another sensor
+        observes it.
         """
         count = max(self.rate * HEADING_MEMORY, 1.0)
         return math.hypot(self.baseline_sigma, math.sqrt(count) * self.heading_error_sigma)

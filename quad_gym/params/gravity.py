@@ -1,4 +1,4 @@
 """Gravity."""
 
 GRAVITY = 9.8
-"""Standard gravity as the laboratory rounds it [m/s^2]."""
+"""Standard gravity as rounded in the laboratory report [m/s^2]."""

@@ -1,4 +1,4 @@
-"""The ground that carries a vehicle: its feet, friction, and what counts as a crash."""
+"""The ground that supports vehicles: feet, friction, and limits of a safe touchdown."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,21 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Matrix
 
 FARTHEST_FOOT = 10.0
-"""No foot is farther from the center of mass [m]."""
+"""Largest distance of a foot from the center of mass [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundParams(Checked):
-    """A level plane at `WorldParams.ground_height` that carries a vehicle anywhere.
+    """A level plane at `WorldParams.ground_height` that supports a vehicle anywhere.
 
-    Four feet and the four rotor hubs can touch it. Contact is a constraint on velocities, solved
-    once in a tick: the plane stops points that would go below it, pushes and never pulls, impacts
-    are inelastic, and friction is Coulomb's. Points of a vehicle that turns fast may be millimeters
-    below the plane after the tick of an impact. There is no stiffness, so that every step is stable
-    (J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", 1988; D. E.
-    Stewart, J. C. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic
-    collisions and Coulomb friction", Int. J. Numerical Methods in Engineering 39, 1996).
+    Four feet and the four rotor hubs can touch it. Contact is a constraint on velocities that is
+    solved once per tick: the plane stops points that would move below it and pushes but never
+    pulls; impacts are inelastic, and friction is Coulomb friction. After the tick of an impact,
+    points of a vehicle that rotates fast may be millimeters below the plane. The contact has no
+    stiffness, so every step size is stable (J. J. Moreau, "Unilateral contact and dry friction in
+    finite freedom dynamics", 1988; D. E. Stewart, J. C. Trinkle, "An implicit time-stepping scheme
+    for rigid body dynamics with inelastic collisions and Coulomb friction", Int. J. Numerical
+    Methods in Engineering 39, 1996).
     """
 
     feet_B: Matrix = (
@@ -31,16 +32,17 @@ class GroundParams(Checked):
         (-0.15, 0.15, -0.1),
         (-0.15, -0.15, -0.1),
     )
-    """(4, 3) soles of the feet relative to the center of mass, in B [m]; legs 0.1 m long under the
-    arms of the laboratory's vehicle, whose hubs are 0.21 m out along both axes; in a level plane,
-    below all rotor hubs of the vehicle"""
+    """(4, 3) positions of the soles of the feet relative to the center of mass, in B [m], in a
+    level plane below all rotor hubs; default: legs 0.1 m long under the arms of the laboratory
+    vehicle, whose hubs are 0.21 m from the center of mass along both axes"""
     friction: float = 0.6
-    """Coulomb's coefficient, sticking and sliding; rubber on concrete has 0.6 to 0.85; 0: ice"""
+    """Coulomb friction coefficient, for sticking and sliding; rubber on concrete has 0.6 to 0.85;
+    0: no friction"""
     max_touchdown_speed: float = 1.5
-    """speed of the center of mass toward the ground beyond which a touchdown is a crash [m/s]; that
-    of a free fall from 0.11 m"""
+    """speed of the center of mass toward the ground above which a touchdown is a crash [m/s]; a
+    free fall from 0.11 m ends at the default"""
     max_touchdown_tilt: float = math.radians(30.0)
-    """angle between the body z axis and the vertical at which touching the ground is a crash
+    """angle between the body z axis and the vertical above which touching the ground is a crash
     [rad]; touching it with a rotor always is"""
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The IMU: its errors, with the source of every number."""
+"""The IMU and its errors, with the source of every number."""
 
 import math
 from dataclasses import dataclass
@@ -7,53 +7,58 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
 
 MANEUVER = 0.5
-"""How long a quadrotor accelerates one way [s]; our judgment, between a turn through a gate (some
-tenths of a second) and steady wind."""
+"""Typical time for which a quadrotor accelerates in one direction [s]; engineering judgment,
+between a turn through a gate (some tenths of a second) and steady wind."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParams(Checked):
-    """Accelerometer and gyro: white noise, Gauss-Markov biases (report equations 4, 6, 7)."""
+    """Accelerometer and gyro, with white noise and Gauss-Markov biases (report eqs. 4, 6, 7)."""
 
     rate: float = 200.0
-    """[Hz]; one sample is one tick of the simulation; report section 4"""
+    """sampling rate [Hz]; one sample is one tick of the simulation; report section 4"""
     lever_arm_B: Vector = (0.0, 0.0, 0.0)
     """(3,) position of the accelerometer in B [m]; report section 2.3"""
     samples: str = "instant"
-    """what the filter predicts a tick with: "instant", a sample of the motion at its start
-    (report); or "average", the mean over it, as real IMUs deliver delta angles and delta
-    velocities, corrected for coning and sculling. The inner loops read the gyro at the present
-    instant either way, with the noise of the last sample: a mean lags by half a tick, which a
-    tight rate loop does not bear."""
+    """samples with which the filter predicts a tick: "instant", a sample of the motion at the start
+    of the tick (report), or "average", the mean over the tick, as real IMUs provide by delta angles
+    and delta velocities with coning and sculling corrections. In both cases the inner loops read
+    the gyro at the present instant, with the noise of the last sample: a mean lags by half a tick,
+    too much for a tight rate loop"""
     accel_noise_density: float = 9.8e-3 * 0.1
-    """[m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
+    """noise density of the accelerometer [m/s^2/sqrt(Hz)]; laboratory: 0.1 milli-g/sqrt(Hz)"""
     gyro_noise_density: float = math.radians(0.05)
-    """[rad/s/sqrt(Hz)]; laboratory: 0.05 deg/s/sqrt(Hz)"""
+    """noise density of the gyro [rad/s/sqrt(Hz)]; laboratory: 0.05 deg/s/sqrt(Hz)"""
     accel_bias_sigma: float = 9.8e-3 * 100.0
-    """stationary standard deviation [m/s^2]; laboratory: 100 milli-g"""
+    """stationary standard deviation of the accelerometer bias, per axis [m/s^2]; laboratory: 100
+    milli-g"""
     gyro_bias_sigma: float = math.radians(100.0) / 3600.0
-    """stationary standard deviation [rad/s]; laboratory: 100 deg/h"""
+    """stationary standard deviation of the gyro bias, per axis [rad/s]; laboratory: 100 deg/h"""
     accel_bias_tau: float = 100.0
-    """correlation time [s]; laboratory"""
+    """correlation time of the accelerometer bias [s]; laboratory"""
     gyro_bias_tau: float = 100.0
-    """correlation time [s]; laboratory"""
+    """correlation time of the gyro bias [s]; laboratory"""
     accel_scale_sigma: float = 0.0
-    """standard deviation of each axis' scale factor error, constant in an episode [-]. Errors of
-    scale and alignment act on what differs from rest on level ground, where biases are defined:
-    `(I + D) (f - g e3)`, `(I + D) w`, with the scale errors on the diagonal of D"""
+    """standard deviation of the accelerometer's scale factor error, per axis, constant in an
+    episode [-]. Errors of scale and alignment act on the difference from rest on level ground,
+    where biases are defined: `(I + D) (f - g e3)` for the accelerometer and `(I + D) w` for the
+    gyro, with the scale factor errors on the diagonal of D"""
     gyro_scale_sigma: float = 0.0
-    """likewise [-]"""
+    """standard deviation of the gyro's scale factor error, per axis, constant in an episode [-]"""
     accel_misalignment_sigma: float = 0.0
-    """standard deviation of each entry of D off its diagonal: axes that are not orthogonal, and the
-    sensor's turn in its housing [rad]"""
+    """standard deviation of each off-diagonal entry of the accelerometer's D, constant in an
+    episode: non-orthogonal axes, and the rotation of the sensor in its housing [rad]"""
     gyro_misalignment_sigma: float = 0.0
-    """likewise [rad]"""
+    """standard deviation of each off-diagonal entry of the gyro's D, constant in an episode
+    [rad]"""
     accel_vibration: float = 0.0
-    """standard deviation that the rotors' vibration adds to a sample in hover, per axis, after the
-    IMU's own filters [m/s^2]. It is white and grows with the square of the rotor speeds, as
-    the forces of unbalanced masses do"""
+    """standard deviation of the noise that rotor vibration adds to an accelerometer sample in
+    hover, per axis, after the IMU's own filters [m/s^2]. The noise is white, and proportional to
+    the square of the rotor speeds, as the forces of unbalanced masses are"""
     gyro_vibration: float = 0.0
-    """likewise [rad/s]"""
+    """standard deviation of the noise that rotor vibration adds to a gyro sample in hover, per
+    axis, after the IMU's own filters [rad/s]. The noise is white, and proportional to the square of
+    the rotor speeds"""
 
     def __post_init__(self) -> None:
         self._check(
@@ -75,12 +80,12 @@ class ImuParams(Checked):
 
     @property
     def dt(self) -> float:
-        """The tick: time between two samples [s]."""
+        """Duration of a tick, the time between two samples [s]."""
         return 1.0 / self.rate
 
     @property
     def errs(self) -> bool:
-        """Whether there are errors of scale or alignment."""
+        """True if there are errors of scale or alignment."""
         return any(
             (
                 self.accel_scale_sigma,
@@ -92,25 +97,25 @@ class ImuParams(Checked):
 
     @property
     def vibrates(self) -> bool:
-        """Whether the rotors' vibration reaches the IMU."""
+        """True if rotor vibration reaches the IMU."""
         return self.accel_vibration > 0.0 or self.gyro_vibration > 0.0
 
     @property
     def believed_accel_sigma(self) -> float:
-        """Standard deviation of a sample that the filter takes for white [m/s^2].
+        """Standard deviation that the filter assumes for an accelerometer's white noise [m/s^2].
 
-        As of hovering; where the specific force differs from g the filter counts the vibration
-        of rotors that lift so much, as it grows with the thrust.
+        The value is for hover; the filter scales the vibration in it with the measured specific
+        force, as vibration is proportional to thrust.
         """
         return math.hypot(self.accel_noise_density / math.sqrt(self.dt), self.accel_vibration)
 
     @property
     def believed_accel_error(self) -> float:
-        """What the filter takes for white of errors of scale and alignment, per m/s^2 [-].
+        """White noise by which the filter models errors of scale and alignment, per m/s^2 [-].
 
-        They are proportional to how much the specific force differs from that at rest, and last as
-        long as a maneuver: one of `MANEUVER` seconds moves the velocity as far as white noise does
-        whose samples are larger by the square root of their number.
+        The errors are proportional to the difference of the specific force from its value at rest,
+        and last as long as a maneuver. Over `MANEUVER` seconds they change the velocity by as much
+        as white noise whose samples are larger by the square root of the number of samples.
         """
         scale, misalignment = self.accel_scale_sigma, self.accel_misalignment_sigma
         mean_square = (scale**2 + 2.0 * misalignment**2) / 3.0  # over the axes
@@ -118,5 +123,5 @@ class ImuParams(Checked):
 
     @property
     def believed_gyro_sigma(self) -> float:
-        """Likewise of the gyro [rad/s]."""
+        """Standard deviation that the filter assumes for a gyro's white noise [rad/s]."""
         return math.hypot(self.gyro_noise_density / math.sqrt(self.dt), self.gyro_vibration)

@@ -1,4 +1,4 @@
-"""The magnetometer: the Earth's magnetic field in the body's axes, and its errors."""
+"""The magnetometer: the Earth's magnetic field in body axes, and its errors."""
 
 import math
 from dataclasses import dataclass
@@ -8,38 +8,38 @@ from quad_gym.params.aids import AidParams, SlowError
 from quad_gym.records import Aid
 
 MICROTESLA = 1e-6
-"""[T]"""
+"""One microtesla [T]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MagnetometerParams(AidParams):
-    """A magnetometer of three axes, among the iron and the currents of a vehicle.
+    """A three-axis magnetometer near the iron and the currents of a vehicle.
 
     It measures `(I + D) R_BI m_I + b + noise` in B, with the Earth's field m_I, soft iron D and
-    hard iron b. The filter takes the field from a model of the Earth's, as do the defaults: the
-    World Magnetic Model 2025 at the laboratory's reference antenna, 2026.0.
+    hard iron b. The filter, like the defaults, takes the field from a model of the Earth: the World
+    Magnetic Model 2025 at the laboratory's reference antenna, 2026.0.
     """
 
     noise_sigma: float = 0.5 * MICROTESLA
-    """standard deviation of white noise per axis [T]; motors' currents, more than the 0.15
-    microtesla of a digit of the AK09916 in the ICM-20948 (data sheet); our judgment"""
+    """standard deviation of the white noise, per axis [T]; dominated by the motor currents, as a
+    digit of the AK09916 in the ICM-20948 is 0.15 microtesla (data sheet); engineering judgment"""
     hard_iron_sigma: float = 1.0 * MICROTESLA
-    """standard deviation per axis of what a calibration leaves of the vehicle's own field, constant
-    in a flight [T]; 2.4 degrees of heading; our judgment. The filter estimates it, as three more
-    states"""
+    """standard deviation of the vehicle's own field that calibration leaves, per axis, constant in
+    a flight [T]; the default is 2.4 degrees of heading; engineering judgment. The filter estimates
+    this field in three augmented states"""
     soft_iron_sigma: float = 0.0
-    """standard deviation of each element of D, likewise [-]; the filter does not estimate it, but
-    counts what it does to the field as hard iron"""
+    """standard deviation of each element of D, constant in a flight [-]; the filter does not
+    estimate D, but assumes hard iron larger by its effect on the field"""
     strength: float = 46.28 * MICROTESLA
-    """of the Earth's field [T]"""
+    """strength of the Earth's field [T]"""
     declination: float = math.radians(3.13)
-    """from true north toward east [rad]"""
+    """declination of the Earth's field, from true north toward east [rad]"""
     inclination: float = math.radians(58.67)
-    """below the horizon [rad]"""
+    """inclination of the Earth's field below the horizon [rad]"""
     declination_sigma: float = math.radians(0.35)
-    """standard deviation by which the model's declination is off, constant in a flight [rad]; the
+    """standard deviation of the error of the model's declination, constant in a flight [rad]; the
     World Magnetic Model's error model, hypot(0.26, 5417 nT / horizontal field) degrees. The filter
-    estimates it, as one more state"""
+    estimates the error in an augmented state"""
 
     aid = Aid.MAGNETOMETER
     raw = ("of the field", "B", 10.0)
@@ -59,13 +59,13 @@ class MagnetometerParams(AidParams):
         self._check(check.number, "inclination", least=-math.pi / 2, most=math.pi / 2)
         if math.cos(self.inclination) < 0.01:
             raise ValueError(
-                "MagnetometerParams.inclination must leave a horizontal field that tells the "
-                f"heading, 0.6 degrees from the vertical at least, got {self.inclination}"
+                "MagnetometerParams.inclination must leave a horizontal field, from which the "
+                f"heading follows: at least 0.6 degrees from the vertical, got {self.inclination}"
             )
 
     @property
     def field_I(self) -> tuple[float, float, float]:
-        """(3,) the Earth's field east, north, up [T]."""
+        """The Earth's field (3,) east, north, up [T]."""
         level = self.strength * math.cos(self.inclination)
         return (
             level * math.sin(self.declination),
@@ -75,43 +75,43 @@ class MagnetometerParams(AidParams):
 
     @property
     def white_sigma(self) -> float:
-        """Standard deviation of white noise per axis [T]."""
+        """Standard deviation of the white noise, per axis [T]."""
         return self.noise_sigma
 
     @property
     def slow_vector(self) -> SlowError:
-        """Hard iron [T]."""
+        """Hard iron, per axis [T]."""
         return SlowError(self.hard_iron_sigma)
 
     @property
     def believed_vector(self) -> SlowError:
-        """Hard iron, and what soft iron makes of the field [T]."""
+        """Hard iron, increased by the effect of soft iron on the field, per axis [T]."""
         return SlowError(math.hypot(self.hard_iron_sigma, self.soft_iron_sigma * self.strength))
 
     @property
     def slow_scalar(self) -> SlowError:
-        """True declination less the believed one [rad]."""
+        """Error of the declination, true minus modeled [rad]."""
         return SlowError(self.declination_sigma)
 
     @property
     def matrix_sigma(self) -> float:
-        """Soft iron [-]."""
+        """Standard deviation of each element of the soft iron D [-]."""
         return self.soft_iron_sigma
 
     @property
     def scale(self) -> float:
-        """The strength of the field [T]."""
+        """Strength of the Earth's field, which normalizes observations [T]."""
         return self.strength
 
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """The field in I [T]."""
+        """The Earth's field east, north, up [T]."""
         return self.field_I
 
     def simplified(self) -> "MagnetometerParams":
-        """A copy without latency and soft iron."""
+        """Return a copy without latency and soft iron."""
         return self.replace(latency=0.0, soft_iron_sigma=0.0)  # type: ignore[no-any-return]
 
     def scaled_noise(self, factor: float) -> "MagnetometerParams":
-        """A copy whose white noise is `factor` times as large."""
+        """Return a copy with the white noise multiplied by `factor`."""
         return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

@@ -1,7 +1,7 @@
-"""What stands in a world: walls and cylinders.
+"""Obstacles of a world: walls and cylinders.
 
-They stand upright, at places in the inertial frame I (east, north, up). A vehicle that comes closer
-to one than its radius has collided, and the camera sees no feature behind one.
+They are upright, at places in the inertial frame I (east, north, up). A vehicle that comes closer
+to one than its radius collides with it, and the camera cannot see features behind one.
 """
 
 import math
@@ -12,22 +12,23 @@ from quad_gym.params.checks import Checked, Vector
 from quad_gym.records import Shape
 
 FARTHEST_OBSTACLE = 1e4
-"""No obstacle is larger, or farther from the origin, or shifted by more [m]."""
+"""Largest size of an obstacle, distance of its center from the origin, and shift [m]."""
 LEAST_SIZE = 1e-3
 """Smallest length, thickness, height or radius [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle(Checked):
-    """What all obstacles have: a place, which each episode may shift."""
+    """Base of all obstacles: a place, which can be shifted at random in each episode."""
 
     center_I: Vector = (0.0, 0.0, 0.0)
-    """(3,) its middle in I [m]"""
+    """(3,) center of the obstacle in I [m]"""
     shift_I: Vector = (0.0, 0.0, 0.0)
-    """(3,) largest shift along each axis of I, either way; each episode draws one uniformly [m]"""
+    """(3,) largest shift along each axis of I, in either direction [m]; each episode draws a shift
+    uniformly"""
     follows: int | None = None
-    """number of an obstacle before it in `WorldParams.obstacles` whose shift it shares, on top of
-    its own, as the other side of a gap does; None: it has its own alone"""
+    """index of an earlier obstacle in `WorldParams.obstacles` whose shift is added to this
+    obstacle's own shift, as for the two sides of a gap; None: its own shift only"""
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -45,17 +46,17 @@ class Obstacle(Checked):
 
     @property
     def half_size(self) -> Vector:
-        """(3,) half length, thickness and height; of a cylinder radius, radius, half height [m]."""
+        """Half sizes (3,): length, thickness, height; of a cylinder radius, radius, height [m]."""
         raise NotImplementedError
 
     @property
     def axis(self) -> Vector:
-        """(2,) level direction of the length, east and north."""
+        """Horizontal direction (2,) of the length, east and north [-]."""
         return (1.0, 0.0)
 
     @property
     def shape(self) -> Shape:
-        """Which of the shapes it is."""
+        """Shape of the obstacle."""
         raise NotImplementedError
 
 
@@ -66,7 +67,7 @@ class Wall(Obstacle):
     size: Vector = (4.0, 0.2, 3.0)
     """(3,) length, thickness and height [m]"""
     yaw: float = 0.0
-    """of the length, from east toward north [rad]"""
+    """direction of the length, from east toward north [rad]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,18 +78,18 @@ class Wall(Obstacle):
 
     @property
     def half_size(self) -> Vector:
-        """(3,) half length, thickness and height [m]."""
+        """Half length, half thickness and half height (3,) [m]."""
         length, thickness, height = self.size
         return (0.5 * length, 0.5 * thickness, 0.5 * height)
 
     @property
     def axis(self) -> Vector:
-        """(2,) level direction of the length, east and north."""
+        """Horizontal direction (2,) of the length, east and north [-]."""
         return (math.cos(self.yaw), math.sin(self.yaw))
 
     @property
     def shape(self) -> Shape:
-        """A wall."""
+        """Shape of a wall."""
         return Shape.WALL
 
 
@@ -97,9 +98,9 @@ class Cylinder(Obstacle):
     """An upright cylinder: a pillar, a tree, a mast."""
 
     radius: float = 0.2
-    """[m]"""
+    """radius of the cylinder [m]"""
     height: float = 3.0
-    """[m]"""
+    """height of the cylinder [m]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,30 +108,30 @@ class Cylinder(Obstacle):
 
     @property
     def half_size(self) -> Vector:
-        """(3,) radius, radius and half height [m]."""
+        """Radius, radius and half height (3,) [m]."""
         return (self.radius, self.radius, 0.5 * self.height)
 
     @property
     def shape(self) -> Shape:
-        """A cylinder."""
+        """Shape of a cylinder."""
         return Shape.CYLINDER
 
 
 def check_obstacles(name: str, obstacles: tuple[Obstacle, ...]) -> None:
-    """Refuse what are no obstacles, and those that follow a later one.
+    """Refuse anything that is not an obstacle, and obstacles that follow a later one.
 
     Args:
-        name: What they are called in messages.
-        obstacles: All of a world's.
+        name: Name of the argument in messages.
+        obstacles: All obstacles of a world.
 
     Raises:
-        ValueError: If there are such.
+        ValueError: If one is refused.
     """
     for k, obstacle in enumerate(obstacles):
         if not isinstance(obstacle, Wall | Cylinder):
             raise ValueError(f"{name} must hold Wall and Cylinder, got {obstacle!r}")
         if obstacle.follows is not None and obstacle.follows >= k:
             raise ValueError(
-                f"{name}[{k}].follows must be the number of one before it, less than {k}, got "
+                f"{name}[{k}].follows must be the index of an earlier obstacle, less than {k}, got "
                 f"{obstacle.follows}"
             )

@@ -1,8 +1,8 @@
-"""Small computations whose results are the same on every processor, to the last bit.
+"""Small computations with bitwise identical results on every processor.
 
 NumPy and LAPACK choose their code by the processor, and with it the order of sums and the
-polynomial of a sine. What is computed here goes into parameters of flights, so it uses Python's
-floats, in a fixed order, and the C library's functions.
+polynomial of a sine. The results here become parameters of flights, so they are computed with
+Python's floats, in a fixed order, and the C library's functions.
 """
 
 import math
@@ -52,11 +52,11 @@ def inverse(matrix: ArrayLike) -> Floats:
 
 
 def lower_root(matrix: ArrayLike, scale: ArrayLike) -> Floats:
-    """Lower triangular L with L L^T = M, for a positive semidefinite M (n, n).
+    """Return the lower triangular L with L L^T = M, for a positive semidefinite M (n, n).
 
     Args:
         matrix: M.
-        scale: (n,) variances beside which a pivot of 1e-12 counts as zero.
+        scale: (n,) variances; a pivot below 1e-12 times its variance counts as zero.
     """
     M, scales = np.asarray(matrix, np.float64).tolist(), np.asarray(scale, np.float64).tolist()
     n = len(M)

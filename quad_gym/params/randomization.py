@@ -1,7 +1,7 @@
-"""Domain randomization: which parameters can be drawn anew for every episode, and from what.
+"""Domain randomization: parameters drawn in every episode, and their distributions.
 
 Draws happen inside the kernel from each flight's own random stream, so the parameters of an episode
-depend on its flight's seed alone.
+depend only on the seed of its flight.
 """
 
 import math
@@ -23,31 +23,31 @@ from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL, UNIFORM, Drawable
 
 FAST = 100.0
-"""Vehicles fly slower than this [m/s]."""
+"""Speed that no vehicle reaches [m/s]."""
 
 FEATURE_DRAWS = ("features_yaw", "features_shift_I", "feature_offsets_I")
-"""Draws that move the camera's features; the filter knows where they are."""
+"""Draws that move the camera's features, to positions that the filter uses, too."""
 
 Given = Distribution | Sequence[Distribution | None]
 
 
 @dataclass(frozen=True)
 class Randomization:
-    """Which parameters are drawn anew for every episode, and from what distributions.
+    """Domain randomization: the distributions of the parameters that are drawn in every episode.
 
-    The names are those of `quad_gym.params.randomization.DRAWABLES`. Of a parameter with several
-    components each is drawn by itself, from the same distribution or from those of a sequence,
-    where None keeps a component. `feature_offsets_I` has three for each of the camera's features,
-    and a sequence holds those of x, y and z.
+    `quad_gym.params.randomization.DRAWABLES` lists the names. The components of a parameter are
+    drawn independently, all from one distribution or each from its own in a sequence, where None
+    keeps the nominal value of a component. `feature_offsets_I` has three components for each of the
+    camera's features; a sequence of three holds the distributions along x, y and z.
 
     Args:
-        parameters: Distributions by name.
-        known: Whether the filter and the controller know the vehicle and the sensors as they are,
-            draws included. By default they believe the nominal parameters. Of wind and ground they
-            never know. Where the camera's features are the filter always knows.
+        parameters: Distributions by name of the parameter.
+        known: True: filter and controller use the true parameters of vehicle and sensors, draws
+            included. False: they assume the nominal ones. Wind and ground are never known to them;
+            the positions of the camera's features always are known to the filter.
 
     Raises:
-        ValueError: If a name is unknown, or something is no distribution.
+        ValueError: If a name is unknown, or a value is not a distribution.
 
     Example:
         `Randomization({"mass": Uniform(0.8, 1.2, relative=True), "wind_speed": Uniform(0.0, 5.0),
@@ -66,7 +66,7 @@ class Randomization:
         unknown = sorted(set(self.parameters) - set(COLUMNS), key=str)
         if unknown:
             raise ValueError(
-                f"randomization of {unknown[0]!r} is unknown; what can be drawn is "
+                f"randomization of {unknown[0]!r} is unknown; parameters that can be drawn are "
                 f"{', '.join(COLUMNS)}"
             )
         if {"wind_speed", "wind_direction"} & set(self.parameters) and {
@@ -83,16 +83,16 @@ class Randomization:
 
     @classmethod
     def of(cls, given: "Randomization | Mapping[str, Given] | None") -> "Randomization":
-        """What a keyword may hold: a randomization, distributions by name, or None for nothing."""
+        """Return a randomization from one, from distributions by name, or from None."""
         return given if isinstance(given, Randomization) else cls({} if given is None else given)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What is drawn, in the order of `DRAWABLES`."""
+        """Names of the parameters that are drawn, in the order of `DRAWABLES`."""
         return tuple(name for name in COLUMNS if name in self.parameters)
 
     def distributions(self, name: str) -> tuple[Distribution | None, ...]:
-        """The distribution of each component of a parameter; None: it is not drawn."""
+        """Return the distribution of each component of a parameter; None: not drawn."""
         size = COLUMNS[name].stop - COLUMNS[name].start
         if name == "feature_offsets_I":
             size = 3
@@ -111,18 +111,17 @@ class Randomization:
 
 
 class DrawingTable:
-    """A randomization in numbers: how each column of a flight's field `drawn` is drawn.
+    """A randomization in numbers: the distribution of each column of a flight's field `drawn`.
 
     Args:
-        randomization: What is drawn.
+        randomization: The distributions.
         vehicle: The vehicle without draws.
         sensors: The sensors without draws.
         world: The world without draws.
-        action_delay: Likewise [control steps].
+        action_delay: The delay of actions without draws [control steps].
 
     Raises:
-        ValueError: If a range holds invalid values, such as a vehicle too heavy to
-            hover.
+        ValueError: If a range holds invalid values, such as a vehicle too heavy to hover.
     """
 
     def __init__(
@@ -153,7 +152,7 @@ class DrawingTable:
             _check_inertia(self)
 
     def mean_square(self, name: str) -> NDArray[np.float64]:
-        """(size,) mean square of each component of a parameter, over its distribution."""
+        """Return the mean squares (size,) of a parameter's components over their distributions."""
         u, quantile = (np.arange(4096) + 0.5) / 4096, NormalDist().inv_cdf
         found = []
         for k in range(COLUMNS[name].start, COLUMNS[name].stop):
@@ -174,7 +173,7 @@ class DrawingTable:
     ) -> None:
         name = drawable.name
         if np.isnan(nominal):
-            raise ValueError(f"randomization of {name!r} needs {_MISSING[name]}, there is none")
+            raise ValueError(f"randomization of {name!r} needs {_MISSING[name]}, got none")
         if part is None:  # a component that stays among others that are drawn
             part = Uniform(nominal, nominal)
         if part.relative and nominal == 0.0:
@@ -218,7 +217,7 @@ _FARTHEST = {
     "features_shift_I": 1e4,
     "feature_offsets_I": 1e4,
 }
-"""What can be drawn at most, either way, where larger numbers are mistakes."""
+"""Largest magnitudes of draws where larger numbers are mistakes."""
 
 
 def _range_in_words(drawable: Drawable) -> str:
@@ -249,7 +248,7 @@ _MISSING = (
 def nominal_values(
     vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
 ) -> NDArray[np.float64]:
-    """(DRAWN_SIZE,) what the columns of `drawn` are without draws; NaN: there is no such part."""
+    """Return the columns (DRAWN_SIZE,) of `drawn` without draws; NaN: of a missing part."""
     imu, gnss, camera, battery = sensors.imu, sensors.gnss, sensors.camera, world.battery
     east, north, up = world.wind_I
     known: dict[str, Any] = {
@@ -309,13 +308,13 @@ def check_draws(
     """Refuse rotors that are too fast, or drag that is too large, for the integration.
 
     Args:
-        table: What is drawn.
-        vehicle: As it is without draws.
-        world: Likewise.
-        clocks: Say how long a Runge-Kutta step is.
+        table: The distributions.
+        vehicle: The vehicle without draws.
+        world: The world without draws.
+        clocks: Rates, for the duration of a Runge-Kutta step.
 
     Raises:
-        ValueError: If they are, or may be drawn so.
+        ValueError: If the nominal values or any draw are refused.
     """
     _check_drag(table, vehicle, world, clocks)
     name = "motor_time_constant"
@@ -332,7 +331,7 @@ def _check_drag(
     """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
 
     def most(name: str) -> float:
-        """The largest draw; of a normal without bounds that of six standard deviations."""
+        """Return the largest draw; for a normal without bounds, six standard deviations."""
         columns = COLUMNS[name]
         high, low = table.high[columns], table.low[columns]
         far = np.abs(table.center[columns]) + 6.0 * table.spread[columns]
@@ -346,7 +345,7 @@ def _check_drag(
     drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
     columns = COLUMNS["mass"]
     mass = float(table.low[columns][0])
-    if "mass" in table.names:  # of a normal with far bounds that of six standard deviations
+    if "mass" in table.names:  # six standard deviations of a normal with far bounds
         mass = max(mass, float((table.center[columns] - 6.0 * table.spread[columns])[0]))
     step = 1.0 / (clocks.imu_rate * clocks.substeps)
     if step * drag > RK4_LIMIT * mass:
@@ -362,8 +361,8 @@ def _check_inertia(table: DrawingTable) -> None:
     """Refuse a range of moments of inertia all of which no body has.
 
     A range in which some draws break the rule that each moment is at most the sum of the other two
-    is taken: components are drawn independently, so that 20 % either way of flat vehicles has such
-    draws, and they fly as well as any. See `params.check_moments`.
+    is accepted: components are drawn independently, so 20 % either way of a flat vehicle includes
+    such draws, and they fly as well as any. See `params.check_moments`.
     """
     columns = COLUMNS["inertia"]
     low, high = table.low[columns], table.high[columns]
@@ -374,5 +373,5 @@ def _check_inertia(table: DrawingTable) -> None:
 
 
 def _open_circuit(battery: BatteryParams, charge: float) -> float:
-    """Voltage of an unloaded battery over that of a full one."""
+    """Return the voltage of an unloaded battery as a fraction of a full battery's."""
     return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge

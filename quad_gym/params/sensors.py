@@ -30,18 +30,19 @@ AID_PARAMS: dict[str, type[AidParams]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class InitialPoseParams(Checked):
-    """How well the place of the start is known where there is no GNSS to measure it.
+    """Accuracy of the initial position and heading where there is no GNSS to measure them.
 
     The vehicle is put down on a marked spot. The filter starts from the position of the spot and
-    the heading of the vehicle, with these errors, and assumes that the vehicle is level. Where the
-    baseline of GNSS lies within 12 degrees of the vertical, so that it hardly tells the heading,
-    the heading is known from the mark, too; and with one antenna, where there is no magnetometer.
+    the heading of the vehicle, with these errors, and assumes that the vehicle is level. The
+    heading of the spot is also used where the GNSS baseline lies within 12 degrees of the vertical,
+    so that it hardly observes the heading, and with a single antenna and no magnetometer.
     """
 
     position_sigma: float = 0.05
-    """per axis [m]; a vehicle put on its mark by hand"""
+    """standard deviation of the initial position, per axis [m]; a vehicle put on its mark by
+    hand"""
     heading_sigma: float = 0.05
-    """[rad]; a vehicle lined up by eye, some 3 degrees"""
+    """standard deviation of the initial heading [rad]; a vehicle lined up by eye, some 3 degrees"""
 
     def __post_init__(self) -> None:
         self._check(check.positive, "position_sigma", "heading_sigma")
@@ -49,26 +50,27 @@ class InitialPoseParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class NoisyObservationParams(Checked):
-    """Standard deviations of `observation="noisy"`: the size of the converged filter's errors.
+    """Standard deviations of the noise of `observation="noisy"`.
 
-    The defaults are those of the laboratory's sensors; a suite of other sensors has its own.
+    They are as large as the errors of the converged filter. The defaults are for the laboratory's
+    sensors; suites of other sensors have their own values.
     """
 
     position: float = 0.0018
-    """per axis [m]; measured on the laboratory's circle"""
+    """standard deviation of the position, per axis [m]; measured on the laboratory's circle"""
     velocity: float = 0.012
-    """per axis [m/s]; measured on the laboratory's circle"""
+    """standard deviation of the velocity, per axis [m/s]; measured on the laboratory's circle"""
     attitude: float = 0.006
-    """per axis [rad]; measured on the laboratory's circle"""
+    """standard deviation of the attitude, per axis [rad]; measured on the laboratory's circle"""
     body_rates: float = 0.0123
-    """per axis [rad/s]; the gyro's noise at 200 Hz"""
+    """standard deviation of the body rates, per axis [rad/s]; the gyro's noise at 200 Hz"""
 
     def __post_init__(self) -> None:
         self._check(check.number, "position", "velocity", "attitude", "body_rates", least=0.0)
 
 
 def delay_ticks(name: str, latency: float, rate: float, imu_rate: float) -> int:
-    """How many ticks a latency [s] is.
+    """Return a latency [s] in ticks.
 
     Raises:
         ValueError: If more than MAX_UNDER_WAY measurements would be in transit at a time.
@@ -87,17 +89,21 @@ class SensorSuite(Checked):
     """All sensors of a vehicle and the filter that fuses them."""
 
     imu: ImuParams = field(default_factory=ImuParams)
+    """IMU, whose samples are the ticks of the simulation"""
     gnss: GnssParams | None = field(default_factory=GnssParams)
-    """None: no GNSS; the filter then starts from `initial_pose`"""
+    """GNSS; None: no GNSS, and the filter starts from `initial_pose`"""
     camera: CameraParams | None = field(default_factory=CameraParams)
-    """None: no camera"""
+    """camera; None: no camera"""
     barometer: BarometerParams | None = None
-    """None: no barometer"""
+    """barometer; None: no barometer"""
     magnetometer: MagnetometerParams | None = None
-    """None: no magnetometer"""
+    """magnetometer; None: no magnetometer"""
     initial_pose: InitialPoseParams = field(default_factory=InitialPoseParams)
+    """accuracy of the initial pose where GNSS does not measure it"""
     estimator: FilterParams = field(default_factory=FilterParams)
+    """Kalman filter that fuses the measurements"""
     noisy: NoisyObservationParams = field(default_factory=NoisyObservationParams)
+    """noise of `observation="noisy"`"""
 
     def __post_init__(self) -> None:
         for name, kind in (
@@ -146,27 +152,27 @@ class SensorSuite(Checked):
 
     @property
     def aids(self) -> dict[Aid, AidParams]:
-        """The aiding sensors that there are."""
+        """Parameters of the aiding sensors in the suite."""
         found = {aid: getattr(self, aid.name.lower()) for aid in Aid}
         return {aid: params for aid, params in found.items() if params is not None}
 
     @property
     def heading_aid(self) -> Aid | None:
-        """The aiding sensor that tells the filter's start its heading, where no baseline does."""
+        """Aiding sensor that initializes the heading where no baseline does; None: none."""
         alone = self.gnss is not None and not self.gnss.has_baseline
         return Aid.MAGNETOMETER if alone and self.magnetometer is not None else None
 
     @property
     def drifts(self) -> bool:
-        """Whether GNSS positions have a slow error, so that a filter estimates it."""
+        """True if GNSS positions have a time-correlated error, which the filter estimates."""
         return self.gnss is not None and self.gnss.drifts
 
     def require_filter(self) -> None:
-        """Refuse a suite whose filter mistakes the samples of the IMU, or would overflow.
+        """Refuse a suite whose filter misinterprets the IMU samples, or would overflow.
 
         Raises:
-            ValueError: If it takes means over a tick for the motion at its start, or divides by
-                the square of hardly any noise.
+            ValueError: If the filter would use means over a tick as samples at its start, or divide
+                by the square of almost no noise.
         """
         if self.gnss is not None and min(self.gnss.position_sigma_I) < 1e-9:
             raise ValueError(
@@ -176,18 +182,18 @@ class SensorSuite(Checked):
         if self.imu.samples == "average" and self.estimator.integration == "euler":
             raise ValueError(
                 "sensors must have FilterParams.integration='midpoint' with ImuParams.samples="
-                "'average': 'euler' takes a sample for the motion at the start of its tick"
+                "'average': 'euler' uses a sample as the motion at the start of its tick"
             )
 
     def require_like(self, true_sensors: "SensorSuite") -> None:
-        """Refuse true sensors that a filter which believes in these cannot be flown with.
+        """Refuse true sensors with which a filter that assumes this suite cannot fly.
 
-        Noise, biases, drift, latency, placement and mounting may differ, and where the features
-        are. Which sensors there are, when and what they measure may not: both sides share a clock
-        and the measurements that the filter expects.
+        Noise, biases, drift, latency, initial pose, mounting and feature positions may differ. The
+        set of sensors, their schedules and their measured quantities must not: both sides share a
+        clock and the measurements that the filter expects.
 
         Raises:
-            ValueError: If they tick otherwise, or others are missing.
+            ValueError: If the ticks differ, or sensors are missing or additional.
         """
         if true_sensors.imu.rate != self.imu.rate:
             raise ValueError("true_sensors must have the IMU rate of sensors, as it is the tick")
@@ -206,7 +212,7 @@ class SensorSuite(Checked):
                 )
 
     def _schedule(self, true: "SensorSuite") -> Iterator[tuple[str, object, object]]:
-        """What measures when, in words: as it is in `true`, and as it is here."""
+        """Yield the rates, phases and measured quantities of sensors: name, in `true`, here."""
         if self.gnss is not None and true.gnss is not None:
             here, there = self.gnss, true.gnss
             yield "GNSS rate [Hz]", there.rate, here.rate
@@ -234,13 +240,13 @@ class SensorSuite(Checked):
         camera: float | None = None,
         **aids: float | None,
     ) -> "SensorSuite":
-        """A copy whose sensors run at other rates [Hz]; None keeps a rate.
+        """Return a copy whose sensors run at other rates [Hz]; None keeps a rate.
 
-        A new IMU rate changes the tick: sensors that measured at every tick keep doing so.
+        A new IMU rate changes the tick: sensors that measured at every tick continue to do so.
 
         Raises:
-            ValueError: If a rate is not positive or not a whole division of the IMU's, or there is
-                no GNSS, or no camera, that could have the rate given for it.
+            ValueError: If a rate is not positive or does not divide the IMU rate, or if the suite
+                lacks the sensor whose rate is given.
         """
         check.keywords(aids, tuple(AID_PARAMS), "with_rates")
         imu_rate = self.imu.rate
@@ -272,16 +278,16 @@ class SensorSuite(Checked):
                 rate = rate_of(f"{name}_rate", wanted, sensor.rate)
                 changed[name] = sensor.replace(rate=rate)
             elif wanted is not None:
-                raise ValueError(f"{name}_rate must not be given without one, got {wanted} Hz")
+                raise ValueError(f"{name}_rate must not be given without a {name}, got {wanted} Hz")
         return self.replace(  # type: ignore[no-any-return]
             imu=self.imu.replace(rate=imu_rate), gnss=gnss_params, camera=camera_params, **changed
         )
 
     def simplified(self) -> "SensorSuite":
-        """A copy whose measurements arrive at once, with white noise, bias and drift alone.
+        """Return a copy with white noise, bias and drift only, and without delays.
 
-        To tell what latency, vibration, misalignment, constant heading errors, blur, range and
-        ground do to a flight. White noise stays as it is.
+        The difference shows the effect of latency, vibration, misalignment, constant heading
+        errors, motion blur, range and ground on a flight. White noise stays as it is.
         """
         gnss, camera = self.gnss, self.camera
         if gnss is not None:
@@ -304,7 +310,7 @@ class SensorSuite(Checked):
         )
 
     def scaled_noise(self, factor: float) -> "SensorSuite":
-        """A copy whose white noise is `factor` times as large, as a filter of this suite knows."""
+        """Return a copy with all white noise multiplied by `factor`, for sensors and filter."""
         check.positive("factor", factor)
         gnss, camera = self.gnss, self.camera
         if camera is not None:

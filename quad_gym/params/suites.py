@@ -8,26 +8,26 @@
 | `consumer` | single frequency, one antenna, 10 Hz; barometer, magnetometer | none | cheap MEMS |
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
-| `stale` | as `rtk`, 40 ms late, taken for fresh | as `rtk`, 10 ms late, likewise | as `rtk` |
+| `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
 
 The last two were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in one
-direction alone, and a filter that ignores time stamps. They are not among SUITES, on which results
+direction only, and a filter that ignores time stamps. They are not among SUITES, on which results
 for all tasks are based.
 
-The IMU runs at 200 Hz, so that cameras of 30 Hz run at 25 Hz, a whole division of it. Outside `lab`
-the phases of GNSS and camera are drawn anew in each episode, the fix that starts the filter is
-counted once, and a gate of false alarm 1e-4 guards the filter.
+The IMU runs at 200 Hz, so cameras of 30 Hz run at 25 Hz, which divides that rate. Except in `lab`,
+the phases of GNSS and camera are drawn in each episode, the fix that starts the filter is used
+once, and an innovation gate with a false alarm probability of 1e-4 protects the filter.
 
-`rtk`, `consumer` and `indoor` also do what real sensors do beside noise and bias: measurements
-arrive late, accelerometer axes are not quite orthogonal, rotors shake the IMU, headings have a
-constant error, the camera blurs and has a limited range. Gyros have no error of scale or alignment
-by default: in a turn it is a bias that goes with the rate, for which a filter of 15 states has no
-place (docs/sensors-and-filter.md says what it does).
+`rtk`, `consumer` and `indoor` also have sensor errors besides noise and bias: delays, accelerometer
+axes that are not quite orthogonal, vibration of the rotors, constant heading errors, motion blur
+and a limited range of the camera. Gyros have no error of scale or alignment by default: in a turn
+this is a bias proportional to the rate, for which a filter of 15 states has no state
+(docs/sensors-and-filter.md explains the effect).
 
-The noise of `observation="noisy"` is the size of each suite's own errors. Outside `lab` it is the
-root mean square error per axis of what control on the estimate sees from 20 s to 30 s after the
-start, in 256 flights of the circle (hovering start, tuned PD control, seeds 5000 to 5255); that of
-the body rates is the gyro's noise together with the error of its estimated bias.
+The noise of `observation="noisy"` is as large as the filter's errors with each suite. Except in
+`lab`, it is the root mean square error of the estimate per axis from 20 s to 30 s after the start,
+in 256 flights of the circle under control on the estimate (hovering start, tuned PD control, seeds
+5000 to 5255); for the body rates, it is the noise of the gyro with the error of its estimated bias.
 """
 
 import math
@@ -63,13 +63,13 @@ FIELD_FILTER = FilterParams(
     attitude_reset=True,
     bearing_noise_at="pinhole",
     initial_covariance_scale=1.0,
-    initial_tilt_sigma=0.03,  # how level vehicles stand or hover at the start of an episode
-    initial_velocity_variance=0.03**2,  # and how still
+    initial_tilt_sigma=0.03,  # of vehicles that stand or hover at the start of an episode
+    initial_velocity_variance=0.03**2,  # of the same vehicles
     reuse_first_fix=False,
     recursive_update_threshold=0.01,  # its square is below what a pixel subtends
     false_alarm_probability=1e-4,
 )
-"""The filter outside the laboratory: consistent from its start on, and gated."""
+"""The filter of all suites except `lab`: consistent from its start, with an innovation gate."""
 
 RTK = SensorSuite(
     imu=ImuParams(
@@ -143,7 +143,7 @@ CONSUMER = SensorSuite(
         # of which a calibration in six orientations leaves a quarter; our judgment
         accel_scale_sigma=0.0025,
         accel_misalignment_sigma=0.005,
-        # rotors that nobody has balanced, an IMU on foam; our judgment
+        # rotors that have not been balanced, an IMU on foam; our judgment
         accel_vibration=0.2,
         gyro_vibration=0.01,
     ),
@@ -158,7 +158,7 @@ CONSUMER = SensorSuite(
         drift_sigma_I=(0.6, 0.6, 1.0),
         drift_tau=60.0,
         velocity_sigma=0.05,  # the same data sheet: velocity accuracy 0.05 m/s
-        # one antenna has no baseline: the magnetometer tells the heading
+        # one antenna has no baseline: the magnetometer measures the heading
         primary_antenna_B=(0.0, 0.0, 0.0472),
         secondary_antenna_B=None,
         phase=None,
@@ -167,11 +167,11 @@ CONSUMER = SensorSuite(
     barometer=BarometerParams(rate=20.0),
     magnetometer=MagnetometerParams(
         rate=20.0,
-        # iron beside the motors, and what a calibration by hand leaves of it: 3.6 degrees of
-        # heading; our judgment
+        # iron near the motors, as far as a calibration by hand leaves it: 3.6 degrees of heading;
+        # our judgment
         hard_iron_sigma=1.5 * MICROTESLA,
     ),
-    estimator=FIELD_FILTER,  # with the slow error among its states
+    estimator=FIELD_FILTER,  # with the GNSS drift among its states
     noisy=NoisyObservationParams(
         position=0.123, velocity=0.024, attitude=0.0040, body_rates=0.011
     ),  # measured, see above
@@ -226,7 +226,7 @@ INDOOR = SensorSuite(
         position=0.0077, velocity=0.0128, attitude=0.00056, body_rates=0.0061
     ),  # measured, see above
 )
-"""A hall without GNSS: the camera sees markers on the walls wherever it looks."""
+"""A hall without GNSS, with markers on all walls in the view of the camera."""
 
 ONE_WALL = INDOOR.replace(
     imu=CONSUMER.imu,
@@ -241,16 +241,17 @@ ONE_WALL = INDOOR.replace(
         position=0.0079, velocity=0.0139, attitude=0.00089, body_rates=0.0107
     ),
 )
-"""For `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west wall."""
+"""The suite of `LookAround`: `indoor` with a cheap IMU, a narrow camera, and markers on the west
+wall."""
 
 STALE = RTK.replace(
-    # small beside those of `rtk`, whose filter is told of them: with 0.1 s and 0.04 s a controller
-    # that passes 97 % of the gates on the true state passes 20 %, with these 64 %
+    # smaller than in `rtk`, whose filter compensates them: with 0.1 s and 0.04 s a controller that
+    # passes 97 % of the gates on the true state passes 20 %, with these 64 %
     gnss=None if RTK.gnss is None else RTK.gnss.replace(latency=0.04),
     camera=None if RTK.camera is None else RTK.camera.replace(latency=0.01),
     estimator=RTK.estimator.replace(delay_compensation="none"),
 )
-"""For `StaleRace`: `rtk` with a filter that takes late measurements for fresh."""
+"""The suite of `StaleRace`: `rtk` with a filter that does not compensate delays."""
 
 STANDARD = SensorSuite(
     imu=ImuParams(samples="average"),
@@ -261,7 +262,7 @@ STANDARD = SensorSuite(
         position=0.0020, velocity=0.0150, attitude=0.0011, body_rates=0.0124
     ),
 )
-"""The environments' default: the laboratory's sensors, and a filter that is consistent."""
+"""The environments' default: the laboratory's sensors with a consistent filter."""
 
 _SUITES = {
     "standard": STANDARD,
@@ -281,7 +282,7 @@ _ALL = {
 }
 
 ALL_SUITES = tuple(_ALL)
-"""The same, and those that belong to one task."""
+"""Names of all sensor suites, with those made for one task."""
 
 
 def sensor_suite(name: str | Path) -> SensorSuite:

@@ -1,4 +1,4 @@
-"""The task: what the vehicle is to do, and when an episode is over."""
+"""The task: its reference, and the start and the end of its episodes."""
 
 import functools
 import math
@@ -16,67 +16,75 @@ TASKS = tuple(task.name.lower() for task in Task)
 """Kinds of task."""
 
 STARTS = tuple(start.name.lower() for start in Start)
-"""How episodes begin."""
+"""Names of the ways in which episodes begin."""
 
 FARTHEST = 1000.0
-"""Positions of references are observed within this [m]."""
+"""Largest distance of a reference from the origin, along an axis, in observations [m]."""
 
 MIN_PERIOD = 0.01
-"""No vehicle follows a faster reference [s]."""
+"""Period of the fastest reference [s]; no vehicle can follow a faster one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskParams(Checked):
-    """What the vehicle is to do, and when an episode is over."""
+    """Reference, start, reward scale and termination of a task."""
 
     kind: str = "circle"
-    """one of TASKS"""
+    """kind of task, one of TASKS"""
     radius: float = 4.0
-    """size of the reference, at most 1000 [m]; report section 4.2"""
+    """size of the reference, at most 1000 [m]; report section 4.2. Radius of the circle; distance
+    of the hover point from the vertical through the origin; half the length of the lemniscate;
+    bound of a random trajectory's distance from its center, and of the gates' distance from the
+    vertical through the origin"""
     period: float = 10.0
-    """of the reference, at least 0.01 [s]; report section 4.2"""
+    """period of the reference, at least 0.01 [s]; report section 4.2"""
     height: float = 1.0
-    """of the reference, at most 1000 [m]; report section 4.2"""
+    """height of the reference, at most 1000 [m]; report section 4.2"""
     start: str = "ground"
-    """"ground": at rest below the reference at height 0, rotors stopped (report section 4.2);
-    "hover": hovering at rest within some decimeters of the reference; "mixed": either, with
-    probability 0.5; "moving": as "hover", with up to 1.5 m/s and 2 rad/s on each axis, uniform, as
-    after a disturbance"""
+    """start of an episode. "ground": at rest below the reference at height 0, with stopped rotors
+    (report section 4.2); "hover": hovering at rest within some decimeters of the reference;
+    "mixed": one of these two, each with probability 0.5; "moving": as "hover", with uniformly drawn
+    velocities of up to 1.5 m/s and body rates of up to 2 rad/s on each axis, as after a
+    disturbance"""
     pad: bool = True
-    """whether a launch pad carries a vehicle that starts on the ground until its thrust lifts it;
-    without one it sinks while its rotors spin up, as in the report. Ground that carries vehicles
-    (`WorldParams.ground`) needs none"""
+    """True: a launch pad supports a vehicle that starts on the ground until its thrust lifts it;
+    False: it sinks while its rotors spin up, as in the report. Ground that supports vehicles
+    (`WorldParams.ground`) makes the pad unnecessary"""
     reward_per: str = "step"
-    """"step": a reward of the order of one in each step, as learning algorithms expect; "second":
-    the same times the control period"""
+    """unit of the reward. "step": of order one in each step, as learning algorithms expect;
+    "second": the reward per step times the control period"""
     randomize_reference: bool = False
-    """draw the reference anew each episode: phase, radius, period and sense of circle and
-    lemniscate, the heading of a random trajectory and of a course of gates; a trajectory of one's
-    own is turned about the vertical through the origin, and a closed one begins anywhere"""
+    """True: draw the reference in each episode: azimuth and distance of the hover point; phase,
+    radius, period and sense of circle and lemniscate; the heading of a random trajectory and of a
+    course of gates. A user-defined trajectory is rotated about the vertical through the origin, and
+    a closed one begins anywhere"""
     duration: float = 10.0
-    """time limit of an episode [s], at least half a control period; 0: none; report section 4.2"""
+    """time limit of an episode [s], at least half a control period; 0: no limit; report section
+    4.2"""
     out_of_bounds: float = 3.0
-    """distance from the reference at which an episode ends [m]"""
+    """distance from the reference above which an episode ends [m]"""
     min_height: float = -0.5
-    """height at which an episode ends [m]; below 0, as a vehicle without a launch pad sinks while
-    its rotors spin up. Where `WorldParams.ground` carries vehicles, at least 0.5 m below it"""
+    """height below which an episode ends [m]; negative, as a vehicle without a launch pad sinks
+    while its rotors spin up. Over ground that supports vehicles (`WorldParams.ground`), at least
+    0.5 m below that ground"""
     truncate_when_diverged: bool = False
-    """whether an episode is truncated where the filter finds that it is lost"""
+    """True: truncate an episode when the filter's consistency monitor flags divergence"""
     max_tilt: float = math.radians(100.0)
-    """angle between the body z axis and the vertical at which an episode ends [rad]"""
+    """angle between the body z axis and the vertical above which an episode ends [rad]"""
     max_speed: float = 2.5
-    """bound of a random trajectory [m/s]"""
+    """bound of the speed of a random trajectory [m/s]"""
     max_acceleration: float = 3.0
-    """bound of a random trajectory [m/s^2]"""
+    """bound of the acceleration of a random trajectory [m/s^2]"""
     gate_count: int = 5
-    """gates of a course, at most MAX_GATES"""
+    """number of gates of a course, at most MAX_GATES"""
     gate_radius: float = 0.3
-    """distance at which a gate counts as passed [m]"""
+    """distance from the center of a gate below which the gate is passed [m]"""
     preview: Vector = (0.2, 0.4)
-    """(2,) how far ahead an observation shows the reference [s]"""
+    """(2,) times ahead of the present at which observations include the reference [s]"""
     trajectory: Trajectory | str | Path | Sequence[Trajectory | str | Path] | None = None
-    """what to follow: a `quad_gym.Trajectory`, the path of a table for `Trajectory.from_csv`, or
-    several of them, of which each episode draws one; None: a figure of eight through five points"""
+    """reference of the task: a `quad_gym.Trajectory`, the path of a table for
+    `Trajectory.from_csv`, or a sequence of these, of which each episode draws one; None: a figure
+    of eight through five points"""
 
     def __post_init__(self) -> None:
         self._check(check.choice, "kind", choices=TASKS)
@@ -110,12 +118,12 @@ class TaskParams(Checked):
 
     @property
     def may_start_on_ground(self) -> bool:
-        """Whether any episode begins on the ground."""
+        """True if any episode may begin on the ground."""
         return self.start in ("ground", "mixed")
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """What flights of the task "trajectory" follow, one of them each; none elsewhere."""
+        """Trajectories of the task "trajectory", one of them per episode; empty for others."""
         if self.kind != "trajectory":
             return ()
         given: Any = self.trajectory
@@ -124,16 +132,17 @@ class TaskParams(Checked):
 
 @functools.cache
 def figure_of_eight() -> Trajectory:
-    """A closed flight through five points at 2.5 m/s and 3 m/s^2 at most, looking ahead."""
+    """Return a closed trajectory through five points, up to 2.5 m/s and 3 m/s^2."""
     points = [(0, 0, 1.5), (3, 1.5, 2), (3, -1.5, 1), (-3, 1.5, 2), (-3, -1.5, 1)]
     return Trajectory.through(points, closed=True, yaw="along")
 
 
 def checked_trajectories(kind: str, given: Any) -> tuple[Trajectory, ...] | None:
-    """Trajectories of a task as a tuple, or None.
+    """Return the trajectories of a task as a tuple, or None.
 
     Raises:
-        ValueError: If something else is among them, one is too far away, or the task follows none.
+        ValueError: If an element is not a trajectory or leads too far away, or the task follows
+            none.
     """
     if given is None:
         return None
@@ -167,15 +176,15 @@ def _read(file: str | Path) -> Trajectory:
 
 
 def check_limit(task: TaskParams, rate: float, name: str) -> None:
-    """Refuse a time limit of less than a step, which would round to none.
+    """Refuse a time limit of less than a step, which would be rounded to no limit.
 
     Args:
-        task: Has the limit.
-        rate: Of steps [Hz].
-        name: Of that rate.
+        task: The task with the limit.
+        rate: Rate of the steps [Hz].
+        name: Name of that rate in messages.
 
     Raises:
-        ValueError: If it is.
+        ValueError: If the limit is refused.
     """
     if task.duration > 0.0 and round(task.duration * rate) == 0:
         raise ValueError(

@@ -1,8 +1,8 @@
 """The vehicle: rigid body, rotors and drag.
 
-Everything is SI (radians too); body frame B: x forward, z up along the thrust. The laboratory's
-numbers come from the Aerial Robotics course (ASE 479W, The University of Texas at Austin) whose
-third laboratory report this package implements.
+All quantities are in SI units, angles in radians; body frame B has x forward and z up along the
+thrust. The laboratory's numbers come from the Aerial Robotics course (ASE 479W, The University of
+Texas at Austin) whose third laboratory report this package implements.
 """
 
 import math
@@ -17,13 +17,14 @@ from quad_gym.params.clocks import Clocks
 from quad_gym.params.gravity import GRAVITY
 
 LEAST_MOMENT = 1e-9
-"""Of inertia, beyond which numbers are mistaken; a quadrotor of 10 g has 1e-6 [kg m^2]."""
+"""Moment of inertia below which numbers are mistakes; a quadrotor of 10 g has 1e-6 [kg m^2]."""
 
 MAX_LIFT = 1000.0
-"""Thrust over weight beyond which numbers are mistaken; racing drones reach 15."""
+"""Thrust-to-weight ratio above which numbers are mistakes; racing drones reach 15."""
 
 MAX_TORQUE_ARM = 10.0
-"""Torque over thrust of a rotor beyond which numbers are mistaken; of propellers it is 0.02 [m]."""
+"""Ratio of torque to thrust of a rotor above which numbers are mistakes; propellers have 0.02
+[m]."""
 
 RK4_LIMIT = 2.78
 """Largest step of the classic Runge-Kutta method over the time constant of a decay, beyond which
@@ -32,39 +33,42 @@ its solution grows: the root of |1 - z + z^2/2 - z^3/6 + z^4/24| = 1 is 2.785.""
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleParams(Checked):
-    """A quadrotor: rigid body, four rotors with first-order speed response, drag of a flat disc."""
+    """A quadrotor: rigid body, four rotors with first-order speed response, disc drag."""
 
     mass: float = 0.78
-    """[kg]; laboratory vehicle"""
+    """mass [kg]; laboratory vehicle"""
     inertia: Matrix = ((1.7565e-3, 0.0, 0.0), (0.0, 3.5723e-3, 0.0), (0.0, 0.0, 4.7134e-3))
-    """(3, 3) about the center of mass, in B [kg m^2]; laboratory vehicle"""
+    """(3, 3) inertia about the center of mass, in B [kg m^2]; laboratory vehicle"""
     rotor_positions_B: Matrix = (
         (0.21, -0.21, 0.0),
         (0.21, 0.21, 0.0),
         (-0.21, 0.21, 0.0),
         (-0.21, -0.21, 0.0),
     )
-    """(4, 3) rotor hubs relative to the center of mass, in B [m]; laboratory vehicle"""
+    """(4, 3) positions of the rotor hubs relative to the center of mass, in B [m]; laboratory
+    vehicle"""
     rotor_spins: Vector = (1.0, -1.0, 1.0, -1.0)
-    """(4,) sense of rotation about body z, opposite to the reaction torque; laboratory vehicle"""
+    """(4,) sense of rotation of each rotor about body z, +1 or -1, opposite to its reaction torque;
+    laboratory vehicle"""
     thrust_coefficient: float = 6.11e-8 / 0.104719755**2
-    """F = kF W^2 [N/(rad/s)^2]; laboratory vehicle, given there per rpm^2"""
+    """kF in the thrust of a rotor, F = kF W^2 [N/(rad/s)^2]; laboratory vehicle, there per rpm^2"""
     torque_coefficient: float = 1.5e-9 / 0.104719755**2
-    """N = kN W^2 [N m/(rad/s)^2]; laboratory vehicle, given there per rpm^2"""
+    """kN in the reaction torque of a rotor, N = kN W^2 [N m/(rad/s)^2]; laboratory vehicle, there
+    per rpm^2"""
     motor_time_constant: float = 0.05
-    """lag of the rotor speed behind the voltage [s]; laboratory vehicle"""
+    """time constant of the rotor speed's response to the voltage [s]; laboratory vehicle"""
     motor_speed_per_volt: float = 200.0
     """steady rotor speed per volt [rad/s/V]; laboratory vehicle"""
     max_voltage: float = 12.0
-    """[V]; laboratory vehicle"""
+    """largest motor voltage [V]; laboratory vehicle"""
     disc_area: float = 0.01
     """area of the drag disc [m^2]; laboratory vehicle"""
     drag_coefficient: float = 0.3
-    """of the drag disc; laboratory vehicle"""
+    """drag coefficient of the drag disc [-]; laboratory vehicle"""
     air_density: float = 1.225
-    """[kg/m^3]; standard atmosphere at sea level"""
+    """density of the air [kg/m^3]; standard atmosphere at sea level"""
     gravity: float = GRAVITY
-    """[m/s^2]"""
+    """gravitational acceleration [m/s^2]; laboratory"""
 
     def __post_init__(self) -> None:
         self._check(
@@ -129,30 +133,30 @@ class VehicleParams(Checked):
 
     @property
     def hover_voltage(self) -> float:
-        """Voltage at which four rotors carry the weight [V]."""
+        """Voltage at which the four rotors carry the weight [V]."""
         force = self.mass * self.gravity / 4
         return math.sqrt(force / self.thrust_coefficient) / self.motor_speed_per_volt
 
     @property
     def hover_torques(self) -> tuple[float, float, float]:
-        """Torques about the body axes that the weight makes on the rotors' lever arms [N m]."""
+        """Torques about the body axes that the weight exerts on the rotors' lever arms [N m]."""
         weight = self.mass * self.gravity
         x, y, _ = np.abs(np.array(self.rotor_positions_B)).mean(axis=0)
         return weight * y, weight * x, weight * self.torque_coefficient / self.thrust_coefficient
 
     @property
     def effectiveness(self) -> np.ndarray:
-        """(4, 4): total thrust [N] and torque in B [N m] per unit of each rotor's thrust."""
+        """Matrix (4, 4): total thrust [N] and torque in B [N m] per unit thrust of each rotor."""
         positions, spins = np.array(self.rotor_positions_B), np.array(self.rotor_spins)
         torque_per_thrust = self.torque_coefficient / self.thrust_coefficient
         return np.stack([np.ones(4), positions[:, 1], -positions[:, 0], -torque_per_thrust * spins])
 
 
 def check_moments(name: str, moments: ArrayLike) -> None:
-    """Refuse moments of inertia that no mass has: each is at most the sum of the other two.
+    """Refuse moments of inertia that no body has: each is at most the sum of the other two.
 
     Args:
-        name: What they belong to.
+        name: Name of the argument in messages.
         moments: (3,) about the principal axes, or about any three orthogonal ones [kg m^2].
 
     Raises:
@@ -161,7 +165,7 @@ def check_moments(name: str, moments: ArrayLike) -> None:
     values = np.asarray(moments, np.float64)
     if 2.0 * values.max() > values.sum() * (1.0 + 1e-9):
         raise ValueError(
-            f"{name} must be that of a body: no moment can be larger than the sum of the other "
+            f"{name} must belong to a body: no moment can be larger than the sum of the other "
             f"two, got {', '.join(f'{value:g}' for value in values)} kg m^2"
         )
 
@@ -170,9 +174,9 @@ def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
     """Refuse rotors that are too fast for the integration.
 
     Args:
-        name: What the time constant belongs to.
-        time_constant: Of the rotors' lag [s].
-        clocks: Say how long a Runge-Kutta step is.
+        name: Name of the time constant in messages.
+        time_constant: Time constant of the rotor speeds [s].
+        clocks: Rates, for the duration of a Runge-Kutta step.
 
     Raises:
         ValueError: If the step is too long, so that the computed rotor speeds would diverge.
@@ -189,5 +193,5 @@ _VEHICLES = {"lab": VehicleParams()}
 
 
 def vehicle_params(name: str) -> VehicleParams:
-    """The vehicle called `name`: "lab", the report's."""
+    """Return the vehicle called `name`: "lab", the vehicle of the laboratory report."""
     return _VEHICLES[check.choice("vehicle", name, tuple(_VEHICLES))]

@@ -1,7 +1,7 @@
-"""The world around a vehicle: air, ground, battery, and what stands in the way.
+"""The world around a vehicle: air, ground, battery and obstacles.
 
 As in `params`: frozen, keyword-only, SI units, the source with every number. By default the air is
-still, the ground far away, the battery never empty and the room without walls, as in the
+still, the ground far away and the battery always full, and there are no obstacles, as in the
 laboratory's model.
 """
 
@@ -16,12 +16,12 @@ from quad_gym.params.obstacles import Obstacle, Wall, check_obstacles
 from quad_gym.records import MAX_OBSTACLES
 
 MAX_WIND = 200.0
-"""The strongest tornadoes blow at some 135 m/s."""
+"""Largest wind speed [m/s]; the strongest tornadoes reach some 135 m/s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryParams(Checked):
-    """A battery whose voltage falls with what was drawn from it and with what is drawn now.
+    """A battery whose voltage falls with the energy drawn so far and with the present power.
 
     With the charge s in [0, 1], `s' = -P / energy` and `P = sum(kN W_i^3) / motor_efficiency`; the
     open-circuit voltage is `U0 = max_voltage (empty_voltage + (1 - empty_voltage) s)`, and the
@@ -29,15 +29,17 @@ class BatteryParams(Checked):
     """
 
     energy: float = 88e3
-    """of a full battery [J]; three lithium-polymer cells of 2.2 A h: 3 x 3.7 V x 2.2 A h"""
+    """energy of a full battery [J]; three lithium-polymer cells of 2.2 A h: 3 x 3.7 V x 2.2 A h"""
     charge: float = 1.0
-    """at the start of an episode, in (0, 1]"""
+    """charge at the start of an episode as a fraction of a full battery, in (0, 1]"""
     empty_voltage: float = 0.83
-    """open-circuit voltage of an empty over that of a full battery; 3.5 V over 4.2 V a cell"""
+    """open-circuit voltage of an empty battery divided by the voltage of a full one; 3.5 V / 4.2 V
+    per cell"""
     resistance: float = 0.03
-    """inside the battery and its leads [ohm]; some 10 milliohm a cell"""
+    """internal resistance of the battery and its leads [ohm]; some 10 milliohm per cell"""
     motor_efficiency: float = 0.75
-    """mechanical power of the rotors over electrical power; typical of small brushless motors"""
+    """mechanical power of the rotors divided by electrical power; typical of small brushless
+    motors"""
 
     def __post_init__(self) -> None:
         self._check(check.positive, "energy", "charge", "empty_voltage", "motor_efficiency")
@@ -51,49 +53,52 @@ class BatteryParams(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldParams(Checked):
-    """What the air, the ground and the battery do to a vehicle, and what stands in its way.
+    """Wind, drag, ground, battery and obstacles.
 
-    Drag of the disc and of the rotors is that of the vehicle's velocity relative to the air. The
-    filter and the controller know nothing of this world.
+    Drag of the disc and of the rotors depends on the velocity of the vehicle relative to the air.
+    Neither the filter nor the controller models this world.
     """
 
     wind_I: Vector = (0.0, 0.0, 0.0)
-    """(3,) steady velocity of the air in I: east, north, up [m/s]"""
+    """(3,) steady wind, the velocity of the air east, north, up in I [m/s]"""
     gust_wind_speed: float = 0.0
-    """W20, the wind speed 20 feet above ground that sets the strength of Dryden gusts [m/s]; 0: no
-    gusts. MIL-F-8785C, 3.7.3.4: 7.7 is light, 15.4 moderate, 23.2 severe turbulence"""
+    """W20, the wind speed at 20 feet above ground, which sets the intensity of the Dryden gusts
+    [m/s]; 0: no gusts. MIL-F-8785C, 3.7.3.4: 7.7 is light, 15.4 moderate, 23.2 severe turbulence"""
     linear_drag_B: Vector = (0.0, 0.0, 0.0)
-    """(3,) force along each body axis per air velocity along it, opposing it [N s/m]; M. Faessler,
-    A. Franchi, D. Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag",
-    RA-L 2018: mass times (0.544, 0.386, 0) 1/s for their vehicle"""
+    """(3,) drag force along each body axis per air velocity along that axis, opposing it [N s/m];
+    M. Faessler, A. Franchi, D. Scaramuzza, "Differential flatness of quadrotor dynamics subject to
+    rotor drag", RA-L 2018: mass times (0.544, 0.386, 0) 1/s for their vehicle"""
     rotor_drag_B: Vector = (0.0, 0.0, 0.0)
-    """(3,) likewise, per rad/s of the sum of the rotor speeds [N s/m per rad/s]; J. Svacha, K.
-    Mohta, V. Kumar, "Improving quadrotor trajectory tracking by compensating for aerodynamic
-    effects", ICUAS 2017"""
+    """(3,) drag force along each body axis per air velocity along that axis and per rad/s of the
+    sum of the rotor speeds, opposing the velocity [N s/m per rad/s]; J. Svacha, K. Mohta, V. Kumar,
+    "Improving quadrotor trajectory tracking by compensating for aerodynamic effects", ICUAS 2017"""
     ground_effect: bool = False
-    """whether thrust grows near the ground: by 1 / (1 - (radius / (4 z))^2) for a rotor at the
+    """True: thrust increases near the ground, by 1 / (1 - (radius / (4 z))^2) for a rotor at the
     height z; I. C. Cheeseman, W. E. Bennett, "The effect of the ground on a helicopter rotor in
-    forward flight", ARC R&M 3021, 1955. Heights below half a radius count as that, so that thrust
-    grows by a third at most; when the vehicle tips the gain falls as the cosine of its tilt"""
+    forward flight", ARC R&M 3021, 1955. Heights below half a radius count as half a radius, so
+    thrust increases by at most a third; for a tilted vehicle the increase is multiplied by the
+    cosine of the tilt"""
     rotor_radius: float = 0.127
-    """[m]; ten-inch propellers"""
+    """radius of the rotors, for the ground effect [m]; ten-inch propellers"""
     ground_height: float = -0.1
     """height of the ground in I, for contact, ground effect and gusts [m]; the center of mass of a
     vehicle that stands on its legs is at height 0"""
     ground: GroundParams | None = None
-    """the ground as a plane at `ground_height` that carries a vehicle anywhere, and crashes one
-    that meets it too fast or too tilted; None: only a launch pad carries vehicles, at the start"""
+    """ground contact: a plane at `ground_height` that supports a vehicle anywhere, with a crash if
+    the vehicle touches down too fast or too tilted; None: only a launch pad supports vehicles, at
+    the start"""
     battery: BatteryParams | None = None
-    """None: always full voltage"""
+    """battery of the vehicle; None: always full voltage"""
     obstacles: tuple[Obstacle, ...] = ()
-    """walls and cylinders, at most MAX_OBSTACLES: who touches one has collided, which ends the
+    """walls and cylinders, at most MAX_OBSTACLES of them: touching one is a collision and ends the
     episode, and the camera sees nothing behind one"""
     vehicle_radius: float = 0.42
-    """distance of the center of mass from an obstacle at which the vehicle touches it [m]; the
-    laboratory's rotor hubs are 0.30 m from there, and its propellers reach 0.13 m beyond"""
+    """distance between center of mass and obstacle below which the vehicle touches the obstacle
+    [m]; the laboratory's rotor hubs are 0.30 m from the center of mass, and its propellers reach
+    0.13 m beyond"""
     geofence: Matrix | None = None
-    """(2, 3) lowest and highest corner in I of the box that the center of mass must not leave [m];
-    who does ends the episode; None: there is none"""
+    """(2, 3) lowest and highest corner in I of a box [m]; an episode ends when the center of mass
+    leaves the box; None: no geofence"""
 
     def __post_init__(self) -> None:
         self._check(check.vector, "wind_I", "linear_drag_B", "rotor_drag_B", length=3)
@@ -175,7 +180,7 @@ _WORLDS = {
         ground_effect=True,
         battery=BatteryParams(),
     ),
-    # that of OutageDash: ten walls, 12 m apart, from east to west, each with a gap somewhere else
+    # for OutageDash: ten walls, 12 m apart, from east to west, each with a gap somewhere else
     "slalom": WorldParams(
         obstacles=_slalom(), geofence=((-200.0, -14.0, -1.0), (72.0, 14.0, 12.0))
     ),
@@ -183,9 +188,9 @@ _WORLDS = {
 
 
 def world_params(name: str) -> WorldParams:
-    """The world called `name`.
+    """Return the world called `name`.
 
-    "calm" is the report's, "breeze" has wind of 4 m/s, "fresh_breeze" of 8 m/s, and "slalom" walls
-    with gaps.
+    "calm" is the world of the laboratory report, "breeze" has wind of 4 m/s, "fresh_breeze" of 8
+    m/s, and "slalom" walls with gaps.
     """
     return _WORLDS[check.choice("world", name, tuple(_WORLDS))]

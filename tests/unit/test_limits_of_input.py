@@ -145,7 +145,7 @@ def test_moments_of_inertia_of_no_body_are_refused():
     turned = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     for bad in (np.diag([1.0, 2.0, 3.001]), turned @ np.diag([1.0, 1.0, 2.1]) @ turned.T):
         bad = (bad + bad.T) / 2.0
-        refused("VehicleParams.inertia must be that of a body", quad_gym.VehicleParams, inertia=bad)
+        refused("VehicleParams.inertia must belong to a body", quad_gym.VehicleParams, inertia=bad)
 
 
 def test_randomized_moments_that_are_never_those_of_a_body_are_refused():

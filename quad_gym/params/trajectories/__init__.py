@@ -1,15 +1,15 @@
-"""Users' references: trajectories, how they are made, and whether a vehicle can fly them.
+"""User-defined references: trajectories, their construction, and checks of their feasibility.
 
-| file | what |
+| file | contents |
 |---|---|
-| `trajectory.py` | `Trajectory`: piecewise polynomials, and how they are evaluated |
+| `trajectory.py` | `Trajectory`: piecewise polynomials and their evaluation |
 | `splines.py` | minimum snap and jerk through points at given times |
 | `timing.py` | the times of segments, from bounds of speed and acceleration |
 | `fitting.py` | piecewise polynomials for any function of time |
 | `reading.py` | points from a table |
-| `headings.py` | what the heading follows |
-| `flatness.py` | thrust, attitude and body rates that a motion takes |
-| `feasibility.py` | whether a vehicle has them |
+| `headings.py` | heading along a trajectory |
+| `flatness.py` | thrust, attitude and body rates that a motion requires |
+| `feasibility.py` | comparison of these with the limits of a vehicle |
 """
 
 from quad_gym.params.trajectories.trajectory import Trajectory

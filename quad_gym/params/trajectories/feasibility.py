@@ -1,4 +1,4 @@
-"""Whether a vehicle can fly a trajectory; if not, what is missing, where, and by how much."""
+"""Feasibility of a trajectory: the demand that exceeds a limit, its time, and the excess."""
 
 import functools
 import math
@@ -17,36 +17,38 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 INTERVAL, SAMPLES, MOST_SAMPLES = 0.01, 16, 400
-"""Demands are looked at this often [s], at least and at most so many times in a segment."""
+"""Interval of the checks [s], and their least and largest number per segment."""
 
 LEAST_THRUST = 0.01
-"""Over the weight; below, in free fall, nothing says where the body z axis points."""
+"""Thrust as a fraction of the weight below which, in free fall, the direction of body z is
+undefined."""
 
 JUMP = 1e-5
 """Largest jump between segments of position [m], velocity [m/s] and acceleration [m/s^2]."""
 
 TURNABOUT = 1.0
-"""Turn of the heading from one look to the next that no vehicle makes [rad]."""
+"""Change of the heading between two checks that no vehicle can follow [rad]."""
 
 ROUNDING = 1e-6
-"""Share of a limit by which a demand may exceed it: bounds that just hold are met."""
+"""Fraction of a limit by which a demand may exceed it, so that a limit that is just met is
+accepted."""
 
 
 class Demand(NamedTuple):
-    """The largest demands of a trajectory."""
+    """The largest demands of a trajectory on a vehicle."""
 
     thrust: tuple[float, float]
-    """least and largest, of all rotors [N]"""
+    """smallest and largest total thrust [N]"""
     rotor_force: tuple[float, float]
-    """least and largest of any rotor [N]"""
+    """smallest and largest thrust of any single rotor [N]"""
     tilt: float
-    """between body z and the vertical [rad]"""
+    """largest angle between body z and the vertical [rad]"""
     body_rates: tuple[float, float, float]
-    """largest about each body axis, either way [rad/s]"""
+    """largest magnitude of the body rate about each body axis [rad/s]"""
     speed: float
-    """[m/s]"""
+    """largest speed [m/s]"""
     acceleration: float
-    """[m/s^2]"""
+    """largest acceleration [m/s^2]"""
 
 
 def check_trajectory(
@@ -88,7 +90,7 @@ def _checked(
     force, rates = motion.rotor_forces, np.abs(motion.body_rates)
     largest = vehicle.max_rotor_force
     least_thrust = LEAST_THRUST * vehicle.mass * vehicle.gravity
-    # what, of each instant, in which unit, and the least and the most that there is
+    # name, values over time, unit, lower and upper limit
     demands: list[tuple[str, Floats, str, float, float]] = [
         ("a speed", speeds, "m/s", 0.0, max_speed or math.inf),
         ("a thrust", motion.thrust, "N", least_thrust, max_thrust or 4.0 * largest),
@@ -117,7 +119,7 @@ def _refuse_excess(
     times: Floats,
     name: str,
 ) -> None:
-    """Name the demand that exceeds what there is by the largest share."""
+    """Refuse demands beyond limits; name the one that exceeds its limit by the largest fraction."""
     worst, words = 0.0, ""
     for what, values, unit, least, most in demands:
         high, low = int(np.argmax(values)), int(np.argmin(values))
@@ -126,7 +128,7 @@ def _refuse_excess(
             share = f"{100.0 * worst:.0f} %" if worst > 0.01 else f"{100.0 * worst:.2g} %"
             words = (
                 f"{what} of {values[high]:.4g} {unit} {_where(trajectory, times[high])}, "
-                f"{share} more than the {most:.4g} {unit} that there are"
+                f"{share} above the limit of {most:.4g} {unit}"
             )
         scale = most if math.isfinite(most) else 1.0
         short = (least - values[low]) / scale
@@ -134,11 +136,11 @@ def _refuse_excess(
             worst = short
             words = (
                 f"{what} of {values[low]:.4g} {unit} {_where(trajectory, times[low])}, "
-                f"{least - values[low]:.3g} {unit} less than the least, {least:.3g} {unit}"
+                f"{least - values[low]:.3g} {unit} below the limit of {least:.3g} {unit}"
             )
     if words:
         raise ValueError(
-            f"{name} must be one that the vehicle can fly: it takes {words}. Give it more time, or "
+            f"{name} must be one that the vehicle can fly: it needs {words}. Give it more time, or "
             "smaller bounds of speed and acceleration"
         )
 
@@ -162,14 +164,14 @@ def _refuse_turnabouts(trajectory: "Trajectory", times: Floats, name: str) -> No
 
 
 def sampling_times(trajectory: "Trajectory") -> Floats:
-    """When demands are looked at."""
+    """Return the times at which demands are checked [s]."""
     lengths = np.diff(trajectory.times)
     count = int(np.clip(np.ceil(lengths.max() / INTERVAL), SAMPLES, MOST_SAMPLES))
     return trajectory.instants(count)
 
 
 def _refuse_jumps(trajectory: "Trajectory", name: str) -> None:
-    """Refuse segments that do not continue each other, as no vehicle does."""
+    """Refuse segments that do not continue each other."""
     lengths = np.diff(trajectory.times)
     path = trajectory._polynomials(0, 3)
     shared = np.concatenate([path.c, np.zeros((0, *path.c.shape[1:]))])

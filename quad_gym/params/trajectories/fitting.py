@@ -1,4 +1,4 @@
-"""Piecewise polynomials in place of any smooth function of time."""
+"""Piecewise polynomials that approximate any smooth function of time."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -19,13 +19,13 @@ FEWEST, MOST = 16, 8192
 """Segments that are tried, each time twice as many."""
 
 STEP = 1e-3
-"""Of differences that check derivatives, as a share of the duration."""
+"""Step of the differences that check derivatives, as a fraction of the duration."""
 
 SLACK = 1e-3
-"""By which a derivative may differ from differences, as a share of its size."""
+"""Largest difference between derivatives and differences, as a fraction of their size."""
 
 LOOSER = 1e3
-"""Times the tolerance, to which derivatives are met [1/s, 1/s^2]."""
+"""Factor on the tolerance for derivatives [1/s, 1/s^2]."""
 
 
 def fit(
@@ -95,7 +95,7 @@ def fit(
 
 
 def _called(name: str, function: Function, times: Any, size: int) -> Floats:
-    """What a function returns at times, (n, size)."""
+    """Return the values (n, size) of a function at times."""
     rows = []
     for t in times:
         label = f"{name}({float(t):g})"
@@ -104,7 +104,7 @@ def _called(name: str, function: Function, times: Any, size: int) -> Floats:
 
 
 def _values(joint: Function, times: Floats, size: int, known: dict[float, Floats]) -> Floats:
-    """The same, of which what was asked before is not asked again."""
+    """Return the values of a function at times; times known from before are not evaluated again."""
     new = [t for t in times.tolist() if t not in known]
     if new:
         known.update(zip(new, _called("function", joint, new, size), strict=True))
@@ -128,7 +128,7 @@ def _misses(
     known: dict[float, Floats],
     given: dict[str, Function | None],
 ) -> float:
-    """How far it is from the function halfway between knots; from derivatives, over LOOSER."""
+    """Return the distance from the function between knots; for derivatives, over LOOSER."""
     between = 0.5 * (times[:-1] + times[1:])
     miss = float(np.abs(spline(between) - _values(joint, between, size, known)).max())
     for order, name in ((1, "velocity"), (2, "acceleration")):
@@ -140,7 +140,7 @@ def _misses(
 
 
 def _check_derivatives(given: dict[str, Any], span: float) -> None:
-    """Refuse derivatives that differences of what they derive contradict."""
+    """Refuse derivatives that contradict differences of the functions that they belong to."""
     step = STEP * span
     times = np.linspace(2.0 * step, span - 2.0 * step, 31)
     weights = np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * step)
@@ -159,7 +159,7 @@ def _check_derivatives(given: dict[str, Any], span: float) -> None:
         allowed = SLACK * (float(np.abs(slope).max()) + 1e-6)
         if miss[k] > allowed:
             raise ValueError(
-                f"{name} must be the derivative of {below}: at {times[k]:g} s differences say "
+                f"{name} must be the derivative of {below}: at {times[k]:g} s differences give "
                 f"{slope[k]}, got {said[k]}"
             )
         below = name

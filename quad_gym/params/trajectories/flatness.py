@@ -1,10 +1,10 @@
-"""What a motion takes: thrust, attitude, body rates and torques, by differential flatness.
+"""Thrust, attitude, body rates and torques that a motion requires, by differential flatness.
 
-Without drag, `f z = m (a + g e3)`, and body y is `unit(z x x*)` with the wanted heading x*. Both
+Without drag, `f z = m (a + g e3)`, and body y is `unit(z x x*)` with the desired heading x*. Both
 are differentiated twice: body rates come from jerk and yaw rate, their change from snap.
 
 Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA
-2011; axes as those of the report's controller.
+2011; axes as in the report's controller.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,18 +22,18 @@ Jet = tuple[Floats, Floats, Floats]
 
 
 class Motion(NamedTuple):
-    """What n instants of a motion take."""
+    """Demands of a motion at n instants."""
 
     thrust: Floats
-    """(n,) of all rotors [N]"""
+    """(n,) total thrust of the rotors [N]"""
     R_BI: Floats
     """(n, 3, 3) attitude; its rows are the body axes in I"""
     body_rates: Floats
-    """(n, 3) in B [rad/s]"""
+    """(n, 3) body rates in B [rad/s]"""
     torque: Floats
-    """(n, 3) in B [N m]"""
+    """(n, 3) torque in B [N m]"""
     rotor_forces: Floats
-    """(n, 4) [N]"""
+    """(n, 4) thrust of each rotor [N]"""
 
     @property
     def tilt(self) -> Floats:
@@ -42,7 +42,7 @@ class Motion(NamedTuple):
 
 
 def motion_of(trajectory: "Trajectory", vehicle: "VehicleParams", times: Floats) -> Motion:
-    """What a trajectory takes of a vehicle at times (n,) [s]."""
+    """Return the demands of a trajectory on a vehicle at times (n,) [s]."""
     force = (
         trajectory(times, 2) + np.array([0.0, 0.0, vehicle.gravity]),
         trajectory(times, 3),
@@ -69,7 +69,7 @@ def motion_of(trajectory: "Trajectory", vehicle: "VehicleParams", times: Floats)
 
 
 def _heading(trajectory: "Trajectory", times: Floats) -> Jet:
-    """The wanted horizontal direction of body x."""
+    """Return the desired horizontal direction of body x."""
     angle, rate, change = (trajectory.yaw(times, k)[:, np.newaxis] for k in range(3))
     zero = np.zeros_like(angle)
     ahead = np.hstack([np.cos(angle), np.sin(angle), zero])

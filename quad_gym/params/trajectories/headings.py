@@ -1,4 +1,4 @@
-"""What the heading of a trajectory follows: from what users give to polynomials, and its angles."""
+"""Heading of a trajectory: from the arguments of users to polynomials, and its angles."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -13,25 +13,25 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 LEAST_SPEED = 1e-3
-"""Below, a heading along the path is taken to stand still [m/s]."""
+"""Horizontal speed below which a heading along the path is held [m/s]."""
 
 
 def heading_choice(yaw: Any, look_at: Any) -> tuple[str, tuple[float, float], Any]:
-    """What the heading follows.
+    """Return the rule that a heading follows.
 
     Args:
-        yaw: None, an angle, "along", or something else that gives angles.
+        yaw: None, an angle, "along", a function, or an array of angles.
         look_at: None, or a point.
 
     Returns:
-        One of HEADINGS, the point (2,), and what gives the angles: a number, or what was given.
+        One of HEADINGS, the point (2,), and the source of the angles: a number, or `yaw` itself.
 
     Raises:
-        ValueError: If both are given, or one is neither.
+        ValueError: If both are given, or one is invalid.
     """
     if look_at is not None:
         if yaw is not None:
-            raise ValueError("yaw must not be given with look_at, which says where to look")
+            raise ValueError("yaw must not be given with look_at, which sets the heading")
         size = np.size(look_at)
         point = check.vector("look_at", look_at, length=3 if size == 3 else 2)
         return "toward", (point[0], point[1]), 0.0

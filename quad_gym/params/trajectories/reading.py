@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from quad_gym.params.trajectories.trajectory import Trajectory
 
 COLUMNS = ("time", "x", "y", "z")
-"""What a table must have; "yaw" is optional."""
+"""Columns that a table must have; "yaw" is optional."""
 
 OPTIONS = ("closed", "minimize", "at_rest", "yaw", "look_at")
 """Keywords of `Trajectory.through` that do not contradict a table."""

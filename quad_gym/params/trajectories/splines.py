@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 ORDERS = {"snap": 4, "jerk": 3}
-"""Which derivative is minimized."""
+"""Order of the derivative that is minimized, by name."""
 
 MAX_SPEED, MAX_ACCELERATION = 2.5, 3.0
-"""Bounds where none are given [m/s], [m/s^2]: those of the task of random trajectories."""
+"""Bounds where none are given [m/s], [m/s^2], as in the task of random trajectories."""
 
 PADDING = 6
 """Points before and after one round of a closed path, where it is approximated."""
@@ -130,9 +130,9 @@ def coefficients(
     Args:
         times: (m + 1,) increasing.
         values: (m + 1, n); closed: the last are the first.
-        order: Which derivative is minimized: 4 or 3.
-        closed: Whether it repeats.
-        at_rest: Whether derivatives below `order` are zero at both ends.
+        order: Order of the derivative that is minimized: 4 or 3.
+        closed: True: the path repeats.
+        at_rest: True: derivatives below `order` are zero at both ends.
 
     Returns:
         (8, m, n), the highest power first, of times since the beginning of a segment.
@@ -159,7 +159,7 @@ def coefficients(
 
 
 def _unrolled(times: Floats, values: Floats, order: int) -> Floats:
-    """Nearly those of a closed path: of one of some rounds, whose ends are too far away to matter.
+    """Return the coefficients of a closed path, nearly: from several rounds, with distant ends.
 
     SciPy's periodic splines take long where several threads share the processor's cores.
     """

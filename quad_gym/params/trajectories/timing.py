@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 EXPONENTS = (0.5, 0.75, 1.0)
-"""Times of segments that are tried first: powers of their lengths."""
+"""Exponents of the first guesses for the durations of segments: powers of their lengths."""
 
 IMPROVED, STEPS = 12, 10
 """Segments up to which their times are improved, and steps of the search: with more, it would take
@@ -18,7 +18,7 @@ NORM = 20.0
 """Power of the mean that stands for the largest use in the search, which needs derivatives."""
 
 SAMPLES = 24
-"""Of a segment, among which its peaks are looked for first."""
+"""Samples of a segment, among which its peaks are looked for first."""
 
 MARGIN = 1e-9
 """Share of the bounds that is left to rounding."""

@@ -1,4 +1,4 @@
-"""`Trajectory`: a reference as piecewise polynomials in time."""
+"""Trajectories: references as piecewise polynomials in time."""
 
 import dataclasses
 import functools
@@ -24,36 +24,40 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 TERMS = 8
-"""Coefficients of a polynomial: of degree 7, which minimum snap takes."""
+"""Coefficients of a polynomial of degree 7, as minimum snap requires."""
 
 HEADINGS = ("given", "along", "toward")
-"""What the heading follows: a polynomial, the horizontal velocity, a point."""
+"""Rules of the heading: given by a polynomial, along the horizontal velocity, toward a point."""
 
 EARLY = 1e-3
-"""Share of a trajectory after which a start from rest has a direction."""
+"""Fraction of a trajectory after which a start from rest has a direction."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory(Checked):
-    """Where a vehicle is to be at every time: piecewise polynomials, exact in the kernels, too.
+    """Desired position and heading over time: piecewise polynomials, exact in the kernels, too.
 
-    `r*(t) = sum_k c_k (t - t_j)^(7 - k)` in the segment that begins at t_j; likewise the yaw. Made
-    by `through`, `from_csv` or `of` rather than from coefficients. A closed one repeats; another
-    one stands still at its first point before time 0 and at its last one past its end.
+    In the segment that begins at t_j, `r*(t) = sum_k c_k (t - t_j)^(7 - k)`, and the yaw has the
+    same form. Make trajectories with `through`, `from_csv` or `of` rather than from coefficients. A
+    closed trajectory repeats; an open one stands still at its first point before time 0, and at its
+    last point after its end.
 
-    Trajectories compare by their numbers, and pickle.
+    Trajectories compare by their numbers, and can be pickled.
     """
 
     times: Floats
-    """(m + 1,) where segments begin, from 0 on, and where the last one ends [s]"""
+    """(m + 1,) times at which segments begin, the first at 0, and the end of the last segment
+    [s]"""
     coefficients: Floats
-    """(8, m, 4) of x, y, z in I [m] and yaw [rad], the highest power first, as SciPy's `PPoly`"""
+    """(8, m, 4) coefficients of x, y, z in I [m] and yaw [rad], the highest power first, as in
+    SciPy's `PPoly`"""
     closed: bool = False
-    """whether it repeats, from its end at its start"""
+    """True: the trajectory repeats, its end joining its start"""
     heading: str = "given"
-    """what body x follows: "given": the yaw; "along": the horizontal velocity; "toward": a point"""
+    """direction of body x: "given": by the yaw polynomial; "along": along the horizontal velocity;
+    "toward": toward a point"""
     point: Vector = (0.0, 0.0)
-    """(2,) that point in I [m]"""
+    """(2,) point in I that body x faces with `heading="toward"` [m]"""
 
     def __post_init__(self) -> None:
         self._check(check.array, "times", shape=(None,))
@@ -90,24 +94,24 @@ class Trajectory(Checked):
         yaw: ArrayLike | str | None = None,
         look_at: ArrayLike | None = None,
     ) -> "Trajectory":
-        """The smoothest flight through points: that of the least integral of squared snap or jerk.
+        """Return the smoothest trajectory through points: least integral of squared snap or jerk.
 
         It is a spline of degree 7 (5) whose derivatives up to the sixth (fourth) are continuous.
 
         Args:
             points: (n, 3) in I [m].
-            times: (n,) when each is passed, counted from the first [s]; closed: (n + 1,), with the
-                return to the first point. None: chosen so that speed and acceleration reach their
-                bounds and stay below them.
-            max_speed: Bound for the choice of times [m/s]; 2.5 if neither is given.
-            max_acceleration: Likewise [m/s^2]; 3 if not given.
-            closed: Whether it returns to the first point, and repeats.
+            times: (n,) times at which the points are passed, counted from the first [s]; closed: (n
+                + 1,), with the return to the first point. None: chosen so that speed and
+                acceleration reach their bounds and stay below them.
+            max_speed: Bound of the speed for the choice of times [m/s]; default: 2.5.
+            max_acceleration: Bound of the acceleration for the choice of times [m/s^2]; default: 3.
+            closed: True: the trajectory returns to the first point, and repeats.
             minimize: "snap" (fourth derivative) or "jerk" (third).
-            at_rest: Whether it starts and ends at rest; otherwise, as the minimum has it. A closed
-                one does neither.
-            yaw: Heading of body x: None (looks east), an angle [rad], "along" the horizontal
-                velocity, or (n,) an angle at each point.
-            look_at: (2,) or (3,) a point in I to look toward instead [m].
+            at_rest: True: the trajectory starts and ends at rest; False: the minimum sets the
+                velocities at its ends. A closed trajectory ignores this.
+            yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
+                (n,) an angle at each point.
+            look_at: (2,) or (3,) a point in I that body x faces instead [m].
 
         Returns:
             The trajectory.
@@ -136,23 +140,24 @@ class Trajectory(Checked):
 
     @classmethod
     def from_csv(cls, path: Path | str, **options: Any) -> "Trajectory":
-        """A trajectory through the rows of a table, at their times.
+        """Return a trajectory through the rows of a table, at their times.
 
         The first line names the columns: `time` [s], `x`, `y`, `z` in I [m], and optionally `yaw`
-        [rad]; others are ignored. Times increase and are counted from the first.
+        [rad]; others are ignored. Times must increase, and are counted from the first.
 
         Args:
-            path: A text file of values separated by commas.
-            options: Those of `through` but times and bounds, such as `minimize="jerk"`, or
-                `at_rest=False` for a table that begins and ends in flight. With `closed=True`, the
-                last row is the return to the first.
+            path: A text file of comma-separated values.
+            options: Keywords of `through` other than times and bounds, such as `minimize="jerk"`,
+                or `at_rest=False` for a table that begins and ends in flight. With `closed=True`,
+                the last row is the return to the first.
 
         Returns:
             The trajectory.
 
         Raises:
             FileNotFoundError: If there is no such file.
-            ValueError: If a column is missing or a value is not a number; names the line.
+            ValueError: If a column is missing or a value is not a number; the message names the
+                line.
         """
         from quad_gym.params.trajectories.reading import from_csv
 
@@ -171,29 +176,31 @@ class Trajectory(Checked):
         yaw: Callable[[float], float] | float | str | None = None,
         look_at: ArrayLike | None = None,
     ) -> "Trajectory":
-        """A trajectory along any smooth function of time.
+        """Return a trajectory that approximates any smooth function of time.
 
-        Splines of degree 7 take the place of the function, with as many segments as it takes.
+        The function is replaced by splines of degree 7, with as many segments as the tolerance
+        requires.
 
         Args:
-            function: Position (3,) in I [m] at a time [s] within 0 and the duration.
-            duration: How long it lasts [s].
-            velocity: Its first derivative, if known: checked against differences, and met to 1000
-                times the tolerance.
-            acceleration: Its second derivative, likewise.
-            closed: Whether it repeats.
+            function: Position (3,) in I [m] as a function of time [s], from 0 to the duration.
+            duration: Duration of the trajectory [s].
+            velocity: First derivative of the position [m/s], if known: checked against differences,
+                and met to 1000 times the tolerance.
+            acceleration: Second derivative of the position [m/s^2], if known: checked and met in
+                the same way.
+            closed: True: the trajectory repeats.
             tolerance: Largest distance from the function [m].
-            yaw: None (looks east), an angle [rad], "along" the horizontal velocity, or a function
-                of time.
-            look_at: (2,) or (3,) a point in I to look toward instead [m].
+            yaw: Heading of body x: None (east), an angle [rad], "along" the horizontal velocity, or
+                a function of time.
+            look_at: (2,) or (3,) a point in I that body x faces instead [m].
 
         Returns:
             The trajectory.
 
         Raises:
-            ValueError: If a function returns something else than finite numbers, a derivative is
-                not that of the function, a closed one does not return to its start, or the function
-                is not smooth enough.
+            ValueError: If a function does not return finite numbers, a derivative contradicts the
+                function, a closed trajectory does not return to its start, or the function is not
+                smooth enough.
         """
         from quad_gym.params.trajectories.fitting import fit
 
@@ -213,15 +220,17 @@ class Trajectory(Checked):
 
     @property
     def duration(self) -> float:
-        """How long it lasts, or one round of it [s]."""
+        """Duration of the trajectory; if closed, of one round [s]."""
         return float(self.times[-1])
 
     def __call__(self, t: ArrayLike, derivative: int = 0) -> Floats:
-        """Position, or a derivative of it.
+        """Return the position, or one of its derivatives.
 
         Args:
-            t: (...) times [s]; a closed trajectory repeats, others stand still beyond their ends.
-            derivative: 0: position, 1: velocity, 2: acceleration, 3: jerk, 4: snap and so on.
+            t: (...) times [s]; a closed trajectory repeats, an open one stands still beyond its
+                ends.
+            derivative: Order of the derivative: 0: position, 1: velocity, 2: acceleration, 3: jerk,
+                4: snap and so on.
 
         Returns:
             (..., 3) in I [m/s^derivative].
@@ -233,11 +242,11 @@ class Trajectory(Checked):
         return np.where(beyond[..., np.newaxis] & (order > 0), 0.0, values)
 
     def yaw(self, t: ArrayLike, derivative: int = 0) -> Floats:
-        """The angle of the heading from east toward north, or its first or second derivative.
+        """Return the angle of the heading, from east toward north, or one of its derivatives.
 
         Args:
             t: (...) times [s].
-            derivative: 0, 1 or 2.
+            derivative: Order of the derivative: 0, 1 or 2.
 
         Returns:
             (...) [rad/s^derivative].
@@ -257,26 +266,28 @@ class Trajectory(Checked):
         max_speed: float | None = None,
         name: str = "trajectory",
     ) -> "Demand":
-        """What the trajectory demands of a vehicle, which must be able to fly it.
+        """Check that a vehicle can fly the trajectory, and return the largest demands.
 
         Thrust, attitude and body rates follow from acceleration, jerk and yaw (differential
-        flatness), torques from snap, and the forces of the four rotors from thrust and torques;
-        without drag, and with rotors that follow at once.
+        flatness), torques from snap, and the forces of the four rotors from thrust and torques.
+        Drag and the lag of the rotors are neglected.
 
         Args:
-            vehicle: Must have the rotor forces, between 0 and those at full voltage.
-            max_thrust: Of all rotors together, if less than they have [N].
-            max_tilt: Between body z and the vertical [rad].
-            max_body_rates: (3,) about the body axes [rad/s]; None: any.
-            max_speed: [m/s]; None: any.
-            name: What messages call it.
+            vehicle: The vehicle; its rotor forces must be between 0 and their values at full
+                voltage.
+            max_thrust: Bound of the total thrust, if below the rotors' own [N].
+            max_tilt: Bound of the angle between body z and the vertical [rad].
+            max_body_rates: (3,) bounds of the body rates about the body axes [rad/s]; None: no
+                bound.
+            max_speed: Bound of the speed [m/s]; None: no bound.
+            name: Name of the trajectory in messages.
 
         Returns:
             The largest demands.
 
         Raises:
-            ValueError: If it demands too much, or jumps. Says what, when, in which segment, and by
-                how much.
+            ValueError: If a demand exceeds its limit, or the trajectory jumps. The message names
+                the demand, the time, the segment and the excess.
         """
         from quad_gym.params.trajectories.feasibility import check_trajectory
 
@@ -291,10 +302,10 @@ class Trajectory(Checked):
         )
 
     def turned(self, angle: float) -> "Trajectory":
-        """The same flight turned about the vertical through the origin.
+        """Return the trajectory rotated about the vertical through the origin.
 
         Args:
-            angle: From east toward north [rad].
+            angle: Angle of the rotation, from east toward north [rad].
         """
         turn = check.number("angle", angle)
         if turn == 0.0:
@@ -309,20 +320,20 @@ class Trajectory(Checked):
 
     @functools.cached_property
     def reach(self) -> float:
-        """The largest distance from the origin, at a hundred instants of each segment [m]."""
+        """Largest distance from the origin, among a hundred instants of each segment [m]."""
         return float(np.linalg.norm(self(self.instants(100)), axis=1).max())
 
     def instants(self, count: int) -> Floats:
-        """So many times in each segment, from its beginning on, and the end [s]."""
+        """Return `count` evenly spaced times per segment, from its beginning, and the end [s]."""
         steps = np.arange(count) / count
         inner = self.times[:-1, np.newaxis] + np.diff(self.times)[:, np.newaxis] * steps
         return np.append(inner.ravel(), self.times[-1])
 
     @functools.cached_property
     def end_headings(self) -> Floats:
-        """(2, 2) horizontal directions of the velocity at the start and the end, even at rest.
+        """Horizontal directions (2, 2) of the velocity at the start and the end, even at rest.
 
-        What a heading along the path holds beyond the ends of a trajectory that is not closed.
+        A heading along the path holds these directions beyond the ends of an open trajectory.
         """
         near = EARLY * self.duration
         found = np.array([[1.0, 0.0], [1.0, 0.0]])
@@ -336,13 +347,13 @@ class Trajectory(Checked):
         return found
 
     def _polynomials(self, first: int, last: int) -> "PPoly":
-        """The polynomials of some of x, y, z and yaw, as SciPy's."""
+        """Return the polynomials of some of x, y, z and yaw, as SciPy's."""
         from scipy.interpolate import PPoly
 
         return PPoly(self.coefficients[..., first:last], self.times)
 
     def _within(self, time: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Times within the first round, and whether those given are beyond the ends."""
+        """Return times within the first round, and a mask of given times beyond the ends."""
         if not np.isfinite(time).all():
             raise ValueError(f"t must be finite, got {time}")
         beyond = np.zeros(time.shape, bool)
@@ -369,6 +380,6 @@ class Trajectory(Checked):
         return f"<Trajectory: {len(self.times) - 1} segments, {self.duration:g} s, {kind}>"
 
     def __reduce__(self) -> Any:
-        """A copy has arrays of its own, which are as immutable."""
+        """Copy with new arrays, which are as immutable."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return functools.partial(type(self), **values), ()
