@@ -1,4 +1,4 @@
-"""What a user writes to change a task: `Task`, its `View` of the flights, pieces of rewards."""
+"""Interface of user-defined tasks: `Task`, its `View` of the flights, and terms of rewards."""
 
 from quad_gym.tasks import rewards
 from quad_gym.tasks.task import ObservationSpec, Task, TaskError, resolve_task

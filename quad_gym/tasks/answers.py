@@ -1,4 +1,4 @@
-"""What a task's methods return, checked; what is wrong names the method and the flights."""
+"""Checks of the return values of a task's methods; errors name the method and the flights."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -21,14 +21,14 @@ Truths = NDArray[np.bool_]
 _FLOAT, _TRUTH = np.dtype(np.float64), np.dtype(np.bool_)
 
 LONE = "observed"
-"""What the table of observations calls an array that `observe` returns without a name."""
+"""Name in the table of observations for an array that `observe` returns without a name."""
 
 
 def ask(task: Task, method: str, *arguments: Any) -> Any:
     """Call a task's method.
 
     Raises:
-        TaskError: If it raises anything; that is the cause.
+        TaskError: If the method raises an exception, which becomes the cause.
     """
     try:
         return getattr(task, method)(*arguments)
@@ -40,11 +40,11 @@ def ask(task: Task, method: str, *arguments: Any) -> Any:
 
 
 def _meant(error: Exception) -> str:
-    """The end of a message about an attribute that there is not: the one that may be meant."""
+    """Suggestion of an attribute's name, for the end of a message about one that is missing."""
     if not isinstance(error, AttributeError) or error.name is None:
         return ""
     if not isinstance(error.obj, Group | State):
-        return ""  # the user's own object, which may answer anything
+        return ""  # attributes of users' objects may have side effects
     if isinstance(error.obj, Group):  # in another group?
         for field in VIEW_FIELDS:
             if field.name.rpartition(".")[2] == error.name:
@@ -53,10 +53,10 @@ def _meant(error: Exception) -> str:
 
 
 def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]:
-    """An array of numbers.
+    """Convert a return value to an array of numbers.
 
     Raises:
-        TaskError: If it is none.
+        TaskError: If it is not an array of numbers.
     """
     try:
         found = np.asarray(value)
@@ -70,10 +70,10 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
 
 
 def reward(task: Task, view: "View", count: int) -> NDArray[Any]:
-    """(n,) rewards that a task pays; they may still be NaN or infinite.
+    """Rewards of a task, (n,), which may still be NaN or infinite.
 
     Raises:
-        TaskError: If it fails, or returns another shape, or no array of numbers.
+        TaskError: If the method fails, or returns another shape or type.
     """
     value = ask(task, "reward", view)
     if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (count,):
@@ -81,17 +81,17 @@ def reward(task: Task, view: "View", count: int) -> NDArray[Any]:
     found = numbers(task, "reward", value)
     if found.shape != (count,):
         raise TaskError(
-            f"{label(task)}.reward must return shape ({count},), a number per flight, "
+            f"{label(task)}.reward must return shape ({count},), one number per flight, "
             f"got {found.shape}"
         )
     return found
 
 
 def truths(task: Task, method: str, view: "View", count: int) -> Truths:
-    """(n,) truth values that a method returns.
+    """Boolean values that a method returns, (n,).
 
     Raises:
-        TaskError: If it fails, or returns something else.
+        TaskError: If the method fails, or returns another shape or type.
     """
     value = ask(task, method, view)
     if type(value) is np.ndarray and value.dtype is _TRUTH and value.shape == (count,):
@@ -106,10 +106,10 @@ def truths(task: Task, method: str, view: "View", count: int) -> Truths:
 
 
 def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
-    """What `observe` returns as (n, k) arrays by name, in its order.
+    """Convert the return value of `observe` to (n, k) arrays by name, in its order.
 
     Raises:
-        TaskError: If an array has another shape, or is none of numbers.
+        TaskError: If an array has another shape or type.
     """
     named = value if isinstance(value, Mapping) else {LONE: value}
     found = {}
@@ -125,17 +125,17 @@ def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
 
 
 def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted: str) -> None:
-    """Refuse values of flights that are not `sound`.
+    """Reject invalid values.
 
     Args:
-        sound: (n,).
-        task: Whose.
-        method: Which returned them.
-        values: (n, ...), for the message.
-        wanted: What they have to be.
+        sound: True for flights whose values are valid, (n,).
+        task: Task that returned them.
+        method: Method that returned them.
+        values: Values, (n, ...), for the message.
+        wanted: Description of valid values, for the message.
 
     Raises:
-        TaskError: If there are any.
+        TaskError: If a value is invalid.
     """
     wrong = np.flatnonzero(~sound)
     if wrong.size:
@@ -146,7 +146,7 @@ def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted
 
 
 def flights_named(flights: NDArray[np.intp]) -> str:
-    """Which flights, the first of them by number."""
+    """List flights by number, at most five."""
     first = ", ".join(str(i) for i in flights[:5])
     more = f" and {len(flights) - 5} more" if len(flights) > 5 else ""
     return f"flight {first}" if len(flights) == 1 else f"flights {first}{more}"

@@ -29,20 +29,20 @@ _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
 
 
 class TaskBatch(ReadableBatch):
-    """Flights of one configuration with a user's task.
+    """Flights of one configuration with a user-defined task.
 
-    The kernels fly, judge and observe as usual; then the task's methods replace their part of it.
-    Episodes begin in the kernel where it flies by the next-step mode, and by masked resets
-    otherwise, so that the flights' random streams go on as without a task.
+    The kernels simulate, evaluate and observe as usual; the task's methods then replace their part
+    of the results. Episodes begin in the kernel with next-step autoreset, and by masked resets
+    otherwise, so that the flights' random streams continue as without a task.
 
     Args:
         count: Number of flights.
-        own_task: The task.
-        parts: What its `observe` returns, by name; None: it is not asked.
-        split: Where that stands in an observation: after so many shipped numbers.
-        kept: Which of these stay; None: all.
-        autoreset: When a flight whose episode is over begins the next one.
-        keywords: Those of `FlightBatch`.
+        own_task: User-defined task.
+        parts: Arrays that its `observe` returns, by name; None: `observe` is not called.
+        split: Index in the built-in observation at which these are inserted.
+        kept: Indices of the built-in observation that are kept; None: all.
+        autoreset: Mode that determines when the next episode begins after one has ended.
+        keywords: Keywords of `FlightBatch`.
 
     Raises:
         ValueError: If an argument is invalid.
@@ -100,8 +100,8 @@ class TaskBatch(ReadableBatch):
         """Begin new episodes; see `FlightBatch.reset`.
 
         Raises:
-            ValueError: If the arguments do not fit the number of flights; nothing has changed then.
-            TaskError: If a method of the task fails; the flights need another reset then.
+            ValueError: If the arguments do not fit the number of flights; nothing is changed.
+            TaskError: If a method of the task fails; the flights must be reset again.
         """
         given: Start = {"position": position, "velocity": velocity, "yaw": yaw}
         chosen = checked_mask(self.count, mask)
@@ -119,9 +119,9 @@ class TaskBatch(ReadableBatch):
         """Fly one control period; see `FlightBatch.step`.
 
         Raises:
-            ValueError: If flights have never been reset; it is a RuntimeError, too.
-            TaskError: If a method of the task fails. The step has been flown then, but nothing
-                says what came of it: all flights need a reset.
+            ValueError: If flights have never been reset; it is also a RuntimeError.
+            TaskError: If a method of the task fails. The vehicles have moved, but the step has no
+                results; all flights must be reset.
         """
         if self._failed is not None:
             raise check.NotResetError(
@@ -140,32 +140,32 @@ class TaskBatch(ReadableBatch):
             raise
 
     def _note_failed(self, flights: Truths) -> None:
-        """Note which flights a method has failed for: they need a reset before the next step."""
+        """Mark flights for which a method has failed; they need a reset before the next step."""
         self._failed = flights if flights.any() else None
 
     def _remember(self) -> None:
-        """Keep what the next step is compared with."""
+        """Store the quantities that the next step is compared with."""
         self._before[:] = self.compared_shown
         if self._counts_gates:
             self._before[COMPARED_GATES] = self.columns("gate_next")
 
     @property
     def error_before(self) -> Floats:
-        """(n,) distance from the reference before the step [m]."""
+        """Distance from the reference before the step, (n,) [m]."""
         return self._before[COMPARED_ERROR]
 
     @property
     def gates_before(self) -> Floats:
-        """(n,) gates passed before the step."""
+        """Number of gates passed before the step, (n,)."""
         return self._before[COMPARED_GATES]
 
     def _after_step(self, shipped: Singles) -> Singles:
-        """Ask the task about a step that has been flown; return what is observed."""
+        """Call the task's methods after a step; return the observations."""
         self.began, self.began_some = self._began_in_step, False
         self._begun_again = False
         if self._in_kernel:
             np.logical_not(self.time_shown, out=self._began_in_step)
-            # bytes of truth values are 0 or 1; any() takes ten times longer for few flights
+            # bytes of booleans are 0 or 1; any() takes ten times longer for few flights
             self.began_some = 1 in self._began_in_step.tobytes()
         if self.began_some:
             shipped = self._begin(self._began_in_step, {}, shipped)
@@ -187,7 +187,7 @@ class TaskBatch(ReadableBatch):
     # ---- episodes that begin ------------------------------------------------------------------
 
     def _begin(self, chosen: Truths, given: Start, shipped: Singles) -> Singles:
-        """Ask the task about episodes that the kernels have begun; return what these observe."""
+        """Call `reset` of the task for episodes begun by the kernels; return the observations."""
         self.began, self.began_some = chosen, True
         self._state.begin(chosen)
         self._returns[chosen] = 0.0
@@ -203,7 +203,7 @@ class TaskBatch(ReadableBatch):
         return shipped
 
     def _begin_again(self, chosen: Truths, start: Start) -> Singles:
-        """Begin the same episodes once more, at other places: their draws are the same."""
+        """Begin the same episodes, with the same draws, at other start values."""
         lanes = np.zeros(len(self._blocks) * WIDTH, bool)
         lanes[: self.count] = chosen
         again = lanes.reshape(-1, WIDTH)
@@ -214,10 +214,10 @@ class TaskBatch(ReadableBatch):
         self.view.forget()
         return shipped
 
-    # ---- judging ------------------------------------------------------------------------------
+    # ---- rewards and endings ------------------------------------------------------------------
 
     def _judge(self) -> None:
-        """Ask for reward and endings, and keep the answers."""
+        """Call `reward`, `terminated` and `truncated`, and store their results."""
         own_task, view, methods, count = self.own_task, self.view, self.methods, self.count
         if "reward" in methods:
             self._rewards[:] = answers.reward(own_task, view, count)
@@ -227,7 +227,7 @@ class TaskBatch(ReadableBatch):
             self._truncated[:] = answers.truths(own_task, "truncated", view, count)
 
     def _settle(self) -> int:
-        """Let results and records say what the task has judged; return how many flights end."""
+        """Write reward and endings of the task to results and records; return the flights ended."""
         ended: int = settle(self._calls.words, self._verdict, self.reward_scale)
         if ended < 0:
             sound = np.abs(self._rewards) <= LARGEST_REWARD
@@ -243,7 +243,7 @@ class TaskBatch(ReadableBatch):
         return ended
 
     def _calls_of_threads(self) -> Calls:
-        """What the compiled code is called with, that which settles steps included."""
+        """Arguments of the compiled code, `settle` included."""
         self._verdict = np.zeros(len(Verdict), np.int64)
         for word, method, said in (
             (Verdict.REWARDS, "reward", self._rewards),
@@ -260,19 +260,19 @@ class TaskBatch(ReadableBatch):
 
     @property
     def final_observations(self) -> Singles:
-        """(count, n_observation) float32, where one episode has ended and the next begun."""
+        """Last observations of episodes that ended in this step, (count, n_observation) float32."""
         return self._finals
 
     @final_observations.setter
     def final_observations(self, value: Singles) -> None:
-        """The kernels' own are never written, as their episodes begin where a step begins."""
+        """Ignore the kernels' array: they begin episodes only at the start of a step."""
 
     def builtin_observation(self) -> Singles:
-        """(count, k) what the kernels observe, less its privileged part."""
+        """Built-in observation without its privileged part, (count, k)."""
         return self._observations[:, : self._split]
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
-        """What `observe` returns at the present instant, (count, k) each."""
+        """Arrays that `observe` returns at the present instant, (count, k) each."""
         return answers.parts(self.own_task, self._asked_to_observe(), self.count)
 
     def _asked_to_observe(self) -> Any:
@@ -284,7 +284,7 @@ class TaskBatch(ReadableBatch):
             view.hide(False)
 
     def _observed(self, shipped: Singles) -> Singles:
-        """The observations that the environment shows."""
+        """Observations of the environment."""
         if self._joiner is None:
             return shipped
         return self._joiner.join(self, self._asked_to_observe(), shipped)
@@ -293,13 +293,13 @@ class TaskBatch(ReadableBatch):
 
     @property
     def view(self) -> View:
-        """What the task sees of the flights."""
+        """View of the flights for the task's methods."""
         if self._view is None:
             self._view = View(self, self._state)
         return self._view
 
     def snapshot(self) -> NDArray[Any]:
-        """A copy of all flights and of what the task keeps; `restore` brings them back."""
+        """Copy all flights and the task's state, for `restore`."""
         flights = super().snapshot()
         if not len(self._state):
             return flights
@@ -309,10 +309,10 @@ class TaskBatch(ReadableBatch):
         return kept
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Bring all flights back to a snapshot of this batch, or of one of the same size.
+        """Restore all flights from a snapshot of this batch, or of another one of equal size.
 
         Raises:
-            ValueError: If the snapshot is of another size, kind or task.
+            ValueError: If the snapshot has another size, kind or task.
         """
         flights = snapshot
         if len(self._state):
@@ -320,7 +320,7 @@ class TaskBatch(ReadableBatch):
             if getattr(kind, "names", None) != ("flights", "state") or (
                 snapshot["state"].dtype != self._state.dtype()
             ):
-                raise ValueError(f"snapshot must be that of a batch with {label(self.own_task)}")
+                raise ValueError(f"snapshot must be one of a batch with {label(self.own_task)}")
             flights = snapshot["flights"]
         super().restore(flights)
         if len(self._state):
@@ -328,19 +328,19 @@ class TaskBatch(ReadableBatch):
         self._returns[:] = self.columns("episode_return")
         self.began = self.time_shown == 0.0
         self.began_some = bool(np.count_nonzero(self.began))
-        self._remember()  # nothing is known of the step before: no progress, no gate
+        self._remember()  # the step before is unknown: no progress, no gate passed
         self._failed = None
         self.view.step_over()
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the threads and the view, which a copy makes anew."""
+        """Everything but the threads and the view, which a copy creates itself."""
         return super().__getstate__() | {"_view": None}
 
     # ---- calling the task ---------------------------------------------------------------------
 
     @contextmanager
     def _writing(self, chosen: Truths, draws: int) -> Iterator[FlightRandom]:
-        """Let a method change the task's state, of some flights alone."""
+        """Allow a method to change the task's state, but only of chosen flights."""
         kept = {} if np.count_nonzero(chosen) == self.count else self._state.copies()
         self._state.lock(False)
         try:

@@ -1,4 +1,4 @@
-"""What a view says of the built-in reward and endings of a step."""
+"""Built-in reward and endings of a step, as a group of a view."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ _JUDGED = ("reward", "terminated", "truncated", "ending")
 
 
 class Builtin(Group):
-    """What the id's task says of the step; nothing of flights that have begun an episode since."""
+    """Reward and endings of the built-in task; zero where an episode has begun since."""
 
     __slots__ = ("_begun",)
 
@@ -28,18 +28,22 @@ class Builtin(Group):
 
     @Lazy
     def reward(self) -> Floats:
-        """(n,) as with `reward_per="step"`."""
+        """Built-in reward per step, (n,), regardless of `reward_per`."""
         reward, scale = self._result("reward"), self._flights.reward_scale
         return reward if scale == 1.0 else reward / scale
 
     @Lazy
     def terminated(self) -> Truths:
-        """(n,) crashed, or through the last gate."""
+        """True where the vehicle has crashed or passed the last gate, (n,)."""
         return self._result("terminated") > 0.0
 
     @Lazy
     def truncated(self) -> Truths:
-        """(n,) time limit, failed filter, or `truncate_when_diverged`; also where terminated."""
+        """True at the time limit or after a failure of the filter, (n,).
+
+        With `truncate_when_diverged` also where the filter has diverged. It may be True together
+        with `terminated`.
+        """
         flights = self._flights
         over = self._result("filter_status") > 0.0
         if flights.max_steps:
@@ -50,22 +54,22 @@ class Builtin(Group):
 
     @Lazy
     def ending(self) -> NDArray[np.int64]:
-        """(n,) see `quad_gym.records.Ending`."""
+        """Reason of the ending, (n,), see `quad_gym.records.Ending`."""
         return self._result("ending").astype(np.int64)
 
     def read(self) -> None:
-        """Make all arrays, before the task's own answers take the place of what they come from."""
+        """Compute all arrays, before the task's results overwrite their sources."""
         for name in _JUDGED:
             getattr(self, name)
 
     def step_over(self) -> None:
-        """Forget what was said of the last step."""
+        """Drop the arrays of the last step."""
         self.forget()
         if self._begun is not None:
             self._begun = None
 
     def begin(self, chosen: Truths) -> None:
-        """Forget what was said of flights that have begun an episode since."""
+        """Set the rows of flights that have begun an episode since to zero."""
         self._begun = chosen if self._begun is None else self._begun | chosen
         for name, value in self.__dict__.items():
             self.__dict__[name] = frozen(np.where(chosen, value.dtype.type(0), value))

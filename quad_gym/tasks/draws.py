@@ -1,8 +1,8 @@
-"""Random numbers for tasks: a stream per flight, independent of the other flights.
+"""Random numbers for tasks: one stream per flight, independent of the other flights.
 
 Threefry-2x64 with 13 rounds, as in `quad_gym.kernels.maths.random`, on NumPy arrays of keys. The
-key is the flight's, changed so that no draw is one of the kernels'; the counter is the instant and
-the number of the draw.
+key is the key of the flight, modified so that tasks and kernels never share a draw; the counter
+consists of the instant and the number of the draw.
 """
 
 import math
@@ -16,11 +16,11 @@ Words = NDArray[np.uint64]
 _PARITY = np.uint64(0x1BD11BDAA9FC1A22)
 _ROTATIONS = ((16, 42, 12, 31), (16, 32, 24, 21), (16, 42, 12, 31), (16,))
 _OURS = np.uint64(0x9E3779B97F4A7C15)
-"""Sets the keys of tasks apart from those of the kernels."""
+"""Constant that makes the keys of tasks differ from the keys of the kernels."""
 
 
 def threefry(key0: Words, key1: Words, counter0: Words, counter1: Words) -> tuple[Words, Words]:
-    """Two random words from a key and a counter of two words each (J. Salmon et al., SC 2011)."""
+    """Generate two random words from a two-word key and counter (J. Salmon et al., SC 2011)."""
     keys = (key0, key1, key0 ^ key1 ^ _PARITY)
     a, b = counter0 + key0, counter1 + key1
     for group, rotations in enumerate(_ROTATIONS):
@@ -34,15 +34,15 @@ def threefry(key0: Words, key1: Words, counter0: Words, counter1: Words) -> tupl
 
 
 class FlightRandom:
-    """Random numbers that depend on the flight and the instant alone, as NumPy's generator gives.
+    """Random number generator with a separate stream for each flight.
 
-    What a flight draws is the same in a batch of any size: row i of every result is drawn from the
-    stream of flight i, at its present instant.
+    Its methods correspond to NumPy's generator. Row i of every result is drawn from the stream of
+    flight i at its present instant, so the numbers of a flight do not depend on the batch size.
 
     Args:
-        keys: (n, 2) keys of the flights.
-        instants: (n,) of their streams.
-        method: Which of the task's methods draws, so that no two draw the same.
+        keys: Keys of the flights, (n, 2).
+        instants: Instants of the flights' streams, (n,).
+        method: Number of the task's method that draws; different methods draw different numbers.
     """
 
     def __init__(self, keys: Words, instants: Words, method: int) -> None:
@@ -51,13 +51,13 @@ class FlightRandom:
         self._next = method << 32
 
     def random(self, size: int | tuple[int, ...] | None = None) -> NDArray[np.float64]:
-        """Uniform numbers in [0, 1).
+        """Draw uniform numbers in [0, 1).
 
         Args:
-            size: Shape, whose first axis is that of the flights; None: (n,).
+            size: Shape, whose first axis must have the length n; None: (n,).
 
         Raises:
-            ValueError: If the first axis is another one.
+            ValueError: If the first axis has another length.
         """
         count = len(self._instants)
         shape = (count,) if size is None else (size,) if isinstance(size, int) else tuple(size)
@@ -80,7 +80,7 @@ class FlightRandom:
         high: ArrayLike = 1.0,
         size: int | tuple[int, ...] | None = None,
     ) -> NDArray[np.float64]:
-        """Uniform numbers in [low, high); see `random` for `size`."""
+        """Draw uniform numbers in [low, high); see `random` for `size`."""
         floor = np.asarray(low, np.float64)
         return np.asarray(floor + (np.asarray(high, np.float64) - floor) * self.random(size))
 
@@ -90,7 +90,13 @@ class FlightRandom:
         scale: ArrayLike = 1.0,
         size: int | tuple[int, ...] | None = None,
     ) -> NDArray[np.float64]:
-        """Normal numbers (Box and Muller); see `random` for `size`."""
+        """Draw normally distributed numbers (Box-Muller); see `random` for `size`.
+
+        Args:
+            loc: Mean.
+            scale: Standard deviation.
+            size: Shape of the result.
+        """
         radius = np.sqrt(-2.0 * np.log(1.0 - self.random(size)))
         mean, sigma = np.asarray(loc, np.float64), np.asarray(scale, np.float64)
         return np.asarray(mean + sigma * (radius * np.cos(2.0 * np.pi * self.random(size))))
@@ -98,7 +104,7 @@ class FlightRandom:
     def integers(
         self, low: int, high: int | None = None, size: int | tuple[int, ...] | None = None
     ) -> NDArray[np.int64]:
-        """Whole numbers in [low, high), or [0, low); see `random` for `size`."""
+        """Draw integers in [low, high), or in [0, low) without `high`; see `random` for `size`."""
         first, end = (0, low) if high is None else (low, high)
         if end <= first:
             raise ValueError(f"high must be greater than low, got {low} and {high}")
@@ -106,5 +112,5 @@ class FlightRandom:
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(
-            f"the random numbers of a task have random, uniform, normal and integers, not {name}"
+            f"the generator of a task has random, uniform, normal and integers, not {name}"
         )

@@ -1,4 +1,4 @@
-"""The groups of a view: truth, estimate, what is seen, what was measured."""
+"""Groups of a view: truth, estimate, observed state, measurements."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ Truths = NDArray[np.bool_]
 
 
 class Truth(Group):
-    """What is so."""
+    """True state."""
 
     __slots__ = ("_view",)
 
@@ -26,50 +26,50 @@ class Truth(Group):
         super().__init__(flights, kept)
         self._view = view
 
-    position = Shown("r", "(n, 3) in I [m].")
+    position = Shown("r", "Position of the center of mass, (n, 3) in I [m].")
 
-    velocity = Shown("v", "(n, 3) in I [m/s].")
+    velocity = Shown("v", "Velocity of the center of mass, (n, 3) in I [m/s].")
 
-    quaternion = Shown("q", "(n, 4) (w, x, y, z), B to I.")
+    quaternion = Shown("q", "Attitude as a quaternion (w, x, y, z), (n, 4), B to I.")
 
-    R_BI = Shown("R_BI", "(n, 3, 3), v_B = R_BI v_I.")
+    R_BI = Shown("R_BI", "Attitude, (n, 3, 3), v_B = R_BI v_I.")
 
-    forward = Shown("R_BI", "(n, 3) the body x axis in I, first row of `R_BI`.", slice(0, 3))
+    forward = Shown("R_BI", "Body x axis, (n, 3) in I, the first row of `R_BI`.", slice(0, 3))
 
-    up = Shown("R_BI", "(n, 3) the vertical in B, last column of `R_BI`.", slice(2, None, 3))
+    up = Shown("R_BI", "Vertical, (n, 3) in B, the last column of `R_BI`.", slice(2, None, 3))
 
-    body_rates = Shown("w", "(n, 3) [rad/s].")
+    body_rates = Shown("w", "Body rates, (n, 3) in B [rad/s].")
 
     @Lazy
     def rotor_speeds(self) -> Floats:
-        """(n, 4) [rad/s]."""
+        """Rotor speeds, (n, 4) [rad/s]."""
         return self._flights.rows("rotor_speeds")
 
     @Lazy
     def accel_bias(self) -> Floats:
-        """(n, 3) in B [m/s^2]."""
+        """Accelerometer bias, (n, 3) in B [m/s^2]."""
         return self._flights.rows("b_a")
 
     @Lazy
     def gyro_bias(self) -> Floats:
-        """(n, 3) [rad/s]."""
+        """Gyro bias, (n, 3) in B [rad/s]."""
         return self._flights.rows("b_g")
 
     @Lazy
     def wind(self) -> Floats:
-        """(n, 3) velocity of the air in I [m/s]."""
+        """Wind velocity, (n, 3) in I [m/s]."""
         return self._flights.rows("wind")
 
-    position_error = Shown("position_error", "(n,) distance from the reference [m].")
+    position_error = Shown("position_error", "Distance from the reference position, (n,) [m].")
 
     @Lazy
     def estimation_error(self) -> Floats:
-        """(n,) distance of the seen from the true position [m]."""
+        """Distance between observed and true position, (n,) [m]."""
         return self._flights.columns("estimation_error")
 
     @Lazy
     def progress(self) -> Floats:
-        """(n,) speed toward the reference; on a course, toward the gate that was next [m/s]."""
+        """Speed toward the reference; on a course, toward the gate that was next, (n,) [m/s]."""
         view, distance = self._view, self.position_error
         if view.gates.shape[1]:
             every = np.arange(view.count)
@@ -81,7 +81,7 @@ class Truth(Group):
 
     @Lazy
     def nees(self) -> Floats:
-        """(n,) normalized estimation error squared."""
+        """Normalized estimation error squared, (n,)."""
         names = ("position", "velocity", "R_BI", "accel_bias", "gyro_bias")
         estimate = self._view.estimate
         error = state_error(
@@ -92,7 +92,7 @@ class Truth(Group):
 
     @Lazy
     def features_in_view(self) -> Truths:
-        """(n, m) whether the camera faces a marker and no obstacle hides it, nominally."""
+        """True for markers in the nominal camera's field of view that no obstacle hides, (n, m)."""
         p = self._flights.nominal()
         R_BI, r = self.R_BI[:, np.newaxis], self.position[:, np.newaxis]
         X_B = (R_BI @ (self._view.features - r)[..., np.newaxis])[..., 0] - p["camera"]
@@ -109,34 +109,37 @@ class Truth(Group):
 
     @Lazy
     def obstacle_distance(self) -> Floats:
-        """(n,) from the nearest obstacle's surface, negative inside; infinite: none there [m]."""
+        """Distance from the nearest obstacle surface, (n,) [m].
+
+        Negative inside an obstacle, infinite without obstacles.
+        """
         if not self._flights.world.obstacles:
             return np.full(self._view.count, np.inf)
         return self._flights.columns("obstacle_distance")
 
     @Lazy
     def obstacle_vector(self) -> Floats:
-        """(n, 3) from the vehicle to the nearest point of that surface, in I [m]."""
+        """Vector from the vehicle to the nearest point of an obstacle surface, (n, 3) in I [m]."""
         return self._flights.rows("obstacle_vector")
 
     @Lazy
     def on_ground(self) -> Truths:
-        """(n,) whether the ground pushes a foot; nowhere in a world whose ground carries nobody."""
+        """True where the ground supports a foot, (n,); False in worlds without ground contact."""
         return np.asarray(self._flights.columns("footing") > 0.0)
 
     @Lazy
     def faults(self) -> Any:
-        """Which are there now: (n,) bool by name."""
+        """Active faults: (n,) bool by name."""
         return self._flights.active_faults()
 
     @Lazy
     def drawn(self) -> Any:
-        """Parameters of the episode: (n, ...) by name."""
+        """Parameters drawn for the episode: (n, ...) by name."""
         return self._flights.drawn()
 
 
 def _covariance(name: str, first: int) -> tuple[Lazy[Floats], Lazy[Floats]]:
-    """A block of the covariance, and the square roots of its diagonal."""
+    """Make attributes for a block of the covariance and the square roots of its diagonal."""
 
     def block(self: "Estimate") -> Floats:
         rows = np.ascontiguousarray(self.factor[:, first : first + 3, : first + 3])
@@ -145,13 +148,13 @@ def _covariance(name: str, first: int) -> tuple[Lazy[Floats], Lazy[Floats]]:
     def sigma(self: "Estimate") -> Floats:
         return self.sigma[:, first : first + 3]
 
-    block.__doc__ = f"(n, 3, 3) covariance of {name}."
-    sigma.__doc__ = f"(n, 3) standard deviations of {name}."
+    block.__doc__ = f"Covariance of {name}, (n, 3, 3)."
+    sigma.__doc__ = f"Standard deviations of {name}, (n, 3)."
     return Lazy(block), Lazy(sigma)
 
 
 class Estimate(Group):
-    """What the filter estimates, and how sure it is."""
+    """Estimate of the filter and its covariance."""
 
     def _need_filter(self) -> None:
         if not self._flights.run_filter:
@@ -166,53 +169,53 @@ class Estimate(Group):
 
     @Lazy
     def position(self) -> Floats:
-        """(n, 3) in I [m]."""
+        """Estimated position, (n, 3) in I [m]."""
         return self._rows("r_hat")
 
     @Lazy
     def velocity(self) -> Floats:
-        """(n, 3) in I [m/s]."""
+        """Estimated velocity, (n, 3) in I [m/s]."""
         return self._rows("v_hat")
 
     @Lazy
     def R_BI(self) -> Floats:
-        """(n, 3, 3), v_B = R_BI v_I."""
+        """Estimated attitude, (n, 3, 3), v_B = R_BI v_I."""
         return self._rows("R_hat")
 
     @Lazy
     def quaternion(self) -> Floats:
-        """(n, 4) (w, x, y, z), B to I."""
+        """Estimated attitude as a quaternion (w, x, y, z), (n, 4), B to I."""
         return dcm_to_quaternion(self.R_BI)
 
     @Lazy
     def body_rates(self) -> Floats:
-        """(n, 3) measured rates less the estimated bias [rad/s]."""
+        """Body rates: gyro measurement minus estimated bias, (n, 3) in B [rad/s]."""
         return self._rows("w_meas") - self.gyro_bias
 
     @Lazy
     def accel_bias(self) -> Floats:
-        """(n, 3) in B [m/s^2]."""
+        """Estimated accelerometer bias, (n, 3) in B [m/s^2]."""
         return self._rows("b_a_hat")
 
     @Lazy
     def gyro_bias(self) -> Floats:
-        """(n, 3) [rad/s]."""
+        """Estimated gyro bias, (n, 3) in B [rad/s]."""
         return self._rows("b_g_hat")
 
     @Lazy
     def factor(self) -> Floats:
-        """(n, 15, 15) lower Cholesky factor of the covariance."""
+        """Lower Cholesky factor of the covariance, (n, 15, 15)."""
         return self._rows("L")
 
     @Lazy
     def covariance(self) -> Floats:
-        """(n, 15, 15) in the order position, velocity, attitude, accelerometer and gyro bias."""
+        """Covariance of position, velocity, attitude, accelerometer and gyro bias, (n, 15, 15)."""
         L = self.factor
         return L @ L.transpose(0, 2, 1)
 
     @Lazy
     def sigma(self) -> Floats:
-        """(n, 15) square roots of the covariance's diagonal."""
+        """Standard deviations, square roots of the diagonal of the covariance, (n, 15)."""
         L = self.factor
         return np.sqrt((L * L).sum(axis=2))
 
@@ -222,55 +225,61 @@ class Estimate(Group):
     accel_bias_covariance, accel_bias_sigma = _covariance("accelerometer bias [m/s^2]", 9)
     gyro_bias_covariance, gyro_bias_sigma = _covariance("gyro bias [rad/s]", 12)
 
-    _status = Shown("filter_status", "(n,) what has failed so far.")
+    _status = Shown("filter_status", "Numerical failures so far, (n,).")
 
     @property
     def status(self) -> NDArray[np.int64]:
-        """(n,) what has failed so far, see `FilterStatus`; 0: nothing."""
+        """Numerical failures so far, (n,), see `FilterStatus`; 0: none."""
         self._need_filter()
         return self._status
 
     @Lazy
     def diverged(self) -> Truths:
-        """(n,) whether the filter flags itself as diverged."""
+        """True where the filter flags itself as diverged, (n,)."""
         self._need_filter()
         return self._flights.columns("diverged") > 0.0
 
     @Lazy
     def nis(self) -> Floats:
-        """(n,) normalized innovation squared of the last update."""
+        """Normalized innovation squared of the last update, (n,)."""
         self._need_filter()
         return self._flights.columns("nis")
 
     @Lazy
     def nis_dimension(self) -> NDArray[np.int64]:
-        """(n,) measurements in it."""
+        """Number of scalar measurements in the last update, (n,)."""
         self._need_filter()
         return self._flights.counts("nis_dimension")  # type: ignore[no-any-return]
 
 
 class Observed(Group):
-    """What the controller goes by: the estimate, the truth, or the truth with noise."""
+    """State observed by the controller: the estimate, the truth, or the truth with noise."""
 
-    position = Shown("r_seen", "(n, 3) in I [m].")
+    position = Shown("r_seen", "Observed position, (n, 3) in I [m].")
 
-    velocity = Shown("v_seen", "(n, 3) in I [m/s].")
+    velocity = Shown("v_seen", "Observed velocity, (n, 3) in I [m/s].")
 
-    R_BI = Shown("R_seen", "(n, 3, 3), v_B = R_BI v_I.")
+    R_BI = Shown("R_seen", "Observed attitude, (n, 3, 3), v_B = R_BI v_I.")
 
-    body_rates = Shown("w_seen", "(n, 3) [rad/s].")
-    position_error = Shown("position_gap", "(n, 3) reference less position, in B [m].")
-    velocity_error = Shown("velocity_gap", "(n, 3) reference less velocity, in B [m/s].")
-    up = Shown("up", "(n, 3) the vertical in B.")
-    heading = Shown("heading", "(n, 3) direction that body x is to point in, in B.")
-    reference_acceleration = Shown("acceleration", "(n, 3) of the reference in B [m/s^2].")
+    body_rates = Shown("w_seen", "Observed body rates, (n, 3) in B [rad/s].")
+    position_error = Shown(
+        "position_gap", "Reference position minus observed position, (n, 3) in B [m]."
+    )
+    velocity_error = Shown(
+        "velocity_gap", "Reference velocity minus observed velocity, (n, 3) in B [m/s]."
+    )
+    up = Shown("up", "Vertical, (n, 3) in B.")
+    heading = Shown("heading", "Desired heading: unit vector for body x, (n, 3) in B.")
+    reference_acceleration = Shown(
+        "acceleration", "Acceleration of the reference, (n, 3) in B [m/s^2]."
+    )
     preview = Shown(
-        "ahead", "(n, 2, 3) the reference a little later, less the present one, in B [m]."
+        "ahead", "Reference at two later times minus the present one, (n, 2, 3) in B [m]."
     )
 
     @Lazy
     def _obstacle(self) -> Any:
-        """Distance from the nearest obstacle, and the vector there in I, by name."""
+        """Distance from the nearest obstacle and the vector to it in I, by name."""
         distance, vector = nearest_obstacle(
             self._flights.world.obstacles, self._flights.obstacle_centers(), self.position
         )
@@ -278,83 +287,86 @@ class Observed(Group):
 
     @Lazy
     def obstacle_distance(self) -> Floats:
-        """(n,) of the seen position from the nearest obstacle's surface, negative inside [m]."""
+        """Distance of the observed position from the nearest obstacle surface, (n,) [m].
+
+        Negative inside an obstacle, infinite without obstacles.
+        """
         return self._obstacle["distance"]
 
     @Lazy
     def obstacle_vector(self) -> Floats:
-        """(n, 3) from the seen position to the nearest point of that surface, in B [m]."""
+        """Vector from the observed position to the nearest obstacle surface, (n, 3) in B [m]."""
         vector = self._obstacle["vector"][:, :, np.newaxis]
         return np.ascontiguousarray((self.R_BI @ vector)[:, :, 0])
 
 
 class Measured(Group):
-    """What was measured in the step, the last of each kind; NaN where there was none."""
+    """Last measurement of each kind in the step; NaN if there was none."""
 
     def _need_sensors(self) -> None:
         if not self._flights.run_filter:
             raise ValueError(
-                'view.measured needs sensors that run: observation="estimate" or "measurements", '
+                'view.measured needs simulated sensors: observation="estimate" or "measurements", '
                 "or include_std=True or innovations=True"
             )
 
     @Lazy
     def gyro(self) -> Floats:
-        """(n, 3) in B [rad/s]."""
+        """Angular rate measured by the gyro, (n, 3) in B [rad/s]."""
         self._need_sensors()
         return self._flights.rows("gyro")
 
     @Lazy
     def accel(self) -> Floats:
-        """(n, 3) specific force in B [m/s^2]."""
+        """Specific force measured by the accelerometer, (n, 3) in B [m/s^2]."""
         self._need_sensors()
         return self._flights.rows("accel")
 
     @Lazy
     def gnss_valid(self) -> Truths:
-        """(n,) whether a position was measured."""
+        """True where a position was measured in this step, (n,)."""
         self._need_sensors()
         return self._flights.columns("position_fresh") > 0.0
 
     @Lazy
     def baseline_valid(self) -> Truths:
-        """(n,) whether a baseline was measured."""
+        """True where a baseline was measured in this step, (n,)."""
         self._need_sensors()
         return self._flights.columns("baseline_fresh") > 0.0
 
     @Lazy
     def features_seen(self) -> Truths:
-        """(n, m) whether an image of this step has the feature."""
+        """True for features in an image of this step, (n, m)."""
         self._need_sensors()
         count = self._flights.feature_places().shape[1]
         return self._flights.rows("feature_fresh")[:, :count] > 0.0
 
     def _in_I(self, name: str, valid: Truths) -> Floats:
-        """A vector in G turned to I, where it was measured."""
+        """Vector in G rotated to I; NaN where it was not measured."""
         x, y, z = self._flights.columns(name)
         turned = [row[0] * x + row[1] * y + row[2] * z for row in self._flights.nominal()["R_IG"]]
         return np.where(valid, turned, np.nan).T
 
     @Lazy
     def gnss_position(self) -> Floats:
-        """(n, 3) primary antenna in I [m]."""
+        """Measured position of the primary antenna, (n, 3) in I [m]."""
         return self._in_I("gnss_position", self.gnss_valid)
 
     @Lazy
     def gnss_baseline(self) -> Floats:
-        """(n, 3) primary to secondary antenna in I [m]."""
+        """Measured baseline from the primary to the secondary antenna, (n, 3) in I [m]."""
         return self._in_I("gnss_baseline", self.baseline_valid)
 
     @Lazy
     def gnss_velocity(self) -> Floats:
-        """(n, 3) of the primary antenna in I [m/s]."""
+        """Measured velocity of the primary antenna, (n, 3) in I [m/s]."""
         gnss = self._flights.sensors.gnss
         gives = gnss is not None and gnss.velocity_sigma is not None
         return self._in_I("gnss_velocity", self.gnss_valid & gives)
 
     @Lazy
     def pixels(self) -> Floats:
-        """(n, m, 2) features from the image's center [pixels]."""
+        """Image coordinates of the features, relative to the image center, (n, m, 2) [pixels]."""
         seen = self.features_seen
         pixels = self._flights.rows("pixels")[:, : seen.shape[1]]
         return np.where(seen[:, :, np.newaxis], pixels, np.nan)

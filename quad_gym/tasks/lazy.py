@@ -12,17 +12,17 @@ from quad_gym.records import SHOWN, SHOWN_KINDS, SHOWN_SHAPES
 T = TypeVar("T")
 
 Attribute = tuple[dict[str, Any], str]
-"""An attribute that holds an array: the attributes of a group, and its name in them."""
+"""Attribute that holds an array: the attributes of a group, and the name of this one."""
 
 
 class Lazy(Generic[T]):
-    """A read-only array of a `Group`, made by a method when it is first read."""
+    """Read-only array of a `Group`, computed by a method when it is first read."""
 
     def __init__(self, make: Callable[[Any], T]) -> None:
         self._make, self.__doc__ = make, make.__doc__
 
     def __set_name__(self, owner: type, name: str) -> None:
-        """Learn what it is called."""
+        """Store the name of the attribute."""
         self._name = name
 
     @overload
@@ -32,22 +32,22 @@ class Lazy(Generic[T]):
     def __get__(self, group: object, owner: type) -> T: ...
 
     def __get__(self, group: Any, owner: type) -> Any:
-        """Make it; from then on it is an ordinary attribute of the group."""
+        """Compute the array and store it as an ordinary attribute of the group."""
         if group is None:
             return self
         return group._keep(self._name, self._make(group))
 
 
 class Shown:
-    """An array of a `Group` that the kernels show, see `quad_gym.records.SHOWN`.
+    """Array of a `Group` that the kernels write, see `quad_gym.records.SHOWN`.
 
-    It is a NumPy view of the memory of what is shown, the same in each step until the memory
-    changes; a matrix is copied.
+    It is a NumPy view of the memory to which the kernels write, and stays the same object until
+    that memory is exchanged; a matrix is copied.
 
     Args:
-        name: Which.
-        meaning: Shape, meaning, unit and frame.
-        part: Which of its numbers, as a vector; None: all of them.
+        name: Name in `SHOWN`.
+        meaning: Docstring: meaning, shape, frame and unit.
+        part: Slice of the elements to take, as a vector; None: all elements.
     """
 
     def __init__(self, name: str, meaning: str, part: slice | None = None) -> None:
@@ -60,14 +60,14 @@ class Shown:
         self._is_matrix = len(self._shape) > 1 and part is None
 
     def part_of(self, shown: NDArray[np.float64]) -> NDArray[Any]:
-        """(n, ...) a NumPy view of what is shown."""
+        """NumPy view of this quantity in the kernels' memory, (n, ...)."""
         found = shown[self._rows].T
         if self._is_matrix:
             found = found.reshape(-1, *self._shape)
         return found if self._kind == found.dtype else found.view(self._kind)
 
     def __set_name__(self, owner: type, name: str) -> None:
-        """Learn what it is called."""
+        """Store the name of the attribute."""
         self._name, self._uncopied = name, f"_{name}_uncopied"
 
     @overload
@@ -77,7 +77,7 @@ class Shown:
     def __get__(self, group: object, owner: type) -> NDArray[Any]: ...
 
     def __get__(self, group: Any, owner: type) -> Any:
-        """Take it; from then on it is an ordinary attribute of the group."""
+        """Take the array and store it as an ordinary attribute of the group."""
         if group is None:
             return self
         if not self._is_matrix:
@@ -85,12 +85,12 @@ class Shown:
         uncopied = group.__dict__.get(self._uncopied)
         if uncopied is None:
             uncopied = group._flights.hand_out(self, group.__dict__, self._uncopied)
-        # in memory as for a single flight, so that products with it have the same bits
+        # memory layout of a single flight, so that products have the same bits in any batch
         return group._keep(self._name, uncopied.copy())
 
 
 def frozen(value: Any) -> Any:
-    """An array that cannot be written to, or a mapping of them."""
+    """Make an array, or the arrays of a dictionary, read-only."""
     if isinstance(value, np.ndarray):
         value.setflags(write=False)
         return value
@@ -100,11 +100,14 @@ def frozen(value: Any) -> Any:
 
 
 class Group:
-    """Some arrays of a view. What it knows of the flights is in slots; what it has made, is not.
+    """Group of arrays of a view.
+
+    Its references to the flights are in slots; the arrays that it has computed are ordinary
+    attributes.
 
     Args:
-        flights: What it shows.
-        kept: Where to note the arrays that are dropped at the next step.
+        flights: Batch whose flights it describes.
+        kept: List to which it adds the arrays that are dropped at the next step.
     """
 
     __slots__ = ("__dict__", "_flights", "_kept")
@@ -113,23 +116,23 @@ class Group:
         self._flights, self._kept = flights, kept
 
     def _keep(self, name: str, value: Any) -> Any:
-        """Keep what cannot be written to any more until `forget`; return it."""
+        """Make a value read-only, store it until `forget`, and return it."""
         arrays, value = self.__dict__, frozen(value)
-        self._kept.append((arrays, name))  # first, so that it is dropped whatever happens
+        self._kept.append((arrays, name))  # first: an interrupt must not leave it undropped
         arrays[name] = value
         return value
 
     def forget(self) -> None:
-        """Drop the arrays that were kept, of all groups that note them in the same place."""
-        kept = self._kept.copy()  # another thread may still add to it
+        """Drop the stored arrays of all groups that share this list."""
+        kept = self._kept.copy()  # another thread may still append to it
         for arrays, name in kept:
-            arrays.pop(name, None)  # two threads may have noted the same one
+            arrays.pop(name, None)  # two threads may have added the same one
         del self._kept[: len(kept)]
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name[0] != "_":
-            raise AttributeError(f"view.{name} is what it is: keep your own in view.state")
+            raise AttributeError(f"view.{name} is read-only; store your own data in view.state")
         super().__setattr__(name, value)
 
     def __delattr__(self, name: str) -> None:
-        raise AttributeError(f"view.{name} is what it is: it cannot be deleted")
+        raise AttributeError(f"view.{name} cannot be deleted")

@@ -1,4 +1,4 @@
-"""`LookAround`: a task in which the position is known only as well as the camera looks."""
+"""`LookAround`: a task in which position accuracy depends on the camera's view of markers."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -14,46 +14,47 @@ if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
 WIDE_WEIGHT, NEAR_WEIGHT = 0.1, 0.1
-"""Of exp(-e) and exp(-5 e): the first still pulls a vehicle back that has been lost for a while."""
+"""Weights of exp(-e) and exp(-5 e); the first still rewards coming closer at errors of meters."""
 
 HEADING_WEIGHT = 0.15
-"""Of the heading. With 0.05 a rule that always faces the wall is as good as one that glances, with
-0.2 a rule that never looks is nearly as good as one that always does."""
+"""Weight of the heading. With 0.05, a rule that always faces the wall is as good as one that
+glances; with 0.2, a rule that never looks is nearly as good as one that always does."""
 
 CRASH_COST = 2.0
-"""Once, as much as ten steps of perfect tracking; a crash also costs the time that was left."""
+"""Cost of a crash, as much as ten steps of perfect tracking; it also loses later rewards."""
 
 
 class LookAround(Task):
-    """Follow a random trajectory and look in the rewarded direction, without getting lost.
+    """Follow a random trajectory and face the rewarded heading without losing the position.
 
-    There is no GNSS. All eight markers hang on one wall, 8 m west of the origin, the camera sees 60
-    degrees, and the IMU is a cheap one: within seconds of looking away, the filter's position is
-    off by decimeters, and after ten by meters. Looking at the markers costs reward, which pays
-    for a heading that is drawn for each episode.
+    There is no GNSS. All eight markers are on one wall, 8 m west of the origin. The camera has a
+    field of view of 60 degrees, and the IMU is a low-cost one: the filter's position error grows to
+    decimeters within seconds of looking away from the markers, and to meters within ten seconds.
+    Looking at the markers costs reward, because the reward favors a heading that is drawn for each
+    episode.
 
     ## Reward
-    In each step, with the true position error e [m] and the alignment h of body x with the wanted
+    In each step, with the true position error e [m] and the alignment h of body x with the desired
     heading (1: aligned, -1: opposite)
 
         0.1 exp(-e) + 0.1 exp(-5 e) + 0.15 h - 2 (crashed)
 
-    At most 0.35 a step, so 262.5 in an episode of 750 steps.
+    At most 0.35 per step, so 262.5 in an episode of 750 steps.
 
     ## Observation
-    The built-in one, and then `features_direction` (3): the unit vector from the vehicle to the
-    middle of the markers in the body frame, both as the controller sees them.
+    The built-in observation, followed by `features_direction` (3): the unit vector from the
+    observed position to the center of the markers, in the observed body frame.
 
     ## Endings
-    Those of `QuadEnv`, with 8 m to the reference as the bound: a controller that is mistaken about
-    its position has time to find it again. There is no ground above -5 m.
+    The endings of `QuadEnv`, with a bound of 8 m on the distance from the reference, so that a
+    controller with a wrong position estimate has time to recover. The minimum height is -5 m.
 
-    Simple rules fail: PD control of the wanted heading gets lost in two thirds of the episodes, and
-    PD control that faces the wall forgoes the reward of the heading.
+    Simple rules fail: PD control that tracks the desired heading loses its position in two thirds
+    of the episodes, and PD control that faces the wall forgoes the reward for the heading.
 
     Args:
-        heading_weight: Of h in the reward.
-        crash_cost: What a crash costs, once.
+        heading_weight: Weight of h in the reward.
+        crash_cost: Cost of a crash.
 
     Raises:
         ValueError: If a number is negative or not finite.
@@ -74,14 +75,14 @@ class LookAround(Task):
         )
 
     def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) see the class."""
+        """Return the reward described in the class, (n,)."""
         return self.pieces(view)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
-        """`features_direction`: (n, 3) unit vector to the middle of the markers, in B.
+        """Return `features_direction`, the unit vector to the center of the markers, (n, 3) in B.
 
         Raises:
-            ValueError: If there is no camera, so that there are no markers.
+            ValueError: If the vehicle has no camera, and therefore no markers.
         """
         if view.features.shape[1] == 0:
             raise ValueError("LookAround needs a camera, expected camera=True, got False")

@@ -1,15 +1,15 @@
-"""`ReadableBatch`: flights that show each instant to the views of a task.
+"""`ReadableBatch`: flights whose state the views of a task can read.
 
-The compiled code writes what is shown to one block of memory, and arrays of views are NumPy views
-of it, without a copy. Rewards and endings of a task are written by `quad_gym.kernels.task.settle`.
+The compiled code writes the quantities of a view to one block of memory, and arrays of views are
+NumPy views of it, without a copy. `quad_gym.kernels.task.settle` writes rewards and endings.
 
-An array that a task keeps must not change in the next step. Before each step, counts of references
-tell whether somebody keeps one, and then the step writes to other memory. The invariant: while
-nobody keeps any, each array that was handed out is referred to by the list of these and by its
-attribute alone, and the memory by the batch, its calls and the arrays in that list alone. Any
-further reference, such as from a slice, which NumPy lets refer to the memory itself, makes a count
-larger. An array that is in no list counts as kept, so an interrupt or a second thread can cost
-memory, but never show an old instant. Weak references are not counted.
+An array that a task keeps must not change in the next step. Before each step, reference counts show
+whether an array is still in use; if so, the step writes to other memory. The invariant: while no
+array is in use, only the list of arrays handed out and its own attribute refer to each array, and
+only the batch, its calls and the arrays in that list refer to the memory. Any further reference
+increases a count, including a slice, which refers to the memory itself. An array that is not in
+the list counts as used, so an interrupt or a second thread can cost memory, but never expose
+outdated data. Weak references are not counted.
 """
 
 from sys import getrefcount
@@ -28,18 +28,21 @@ from quad_gym.tasks.lazy import Attribute, Shown
 Floats = NDArray[np.float64]
 
 _GAP = 8
-"""Numbers between two rows of what is shown: a line of the cache."""
+"""Padding between two rows of the memory: a cache line."""
 _TIME = SHOWN["time"].start
 _COMPARED = slice(SHOWN["position_error"].start, SHOWN["gate_next"].stop)
-"""What a step is compared with the one before in."""
+"""Rows of the quantities that a step is compared in with the step before."""
 COMPARED_ERROR = SHOWN["position_error"].start - _COMPARED.start
-"""The row of the position's error among what is compared."""
+"""Row of the position error among the compared quantities."""
 COMPARED_GATES = SHOWN["gate_next"].start - _COMPARED.start
-"""The row of the gates passed."""
+"""Row of the number of gates passed among the compared quantities."""
 
 
 def _references_unless_kept() -> int:
-    """To an array that was handed out; measured, as interpreters count differently."""
+    """Reference count of an array that only its attribute and the list of arrays refer to.
+
+    It is measured because interpreters count differently.
+    """
     attributes = {"": np.zeros(1)}
     return max(map(getrefcount, [attributes[""]]))
 
@@ -48,12 +51,11 @@ _UNLESS_KEPT = _references_unless_kept()
 
 
 class ReadableBatch(FlightBatch):
-    """A `FlightBatch` with what the views of a task read.
+    """`FlightBatch` with the memory that the views of a task read.
 
-    `shown` is memory that the next step overwrites, unless somebody keeps an array of it: then the
-    step writes to other memory. Arrays of views are handed out once for each memory, as making
-    them in every step would take longer than the rest of a small task. Other fields are read as
-    new arrays.
+    The next step overwrites `shown`, unless an array of it is still in use: then the step writes to
+    other memory. Arrays of views are made once for each memory, because making them in every step
+    would take longer than the rest of a small task. Other fields are read as new arrays.
     """
 
     def __init__(self, count: int, **keywords: Any) -> None:
@@ -65,30 +67,30 @@ class ReadableBatch(FlightBatch):
         self._handed_out: list[NDArray[Any]] = []
         self._attributes: list[Attribute] = []
         self._memory_references = 0
-        # rows that lie a power of two apart would share a few lines of the cache
+        # rows at distances of a power of two would compete for a few cache lines
         self._use_memory(np.zeros((SHOWN_SIZE, len(self._blocks) * WIDTH + _GAP)))
 
     shown: Floats
-    """(SHOWN_SIZE, n) of `quad_gym.records.SHOWN` at the present instant; read-only"""
+    """Quantities of `quad_gym.records.SHOWN` at the present instant, (SHOWN_SIZE, n); read-only."""
     _handed_out: list[NDArray[Any]]
     """Arrays of the present memory, each of which is an attribute of a view."""
     _attributes: list[Attribute]
     """All attributes that may hold an array of the present memory."""
     _memory_references: int
-    """To the memory, without those of arrays that were handed out."""
+    """Number of references to the memory, except from arrays that were handed out."""
 
     def _use_memory(self, memory: Floats) -> None:
-        """Show what this memory holds from now on."""
+        """Use this memory from now on."""
         for group, name in self._attributes:
             group.pop(name, None)
         self._attributes, self._handed_out = [], []
-        memory.setflags(write=False)  # no array of it can be made writable then
+        memory.setflags(write=False)  # prevents that an array of it is made writable
         self._memory, self.shown = memory, memory[:, : self.count]
         self.time_shown, self.compared_shown = self.shown[_TIME], self.shown[_COMPARED]
 
     def _change_memory(self, calls: Calls) -> None:
-        """Leave the present memory to those who keep it, and use a copy."""
-        self._memory_references = 0  # whatever interrupts this, the next step does it again
+        """Leave the present memory to the arrays still in use, and continue with a copy."""
+        self._memory_references = 0  # after an interrupt, the next step repeats this
         self._use_memory(self._memory.copy())
         calls.show_into(self._memory)
         self._memory_references = getrefcount(self._memory)
@@ -97,11 +99,11 @@ class ReadableBatch(FlightBatch):
         """Make an array (n, ...) of the present memory an attribute, until the memory changes.
 
         Args:
-            field: What it holds.
-            group: The attributes of a group.
-            name: Its name in them.
+            field: Quantity that it contains.
+            group: Attributes of a group.
+            name: Name of the attribute.
         """
-        self._attributes.append((group, name))  # first, so that it is dropped whatever happens
+        self._attributes.append((group, name))  # first: an interrupt must not leave it undropped
         made = field.part_of(self.shown)
         array = group.setdefault(name, made)
         if array is made:  # no other thread was faster
@@ -109,7 +111,7 @@ class ReadableBatch(FlightBatch):
         return array
 
     def _is_kept(self) -> bool:
-        """Whether anybody keeps an array of the present memory."""
+        """True if an array of the present memory is still in use."""
         arrays = self._handed_out
         return (
             getrefcount(self._memory) - len(arrays) > self._memory_references
@@ -118,7 +120,7 @@ class ReadableBatch(FlightBatch):
 
     def _run(self, command: Command) -> NDArray[np.float32]:
         if self._crew is not None and self._is_kept():
-            self._crew.gather()  # nobody may still write to the memory that goes
+            self._crew.gather()  # no thread may still write to the old memory
             self._change_memory(self._calls)
         return super()._run(command)
 
@@ -128,36 +130,36 @@ class ReadableBatch(FlightBatch):
         return calls
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Bring all flights back to a snapshot; `shown` is of its instant then.
+        """Restore all flights, and `shown`, from a snapshot.
 
         Raises:
-            ValueError: If the snapshot is of another size or kind.
+            ValueError: If the snapshot has another size or kind.
         """
         super().restore(snapshot)
         self._resets[:] = 0
-        self._run(Command.RESET)  # of no flight, which shows and observes all of them
-        self._blocks[:] = snapshot  # what fills the last block has begun anew
+        self._run(Command.RESET)  # resets no flight, but updates `shown` and the observations
+        self._blocks[:] = snapshot  # padding lanes of the last block have begun again
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the arrays of its memory, which a copy makes anew."""
+        """Everything but the arrays of its memory, which a copy creates itself."""
         arrays: dict[str, Any] = {"_fields": {}, "_attributes": [], "_handed_out": []}
         arrays |= {"shown": None, "time_shown": None, "compared_shown": None}
         return super().__getstate__() | arrays
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Use memory of its own."""
+        """Restore the attributes, with separate memory."""
         self.__dict__.update(state)
         self._use_memory(self._memory)
 
     def _field(self, name: str) -> NDArray[Any]:
-        """A field of the flights' records, (blocks, ..., lanes), found once."""
+        """Field of the flights' records, (blocks, ..., lanes), looked up once."""
         field = self._fields.get(name)
         if field is None:
             field = self._fields[name] = self._blocks[name]
         return field
 
     def columns(self, name: str) -> NDArray[Any]:
-        """A field of the flights' records as a new array (..., n)."""
+        """Read a field of the flights' records into a new array (..., n)."""
         if name not in self._fields and not self._room.holds(name):
             return np.ascontiguousarray(np.moveaxis(self.record(name), 0, -1))
         values = self._field(name)
@@ -168,7 +170,7 @@ class ReadableBatch(FlightBatch):
         return values.reshape(*values.shape[:-2], -1)[..., : self.count]
 
     def rows(self, name: str) -> NDArray[Any]:
-        """A field of the flights' records as a new array (n, ...)."""
+        """Read a field of the flights' records into a new array (n, ...)."""
         if name not in self._fields and not self._room.holds(name):
             return self.record(name)
         values = self._field(name)
@@ -179,7 +181,7 @@ class ReadableBatch(FlightBatch):
         return values.reshape(-1, *values.shape[2:])[: self.count]
 
     def counts(self, name: str) -> NDArray[np.int64]:
-        """A field of the flights' records as whole numbers, (n,)."""
+        """Read a field of the flights' records as integers, (n,)."""
         values = self._field(name).astype(np.int64).reshape(-1)
         return values if len(values) == self.count else values[: self.count]
 
@@ -194,25 +196,25 @@ class ReadableBatch(FlightBatch):
         field[:] = lanes.reshape(field.shape)
 
     def gates(self) -> Floats:
-        """(n, gates, 3) of a course in I [m]; none elsewhere."""
+        """Gates of a course, (n, gates, 3) in I [m]; (n, 0, 3) in other tasks."""
         if self.task.kind != "waypoints":
             return np.zeros((self.count, 0, 3))
         return self.rows("gates")[:, : self.task.gate_count]
 
     def obstacle_centers(self) -> Floats:
-        """(n, k, 3) where the middles of the world's obstacles are in I [m]."""
+        """Centers of the obstacles in this episode, (n, o, 3) in I [m]."""
         count = len(self.world.obstacles)
         if not count:
             return np.zeros((self.count, 0, 3))
         return np.ascontiguousarray(self.rows("obstacle_center")[:, :count])
 
     def nominal(self) -> dict[str, Any]:
-        """Numbers of the nominal sensors."""
+        """Parameters of the nominal camera, and the rotation from G to I, by name."""
         names = ("camera", "R_CB", "focal_length", "half_image", "R_IG")
         return {name: self._world[name][0, ..., 0] for name in names}
 
     def finite(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(n,) whether the true state of flights is finite; looked at where `chosen`."""
+        """True where the true state is finite, (n,); checked only for `chosen` flights."""
         finite = np.ones(self.count, bool)
         flights = np.flatnonzero(chosen)
         state = np.concatenate(

@@ -1,4 +1,4 @@
-"""Observations with a task's own numbers: joined with the shipped ones, checked, within bounds."""
+"""Observations of a task: joined with the built-in observation, checked and clipped."""
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
@@ -18,11 +18,11 @@ Singles = NDArray[np.float32]
 _ARRAYS, _SHAPE = {np.ndarray}, attrgetter("shape")
 
 _SQUARABLE = 1e15
-"""Numbers whose squares have a sum in single precision."""
+"""Magnitude up to which a sum of squares does not overflow in single precision."""
 
 
 class Part(NamedTuple):
-    """One part of what `observe` returns."""
+    """Size and bounds of one array that `observe` returns."""
 
     size: int
     low: float
@@ -30,14 +30,14 @@ class Part(NamedTuple):
 
 
 class Joiner:
-    """Makes observations: the shipped numbers that stay, the task's, the privileged ones.
+    """Assembly of observations: built-in values that are kept, the task's, and privileged ones.
 
     Args:
         count: Number of flights.
-        parts: What `observe` returns, by name.
-        shipped: How many numbers the shipped observation has.
-        split: Where the task's stand: after so many of them.
-        kept: Which of these stay; None: all.
+        parts: Arrays that `observe` returns, by name.
+        shipped: Size of the built-in observation.
+        split: Index in the built-in observation at which the task's values are inserted.
+        kept: Indices before `split` that are kept; None: all.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Joiner:
             self._kept = np.array(kept, np.intp)
         self._begin = split if kept is None else len(kept)
         self.size = self._begin + sum(self._sizes.values()) + self._rest
-        """how many numbers an observation has"""
+        """Size of an observation."""
         bounds = [(part.low, part.high) for part in parts.values() for _ in range(part.size)]
         self._low, self._high = np.array(bounds, np.float32).reshape(-1, 2).T.copy()
         self._least = self._low.max(initial=-_SQUARABLE)
@@ -65,15 +65,15 @@ class Joiner:
         self._surely_within = 0.99 * float(max(min(-self._least, self._most), 0.0)) ** 2
 
     def join(self, flights: "TaskBatch", value: Any, shipped: Singles) -> Singles:
-        """The observations that the environment shows.
+        """Assemble the observations of the environment.
 
         Args:
-            flights: Whose.
-            value: What `observe` has returned.
-            shipped: The shipped observations, (n, k).
+            flights: Flights of the task.
+            value: Return value of `observe`.
+            shipped: Built-in observations, (n, k).
 
         Raises:
-            TaskError: If something is wrong with what it has returned.
+            TaskError: If the return value is invalid.
         """
         if not self._is_as_at_first(value):
             value = self._checked(flights, value)
@@ -85,39 +85,40 @@ class Joiner:
         try:
             joined = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
         except TypeError:
-            self._checked(flights, value)  # says which are no numbers
+            self._checked(flights, value)  # raises an error that names the array
             raise
-        flat = joined.ravel(order="K")  # as it lies in memory
-        if not flat.dot(flat) <= self._surely_within:  # NaN is not, either
+        flat = joined.ravel(order="K")  # in memory order, without a copy
+        if not flat.dot(flat) <= self._surely_within:  # also for NaN
             self._hold(flights, joined[:, self._begin : self.size - self._rest], value)
         return joined
 
     def _is_as_at_first(self, value: Any) -> bool:
-        """Whether `observe` has returned arrays of the names and shapes that it had at first."""
+        """True if `observe` has returned arrays with the same names and shapes as at first."""
         if type(value) is not dict or tuple(value) != self._names:
             return False
         parts = value.values()
         return set(map(type, parts)) == _ARRAYS and list(map(_SHAPE, parts)) == self._shapes
 
     def _checked(self, flights: "TaskBatch", value: Any) -> dict[str, NDArray[Any]]:
-        """What `observe` has returned, (n, k) each by name, in the order of the observation."""
+        """Check the return value of `observe`; return (n, k) arrays in the observation's order."""
         found = answers.parts(flights.own_task, value, flights.count)
         sizes = {name: part.shape[1] for name, part in found.items()}
         if sizes != self._sizes:
             raise TaskError(
-                f"{label(flights.own_task)}.observe must return as many numbers as at first, "
+                f"{label(flights.own_task)}.observe must always return the same sizes, "
                 f"{self._sizes}, got {sizes}"
             )
         return {name: found[name] for name in self._sizes}
 
     def _hold(self, flights: "TaskBatch", ours: Singles, own: Mapping[str, Any]) -> None:
-        """Hold the task's part of observations within its bounds.
+        """Clip the task's part of observations to its bounds.
 
         Raises:
-            TaskError: If it is not finite, of flights whose state is; others' is made finite.
+            TaskError: If it is not finite although the state of the flight is. For flights whose
+                state is not finite, it is replaced by finite numbers.
         """
         if ours.min() >= self._least and ours.max() <= self._most:
-            return  # clipping takes long
+            return  # clipping is slow
         if not np.isfinite(ours).all():
             for name, values in own.items():
                 sound = np.isfinite(values).all(axis=1)

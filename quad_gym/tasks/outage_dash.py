@@ -1,4 +1,4 @@
-"""`OutageDash`: a task in which uncertainty changes the best action."""
+"""`OutageDash`: a task in which the best action depends on the filter's uncertainty."""
 
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,97 +18,100 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 PROGRESS_WEIGHT = 5.0
-"""Of each meter along the course, as far as its speed is paid for [1/m]."""
+"""Reward for each meter along the course, up to the rewarded speed [1/m]."""
 
 PAID_SPEED = 5.0
-"""No more than this is paid for [m/s]: faster, an outage would be over after some gaps."""
+"""Highest rewarded speed [m/s]; at higher speeds, many gaps would be flown in one outage."""
 
 CRASH_COST = 50.0
-"""On top of what the course has earned so far. A constant cost would make hurrying through the
-outage pay late in the course."""
+"""Cost of a crash, in addition to the rewards for progress so far. With a constant cost alone,
+hurrying through an outage late in the course would be worthwhile."""
 
 ACTION_COST, RATE_COST = 0.02, 0.002
-"""Of |change of action|^2 and |body rates|^2 in each step, as those that ship."""
+"""Weights of |change of action|^2 and |body rates|^2 in each step, as in the built-in reward."""
 
 _COSTS: Term = -ACTION_COST * ActionRate() - RATE_COST * BodyRates()
 _CRASH = Crash()
 
 PAST = 0.7
-"""How far beyond a wall the vehicle is through its gap: then nothing of it is in there [m]."""
+"""Distance beyond a wall at which the whole vehicle is through its gap [m]."""
 
 FINISH_WIDTH = 6.0
-"""Of what follows the last gap in observations [m]."""
+"""Width in observations for the finish, which follows the last gap [m]."""
 
 
 class Gaps(NamedTuple):
-    """The gaps of a course, in the order in which they come, and the finish last."""
+    """Gaps of a course in order, followed by the finish."""
 
     centers: Floats
-    """(n, gaps + 1, 3) in I [m]"""
+    """Centers, (n, gaps + 1, 3) in I [m]"""
     widths: Floats
-    """(n, gaps + 1) [m]"""
+    """Widths, (n, gaps + 1) [m]"""
 
 
 class OutageDash(Task):
-    """Dash through the gaps of ten walls, while GNSS fails for 5 to 15 s.
+    """Fly through the gaps of ten walls while GNSS is lost for 5 to 15 s.
 
-    The sensors are those of a hobby vehicle (`consumer`). With GNSS the filter knows the position
-    to 0.2 m; without it the error is 0.25 m after two seconds, 0.8 m after five, 2 m after eight,
-    and 4 m after twelve (root mean square). Gaps are 3 to 6 m wide, walls 12 m apart. A controller
-    that hurries on through an outage hits a wall; one that waits for its end needs the time, and
-    drifts. How far to go on depends on the filter's uncertainty and on the width of the next gap.
+    The sensors are typical of hobby vehicles (`consumer`). With GNSS the position error of the
+    filter is 0.2 m; without it the error grows to 0.25 m after two seconds, 0.8 m after five, 2 m
+    after eight, and 4 m after twelve (root mean square). Gaps are 3 to 6 m wide, walls 12 m apart.
+    A controller that continues through an outage hits a wall; one that waits for GNSS needs time,
+    and drifts. The best distance to continue depends on the filter's uncertainty and on the width
+    of the next gap.
 
-    At 5 m/s the course takes 27 s of the 45 s, and nothing is paid for time that is left: there is
-    time to wait for the end of every outage, and none to fly the whole course slowly.
+    At 5 m/s the course takes 27 s of the 45 s, and time that remains is not rewarded: there is
+    enough time to wait for the end of every outage, but not to fly the whole course slowly.
 
-    Actions command velocities (`action="velocity"`) ten times a second (`control_rate=10`). An
-    inner loop carries them out on the estimate: the task is to decide how far to go on, not to
-    stabilize the vehicle. Other kinds of actions, and rates, are keywords as everywhere.
+    Actions command velocities (`action="velocity"`) at 10 Hz (`control_rate=10`), and an inner loop
+    tracks them on the estimate: the task is to decide when to continue, not to stabilize the
+    vehicle. The keywords `action` and `control_rate` select others.
 
     ## Course
-    It leads from east to west, from (60, 0, 4) through the origin. Walls stand at x = 48, 36, ...,
-    -60 m, each with a gap. The northern edge of a gap is drawn within 1.5 m of its place,
-    alternately 0.75 and 3.75 m north of the course's line, and the width uniformly in [3, 6] m: new
-    for each episode. A geofence keeps the vehicle within 14 m of the line and below 12 m.
+    The course leads from east to west, from (60, 0, 4) through the origin. The walls are at
+    x = 48, 36, ..., -60 m, each with one gap. For each episode, the northern edge of each gap is
+    drawn within 1.5 m of its nominal place, alternately 0.75 and 3.75 m north of the course line,
+    and the width uniformly in [3, 6] m. A geofence keeps the vehicle within 14 m of the line and
+    below 12 m.
 
-    GNSS (position and velocity) fails once, from a time in [2, 8] s on, for a time in [5, 15] s.
+    GNSS (position and velocity) fails once per episode, at a time in [2, 8] s, for a duration in
+    [5, 15] s.
 
     ## Reward
-    In each step of h seconds, with the true speed v to the west [m/s] until the last gap is 12 m
-    behind, the size d of the change of the action and the size w of the body rates [rad/s]
+    In each step of h seconds, with the true speed v to the west [m/s] until 12 m behind the last
+    gap, the norm d of the change of the action and the norm w of the body rates [rad/s]
 
         5 h min(v, 5) - 0.02 d^2 - 0.002 w^2
 
-    At most 2.5 a step of 0.1 s, and 660 for the course of 132 m. A crash forfeits the course: it
-    costs 50, and the sum of 5 h min(v, 5) so far.
+    At most 2.5 per step of 0.1 s, and 660 for the course of 132 m. A crash costs 50, and forfeits
+    the sum of 5 h min(v, 5) so far.
 
     ## Observation
-    In place of the built-in observation, as the controller sees it:
+    It replaces the built-in observation. Position, velocity and attitude are the observed ones:
 
     | name | meaning | unit | frame |
     |---|---|---|---|
-    | position_error (3) | from the vehicle to the middle of the next gap | m | B |
-    | velocity_error (3) | minus the velocity | m/s | B |
-    | up (3) | the vertical | - | B |
-    | heading (3) | the direction of the course | - | B |
+    | position_error (3) | vector from the vehicle to the center of the next gap | m | B |
+    | velocity_error (3) | negative velocity | m/s | B |
+    | up (3) | vertical | - | B |
+    | heading (3) | direction of the course | - | B |
     | body_rates (3) | angular rate | rad/s | B |
-    | gap_width (1) | of the next gap | m | - |
-    | next_gap (3) | from the middle of the next gap to that of the one after it | m | B |
-    | next_width (1) | of that one | m | - |
-    | course_share (1) | of the course that is behind, to the finish | - | - |
+    | gap_width (1) | width of the next gap | m | - |
+    | next_gap (3) | vector from the center of the next gap to the gap after it | m | B |
+    | next_width (1) | width of the gap after the next | m | - |
+    | course_share (1) | share of the course completed, 1 at the finish | - | - |
 
-    and before it `last_action` (4) and, with `include_std=True`, the filter's 15 standard
-    deviations, which tell that GNSS is gone. The next gap is the first one that is not yet 0.7 m
-    behind the vehicle; after the last one comes the finish, 12 m further.
+    It is preceded by `last_action` (4) and, with `include_std=True`, by the filter's 15 standard
+    deviations, which reveal the loss of GNSS. The next gap is the first one that is not yet 0.7 m
+    behind the vehicle; the last one is followed by the finish, 12 m further.
 
     ## Endings
-    The finish, 12 m behind the last wall. Beside it those of `QuadEnv`: touching a wall, leaving
-    the geofence, the ground at height 0, tipping over; the time limit of 45 s.
-    `info["gates_passed"]` counts the gaps that are 0.7 m behind.
+    The finish, 12 m behind the last wall; contact with a wall, leaving the geofence, the ground at
+    height 0, tipping over, and the time limit of 45 s, as in `QuadEnv`. `info["gates_passed"]`
+    counts the gaps that are at least 0.7 m behind the vehicle.
 
     Args:
-        progress_weight: Of h v in the reward [1/m].
-        crash_cost: What a crash costs on top of what it forfeits.
+        progress_weight: Weight of h v in the reward [1/m].
+        crash_cost: Cost of a crash, in addition to the forfeited reward.
 
     Raises:
         ValueError: If a number is negative or not finite.
@@ -139,23 +142,23 @@ class OutageDash(Task):
         self._crash_cost = check.number("crash_cost", crash_cost, least=0.0)
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Add up what the course has earned, `view.state.earned` (n,), and count gaps."""
+        """Add up the rewards for progress, `view.state.earned` (n,), and count gaps."""
         view.state.earned = view.state.earned + self._weight * view.period * westward(view)
         behind = gaps_behind(gaps_of(view), view.position)
         view.state.gates_passed = np.maximum(view.state.gates_passed, behind)
 
     def reward(self, view: "View") -> Floats:
-        """(n,) see the class."""
+        """Return the reward described in the class, (n,)."""
         forfeited = _CRASH(view) * (self._crash_cost + view.state.earned)
         return self._weight * view.period * westward(view) + _COSTS(view) - forfeited
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
-        """(n,) whether the vehicle has crashed, or is beyond the finish."""
+        """Return True where the vehicle has crashed or is beyond the finish, (n,)."""
         finish = gaps_of(view).centers[:, -1, 0]
         return view.builtin.terminated | (view.position[:, 0] < finish)
 
     def observe(self, view: "View") -> dict[str, Floats]:
-        """See the class."""
+        """Return the observation described in the class, by name."""
         seen, gaps = view.observed, gaps_of(view)
         through = gaps_behind(gaps, seen.position)
         every, last = np.arange(view.count), gaps.widths.shape[1] - 1
@@ -179,14 +182,14 @@ class OutageDash(Task):
 
 
 def gaps_of(view: "View") -> Gaps:
-    """The gaps between the walls of a world, which come in pairs, from the north and the south.
+    """Find the gaps between pairs of walls; of each pair, the northern wall is listed first.
 
     Raises:
-        ValueError: If the world is none of these.
+        ValueError: If the obstacles of the world are not pairs of walls.
     """
     walls = view.world.obstacles
     if len(walls) < 2 or len(walls) % 2 or not all(isinstance(wall, Wall) for wall in walls):
-        raise ValueError('OutageDash needs pairs of walls, as those of world="slalom"')
+        raise ValueError('OutageDash needs pairs of walls, as in world="slalom"')
     half = np.array([wall.half_size[1] for wall in walls])
     middle = view.obstacles
     north, south = middle[:, ::2, 1] - half[::2], middle[:, 1::2, 1] + half[1::2]
@@ -200,18 +203,18 @@ def gaps_of(view: "View") -> Gaps:
 
 
 def gaps_behind(gaps: Gaps, position: Floats) -> NDArray[np.intp]:
-    """(n,) how many gaps are behind a vehicle at a position (n, 3) in I."""
+    """Number of gaps behind a vehicle at a position (n, 3) in I, (n,)."""
     return (position[:, :1] < gaps.centers[:, :-1, 0] - PAST).sum(axis=1)
 
 
 def _share(view: "View", gaps: Gaps) -> Floats:
-    """(n,) of the course that is behind the seen position."""
+    """Share of the course that is behind the observed position, (n,)."""
     start, finish = view.reference_position[:, 0], gaps.centers[:, -1, 0]
     return np.asarray((start - view.observed.position[:, 0]) / (start - finish))
 
 
 def westward(view: "View") -> Floats:
-    """(n,) true speed along the course as far as it is paid for [m/s], 0 beyond the finish."""
+    """Rewarded true speed along the course, (n,) [m/s]; 0 beyond the finish."""
     finish = gaps_of(view).centers[:, -1, 0]
     speed = np.minimum(-view.velocity[:, 0], PAID_SPEED)
     return np.where(view.position[:, 0] > finish, speed, 0.0)

@@ -1,8 +1,8 @@
-"""Pieces of rewards, to weight and add up: `Tracking() + 0.1 * Heading() - 0.02 * ActionRate()`.
+"""Terms of rewards, to weight and add up: `Tracking() + 0.1 * Heading() - 0.02 * ActionRate()`.
 
-A piece is a function of a `View` that returns a number per flight, (n,). Sums, differences and
-multiples of pieces are pieces. The rewards that ship are such sums: `TRACKING`, and `RACING` for
-gates.
+A term is a function of a `View` that returns one number per flight, (n,). Sums, differences and
+multiples of terms are terms. The built-in rewards are such sums: `TRACKING`, and `RACING` for
+courses of gates.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,10 @@ _CRASHED = np.array([float(ending in _CRASHES) for ending in range(max(Ending) +
 
 
 class Term:
-    """A term of a reward; called with a view, it returns (n,)."""
+    """Term of a reward; called with a view, it returns its values (n,)."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) its value in this step."""
+        """Return the value of the term in this step, (n,)."""
         raise NotImplementedError
 
     def __add__(self, other: Any) -> "Term":
@@ -65,12 +65,13 @@ Weighted = tuple[float, Term]
 
 @dataclass(frozen=True)
 class Sum(Term):
-    """Pieces with weights."""
+    """Weighted sum of terms."""
 
     terms: tuple[Weighted, ...]
+    """Pairs of a weight and a term"""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) their sum."""
+        """Return the weighted sum, (n,)."""
         (weight, piece), *rest = self.terms
         total = weight * piece(view)
         for weight, piece in rest:
@@ -80,23 +81,25 @@ class Sum(Term):
 
 @dataclass(frozen=True)
 class Constant(Term):
-    """The same in every step; what a number in a sum becomes."""
+    """Constant term; numbers in sums are converted to it."""
 
     value: float = 1.0
+    """Value in every step"""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) the value."""
+        """Return the constant, (n,)."""
         return np.full(view.count, self.value)
 
 
 @dataclass(frozen=True)
 class FunctionTerm(Term):
-    """What a function of a view returns; what a function in a sum becomes."""
+    """Term computed by a function of a view; functions in sums are converted to it."""
 
     function: "Callable[[View], Floats]"
+    """Function that takes a `View` and returns (n,)"""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) what it returns."""
+        """Return the values of the function, (n,)."""
         return self.function(view)
 
 
@@ -113,87 +116,95 @@ def _terms(value: Any) -> tuple[Weighted, ...]:
 
 @dataclass(frozen=True)
 class Tracking(Term):
-    """exp(-rate e): 1 on the reference, falling with the true distance e from it."""
+    """exp(-rate e) of the true position error e: 1 on the reference, decreasing with distance."""
 
     rate: float = 2.0
-    """[1/m]"""
+    """Rate of decay with distance [1/m]"""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) in [0, 1]."""
+        """Return values in [0, 1], (n,)."""
         return np.exp(-self.rate * view.position_error)
 
 
 @dataclass(frozen=True)
 class Heading(Term):
-    """x_B . x*: 1 where body x points in the wanted direction, -1 where it points away."""
+    """Alignment of body x with the desired heading, x_B . x*: 1 if aligned, -1 if opposite."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) in [-1, 1]."""
+        """Return values in [-1, 1], (n,)."""
         return _dot(view.truth.forward, view.reference_heading)
 
 
 @dataclass(frozen=True)
 class ActionRate(Term):
-    """`|a - a_last|^2`: how much the action has changed."""
+    """Squared change of the action, `|a - a_last|^2`."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) at least 0."""
+        """Return non-negative values, (n,)."""
         change = view.action - view.last_action
         return _dot(change, change)
 
 
 @dataclass(frozen=True)
 class BodyRates(Term):
-    """`|w|^2` of the true body rates [rad^2/s^2]."""
+    """Squared norm of the true body rates, `|w|^2` [rad^2/s^2]."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) at least 0."""
+        """Return non-negative values [rad^2/s^2], (n,)."""
         return _dot(view.body_rates, view.body_rates)
 
 
 @dataclass(frozen=True)
 class Progress(Term):
-    """Speed toward the reference; on a course, toward the gate that was next [m/s]."""
+    """True speed toward the reference; on a course, toward the gate that was next [m/s]."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,)."""
+        """Return speeds [m/s], (n,)."""
         return view.truth.progress * 1.0
 
 
 @dataclass(frozen=True)
 class GatePassed(Term):
-    """One over the control period where a gate was passed, as one per gate and second [1/s]."""
+    """1 / control period in a step that passes a gate, else 0 [1/s].
+
+    Multiplied by the control period, it adds up to one per gate.
+    """
 
     def __call__(self, view: "View") -> Floats:
-        """(n,)."""
+        """Return values [1/s], (n,)."""
         return view.gate_passed / view.period
 
 
 @dataclass(frozen=True)
 class Crash(Term):
-    """1 where the id's task finds that the vehicle has crashed, else 0."""
+    """1 in a step in which the built-in task ends the episode with a crash, else 0."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) 0 or 1."""
+        """Return 0 or 1, (n,)."""
         return _CRASHED[view.builtin.ending]
 
 
 @dataclass(frozen=True)
 class Uncertainty(Term):
-    """How unsure the filter is of a block of its state."""
+    """Uncertainty of a block of the filter's state, computed from its covariance."""
 
     of: str = "position"
-    """one of BLOCKS"""
+    """Block of the state, one of `BLOCKS`"""
     measure: str = "trace"
-    """"trace" of its covariance, the sum of variances; or "log_det", the logarithm of its
-    determinant: of the squared volume of its ellipsoid"""
+    """Measure of uncertainty. "trace": trace of the covariance, the sum of variances; "log_det":
+    logarithm of its determinant, which is proportional to the squared volume of the covariance
+    ellipsoid"""
 
     def __post_init__(self) -> None:
         check.choice("of", self.of, BLOCKS)
         check.choice("measure", self.measure, ("trace", "log_det"))
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) in squared units of the block, or the logarithm of their cube."""
+        """Return the measure, (n,).
+
+        Its unit is the squared unit of the block for "trace"; for "log_det" it is the logarithm of
+        a number in the sixth power of that unit.
+        """
         if self.measure == "trace":
             sigma = getattr(view.estimate, f"{self.of}_sigma")
             return _dot(sigma, sigma)
@@ -202,17 +213,17 @@ class Uncertainty(Term):
 
 @dataclass(frozen=True)
 class Visibility(Term):
-    """How many features the camera faces."""
+    """Number of features in the camera's field of view that no obstacle hides."""
 
     def __call__(self, view: "View") -> Floats:
-        """(n,) whole numbers."""
+        """Return counts, (n,)."""
         return view.truth.features_in_view.sum(axis=1).astype(np.float64)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
-    """(n,) products of rows, which have at least three columns."""
-    # whole columns, whose sums have the same bits however the arrays lie in memory; the first
-    # column comes last, as it always has: another order would change the last bits of rewards
+    """Dot products of the rows of two arrays with at least three columns, (n,)."""
+    # column by column: the bits of these sums do not depend on the memory layout; the first column
+    # is added last because another order would change the last bits of rewards
     first, second, third, *others = (a * b).T
     total = second + third
     for column in (*others, first):
@@ -226,9 +237,9 @@ _HEADING = shipped.HEADING_WEIGHT * Heading()
 TRACKING: Term = (
     shipped.NEAR_WEIGHT * Tracking(2.0) + shipped.FINE_WEIGHT * Tracking(20.0) + _HEADING - _COSTS
 )
-"""The reward that ships for all tasks but courses of gates."""
+"""Built-in reward of all tasks except courses of gates, per step."""
 
 RACING: Term = (
     shipped.PROGRESS_WEIGHT * Progress() + shipped.GATE_BONUS * GatePassed() + _HEADING - _COSTS
 )
-"""The reward that ships for courses of gates."""
+"""Built-in reward for courses of gates, per step."""

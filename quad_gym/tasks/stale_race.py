@@ -1,4 +1,4 @@
-"""`StaleRace`: a race on measurements that are older than the filter takes them for."""
+"""`StaleRace`: a race with sensor latency that the filter does not model."""
 
 from typing import TYPE_CHECKING
 
@@ -13,42 +13,44 @@ if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
 PROGRESS_WEIGHT = 0.1
-"""Of the speed toward the next gate: a race at 4 m/s earns 0.4 a step by it."""
+"""Weight of the speed toward the next gate: a race at 4 m/s earns 0.4 per step."""
 
 GATE_REWARD = 1.0
-"""Once for each gate, as much as half a meter of progress: fast flight past a gate does not pay."""
+"""Reward for each gate passed, so that flying past a gate is not worthwhile."""
 
 CRASH_COST = 5.0
-"""Once, as much as five gates."""
+"""Cost of a crash, as much as five gates."""
 
 
 class StaleRace(Task):
-    """Race through gates on measurements that are older than the filter takes them for.
+    """Race through gates with sensor latency that the filter does not model.
 
-    Eight gates lie on a course that is drawn for each episode, as in `Waypoints`; one is passed
-    within 0.6 m of its center. GNSS is 40 ms late and images are 10 ms late, which is little, and
-    the filter takes both for fresh, as many do. The cost depends on the controller: at rest a late
-    measurement is right, at 4 m/s it is off by 16 cm, many times what the filter expects, so that
-    attitude and biases go wrong as well. The faster the flight, the worse the estimate.
+    Eight gates lie on a course that is drawn for each episode, as in `Waypoints`; a gate is passed
+    within 0.6 m of its center. GNSS is delayed by 40 ms and images by 10 ms. These delays are
+    short, and the filter ignores them, as many filters do. Their effect depends on the controller:
+    at rest a delayed position is correct, at 4 m/s it is off by 16 cm, many times the standard
+    deviation that the filter assumes, so that attitude and biases become wrong as well. The faster
+    the flight, the worse the estimate.
 
     With `sensors` whose filter uses the time stamps (`delay_compensation="retrodict"`) the same
-    race is easy; that is the control.
+    race is easy; this is the control condition of the experiment.
 
     ## Reward
-    In each step, with the speed s toward the next gate [m/s], the size d of the change of the
-    action and the size w of the body rates [rad/s]
+    In each step, with the speed s toward the next gate [m/s], the norm d of the change of the
+    action and the norm w of the body rates [rad/s]
 
         0.1 s - 0.02 d^2 - 0.002 w^2 + 1 (passed a gate) - 5 (crashed)
 
     ## Observation
-    That of `Waypoints`: the next gate relative to the vehicle in the body frame as the controller
-    sees it, and the two gates after it.
+    The observation of `Waypoints`: the observed position of the next gate relative to the vehicle,
+    in the body frame, and the two gates after it.
 
     ## Endings
-    Those of `Waypoints`: the last gate, 20 s, and 12 m from the next gate.
+    The endings of `Waypoints`: the last gate, a time limit of 20 s, and a distance of 12 m from the
+    next gate.
 
     Args:
-        crash_cost: What a crash costs, once.
+        crash_cost: Cost of a crash.
 
     Raises:
         ValueError: If it is negative or not finite.
@@ -64,5 +66,5 @@ class StaleRace(Task):
         self._gate: Term = GATE_REWARD * GatePassed()
 
     def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) see the class."""
+        """Return the reward described in the class, (n,)."""
         return self._costs(view) + view.period * self._gate(view)

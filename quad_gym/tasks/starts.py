@@ -1,4 +1,4 @@
-"""Where a task's `reset` lets episodes start."""
+"""Start values that `reset` of a task returns."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,7 +15,7 @@ from quad_gym.tasks.task import Task, TaskError, label
 Start = dict[str, Any]
 
 _SHAPES: dict[str, tuple[int, ...]] = {"position": (3,), "velocity": (3,), "yaw": ()}
-"""What `reset` may return, with the shapes of its rows."""
+"""Start values that `reset` may return, with the shapes of their rows."""
 
 
 def starts(
@@ -26,25 +26,25 @@ def starts(
     params: TaskParams,
     world: WorldParams,
 ) -> Start:
-    """Start values that a task's `reset` returned, beside those that a caller has given.
+    """Combine the start values returned by `reset` of a task with those given by the caller.
 
     Args:
-        task: Whose.
-        returned: By its `reset`.
-        chosen: (n,) which flights begin an episode; the rows of the others do not count.
-        given: What the caller has given, which comes first; None: nothing.
-        params: Of the id's task.
-        world: Says what stands in the way.
+        task: Task that returned them.
+        returned: Return value of its `reset`.
+        chosen: True for flights that begin an episode, (n,); rows of the others are ignored.
+        given: Start values of the caller, which take precedence; None: not given.
+        params: Parameters of the built-in task.
+        world: World with its obstacles, in which the vehicles start.
 
     Returns:
-        "position", "velocity", "yaw", as `FlightBatch.reset` takes them.
+        "position", "velocity" and "yaw" for `FlightBatch.reset`.
 
     Raises:
-        TaskError: If something is wrong with them.
+        TaskError: If the start values are invalid.
     """
     if not isinstance(returned, Mapping) or not set(returned) <= set(_SHAPES):
         raise TaskError(
-            f"{label(task)}.reset must return None or start values by name, of "
+            f"{label(task)}.reset must return None or a dictionary with any of "
             f"{', '.join(_SHAPES)}; got {returned!r}"
         )
     count, found = len(chosen), {name: given.get(name) for name in _SHAPES}
@@ -64,5 +64,5 @@ def starts(
     try:
         checked_start(count, **found, task=params, world=world, chosen=chosen)
     except ValueError as error:
-        raise TaskError(f"{label(task)}.reset returned a wrong start: {error}") from None
+        raise TaskError(f"{label(task)}.reset returned an invalid start: {error}") from None
     return found

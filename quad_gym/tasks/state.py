@@ -1,4 +1,4 @@
-"""What a task keeps for each flight."""
+"""State variables that a task keeps for each flight."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -12,14 +12,14 @@ _KINDS = {"b": np.bool_, "i": np.int64, "u": np.int64, "f": np.float64}
 
 
 class State:
-    """Named arrays (n, ...), one row per flight, which begin every episode with the same values.
+    """Named arrays (n, ...), one row per flight, which have the same values in each new episode.
 
     Args:
         count: Number of flights.
         start: Values at the start of an episode, by name.
 
     Raises:
-        ValueError: If a name is none, or a value is no number or array of numbers.
+        ValueError: If a name is not an identifier, or a value is not a number or array of numbers.
     """
 
     __slots__ = ("_arrays", "_start")
@@ -31,7 +31,9 @@ class State:
         first: dict[str, NDArray[Any]] = {}
         for name, value in start.items():
             if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
-                raise ValueError(f"state must hold values by name, got {name!r}")
+                raise ValueError(
+                    f"names in state must be identifiers without leading underscore, got {name!r}"
+                )
             values = np.asarray(value)
             if values.dtype.kind not in _KINDS:
                 raise ValueError(f"state must hold numbers, got {value!r} for {name!r}")
@@ -51,7 +53,7 @@ class State:
         self.__getattr__(name)[:] = value
 
     def __dir__(self) -> list[str]:
-        return [*super().__dir__(), *self._arrays]  # from which Python suggests names
+        return [*super().__dir__(), *self._arrays]  # for "did you mean" suggestions
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._arrays)
@@ -63,18 +65,18 @@ class State:
         return self._arrays, self._start
 
     def __setstate__(self, state: Any) -> None:
-        # larger arrays come out of a pickle as views of its bytes, which cannot be unlocked again
+        # pickle restores larger arrays as views of its bytes, which cannot be made writable again
         super().__setattr__("_arrays", {name: array.copy() for name, array in state[0].items()})
         super().__setattr__("_start", state[1])
         self.lock(True)
 
     def lock(self, locked: bool) -> None:
-        """Refuse writing, or allow it."""
+        """Make all arrays read-only, or writable."""
         for array in self._arrays.values():
             array.flags.writeable = not locked
 
     def begin(self, chosen: NDArray[np.bool_]) -> None:
-        """Set the rows of flights that begin an episode to its first values."""
+        """Set the rows of flights that begin an episode to the initial values."""
         self.lock(False)
         for name, array in self._arrays.items():
             array[chosen] = self._start[name]
@@ -85,27 +87,27 @@ class State:
         return {name: array.copy() for name, array in self._arrays.items()}
 
     def bring_back(self, copies: Mapping[str, NDArray[Any]], chosen: NDArray[np.bool_]) -> None:
-        """Set the rows of some flights to those of copies."""
+        """Restore the rows of chosen flights from copies."""
         self.lock(False)
         for name, array in self._arrays.items():
             array[chosen] = copies[name][chosen]
         self.lock(True)
 
     def dtype(self) -> np.dtype[Any]:
-        """Of the state of a block of flights, as snapshots hold it."""
+        """Data type for the state of a block of flights in snapshots."""
         return np.dtype(
             [(name, a.dtype, (WIDTH, *a.shape[1:])) for name, a in self._arrays.items()]
         )
 
     def write_to(self, blocks: NDArray[Any]) -> None:
-        """Copy it into a snapshot's blocks, of `dtype`."""
+        """Copy the state into the blocks of a snapshot, of type `dtype`."""
         for name, array in self._arrays.items():
             flat = np.zeros((len(blocks) * WIDTH, *array.shape[1:]), array.dtype)
             flat[: len(array)] = array
             blocks[name] = flat.reshape(blocks[name].shape)
 
     def read_from(self, blocks: NDArray[Any]) -> None:
-        """Copy it from a snapshot's blocks."""
+        """Copy the state from the blocks of a snapshot."""
         self.lock(False)
         for name, array in self._arrays.items():
             array[:] = blocks[name].reshape(-1, *array.shape[1:])[: len(array)]

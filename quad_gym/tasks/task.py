@@ -1,4 +1,4 @@
-"""`Task`: a user's reward, endings, observation and reset, in place of the built-in ones."""
+"""`Task`: reward, endings, observation and reset defined by a user instead of the built-in ones."""
 
 import difflib
 import importlib
@@ -16,62 +16,65 @@ if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
 METHODS = ("reset", "update", "reward", "terminated", "truncated", "observe")
-"""What a task can have, in the order in which a step calls them."""
+"""Methods that a task may define, in the order in which a step calls them."""
 
 BOUND = 1e6
-"""Numbers that `observe` returns are held within this, unless `observes` says otherwise."""
+"""Default bound on the magnitude of values returned by `observe`; larger values are clipped."""
 
 
 class TaskError(RuntimeError):
-    """A task's method failed, or returned something else than it has to."""
+    """Error raised when a method of a task fails or returns an invalid value."""
 
 
 class HiddenTruthError(RuntimeError):
-    """`observe` asked for what the controller cannot know."""
+    """Error raised when `observe` of a task that is not privileged reads the true state."""
 
 
 class ObservationSpec(NamedTuple):
-    """What the table of observations says of a part that `observe` returns."""
+    """Unit, frame and bounds of an array that `observe` returns."""
 
     unit: str = "-"
+    """Unit as listed in the table of observations; "-": dimensionless"""
     frame: str = "-"
-    """I: inertial, B: body, "-": none"""
+    """Frame of the components. I: inertial, B: body, "-": none"""
     low: float = -BOUND
+    """Lower bound; smaller values are clipped"""
     high: float = BOUND
-    """bounds that it is held within"""
+    """Upper bound; larger values are clipped"""
 
 
 class Task:
-    """Your own reward, endings, observation and reset; the id's task does what it leaves out.
+    """Your own reward, endings, observation and reset of an environment.
 
-    Each method is called once in a control step, for all flights at once, with a `View` whose arrays
-    have one row per flight. `gymnasium.make(id, task=Mine())`, `make_vec` and `make_sb3_vec_env`
-    fly the same flights with it, bit for bit as far as its methods treat every row alike.
+    Methods that you do not override keep the behavior of the environment's built-in task. Each
+    method is called once per control step for all flights, with a `View` whose arrays have one row
+    per flight. `gymnasium.make(id, task=Mine())`, `make_vec` and `make_sb3_vec_env` produce bitwise
+    identical flights, provided that the methods compute each row independently of the others.
 
     | method | returns |
     |---|---|
-    | `reset(view, rng)` | None, or start values by name; rows of flights that begin an episode count |
+    | `reset(view, rng)` | None, or start values by name; only rows of flights that begin an episode are used |
     | `update(view, rng)` | None; called first in a step, to change `view.state` |
-    | `reward(view)` | (n,) float: of the step; `reward_per="second"` multiplies it by the control period |
-    | `terminated(view)` | (n,) bool: the episode is over by a crash, or at the goal |
-    | `truncated(view)` | (n,) bool: it is cut short |
-    | `observe(view)` | (n,) or (n, k) float, or such arrays by name |
+    | `reward(view)` | (n,) float: reward of the step; `reward_per="second"` multiplies it by the control period |
+    | `terminated(view)` | (n,) bool: True ends the episode by a crash or at the goal |
+    | `truncated(view)` | (n,) bool: True cuts the episode short |
+    | `observe(view)` | (n,) or (n, k) float, or a dictionary of such arrays |
 
-    In the step that begins an episode (Gymnasium's next-step autoreset) reward and endings of that
-    flight do not count. A flight whose state is no longer finite ends in any case. Where a step
-    ends an episode and begins the next one, `observe` is called for both.
+    In the step that begins an episode (Gymnasium's next-step autoreset), reward and endings of that
+    flight are ignored. A flight whose state is no longer finite always ends. If one step ends an
+    episode and begins the next one, `observe` is called for both.
 
     Class attributes, all optional:
 
-    - `state`: what the task keeps for each flight: values at the start of an episode, by name. Shape
-      and type follow from them: {"target": np.zeros(3), "laps": 0, "caught": False}. Methods read
+    - `state`: variables that the task keeps for each flight: initial values by name, which define
+      shape and type: {"target": np.zeros(3), "laps": 0, "caught": False}. Methods read
       `view.state.target`, (n, 3); `reset` and `update` may change it.
-    - `observes`: unit, frame and bounds of what `observe` returns, by name.
-    - `replaces_observation`: whether that takes the place of the shipped observation; else it
-      follows it.
-    - `keeps`: names of parts of the shipped observation that stay where it is replaced, as far as
-      there are such, and come first.
-    - `privileged`: whether `observe` may read the truth.
+    - `observes`: unit, frame and bounds of the arrays that `observe` returns, by name.
+    - `replaces_observation`: True if the output of `observe` replaces the built-in observation;
+      False (default) appends it.
+    - `keeps`: names of parts of the built-in observation to keep if it is replaced. They come
+      first; names of parts that the observation does not have are ignored.
+    - `privileged`: True if `observe` may read the true state.
     """
 
     state: Mapping[str, ArrayLike] = {}
@@ -81,7 +84,7 @@ class Task:
     privileged: bool = False
 
     def __init_subclass__(cls) -> None:
-        """Warn of methods whose names are nearly those of a task: nobody would call them."""
+        """Warn about misspelled method names, which would never be called."""
         super().__init_subclass__()
         for name, value in vars(cls).items():
             near = difflib.get_close_matches(name, METHODS, 1, cutoff=0.8)
@@ -100,18 +103,19 @@ class Task:
         privileged: bool = False,
         **methods: Callable[..., Any],
     ) -> "Task":
-        """A task made of plain functions, called as the methods are: `Task.of(reward=f)`.
+        """Make a task of plain functions, with the arguments of the methods: `Task.of(reward=f)`.
 
         Args:
-            state: As the class attribute.
-            observes: Likewise.
-            replaces_observation: Likewise.
-            keeps: Likewise.
-            privileged: Likewise.
-            methods: Functions by the names of the methods.
+            state: Variables for each flight, see the class attribute `state`.
+            observes: Units, frames and bounds, see the class attribute `observes`.
+            replaces_observation: True to replace the built-in observation instead of extending it.
+            keeps: Names of parts of the built-in observation to keep if it is replaced.
+            privileged: True if `observe` may read the true state.
+            methods: Functions by name of the method (`reset`, `update`, `reward`, `terminated`,
+                `truncated`, `observe`).
 
         Raises:
-            TypeError: If there is no such method, or one cannot be called.
+            TypeError: If a name is not a method of `Task`, or a value is not callable.
         """
         for name, function in methods.items():
             if name not in METHODS:
@@ -126,49 +130,52 @@ class Task:
         return task
 
     def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike] | None:
-        """Begin episodes: set `view.state`, choose starts. The view shows the episodes that begin.
+        """Begin episodes: set `view.state`, choose starts. The view shows the new episodes.
 
         Args:
-            view: All flights; `view.is_first` says which begin. What is written to the rows of the
-                others does not count.
-            rng: Draws for each flight from its own stream.
+            view: All flights; `view.is_first` is True for flights that begin an episode. Values
+                written to other rows are discarded.
+            rng: Random numbers, drawn for each flight from its own stream.
 
         Returns:
-            None, or any of "position" (n, 3) in I [m], "velocity" (n, 3) in I [m/s] and "yaw" (n,)
-            [rad] to start with. What a caller's reset asks for comes first.
+            None, or any of the start values "position" (n, 3) in I [m], "velocity" (n, 3) in I
+            [m/s] and "yaw" (n,) [rad]. Values passed to the environment's `reset` take precedence.
         """
         return None
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Change `view.state` after a step has been flown, before anything else is asked."""
+        """Change `view.state` after a step, before reward, endings and observation are computed."""
 
     def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) the reward of the step that has been flown."""
+        """Return the reward of the last step, (n,)."""
         return view.builtin.reward  # type: ignore[no-any-return]
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
-        """(n,) whether a crash, or the goal, ends the episode."""
+        """Return True for episodes that end by a crash or at the goal, (n,)."""
         return view.builtin.terminated  # type: ignore[no-any-return]
 
     def truncated(self, view: "View") -> NDArray[np.bool_]:
-        """(n,) whether something else ends it, such as the time limit; `terminated` comes first."""
+        """Return True for episodes that are cut short, such as by the time limit, (n,).
+
+        If both are True, the episode counts as terminated.
+        """
         return view.builtin.truncated  # type: ignore[no-any-return]
 
     def observe(self, view: "View") -> Any:
-        """(n,) or (n, k) numbers, or such arrays by name."""
+        """Return the task's observation: numbers (n,) or (n, k), or a dictionary of such arrays."""
         return {}
 
     def has(self, method: str) -> bool:
-        """Whether it has a method of its own."""
+        """Return True if the task overrides a method."""
         return method in vars(self) or getattr(type(self), method) is not getattr(Task, method)
 
 
 def resolve_task(given: Any) -> Task:
-    """The task that the keyword `task` means.
+    """Task specified by the keyword `task`.
 
     Args:
-        given: A `Task`; a class of them, made without arguments; or "module:name" of either, which
-            is looked for in the working directory, too.
+        given: A `Task`; a subclass of `Task`, which is instantiated without arguments; or
+            "module:name" of either. Modules in the working directory are found, too.
 
     Raises:
         ValueError: If it is none of these, or its attributes are invalid.
@@ -177,33 +184,35 @@ def resolve_task(given: Any) -> Task:
     if isinstance(found, type) and issubclass(found, Task):
         found = found()
     if not isinstance(found, Task):
-        raise ValueError(f'task must be a quad_gym.Task, or its "module:name", got {given!r}')
+        raise ValueError(f'task must be a quad_gym.Task or its "module:name", got {given!r}')
     for name in ("replaces_observation", "privileged"):
         if not isinstance(getattr(found, name), bool):
-            raise ValueError(f"{name} of {label(found)} must be True or False")
+            raise ValueError(
+                f"{name} of {label(found)} must be True or False, got {getattr(found, name)!r}"
+            )
     if isinstance(found.keeps, str) or not all(isinstance(name, str) for name in found.keeps):
         raise ValueError(f"keeps of {label(found)} must hold names, got {found.keeps!r}")
     for name, part in found.observes.items():
         if not isinstance(part, ObservationSpec) or not part.low < part.high:
             raise ValueError(
-                f"observes of {label(found)} must hold ObservationSpec with low < high, got {part!r} "
-                f"for {name!r}"
+                f"observes of {label(found)} must map names to ObservationSpec with low < high, "
+                f"got {part!r} for {name!r}"
             )
     return found
 
 
 def _named(name: str) -> Any:
-    """What "module:name" names.
+    """Object specified by "module:name".
 
     Raises:
-        ValueError: If there is no such module, or nothing of that name in it.
+        ValueError: If the module or the name in it does not exist.
     """
     module, colon, attribute = name.partition(":")
     if not (colon and module and attribute):
         raise ValueError(f'task must be "module:name" of a quad_gym.Task, got {name!r}')
     here = os.getcwd()
     added = here not in sys.path and "" not in sys.path
-    if added:  # as a console command has not
+    if added:  # console commands do not have the working directory on the path
         sys.path.insert(0, here)
     try:
         return getattr(importlib.import_module(module), attribute)
@@ -215,5 +224,5 @@ def _named(name: str) -> Any:
 
 
 def label(task: Task) -> str:
-    """What to call a task in messages."""
+    """Name of a task in messages."""
     return type(task).__name__

@@ -37,7 +37,7 @@ def actions(count, steps, seed=0):
 
 
 def hovering(count=6, **keywords):
-    return QuadVectorEnv(count, "hover", world=WORLD, **keywords)
+    return QuadVectorEnv(count, base="hover", world=WORLD, **keywords)
 
 
 def test_all_three_interfaces_fly_the_same_flights():
@@ -179,7 +179,7 @@ class InTheWall(quad_gym.Task):
 def test_starts_that_a_task_puts_into_obstacles_are_refused():
     env = hovering(2, task=InTheWall)
     with pytest.raises(
-        quad_gym.TaskError, match=r"InTheWall\.reset returned a wrong start: position"
+        quad_gym.TaskError, match=r"InTheWall\.reset returned an invalid start: position"
     ):
         env.reset(seed=0)
 

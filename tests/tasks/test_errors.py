@@ -42,7 +42,7 @@ WRONG = {
         (lambda v: v.observed.gyro, r"no attribute 'gyro'; did you mean view.measured.gyro\?$"),
         (lambda v: v.position.__setitem__(0, 1.0), "reward failed.*read-only"),
         (lambda v: v.builtin.reward.__iadd__(1.0), "reward failed.*read-only"),
-        (lambda v: setattr(v, "mine", 1.0), "reward failed.*keep your own in view.state"),
+        (lambda v: setattr(v, "mine", 1.0), "reward failed.*store your own data in view.state"),
         (lambda v: setattr(v.state, "count", 1.0), "reward failed.*read-only"),
         (lambda v: v.state.other, "declares no state 'other'"),
         (lambda v: v.state.cuont, r"no state 'cuont'.*; did you mean count\?$"),
@@ -56,8 +56,11 @@ WRONG = {
     "truncated": [(lambda v: np.zeros(FLIGHTS, int), "truncated must return booleans")],
     "update": [(lambda v, rng: rng.normal(size=3), "update failed.*size must begin")],
     "observe": [
-        (lambda v: np.ones((FLIGHTS, 3)), "as many numbers as at first"),
-        (lambda v: {"observed": np.ones(FLIGHTS), "more": np.ones(FLIGHTS)}, "as many numbers"),
+        (lambda v: np.ones((FLIGHTS, 3)), "must always return the same sizes"),
+        (
+            lambda v: {"observed": np.ones(FLIGHTS), "more": np.ones(FLIGHTS)},
+            "always return the same sizes",
+        ),
         (lambda v: np.ones(3), r"observe must return shape \(9,\) or \(9, k\)"),
         (lambda v: np.ones((FLIGHTS, 1, 1)), "observe must return shape"),
         (lambda v: at([3], np.nan), "observe must return finite 'observed'.*flight 3"),
@@ -152,9 +155,9 @@ def test_a_reset_of_the_flights_that_failed_is_needed():
     for wrong, message in (
         ({"position": np.full((3, 3), np.nan)}, "finite numbers for 'position'.*flight 1"),
         ({"position": np.zeros(2)}, r"shape \(3, 3\) for 'position', got \(2,\)"),
-        ({"height": 1.0}, "None or start values by name, of position, velocity, yaw"),
-        ({"velocity": np.full(3, 1e6)}, "wrong start: velocity must be at most"),
-        (7, "None or start values by name"),
+        ({"height": 1.0}, "None or a dictionary with any of position, velocity, yaw"),
+        ({"velocity": np.full(3, 1e6)}, "invalid start: velocity must be at most"),
+        (7, "None or a dictionary with any of"),
     ):
         task.wrong = wrong
         with pytest.raises(TaskError, match=f"Wrong.reset .*{message}"):
@@ -241,9 +244,12 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"state": {"a b": 1.0}}, "state must hold values by name"),
+        ({"state": {"a b": 1.0}}, "names in state must be identifiers"),
         ({"state": {"a": "text"}}, "state must hold numbers"),
-        ({"observes": {"a": 3}, "observe": lambda v: {"a": v.time}}, "must hold ObservationSpec"),
+        (
+            {"observes": {"a": 3}, "observe": lambda v: {"a": v.time}},
+            "must map names to ObservationSpec",
+        ),
         (
             {"observes": {"b": quad_gym.ObservationSpec()}, "observe": lambda v: {"a": v.time}},
             "observes has 'b', which observe does not return",

@@ -203,7 +203,7 @@ def test_a_snapshot_brings_back_what_the_task_keeps():
     assert batch.snapshot().tobytes() == instant.tobytes()
     env._over[:] = False
     assert_same([env.step(action) for action in actions(3)[12:18]], after)
-    with pytest.raises(ValueError, match="snapshot must be that of a batch with Chase"):
+    with pytest.raises(ValueError, match="snapshot must be one of a batch with Chase"):
         batch.restore(QuadVectorEnv(3, "hover").flights.batch.snapshot())
 
 
