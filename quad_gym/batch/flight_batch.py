@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.batch import quantities
 from quad_gym.batch.calls import Calls, address_of
+from quad_gym.batch.cold_start import check_cold_start
 from quad_gym.batch.following import check_trajectories, followed
 from quad_gym.batch.memory import FlightMemory
 from quad_gym.batch.standing import check_standing
@@ -89,7 +90,7 @@ class FlightBatch(FlightMemory):
         run_filter: Whether sensors and filter run; None: where something needs them.
         filter_start: "cold": the filter starts from its first fix; "warm": it has converged in
             `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn
-            from the covariance that it has reached.
+            from the covariance that it has reached. See `quad_gym.batch.cold_start` for the bounds.
         innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
             "innovation_sigma", "block_nis"; a gate keeps them anyway, and so does a filter that
             meets `faults`, or whose task has `truncate_when_diverged`.
@@ -187,6 +188,8 @@ class FlightBatch(FlightMemory):
         if longest_delay > 0 and self.control is Control.PD:
             raise ValueError("action_delay needs actions: Control.PD flies without any")
         check_draws(draws, true_vehicle, self.world, self.clocks)
+        if run_filter and filter_start == "cold":
+            check_cold_start(self.sensors, draws)
         check_trajectories(self.task, self.vehicle, self.action_params, self.control)
         check_standing(self.task, true_vehicle, self.world, draws)
         model = params_record(self.vehicle, self.sensors, self.gains, self.action_params)

@@ -229,7 +229,7 @@ def _checked_noise(
             continue
         sigma = check.positive(name, value, least=1e-12)
         if name == "baseline_sigma":
-            noise["baseline_noise"] = min(sigma, math.pi)
+            noise["baseline_noise"] = noise["baseline_sigma"] = min(sigma, math.pi)
         elif name.removesuffix("_sigma").upper() in Aid.__members__:
             noise.setdefault("aid_sigma", {})[Aid[name.removesuffix("_sigma").upper()]] = sigma
         else:

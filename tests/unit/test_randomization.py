@@ -316,8 +316,8 @@ def test_the_start_is_spread_as_told():
         "start_velocity_I": Normal(0.0, 2.0),
         "start_body_rates": Uniform(-1.0, 1.0),
         "start_yaw": Uniform(-3.0, 3.0),
-        "start_roll": Uniform(-0.5, 0.5),
-        "start_pitch": Uniform(-0.5, 0.5),
+        "start_roll": Uniform(-0.25, 0.25),
+        "start_pitch": Uniform(-0.25, 0.25),
     }
     plain, spread = flown(0, range(20)), flown(0, range(20), randomization=given)
     drawn = spread.drawn()

@@ -104,8 +104,13 @@ def _sum_noise(p, work, n, doubt):
             store_block(work.Rz, i, j, block)
 
 
-_DOUBTS = (100.0, 100.0 / 9.0, 100.0 / 90.0)
+_DOUBTS = (1e6, 1e6 / 9.0, 1e5 / 9.0, 1e4 / 9.0, 1e3 / 9.0, 100.0 / 9.0, 10.0 / 9.0)
 """Factors on the noise of the steps of a measurement; the sum of their inverses is one."""
+_LAST = len(_DOUBTS) - 1
+_FEW, _FIRST_OF_FEW = _LAST - 2, 100.0
+"""The first of the last three steps, and its factor where these are enough."""
+_VAGUE = 0.2
+"""Standard deviation of a direction above which three steps are too few [rad]."""
 
 
 @kernel
@@ -117,10 +122,11 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
     the moments in their fourth order only.
 
     With GRADUAL, lanes whose attitude is uncertain process images in steps: three updates by the
-    same measurements with more noise, each about the estimate that the one before has left. Their
-    information adds up to that of the measurements, so that a linear model would see no difference;
-    the derivatives of this one are taken where they matter. (R. Zanetti, "Recursive Update
-    Filtering for Nonlinear Estimation", IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
+    same measurements with more noise, or seven where a direction is uncertain by `_VAGUE`, each
+    about the estimate that the one before has left. Their information adds up to that of the
+    measurements, so that a linear model would see no difference; the derivatives of this one are
+    taken where they matter. (R. Zanetti, "Recursive Update Filtering for Nonlinear Estimation",
+    IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
@@ -131,19 +137,22 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
         stages: The table of stages, which has those of aiding sensors; None without slow errors.
     """
-    loose, first, form = mask & (p.sigma_spread < 0.0), 2, settings.form  # nobody
-    hidden = loose
+    loose, first, form = mask & (p.sigma_spread < 0.0), _LAST, settings.form  # nowhere
+    hidden, vague = loose, loose
     if (form & _GRADUAL) != 0 and settings.feature_count > 0:
-        loose = mask & _is_loose(flight, p, work, settings.feature_count)
+        loose, vague = _are_loose(flight, p, work, settings.feature_count)
+        loose, vague = mask & loose, mask & vague
         if any_of(loose):
-            first = 0
+            first = 0 if any_of(vague) else _FEW
             if (form & _GATE) == 0:  # a gate leaves them out by itself
                 hidden = _hide_unsure(flight, work, settings.feature_count, loose)
     failures = flight.update_failures
-    for part in range(first, 3):
-        doubt = select(loose, _DOUBTS[part], 1.0)
+    for part in range(first, _LAST + 1):
+        few = _FIRST_OF_FEW if part == _FEW else _DOUBTS[part]
+        doubt = select(vague, _DOUBTS[part], select(loose, few, 1.0))
         well = flight.update_failures == failures  # a step that fails is the last
-        taking, again = mask & well & (loose | (part == 2)), loose & (part > 0)
+        taking = mask & well & (vague | (loose & (part >= _FEW)) | (part == _LAST))
+        again = (vague & (part > 0)) | (loose & (part > _FEW))
         _update_by(flight, p, work, settings, taking, doubt, again, slow, stages)
     if any_of(hidden):
         _show_hidden(flight, work, settings, hidden)
@@ -152,24 +161,28 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
 
 
 @kernel
-def _is_loose(flight, p, work, feature_count):
-    """Lanes in which a visible feature's direction is uncertain by `recursive_update_threshold`.
+def _are_loose(flight, p, work, feature_count):
+    """Lanes in which the direction of a visible feature is uncertain, and those by `_VAGUE`.
 
-    It is off by the errors of attitude and position, whose share is the larger the nearer the
-    feature is. Keeps where that is more than a linear model bears even in steps.
+    Uncertain is more than `recursive_update_threshold`; features that are left out do not count as
+    vague. A direction is off by the errors of attitude and position, whose share is the larger the
+    nearer the feature is. Keeps where that is more than a linear model bears even in steps.
     """
     P_rr, P_ee = sum_of_squares(flight.L, R, 3), sum_of_squares(flight.L, E, 9)
     position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
     attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
     too_much, r = p.recursive_update_threshold * p.recursive_update_threshold, load3(flight.r_hat)
     loose = attitude < 0.0  # nowhere
+    vague = loose
     for i in range(feature_count):
         offset = sub(load3(p.features[i]), r)
         square, seen = dot(offset, offset), flight.feature_valid[i] > 0.0
         loose = loose | (seen & (position > (too_much - attitude) * square))
         unsure = seen & (position > (p.gate_uncertainty - attitude) * square)
         work.hidden[i] = select(unsure, 1.0, 0.0)
-    return loose
+        much = seen & (position > (_VAGUE * _VAGUE - attitude) * square)
+        vague = vague | (much & logical_not(unsure))
+    return loose, loose & vague
 
 
 @kernel

@@ -3,6 +3,11 @@
 It measures `z = unit(R^T l_b)` in I with noise across that direction. With a pair of sigma points,
 R(+-e) R_hat = (I + even +- odd) R_hat, that is R_hat^T odd^T u and R_hat^T even^T u, u = unit(l_b);
 the derivative along an offset is R_hat^T (de x u).
+
+Noise n across a unit vector shortens its part along the direction by n^2 / 2, whose mean square is
+2 sigma^4 for two axes of standard deviation sigma. It is added along the direction if sigma exceeds
+`_COARSE`: the sigma points of an uncertain attitude are shortened, too, so that the filter would
+attribute an innovation along the direction to the attitude.
 """
 
 import math
@@ -51,6 +56,8 @@ from quad_gym.records import BASELINE_BLOCK, FilterForm, Sensor
 
 SENSOR = Sensor.GNSS
 _EKF = int(FilterForm.EKF)
+_COARSE = 0.05
+"""Noise up to which that is left out [rad], as of the laboratory: it makes no difference."""
 
 count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
     "baseline", BASELINE_BLOCK
@@ -96,7 +103,10 @@ def _center(flight, p, work, k, has, R_BI, unit_baseline):
     measured = apply(load33(p.R_IG), load3(flight.gnss_baseline))
     put_three(work.z, k, has, scale(1.0 / norm(measured), measured))
     variance = p.baseline_noise * p.baseline_noise
-    put_noise(work, k, has, direction_noise(u_I, variance, p.direction_floor))
+    noise = direction_noise(u_I, variance, p.direction_floor)
+    white = p.baseline_sigma * p.baseline_sigma
+    along = select(p.baseline_sigma > _COARSE, 2.0 * white * white, 0.0)
+    put_noise(work, k, has, add_outer(noise, scale(along, u_I), u_I))
 
 
 @kernel
