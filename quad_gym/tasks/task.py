@@ -153,7 +153,7 @@ class Task:
         return view.builtin.terminated  # type: ignore[no-any-return]
 
     def truncated(self, view: "View") -> NDArray[np.bool_]:
-        """(n,) whether something else ends it, such as the time limit; `terminated` comes first."""
+        """(n,) whether something else ends it, such as the time limit; both where both do."""
         return view.builtin.truncated  # type: ignore[no-any-return]
 
     def observe(self, view: "View") -> Any:
