@@ -37,7 +37,7 @@ def actions(count, steps, seed=0):
 
 
 def hovering(count=6, **keywords):
-    return QuadVectorEnv(count, "hover", world=WORLD, **keywords)
+    return QuadVectorEnv(count, base="hover", world=WORLD, **keywords)
 
 
 def test_all_three_interfaces_fly_the_same_flights():
