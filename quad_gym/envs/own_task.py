@@ -28,10 +28,12 @@ def with_task(
         table: Of their observation.
 
     Raises:
-        ValueError: If it is no task, or a part of its observation has a shipped name.
+        ValueError: If it is no task, it cannot be flown with these sensors or in this world, or a
+            part of its observation has a shipped name.
         TaskError: If its `reset` or `observe` fail.
     """
     task = resolve_task(given)
+    task._require(make.keywords["sensors"], make.keywords["world"])
     split = policy_size(table)
     under: Callable[..., TaskBatch] = partial(
         TaskBatch, **make.keywords, own_task=task, split=split

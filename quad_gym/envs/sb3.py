@@ -35,7 +35,7 @@ class QuadSB3VecEnv(VecEnv):
     the return "r", the length "l", the time "t" since construction [s] and the mean true position
     error "e" [m]. With `randomization` it also holds `drawn`, the parameters of that episode; so
     do `reset_infos`. With `faults` and `innovations` every `info` and `reset_infos` hold these, as
-    in `QuadEnv`; but the last of an episode has no innovations, as the filter has begun anew.
+    in `QuadEnv`.
 
     Args:
         num_envs: Number of flights.
@@ -134,8 +134,9 @@ class QuadSB3VecEnv(VecEnv):
             for i, info in enumerate(infos):
                 info |= info_of_flight(more, i)
         for i in np.flatnonzero(done).tolist():
-            infos[i].pop("innovations", None)
             infos[i] |= self._episode_end(i, results[i]) | drawn_info(flown_with, i)
+            if batch.innovations:
+                infos[i] |= info_of_flight({"innovations": batch.final_innovations}, i)
         rewards = results[:, COLUMN["reward"]].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
 
@@ -145,7 +146,7 @@ class QuadSB3VecEnv(VecEnv):
         steps = int(row[COLUMN["episode_steps"]])
         return {
             "terminal_observation": self.flights.split(final),
-            "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > 0.0),
+            "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > row[COLUMN["terminated"]]),
             "ending": ENDINGS[int(row[COLUMN["ending"]])],
             "ending_code": int(row[COLUMN["ending"]]),
             "filter_status": int(row[COLUMN["filter_status"]]),
@@ -234,7 +235,8 @@ class QuadSB3VecEnv(VecEnv):
             return {}
         if any(set(options) != names for options in chosen):
             raise ValueError("options must hold the same names for every environment")
-        return {name: np.array([options[name] for options in chosen]) for name in names}
+        start = {name: np.array([options[name] for options in chosen]) for name in names}
+        return self.flights.start(start)
 
     def _infos_of_start(self) -> list[dict[str, Any]]:
         batch = self.flights.batch

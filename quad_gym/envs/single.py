@@ -113,7 +113,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     (`LookAround`: -5 m), through the last gate, or, in a world that has any, where the vehicle
     touches an obstacle or leaves the geofence. Truncated: at the time limit, when the filter has
     failed (`info["filter_status"]`), or with `truncate_when_diverged=True` when it finds that it is lost.
-    `info["ending"]` says which.
+    Where a step does both, both are true, as Gymnasium's `TimeLimit` has it. `info["ending"]` says
+    which, and names the termination where there are both.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking

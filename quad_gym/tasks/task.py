@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
+    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.params.world import WorldParams
     from quad_gym.tasks.draws import FlightRandom
     from quad_gym.tasks.view import View
 
@@ -157,13 +159,16 @@ class Task:
     def truncated(self, view: "View") -> NDArray[np.bool_]:
         """Return True for episodes that are cut short, such as by the time limit, (n,).
 
-        If both are True, the episode counts as terminated.
+        Both `terminated` and `truncated` may be True in the same step.
         """
         return view.builtin.truncated  # type: ignore[no-any-return]
 
     def observe(self, view: "View") -> Any:
         """Return the task's observation: numbers (n,) or (n, k), or a dictionary of such arrays."""
         return {}
+
+    def _require(self, sensors: "SensorSuite", world: "WorldParams") -> None:
+        """Raise a ValueError for sensors or a world that a built-in task cannot use."""
 
     def has(self, method: str) -> bool:
         """Return True if the task overrides a method."""
