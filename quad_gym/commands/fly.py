@@ -42,6 +42,7 @@ from quad_gym.evaluation import Policy
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import PRESETS, faults_of
 from quad_gym.flights.rerun import load_rerun
+from quad_gym.records import Ending
 from quad_gym.rendering import Renderer, save_video
 from quad_gym.rendering.live import WINDOW_RATE, Window
 from quad_gym.rendering.video import VIDEO_ENDINGS, checked_video_path
@@ -229,9 +230,8 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
         starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
         recorder.keep()
         yield recorder.flight
-    print(
-        f"seed {seed}: {str(info['ending'][0]).replace('_', ' ')} after {in_words(recorder.flight)}"
-    )
+    ending = str(Ending(info["ending"][0])).replace("_", " ")
+    print(f"seed {seed}: {ending} after {in_words(recorder.flight)}")
 
 
 def replayed(flight: Flight) -> Iterator[Flight]:

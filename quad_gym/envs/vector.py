@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import (
     COLUMN,
-    ENDINGS,
     Flights,
     checked_actions,
     named_options,
@@ -21,7 +20,7 @@ from quad_gym.envs.flight_info import final_faults, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import seeds_of, with_limit
 from quad_gym.envs.spaces import action_space
-from quad_gym.records import Autoreset
+from quad_gym.records import Autoreset, Ending
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -31,7 +30,6 @@ _MODES = {
     AutoresetMode.SAME_STEP: Autoreset.SAME_STEP,
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
-_ENDING_NAMES = np.array(ENDINGS, dtype=object)
 _TERMINATED, _TRUNCATED = COLUMN["terminated"], COLUMN["truncated"]
 
 
@@ -86,7 +84,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         self._spec: EnvSpec | None = None
         self._over = np.zeros(self.num_envs, bool)
         self._everyone = np.ones(self.num_envs, bool)
-        self._no_ending = np.full(self.num_envs, ENDINGS[0], object)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -142,8 +139,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         infos: dict[str, Any] = {
             "position_error": batch.record("position_error"),
             "estimation_error": batch.record("estimation_error"),
-            "ending": np.full(self.num_envs, ENDINGS[0], object),
-            "ending_code": np.zeros(self.num_envs, np.int64),
+            "ending": np.zeros(self.num_envs, np.int64),
             "filter_status": batch.record("filter_status").astype(np.int64),
             "filter_diverged": batch.record("diverged") > 0.0,
             "gates_passed": np.zeros(self.num_envs, np.int64),
@@ -232,8 +228,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         infos: dict[str, Any] = {
             "position_error": results[:, COLUMN["position_error"]].copy(),
             "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
-            "ending": self._no_ending.copy(),
-            "ending_code": np.zeros(self.num_envs, np.int64),
+            "ending": results[:, COLUMN["ending"]].astype(np.int64),
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
             "filter_diverged": results[:, COLUMN["filter_diverged"]] > 0.0,
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
@@ -243,10 +238,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos["drawn"] = batch.drawn()
         if batch.faults or batch.innovations:
             infos |= flight_info(batch, results[:, COLUMN["faults"]])
-        ended = np.flatnonzero(self._over)
-        if ended.size:  # rare: looking up a name for every flight would cost more than the rest
-            codes = results[ended, COLUMN["ending"]].astype(np.int64)
-            infos["ending"][ended], infos["ending_code"][ended] = _ENDING_NAMES[codes], codes
         return infos
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
@@ -254,7 +245,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.record(name, began)
         infos["filter_diverged"][began] = self.flights.batch.record("diverged", began) > 0.0
-        infos["ending"][began], infos["ending_code"][began] = ENDINGS[0], 0
+        infos["ending"][began] = Ending.NONE
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)
 
@@ -273,7 +264,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         for i in np.flatnonzero(over):
             final_obs[i] = self.flights.split(finals[i].copy())
         final_info = {
-            name: np.where(over, values, _blank(values))
+            name: np.where(over, values, values.dtype.type(0))
             for name, values in infos.items()
             if not (name.startswith("_") or isinstance(values, dict))
         }
@@ -304,10 +295,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         if not mask.any():
             raise ValueError("options['reset_mask'] must choose at least one environment")
         return mask
-
-
-def _blank(values: NDArray[Any]) -> Any:
-    return None if values.dtype == object else values.dtype.type(0)
 
 
 def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:

@@ -164,7 +164,7 @@ class Autoreset(IntEnum):
 
 
 class Ending(IntEnum):
-    """Why an episode ended."""
+    """Why an episode ended: `info["ending"]`, which prints as text, such as "collision"."""
 
     NONE = 0
     TIME_LIMIT = 1
@@ -179,6 +179,9 @@ class Ending(IntEnum):
     COLLISION = 9
     """the vehicle touched an obstacle"""
     LEFT_GEOFENCE = 10
+
+    def __str__(self) -> str:
+        return self.name.lower()
 
 
 class Shape(IntEnum):
