@@ -25,6 +25,7 @@ from quad_gym.params.task import TaskParams
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import BatteryParams, WorldParams, world_params
+from quad_gym.records import Ending
 
 if TYPE_CHECKING:  # what _LAZY imports on first use
     from quad_gym.batch.flight_batch import FlightBatch as FlightBatch
@@ -78,6 +79,7 @@ __all__ = [
     "BatteryParams",
     "CameraParams",
     "Cylinder",
+    "Ending",
     "FilterParams",
     "GnssParams",
     "GroundParams",

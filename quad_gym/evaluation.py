@@ -11,8 +11,9 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs import keywords_of
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params import checks as check
+from quad_gym.records import Ending
 
-NO_CRASHES = ["last_gate", "task"]
+NO_CRASHES = (Ending.LAST_GATE, Ending.TASK)
 """Endings of terminated episodes that are no crashes; what a task's own ending is, it knows."""
 
 
@@ -48,7 +49,7 @@ class Episodes(NamedTuple):
     gates_passed: NDArray[np.int64]
     """on a course of gates"""
     ending: NDArray[Any]
-    """name of the ending"""
+    """the ending as text"""
 
     def summary(self) -> dict[str, float]:
         """Means over the episodes, and the share that crashed."""
@@ -120,7 +121,7 @@ def roll_out(
             late[flying] += info["position_error"][flying]
             late_steps += flying
         over = flying & (terminated | truncated)
-        ending[over] = info["ending"][over]
+        ending[over] = [str(reason) for reason in info["ending"][over]]
         crashed |= over & terminated & ~np.isin(info["ending"], NO_CRASHES)
         gates[over] = info["gates_passed"][over]
         flying &= ~over

@@ -59,7 +59,7 @@ class Recording:
 
     def ending_names(self) -> list[str]:
         """Why each flight ended early, or "finished"."""
-        names = {int(e): e.name.lower() for e in Ending} | {0: "finished"}
+        names = {int(e): str(e) for e in Ending} | {0: "finished"}
         return [names[int(code)] for code in self.ending]
 
 

@@ -229,9 +229,8 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
         starts, over = np.zeros(1, bool), bool(terminated[0] or truncated[0])
         recorder.keep()
         yield recorder.flight
-    print(
-        f"seed {seed}: {str(info['ending'][0]).replace('_', ' ')} after {in_words(recorder.flight)}"
-    )
+    ending = str(info["ending"][0]).replace("_", " ")
+    print(f"seed {seed}: {ending} after {in_words(recorder.flight)}")
 
 
 def replayed(flight: Flight) -> Iterator[Flight]:

@@ -33,7 +33,7 @@ from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams, world_params
-from quad_gym.records import RESULTS, Autoreset, Ending, Layout
+from quad_gym.records import RESULTS, Autoreset, Layout
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -407,7 +407,3 @@ def drawn_info(drawn: dict[str, NDArray[np.float64]], flight: int) -> dict[str, 
     values = {name: flights[flight] for name, flights in drawn.items()}
     numbers = {name: float(v) if v.ndim == 0 else v for name, v in values.items()}
     return {"drawn": numbers} if numbers else {}
-
-
-ENDINGS = tuple(ending.name.lower() for ending in Ending)
-"""Names of the endings that `info["ending"]` reports, by their number."""

@@ -12,7 +12,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import (
     COLUMN,
-    ENDINGS,
     Flights,
     checked_actions,
     drawn_info,
@@ -22,7 +21,7 @@ from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset
+from quad_gym.records import Autoreset, Ending
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -147,8 +146,7 @@ class QuadSB3VecEnv(VecEnv):
         return {
             "terminal_observation": self.flights.split(final),
             "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > row[COLUMN["terminated"]]),
-            "ending": ENDINGS[int(row[COLUMN["ending"]])],
-            "ending_code": int(row[COLUMN["ending"]]),
+            "ending": Ending(int(row[COLUMN["ending"]])),
             "filter_status": int(row[COLUMN["filter_status"]]),
             "filter_diverged": bool(row[COLUMN["filter_diverged"]] > 0.0),
             "gates_passed": int(row[COLUMN["gates_passed"]]),

@@ -11,7 +11,6 @@ from gymnasium.envs.registration import EnvSpec, make
 from quad_gym.batch.starts import stream_key
 from quad_gym.envs.configuration import (
     COLUMN,
-    ENDINGS,
     Flights,
     checked_actions,
     drawn_info,
@@ -20,7 +19,7 @@ from quad_gym.envs.flight_info import flight_info, info_of_flight
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
-from quad_gym.records import Autoreset
+from quad_gym.records import Autoreset, Ending
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -113,8 +112,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     (`LookAround`: -5 m), through the last gate, or, in a world that has any, where the vehicle
     touches an obstacle or leaves the geofence. Truncated: at the time limit, when the filter has
     failed (`info["filter_status"]`), or with `truncate_when_diverged=True` when it finds that it is lost.
-    Where a step does both, both are true, as Gymnasium's `TimeLimit` has it. `info["ending"]` says
-    which, and names the termination where there are both.
+    Where a step does both, both are true, as with Gymnasium's `TimeLimit`. `info["ending"]`, a
+    `quad_gym.Ending` that equals its name as text, says which, and names the termination where there
+    are both.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking
@@ -269,8 +269,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         return self.flights.split(observations[0]), {
             "position_error": float(batch.record("position_error")[0]),
             "estimation_error": float(batch.record("estimation_error")[0]),
-            "ending": ENDINGS[0],
-            "ending_code": 0,
+            "ending": Ending.NONE,
             "filter_status": int(batch.record("filter_status")[0]),
             "filter_diverged": bool(batch.record("diverged")[0] > 0.0),
             "gates_passed": 0,
@@ -307,8 +306,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         info = {
             "position_error": row[_POSITION_ERROR],
             "estimation_error": row[_ESTIMATION_ERROR],
-            "ending": ENDINGS[int(row[_ENDING])],
-            "ending_code": int(row[_ENDING]),
+            "ending": Ending(int(row[_ENDING])),
             "filter_status": int(row[_FILTER_STATUS]),
             "filter_diverged": row[_FILTER_DIVERGED] > 0.0,
             "gates_passed": int(row[_GATES_PASSED]),

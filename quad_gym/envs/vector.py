@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from quad_gym.batch.starts import stream_keys
 from quad_gym.envs.configuration import (
     COLUMN,
-    ENDINGS,
     Flights,
     checked_actions,
     named_options,
@@ -21,7 +20,7 @@ from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import seeds_of, with_limit
 from quad_gym.envs.spaces import action_space
-from quad_gym.records import Autoreset
+from quad_gym.records import Autoreset, Ending
 
 if TYPE_CHECKING:
     from quad_gym.tasks import Task
@@ -31,7 +30,7 @@ _MODES = {
     AutoresetMode.SAME_STEP: Autoreset.SAME_STEP,
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
-_ENDING_NAMES = np.array(ENDINGS, dtype=object)
+_ENDINGS = np.array(list(Ending), object)
 _TERMINATED, _TRUNCATED = COLUMN["terminated"], COLUMN["truncated"]
 
 
@@ -86,7 +85,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         self._spec: EnvSpec | None = None
         self._over = np.zeros(self.num_envs, bool)
         self._everyone = np.ones(self.num_envs, bool)
-        self._no_ending = np.full(self.num_envs, ENDINGS[0], object)
+        self._no_ending = np.full(self.num_envs, Ending.NONE, object)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -142,8 +141,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         infos: dict[str, Any] = {
             "position_error": batch.record("position_error"),
             "estimation_error": batch.record("estimation_error"),
-            "ending": np.full(self.num_envs, ENDINGS[0], object),
-            "ending_code": np.zeros(self.num_envs, np.int64),
+            "ending": self._no_ending.copy(),
             "filter_status": batch.record("filter_status").astype(np.int64),
             "filter_diverged": batch.record("diverged") > 0.0,
             "gates_passed": np.zeros(self.num_envs, np.int64),
@@ -233,7 +231,6 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             "position_error": results[:, COLUMN["position_error"]].copy(),
             "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
             "ending": self._no_ending.copy(),
-            "ending_code": np.zeros(self.num_envs, np.int64),
             "filter_status": results[:, COLUMN["filter_status"]].astype(np.int64),
             "filter_diverged": results[:, COLUMN["filter_diverged"]] > 0.0,
             "gates_passed": results[:, COLUMN["gates_passed"]].astype(np.int64),
@@ -244,9 +241,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         if batch.faults or batch.innovations:
             infos |= flight_info(batch, results[:, COLUMN["faults"]])
         ended = np.flatnonzero(self._over)
-        if ended.size:  # rare: looking up a name for every flight would cost more than the rest
-            codes = results[ended, COLUMN["ending"]].astype(np.int64)
-            infos["ending"][ended], infos["ending_code"][ended] = _ENDING_NAMES[codes], codes
+        if ended.size:  # rare: members for every flight would cost more than the rest
+            infos["ending"][ended] = _ENDINGS[results[ended, COLUMN["ending"]].astype(np.int64)]
         return infos
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
@@ -254,7 +250,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.record(name, began)
         infos["filter_diverged"][began] = self.flights.batch.record("diverged", began) > 0.0
-        infos["ending"][began], infos["ending_code"][began] = ENDINGS[0], 0
+        infos["ending"][began] = Ending.NONE
         infos["gates_passed"][began] = 0
         replace_faults(infos, self.flights.batch, began)
 

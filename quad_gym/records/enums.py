@@ -164,7 +164,11 @@ class Autoreset(IntEnum):
 
 
 class Ending(IntEnum):
-    """Why an episode ended."""
+    """Reason of an episode's ending, in `info["ending"]`.
+
+    A number, as libraries that store infos in tensors expect, which prints as its name in lower
+    case and equals it: `Ending.COLLISION == "collision"`.
+    """
 
     NONE = 0
     TIME_LIMIT = 1
@@ -179,6 +183,15 @@ class Ending(IntEnum):
     COLLISION = 9
     """the vehicle touched an obstacle"""
     LEFT_GEOFENCE = 10
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+    def __eq__(self, other: object) -> bool:
+        return str(self) == other if isinstance(other, str) else int(self) == other
+
+    def __hash__(self) -> int:
+        return hash(str(self))
 
 
 class Shape(IntEnum):

@@ -6,6 +6,7 @@ import pytest
 
 import quad_gym
 from baselines import PDPolicy
+from quad_gym import Ending
 
 minari = pytest.importorskip("minari")
 
@@ -32,6 +33,8 @@ def test_minari_keeps_flights_of_pd_and_makes_their_environment_again(tmp_path, 
     flown = [np.concatenate(column) for column in zip(*map(columns_of, episodes), strict=True)]
     for mine, kept in zip(zip(*rows, strict=True), flown, strict=True):
         np.testing.assert_array_equal(np.array(mine), kept)
+    endings = episodes[0].infos["ending"]
+    np.testing.assert_array_equal(endings, 20 * [Ending.NONE] + [Ending.TIME_LIMIT])
     again = dataset.recover_environment()
     np.testing.assert_array_equal(again.reset(seed=3)[0], episodes[0].observations[0])
     assert again.spec.max_episode_steps == 20

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import quad_gym  # noqa: F401
+import quad_gym
 
 torch = pytest.importorskip("torch")
 envs = pytest.importorskip("torchrl.envs")
@@ -39,3 +39,16 @@ def test_torchrl_flies_the_native_vector_environment():
         np.testing.assert_array_equal(data["next", "reward"][:, k, 0], reward.astype(np.float32))
         np.testing.assert_array_equal(data["next", "observation"][:, k], observation)
     assert (data["observation"][:, 20] != data["next", "observation"][:, 19]).any()  # begun anew
+
+
+def test_torchrl_flies_single_environments_in_processes():
+    env = envs.GymEnv("QuadGym/Hover-v0", num_envs=2, observation="truth", **SHORT)
+    env.set_seed(5)
+    data = env.rollout(45, break_when_any_done=False)
+    assert data["next", "observation"].shape == (2, 45, 28)
+    over = data["next", "done"][..., 0]
+    assert over.sum() == 4
+    truncated = int(quad_gym.Ending.TIME_LIMIT)
+    assert (data["next", "ending"] == torch.where(over, truncated, 0)).all()
+    assert data["next", "position_error"].isfinite().all()
+    env.close()

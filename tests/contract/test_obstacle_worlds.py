@@ -9,6 +9,7 @@ from quad_gym import Cylinder, Wall, WorldParams
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.flights.record import Flight, FlightRecorder
+from quad_gym.records import Ending
 from quad_gym.tasks.rewards import Crash
 
 WORLD = WorldParams(
@@ -70,7 +71,7 @@ def test_hitting_a_wall_is_a_crash_and_info_says_so():
             break
     assert terminated
     assert not truncated
-    assert info["ending"] == "collision"
+    assert info["ending"] == Ending.COLLISION
     view = env.flights.batch.view
     assert 0.3 < view.obstacle_distance[0] <= WORLD.vehicle_radius
     assert Crash()(view)[0] == 1.0
@@ -88,7 +89,7 @@ def test_leaving_the_geofence_is_a_crash_too():
         if terminated or truncated:
             break
     assert terminated
-    assert info["ending"] == "left_geofence"
+    assert info["ending"] == Ending.LEFT_GEOFENCE
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
@@ -103,10 +104,10 @@ def test_a_new_episode_has_its_own_obstacles_and_goes_on(mode):
         *_, info = env.step(np.tile(EASTWARD, (4, 1)))
         places.append(batch.record("obstacle_center"))
         ended = info.get("final_info", info)
-        endings += [str(name) for name in np.ravel(ended["ending"])]
+        endings += np.ravel(ended["ending"]).tolist()
         lasted.append(batch.record("step"))
     episodes = (np.diff(np.array(places)[:, 0, 0, 0]) != 0.0).sum()
-    assert endings.count("collision") > 4
+    assert endings.count(Ending.COLLISION) > 4
     assert episodes >= 1
     # nobody collides at once in the next episode, as one whose collision is not forgotten would
     assert np.array(lasted).max() > 50

@@ -9,6 +9,7 @@ import pytest
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Ending
 from tests.contract.comparing import ACTIONS, IDS, OBSERVATIONS, actions_of, assert_same, state_of
 
 TASKS = tuple(quad_gym.IDS.values())
@@ -112,17 +113,17 @@ def test_a_final_observation_is_that_of_the_flight_that_ended():
 def test_a_crash_is_terminated_and_the_time_limit_truncated():
     env = QuadVectorEnv(64, "hover", autoreset_mode="SameStep", max_tilt=0.6, max_episode_steps=30)
     env.reset(seed=2)
-    counts = {"time_limit": 0, "tipped_over": 0}
+    counts = {Ending.TIME_LIMIT: 0, Ending.TIPPED_OVER: 0}
     for k in range(100):
         actions = np.stack([actions_of(100 * k + i, 1)[0] for i in range(64)])
         _, _, terminated, truncated, info = env.step(np.sign(actions) * abs(actions) ** 0.5)
         if "final_info" not in info:
             continue
         ending = info["final_info"]["ending"]
-        np.testing.assert_array_equal(terminated, ending == "tipped_over")
-        np.testing.assert_array_equal(truncated & ~terminated, ending == "time_limit")
-        for name in counts:
-            counts[name] += (ending == name).sum()
+        np.testing.assert_array_equal(terminated, ending == Ending.TIPPED_OVER)
+        np.testing.assert_array_equal(truncated & ~terminated, ending == Ending.TIME_LIMIT)
+        for why in counts:
+            counts[why] += (ending == why).sum()
     assert min(counts.values()) > 20
 
 
@@ -135,7 +136,7 @@ def test_a_crash_in_the_last_step_is_a_crash_and_the_time_limit():
     env.reset(seed=1)
     for _ in range(last):
         _, _, terminated, truncated, info = env.step(down)
-    assert (terminated, truncated, info["ending"]) == (True, True, "below_min_height")
+    assert (terminated, truncated, info["ending"]) == (True, True, Ending.BELOW_MIN_HEIGHT)
 
 
 # ---- global state --------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, Ve
 
 import quad_gym
 from quad_gym.envs.single import QuadEnv
+from quad_gym.records import Ending
 from tests.contract.comparing import actions_of, assert_same, state_of
 
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
@@ -47,7 +48,6 @@ def test_it_does_what_a_dummy_vec_env_of_monitored_environments_does(privileged)
                 ended += 1
                 assert_same(info["terminal_observation"], expected["terminal_observation"])
                 assert info["ending"] == expected["ending"]
-                assert info["ending_code"] == expected["ending_code"]
                 assert info["episode"]["l"] == expected["episode"]["l"]
                 assert info["episode"]["r"] == pytest.approx(expected["episode"]["r"], abs=1e-6)
     assert ended > 10
@@ -69,7 +69,7 @@ def test_an_episode_ends_with_its_return_its_length_its_time_and_its_error():
         assert info["episode"]["t"] >= 0.0
         assert info["episode"]["e"] == pytest.approx(errors[i] / 10)
         assert info["TimeLimit.truncated"] is True
-        assert info["ending"] == "time_limit"
+        assert info["ending"] == Ending.TIME_LIMIT
 
 
 def test_a_crash_is_not_reported_as_truncation():
@@ -81,7 +81,7 @@ def test_a_crash_is_not_reported_as_truncation():
             break
     assert dones.all()
     assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
-    assert infos[0]["ending"] == "below_min_height"
+    assert infos[0]["ending"] == Ending.BELOW_MIN_HEIGHT
 
 
 def test_the_replay_of_sac_tells_time_limits_from_crashes_and_keeps_final_observations():

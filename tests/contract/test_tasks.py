@@ -117,7 +117,7 @@ def test_the_reward_of_waypoints_is_the_documented_formula():
         if (terminated | truncated).any():
             break
     assert info["gates_passed"].max() == 4
-    assert set(info["ending"][terminated]) == {"last_gate"}
+    assert set(info["ending"][terminated]) == {Ending.LAST_GATE}
 
 
 @pytest.mark.parametrize("action", ["ctbr", "wrench", "attitude", "velocity", "motor"])
@@ -177,8 +177,7 @@ def test_farther_from_the_reference_than_its_bound_is_out_of_bounds(task):
         env.reset(seed=1, options=options)
         _, _, terminated, truncated, info = env.step(STILL)
         assert (terminated, truncated) == (over, False)
-        assert info["ending"] == ("out_of_bounds" if over else "none")
-        assert info["ending_code"] == (Ending.OUT_OF_BOUNDS if over else Ending.NONE)
+        assert info["ending"] == (Ending.OUT_OF_BOUNDS if over else Ending.NONE)
 
 
 def test_no_hovering_start_is_out_of_bounds():
@@ -195,13 +194,13 @@ def test_a_course_has_wider_bounds():
     env.reset(seed=1, options={"position": [0.0, 0.0, 9.0]})
     assert not env.step(STILL)[2]
     env.reset(seed=1, options={"position": [0.0, 0.0, 13.8]})  # near enough to a lower gate
-    assert env.step(STILL)[4]["ending"] == "out_of_bounds"
+    assert env.step(STILL)[4]["ending"] == Ending.OUT_OF_BOUNDS
 
 
 def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
     env = QuadEnv("hover", action="motor", out_of_bounds=100.0, min_height=-100.0)
     *_, terminated, truncated, info = last_step(env, np.array([0.2, -0.2, -0.2, 0.2]))
-    assert (terminated, truncated, info["ending"]) == (True, False, "tipped_over")
+    assert (terminated, truncated, info["ending"]) == (True, False, Ending.TIPPED_OVER)
     up = body_axes(env.flights.batch.record("q"))[0, 2, 2]
     assert up < np.cos(np.radians(100.0))
 
@@ -213,7 +212,7 @@ def test_more_than_a_hundred_degrees_of_tilt_is_tipped_over():
 def test_half_a_meter_below_the_origin_is_on_the_ground(task, options):
     env = QuadEnv(task, **options)
     *_, terminated, truncated, info = last_step(env, np.array([-1.0, 0.0, 0.0, 0.0]))
-    assert (terminated, truncated, info["ending"]) == (True, False, "below_min_height")
+    assert (terminated, truncated, info["ending"]) == (True, False, Ending.BELOW_MIN_HEIGHT)
     assert -1.0 < env.flights.batch.record("r")[0, 2] < -0.5
 
 
@@ -224,7 +223,8 @@ def test_the_time_limit_truncates(task, steps):
     for k in range(1, steps + 1):
         _, _, terminated, truncated, info = env.step(STILL)
         assert (terminated, truncated) == (False, k == steps)
-    assert info["ending"] == "time_limit"
+    assert info["ending"] == Ending.TIME_LIMIT
+    assert f"{info['ending']}" == "time_limit"
 
 
 def test_the_last_gate_terminates():
@@ -233,7 +233,7 @@ def test_the_last_gate_terminates():
     gate = env.flights.batch.record("gates")[0, 0]
     env.reset(seed=1, options={"position": gate, "velocity": [0, 0, 0]})
     _, reward, terminated, truncated, info = env.step(STILL)
-    assert (terminated, truncated, info["ending"]) == (True, False, "last_gate")
+    assert (terminated, truncated, info["ending"]) == (True, False, Ending.LAST_GATE)
     assert info["gates_passed"] == 1
     assert 0.9 < SECONDS * reward < 1.1
 
@@ -247,7 +247,7 @@ def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
     instant["L"] *= 1e160  # its square does not fit into a float
     batch.restore(instant)
     observation, reward, terminated, truncated, info = env.step(STILL)
-    assert (terminated, truncated, info["ending"]) == (False, True, "filter_failed")
+    assert (terminated, truncated, info["ending"]) == (False, True, Ending.FILTER_FAILED)
     assert info["filter_status"] > 0
     assert observation in env.observation_space
     assert np.isfinite(reward)

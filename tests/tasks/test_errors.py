@@ -9,6 +9,7 @@ import pytest
 import quad_gym
 from quad_gym import TaskError
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Ending
 from tests.contract.comparing import assert_same
 
 FLIGHTS = 9
@@ -236,7 +237,7 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
         observation, reward, terminated, _, info = env.step(np.zeros((2, 4)))
     assert list(terminated) == [False, True]
     assert reward[1] == 0.0
-    assert info["final_info"]["ending"][1] == "out_of_bounds"
+    assert info["final_info"]["ending"][1] == Ending.OUT_OF_BOUNDS
     assert np.isfinite(observation).all()
     assert np.isfinite(info["final_obs"][1]).all()
 

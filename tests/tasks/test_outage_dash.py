@@ -9,6 +9,7 @@ import quad_gym
 from baselines import PDPolicy
 from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.evaluation import roll_out
+from quad_gym.records import Ending
 from quad_gym.tasks.outage_dash import OutageDash
 
 ID = "QuadGym/OutageDash-v0"
@@ -132,7 +133,7 @@ def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
     _, reward, terminated, _, info = env.step(np.zeros((2, 4), np.float32))
     np.testing.assert_allclose(reward, 0.0, atol=1e-3)
     assert terminated.all()
-    assert (info["ending"] == "task").all()
+    assert (info["ending"] == Ending.TASK).all()
     assert (info["gates_passed"] == 10).all()
 
 

@@ -19,7 +19,7 @@ def fly(mode, own, randomize):
     rows, rewards = [observations], []
     for action in actions:
         observations, reward, terminated, truncated, infos = env.step(action)
-        rows += [observations, terminated, truncated, infos["ending_code"]]
+        rows += [observations, terminated, truncated, infos["ending"]]
         rewards.append(reward)
     return (
         rows,

@@ -12,6 +12,7 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.sb3 import QuadSB3VecEnv
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import Ending
 from tests.contract.comparing import actions_of, assert_same
 from tests.tasks.chase import Chase
 
@@ -172,10 +173,10 @@ def test_the_endings_say_why():
     found = set()
     for action in actions():
         *_, terminated, truncated, info = env.step(action)
-        assert ((info["ending"] != "none") == (terminated | truncated)).all()
-        assert (info["ending"][truncated] == "time_limit").all()
+        assert ((info["ending"] != Ending.NONE) == (terminated | truncated)).all()
+        assert (info["ending"][truncated] == Ending.TIME_LIMIT).all()
         found |= set(info["ending"][terminated])
-    assert "task" in found
+    assert Ending.TASK in found
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -11,6 +11,7 @@ from baselines.policies import load_policy, pretrained_file
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.evaluation import evaluate, roll_out
+from quad_gym.records import Ending
 
 LIMIT = 41
 
@@ -51,16 +52,16 @@ def plain_loop(task, policy, seed, **keywords):
         estimation.append(info["estimation_error"])
         if terminated or truncated:
             break
-    complete = len(errors) == LIMIT and not (terminated and info["ending"] != "last_gate")
+    complete = len(errors) == LIMIT and not (terminated and info["ending"] != Ending.LAST_GATE)
     return {
         "returns": sum(rewards),
         "lengths": len(rewards),
         "mean_error": np.mean(errors),
         "late_error": np.mean(errors[LIMIT // 2 :]) if complete else np.nan,
         "estimation_error": np.mean(estimation),
-        "crashed": terminated and info["ending"] != "last_gate",
+        "crashed": terminated and info["ending"] != Ending.LAST_GATE,
         "gates_passed": info["gates_passed"],
-        "ending": info["ending"],
+        "ending": str(info["ending"]),
     }
 
 

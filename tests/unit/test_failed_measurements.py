@@ -11,6 +11,7 @@ from quad_gym.records import (
     POSITION_BLOCK,
     VELOCITY_BLOCK,
     WIDTH,
+    Ending,
     FilterForm,
     FilterStatus,
     GateDecision,
@@ -150,7 +151,7 @@ def test_an_environment_tells_of_a_failed_filter_and_begins_anew():
     *_, truncated, info = env.step(np.zeros((9, 4)))
     np.testing.assert_array_equal(np.flatnonzero(truncated), [3])
     final = info["final_info"]
-    assert final["ending"][3] == "filter_failed"
+    assert final["ending"][3] == Ending.FILTER_FAILED
     assert final["filter_status"][3] == 3
     assert not info["filter_status"].any()
     assert not batch.record("update_failures").any()

@@ -12,7 +12,7 @@ from quad_gym import FlightBatch, TaskParams, Uniform, UnscentedKalmanFilter
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, PositionJump, RotorLoss
-from quad_gym.records import Source
+from quad_gym.records import Ending, Source
 
 LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
 VEHICLE = quad_gym.vehicle_params("lab")
@@ -337,7 +337,7 @@ def test_a_limit_in_steps_holds_in_every_interface_and_its_description(given, st
         _, _, terminated, truncated, info = single.step(np.zeros(4))
         assert not terminated
         assert truncated == (k == steps)
-    assert info["ending"] == "time_limit"
+    assert info["ending"] == Ending.TIME_LIMIT
 
 
 def test_without_any_limit_the_description_has_none():

@@ -150,7 +150,7 @@ def test_a_reference_out_of_bounds_of_the_pad_is_refused(task, start):
     env = QuadVectorEnv(16, task, height=1.6, **options)
     env.reset(seed=1)
     if task == "hover":  # elsewhere the reference moves away from the limit
-        ending = env.step(np.tile([-1.0, 0.0, 0.0, 0.0], (16, 1)))[4]["ending_code"]
+        ending = env.step(np.tile([-1.0, 0.0, 0.0, 0.0], (16, 1)))[4]["ending"]
         assert (ending == 0).all()
     message = rf"out_of_bounds must be at least 1\.61 m.*start='{start}'.*got out_of_bounds=1\.6 m"
     for pad in (True, False):

@@ -12,7 +12,7 @@ from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import AccelBiasStep, GnssRamp, GyroBiasStep
-from quad_gym.records import Source
+from quad_gym.records import Ending, Source
 from tests.field_flights import fly, state_errors, steps
 from tests.filter_states import set_at_rest
 
@@ -168,7 +168,7 @@ def test_info_tells_of_it_and_episodes_can_end_with_it():
         *_, truncated, info = ended.step(np.zeros((32, 4)))
         endings += info["ending"][truncated].tolist()
     assert lost.mean() > 0.9
-    assert endings.count("filter_diverged") > 16
+    assert endings.count(Ending.FILTER_DIVERGED) > 16
 
 
 @pytest.mark.parametrize("sensors", ["standard", "rtk"])
