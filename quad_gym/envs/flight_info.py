@@ -1,4 +1,4 @@
-"""What `info` says of a flight besides errors and endings: faults, and innovations."""
+"""Faults and innovations in `info`."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ Parts = dict[str, dict[str, NDArray[Any]]]
 
 
 def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
-    """What `info` holds as "faults" and "innovations" of all flights, each if there are any.
+    """Return the entries "faults" and "innovations" of `info` for all flights, if they have any.
 
     Args:
         batch: The flights.
-        bits: (n,) active faults, as of a flight's field "faults".
+        bits: (n,) active faults, as in a flight's field "faults".
     """
     found: Parts = {}
     if batch.faults:
@@ -28,15 +28,16 @@ def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
 
 
 def innovations_of(batch: FlightBatch) -> dict[str, NDArray[Any]]:
-    """The last innovations of all flights, block by block.
+    """Return the last innovations of all flights, block by block.
 
-    The blocks are position, baseline, velocity and features; then barometer and magnetometer, if
-    the suite has such.
+    The blocks are position, baseline, velocity and features, followed by barometer and magnetometer
+    if the suite has them.
 
     Returns:
-        Arrays (n, blocks, ...): "measured" (since the last step), "innovation" and "sigma" (what
-        the filter expected), three numbers each, of which a direction has two; "nis"; "gate", see
-        `quad_gym.records.GateDecision`; "rejections" in this episode. NaN: not measured yet.
+        Arrays (n, blocks, ...): "measured" (True if measured since the last step); "innovation" and
+        "sigma" (its standard deviation predicted by the filter), three numbers each, of which a
+        direction uses two; "nis"; "gate", see `quad_gym.records.GateDecision`; "rejections" in this
+        episode. NaN: not measured yet.
     """
     blocks = list(blocks_of(batch.sensors))
     position, baseline = batch.record("position_fresh"), batch.record("baseline_fresh")
@@ -54,7 +55,7 @@ def innovations_of(batch: FlightBatch) -> dict[str, NDArray[Any]]:
 
 
 def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
-    """The same of one flight, with truth values in place of arrays of one."""
+    """Return the entries of one flight, with booleans in place of arrays of one."""
     return {
         name: {
             key: values[flight] if values.ndim > 1 else bool(values[flight])
@@ -65,7 +66,7 @@ def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
 
 
 def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[np.intp]) -> None:
-    """Describe the present instant of some flights instead, where `info` has faults."""
+    """Describe the present instant of some flights instead, if `info` has faults."""
     if batch.faults:
         now = named_faults(batch.faults, batch.record("faults", flights))
         for name, values in now.items():
@@ -73,7 +74,7 @@ def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[n
 
 
 def final_faults(infos: dict[str, Any], over: NDArray[np.bool_]) -> dict[str, Any]:
-    """Faults at the end of the episodes that are over, as `final_info` holds them."""
+    """Return the faults at the end of the episodes that are over, as `final_info` holds them."""
     if "faults" not in infos:
         return {}
     faults = infos["faults"].items()
