@@ -174,8 +174,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             episode, and has converged.
         control_rate: Actions per second, by default 10 on `OutageDash`, 50 elsewhere; must divide
             the IMU rate [Hz].
-        action_delay: Delay from the command of an action to its execution, in control steps (whole
-            ticks), at most 10; 0 by default. Until the first action arrives, the vehicle executes
+        action_delay: Delay from the command of an action to its execution, in control steps
+            (rounded to ticks), at most 10; 0 by default. Until the first action arrives, the vehicle executes
             zeros, which hover. `last_action` in the observation is the commanded action.
         substeps: Runge-Kutta steps per tick.
         max_episode_steps: Time limit in steps, in place of the task's own, whether longer or
