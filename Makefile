@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 BYTECODE := $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
 
-.PHONY: setup demo circle results test test-oldest test-clients test-slow soak golden lint benchmark docs wheel clean
+.PHONY: setup demo circle results test test-oldest test-clients test-slow soak golden lint benchmark docs reference wheel clean
 
 setup: $(VENV)/.developer
 
@@ -86,6 +86,9 @@ benchmark: setup  ## steps per second of every face and the cost of each part
 docs: $(VENV)/.writer  ## the site in docs/_build/html/index.html; runs the tutorials, some minutes
 	$(BIN)/quad-gym compile --stages all # here, so that no tutorial says that it compiles
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+reference: setup  ## the tables of docs/reference, from the code
+	$(BIN)/python -m docs.extensions.environment_pages
 
 wheel: $(VENV)/.user  ## build wheel and sdist into dist, and check what they hold
 	rm -rf dist

@@ -235,7 +235,11 @@ def is_private(name: str) -> bool:
 def counts() -> dict[str, Count]:
     """The count of every page, of the public docstrings by page of the interface, and of others."""
     found = {}
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*/*.md")]
+    pages = [
+        *ROOT.glob("*.md"),
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "docs" / "api").glob("*.md"),
+    ]
     for page in sorted(pages):
         found[page.relative_to(ROOT).as_posix()] = count(page.read_text(encoding="utf-8"))
     for file in sorted((ROOT / "docs" / "gallery").glob("*.py")):

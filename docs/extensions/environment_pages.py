@@ -1,25 +1,28 @@
-"""Pages on environments and sensor suites, written from the code before Sphinx reads its sources.
+"""Reference pages, written from the code: environments, keywords, observations, suites, fields.
 
-Tables of observations come from `observation_layout`, those of keywords from the fields of
-`TaskParams` and the signature behind the environments, their words from docstrings. What is said of
-a keyword or of a part of an observation that the code has and the docstring lacks is an error.
+    python -m docs.extensions.environment_pages    # or make reference
+
+They are committed in docs/reference, so that a repository's web page shows them; a test compares
+them with the code. Tables of observations come from `observation_layout`, tables of keywords from
+the fields of `TaskParams` and the signature behind the environments, their words from docstrings.
+A keyword or a part of an observation that the docstring lacks is an error.
 """
 
+import ast
 import dataclasses
 import importlib
 import inspect
+import itertools
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import docstring_parser
-from sphinx.application import Sphinx
-from sphinx.errors import ExtensionError
-from sphinx.pycode import ModuleAnalyzer
 
 import quad_gym
-from extensions.films import film_of
+from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import (
     KEYWORDS_WITHOUT_EFFECT,
@@ -32,11 +35,18 @@ from quad_gym.envs.rendered import rendering_of
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights.record import COLUMNS, FEATURES
 from quad_gym.params.suites import ALL_SUITES
-from quad_gym.records import FLIGHT_FIELDS
+from quad_gym.records import DRAWABLES
 from quad_gym.tasks.fields import VIEW_FIELDS
 
-FOLDER = "generated"
-"""Where the pages go, inside the sources of the site; Git ignores it."""
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+DOCS = Path(__file__).parents[1]
+FOLDER = DOCS / "reference"
+GUIDE = DOCS / "environments.md"
+"""A page with the table of the default observation, between two marks."""
+FILM = "<!-- film -->"
+"""Line of an environment's page; the site shows a film there (`films`)."""
 
 
 def _sections() -> dict[str, str]:
@@ -53,19 +63,33 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join([line(head), line(["---"] * len(head)), *map(line, rows)]) + "\n"
 
 
+def _attribute_docs(kind: type) -> dict[str, str]:
+    """Docstrings below the fields of a class, in its own body."""
+    module = ast.parse(Path(inspect.getfile(kind)).read_text(encoding="utf-8"))
+    body = next(
+        node.body
+        for node in ast.walk(module)
+        if isinstance(node, ast.ClassDef) and node.name == kind.__name__
+    )
+    return {
+        part.target.id: " ".join(after.value.value.split())
+        for part, after in itertools.pairwise(body)
+        if isinstance(part, ast.AnnAssign)
+        and isinstance(part.target, ast.Name)
+        and isinstance(after, ast.Expr)
+        and isinstance(after.value, ast.Constant)
+        and isinstance(after.value.value, str)
+    }
+
+
 def _field_docs(kind: type) -> dict[str, str]:
-    """What is said below each field of a dataclass, inherited fields first."""
-    docs = {}
+    """Docstrings below each field of a dataclass, inherited fields first."""
+    docs: dict[str, str] = {}
     for part in filter(dataclasses.is_dataclass, reversed(kind.__mro__)):
-        found = ModuleAnalyzer.for_module(part.__module__).find_attr_docs()
-        docs |= {
-            name: " ".join(lines).strip()
-            for (of, name), lines in found.items()
-            if of == part.__name__
-        }
+        docs |= _attribute_docs(part)
     for field in dataclasses.fields(kind):
         if field.name not in docs:
-            raise ExtensionError(f"{kind.__name__}.{field.name} has no docstring")
+            raise ValueError(f"{kind.__name__}.{field.name} has no docstring")
     return docs
 
 
@@ -106,7 +130,7 @@ def _meanings(section: str) -> dict[str, str]:
     rows = re.findall(r"^\| *(\d+:\d+) *\| *(\w+) *\|([^|]*)\|", section, flags=re.MULTILINE)
     for (where, name, _), field in zip(rows, quad_gym.observation_layout(), strict=True):
         if (where, name) != (f"{field.slice.start}:{field.slice.stop}", field.name):
-            raise ExtensionError(f"the specification has {where} {name}, the code {field}")
+            raise ValueError(f"the specification has {where} {name}, the code {field}")
     return {name: meaning.strip() for _, name, meaning in rows}
 
 
@@ -125,9 +149,8 @@ def _observations_page() -> str:
         },
         "Relative, with the truth for a critic (`privileged=True`)": {"privileged": True},
     }
-    text = "# Observations\n\nWhat `quad_gym.observation_layout` says of the observations. I: "
-    text += "inertial (east, north, up), B: body, C: image. Observations are held within their "
-    text += "bounds.\n"
+    text = "# Observations\n\nTables of `quad_gym.observation_layout`. Frames: I inertial (east, "
+    text += "north, up), B body, C image. Observations are clipped to their bounds.\n"
     for title, options in layouts.items():
         rows = _observation_rows(quad_gym.observation_layout(**options))
         text += f"\n## {title}\n\n{_table(HEAD, rows)}"
@@ -159,7 +182,7 @@ def _keywords_page() -> str:
     }
     missing = sorted(set(defaults) - set(said))
     if missing:
-        raise ExtensionError(f"the specification says nothing of {', '.join(missing)}")
+        raise ValueError(f"the specification says nothing of {', '.join(missing)}")
     rows = [(f"`{name}`", _value(value), said[name]) for name, value in defaults.items()]
     return (
         "# Keywords of every environment\n\nOf `gymnasium.make`, `gymnasium.make_vec` and "
@@ -184,17 +207,30 @@ def _task_sections(task: type[quad_gym.Task]) -> dict[str, str]:
     }
 
 
+SHARED = ("Observation space", "Action space", "Reward", "Episode end", "Start", "Info", "World")
+
+
+def _specification_page(sections: dict[str, str]) -> str:
+    """Sections of the specification that all environments share."""
+    text = (
+        "# Specification of the environments\n\nThe text of `help(quad_gym.QuadEnv)`. Keywords are "
+    )
+    text += "under [Keywords of every environment](keywords.md); each environment's page lists "
+    text += "those of its task, and the parts that differ.\n"
+    return text + "".join(f"\n## {name}\n\n{sections[name]}\n" for name in SHARED)
+
+
 def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str]) -> str:
     kind = quad_gym.IDS[env_id]
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", env_id.split("/")[1].removesuffix("-v0"))
     row = re.search(rf"^\| `{re.escape(env_id)}` \|(.+)\|$", sections["Description"], re.MULTILINE)
     if row is None:
-        raise ExtensionError(f"the table of environments lacks {env_id}")
+        raise ValueError(f"the table of environments lacks {env_id}")
     reference, start, limit = (cell.strip() for cell in row[1].split("|"))
     own = BENCHMARKS.get(kind)
     defaults = TASK_DEFAULTS[kind] if own is None else own.task
     task = None if own is None else _task_class(own.keywords["task"])
-    spec = sections if task is None else sections | _task_sections(task)
+    spec = {} if task is None else _task_sections(task)
     settings = {} if own is None else dict(own.keywords)
     rows = [
         (f"`{key}`", _value(getattr(defaults, key)), docs[key])
@@ -206,34 +242,27 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         (f"`{key}`", _value(value), "a keyword of every environment")
         for key, value in settings.items()
     ]
-    rows_seen = _observation_rows(
-        quad_gym.observation_layout(), _meanings(sections["Observation space"])
+    if task is None:
+        different = ""
+    else:
+        different = "".join(
+            f"## {heading}\n\n{spec[heading]}\n\n"
+            for heading in ("Observation", "Reward", "Endings")
+        )
+    return "\n".join(
+        [
+            f"# {name}\n\n`{env_id}`\n",
+            f"{spec['About']}\n" if spec else "",
+            f"- **Reference**: {reference}\n- **Start**: {start}\n- **Time limit**: {limit}\n",
+            "```python\nimport gymnasium\n\nimport quad_gym\n\n"
+            f'env = gymnasium.make("{env_id}")\n```\n',
+            f"{FILM}\n",
+            f"{different}Unless stated here, observation, action, reward, start, endings and "
+            "`info` follow the [specification](../specification.md) of all environments.\n",
+            f"## Keywords of the task\n\n{_table(('keyword', 'default here', 'meaning'), rows)}",
+            "All others are under [Keywords of every environment](../keywords.md).\n",
+        ]
     )
-    built_in = _table(("slice", "name", "meaning", "unit", "frame", "bounds"), rows_seen)
-    seen = spec["Observation"] if task is not None else ""
-    # a task's own observation takes the place of the built-in one, or follows it
-    observation = seen if task is not None and task.replaces_observation else built_in + "\n" + seen
-    shared = "Start and `info`" if own else "Reward, start, endings and `info`"
-    parts = [
-        f"# {name}\n\n`{env_id}`\n",
-        f"{spec['About']}\n" if own else "",
-        f"- **Reference**: {reference}\n- **Start**: {start}\n- **Time limit**: {limit}\n",
-        "```python\nimport gymnasium\n\nimport quad_gym\n\n"
-        f'env = gymnasium.make("{env_id}")\n```\n',
-        film_of(env_id),
-        f"{shared} below are from the specification that all environments share, "
-        "`help(quad_gym.QuadEnv)`.\n",
-        f"## Observation\n\n{observation}\n",
-        "The other layouts are under [Observations](../observations.md).\n",
-        f"## Action\n\n{sections['Action space']}\n",
-        f"## Keywords of the task\n\n{_table(('keyword', 'default here', 'meaning'), rows)}",
-        "All others are under [Keywords of every environment](../keywords.md).\n",
-        f"## Reward\n\n{spec['Reward']}\n",
-        f"## Start\n\n{sections['Start']}\n",
-        f"## Endings\n\n{sections['Episode end']}\n\n{spec['Endings'] if own else ''}\n",
-        f"## Info\n\n{sections['Info']}\n",
-    ]
-    return "\n".join(parts)
 
 
 def _suites_page() -> str:
@@ -265,7 +294,10 @@ def _suites_page() -> str:
 
 def _fields_page() -> str:
     """What a flight's record and a recorded flight hold."""
-    fields = [(f"`{f.name}`", str(f.shape), f.unit, f.meaning) for f in FLIGHT_FIELDS]
+    fields = [
+        (f"`{name}`", "(" + ", ".join(map(str, q.shape)) + ")", q.unit, q.frame, q.meaning)
+        for name, q in QUANTITIES.items()
+    ]
     view = [(f"`{f.name}`", f.shape, f.unit, f.frame, f.meaning) for f in VIEW_FIELDS]
     columns = [
         (
@@ -278,45 +310,85 @@ def _fields_page() -> str:
         for c in COLUMNS
     ]
     return (
-        "# Fields of flights\n\n## Columns of a recorded flight\n\nWhat `quad_gym.Flight` holds, "
-        "a row for each control step.\n\n"
+        "# Fields of flights\n\n## Columns of a recorded flight\n\nColumns of `quad_gym.Flight`, "
+        "with a row for each control step.\n\n"
         + _table(("column", "shape of a row", "unit", "frame", "meaning"), columns)
-        + "\n## Fields of a flight's record\n\nWhat `FlightBatch.read` returns by name, with the "
-        "flights as a first axis.\n\n"
-        + _table(("field", "shape", "unit", "meaning"), fields)
-        + "\n## Fields of a view\n\nWhat the methods of a `quad_gym.Task` read.\n\n"
-        + _table(("field", "shape", "unit", "frame", "meaning"), view)
+        + "\n## Quantities of a batch of flights\n\nNames of `FlightBatch.read`, with the flights "
+        "as first axis.\n\n"
+        + _table(("name", "shape", "unit", "frame", "meaning"), fields)
+        + "\n## Fields of a view\n\nFields of the `view` that the methods of a `quad_gym.Task` "
+        "read. In the shapes, n is the number of flights, m of features (markers), o of "
+        "obstacles, and k of values in an observation. Frames: I inertial (east, north, up), B "
+        "body, C image.\n\n" + _table(("field", "shape", "unit", "frame", "meaning"), view)
     )
 
 
-def pages() -> dict[str, str]:
-    """All pages by their names."""
+def _drawable_page() -> str:
+    """Parameters that can be drawn for each episode."""
+    rows = [
+        (f"`{d.name}`", str(d.size) if d.size < 16 else "3 per feature", d.unit, d.meaning)
+        for d in DRAWABLES
+    ]
+    return (
+        "# Parameters that can be randomized\n\nNames for `randomization=`, the domain "
+        "randomization of every environment "
+        "([examples](../configure.md#domain-randomization-sim-to-real)).\n\n"
+        + _table(("parameter", "values", "unit", "meaning"), rows)
+    )
+
+
+def observation_table() -> str:
+    """The default observation, with meanings."""
+    rows = _observation_rows(
+        quad_gym.observation_layout(), _meanings(_sections()["Observation space"])
+    )
+    return _table(("slice", "name", "meaning", "unit", "frame", "bounds"), rows)
+
+
+def pages() -> dict[Path, str]:
+    """The texts of all pages, by file, and of the guide."""
     sections, docs = _sections(), _field_docs(quad_gym.TaskParams)
     found = {
         f"environments/{kind}": _environment_page(env_id, sections, docs)
         for env_id, kind in quad_gym.IDS.items()
-    }
-    return found | {
+    } | {
+        "specification": _specification_page(sections),
         "observations": _observations_page(),
         "keywords": _keywords_page(),
+        "drawable": _drawable_page(),
         "suites": _suites_page(),
         "fields": _fields_page(),
     }
+    guide = re.sub(
+        r"(<!-- observation -->\n).*?(<!-- /observation -->)",
+        lambda marks: marks[1] + observation_table() + marks[2],
+        GUIDE.read_text(encoding="utf-8"),
+        flags=re.DOTALL,
+    )
+    return {FOLDER / f"{name}.md": text for name, text in found.items()} | {GUIDE: guide}
 
 
-def write_pages(app: Sphinx) -> None:
-    """Write the pages that are not there as they should be, and remove others."""
-    folder = Path(app.srcdir) / FOLDER
-    (folder / "environments").mkdir(parents=True, exist_ok=True)
-    wanted = {folder / f"{name}.md": text for name, text in pages().items()}
-    for file in set(folder.rglob("*.md")) - set(wanted):
+def write_pages(app: "Sphinx | None" = None) -> list[Path]:
+    """Write the pages that differ from the code, and remove others; return those that changed."""
+    texts = pages()
+    changed = [
+        file
+        for file, text in texts.items()
+        if not file.exists() or file.read_text(encoding="utf-8") != text
+    ]
+    for file in changed:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(texts[file], encoding="utf-8")
+    for file in set(FOLDER.rglob("*.md")) - set(texts):
         file.unlink()
-    for file, text in wanted.items():
-        if not file.exists() or file.read_text(encoding="utf-8") != text:
-            file.write_text(text, encoding="utf-8")
+    return changed
 
 
-def setup(app: Sphinx) -> dict[str, Any]:
-    """Write the pages when a build begins."""
+def setup(app: "Sphinx") -> dict[str, Any]:
+    """Write the pages when a build of the site begins."""
     app.connect("builder-inited", write_pages, priority=100)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+if __name__ == "__main__":
+    sys.stdout.writelines(f"{file.relative_to(DOCS.parent)}\n" for file in write_pages())

@@ -1,4 +1,4 @@
-"""A film for the page of each environment, made when the site is built: the policy that ships."""
+"""A film for the page of each environment, made when the site is built: the included policy."""
 
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,12 @@ from sphinx.util.display import status_iterator
 
 import quad_gym
 from baselines.policies import pretrained_file
+from extensions.environment_pages import FILM
 from quad_gym.commands import fly
 from quad_gym.commands.fly import Args
 
-FOLDER = "generated/environments"
+FOLDER = "generated/films"
+"""Inside the sources of the site; Git ignores it."""
 SIZE = (480, 360)
 SPEED = 2.0
 """Seconds of flight per second of the film."""
@@ -20,7 +22,7 @@ RATE = 12.5
 
 
 def policy_of(env_id: str) -> str:
-    """Who flies in the film: the trained policy that ships, or PD control where there is none."""
+    """Policy in the film: the included trained policy, or PD control where there is none."""
     try:
         pretrained_file(env_id)
     except ValueError:
@@ -29,11 +31,11 @@ def policy_of(env_id: str) -> str:
 
 
 def film_of(env_id: str) -> str:
-    """The lines of a page that show its film."""
-    flies = {"pd": "PD control", "pretrained": "the trained policy that ships"}[policy_of(env_id)]
+    """Lines of a page with its film."""
+    flies = {"pd": "PD control", "pretrained": "the included trained policy"}[policy_of(env_id)]
     kind = quad_gym.IDS[env_id]
     return (
-        f"![An episode of {env_id}, flown by {flies}]({kind}.webp)\n\n"
+        f"![An episode of {env_id}, flown by {flies}](/{FOLDER}/{kind}.webp)\n\n"
         f"An episode on the estimate, flown by {flies}, at twice the speed:\n\n"
         f"```sh\nquad-gym fly {kind} --policy {policy_of(env_id)} --speed {SPEED:g} "
         f"--output {kind}.webp\n```\n"
@@ -41,7 +43,7 @@ def film_of(env_id: str) -> str:
 
 
 def write_films(app: Sphinx) -> None:
-    """Fly an episode of each environment, and write it as a film beside its page."""
+    """Fly an episode of each environment, and write it as a film."""
     folder = Path(app.srcdir) / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for env_id, kind in status_iterator(
@@ -55,7 +57,15 @@ def write_films(app: Sphinx) -> None:
         film.with_suffix(".npz").unlink()
 
 
+def show_film(app: Sphinx, name: str, source: list[str]) -> None:
+    """Put the film into the page of an environment as it is read."""
+    for env_id, kind in quad_gym.IDS.items():
+        if name == f"reference/environments/{kind}":
+            source[0] = source[0].replace(FILM, film_of(env_id))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Film when a build begins."""
     app.connect("builder-inited", write_films, priority=110)
+    app.connect("source-read", show_film)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -3,7 +3,7 @@ Fly the circle on truth and on the estimate
 ===========================================
 
 The same controller flies the same circle twice: once on the true state, once on the estimate of the
-filter. What does the estimate cost?
+filter. The difference is the cost of the estimate.
 """
 
 import gymnasium
@@ -39,8 +39,8 @@ def fly(source):
 truth, estimate = fly("truth"), fly("estimate")
 
 # %%
-# ``FlightBatch.read`` gives any quantity of the flights behind an environment; ``"r"`` is the
-# true position. From above, both flights look alike: the vehicle leaves its launch pad late, cuts
+# ``FlightBatch.read`` returns any quantity of the flights behind an environment, such as the true
+# position. From above, both flights look the same: the vehicle leaves its launch pad late, cuts
 # the corner, and joins the circle.
 
 figure, (above, error) = plt.subplots(1, 2, figsize=(9, 4))
@@ -56,8 +56,8 @@ above.legend()
 error.legend()
 
 # %%
-# Tracking errors count from the true position in both cases. On the estimate a few millimeters
-# come on top, about as many as the filter errs:
+# Tracking errors use the true position in both cases. The estimate adds a few millimeters, about
+# as much as the error of the filter:
 
 for (_, tracking, estimation), name in ((truth, "truth"), (estimate, "estimate")):
     print(

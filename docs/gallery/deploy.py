@@ -3,8 +3,8 @@ Export a policy to C
 ====================
 
 A trained policy is exported as a single C99 file, compiled with the system's compiler, and flown in
-place of the policy: the flights are the same. :doc:`Deployment </deployment>` says how to call it
-on an autopilot.
+place of the policy: the flights are the same. :doc:`Deployment </deployment>` explains how to call
+it on an autopilot.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ import quad_gym
 from baselines.exporting import c_source, controller_of
 
 # %%
-# The policy that ships for the figure of eight. ``controller_of`` also takes the files of
+# The included policy for the figure of eight. ``controller_of`` also accepts the files of
 # ``quad-gym train``.
 
 controller = controller_of("pretrained", "QuadGym/Lemniscate-v0")
@@ -30,7 +30,7 @@ print(source[: source.index("static const")])
 print(f"... {len(source.splitlines())} lines, {len(source) / 1000:.0f} kB")
 
 # %%
-# Compiled as a library that Python can call.
+# Compiled as a library for Python.
 
 compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 folder = Path(tempfile.mkdtemp())
@@ -79,7 +79,7 @@ print(f"largest difference of an action   {max(differences):.1e}")
 print(f"largest distance between flights  {np.abs(paths['C'] - paths['policy']).max():.1e} m")
 
 # %%
-# Single precision rounds sums in another order, no more.
+# The only difference is the rounding of single precision.
 
 figure, axes = plt.subplots()
 axes.plot(*paths["policy"][:, 0, :2].T, color="0.7", linewidth=5, label="policy")

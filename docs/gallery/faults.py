@@ -1,8 +1,8 @@
 """
-Faults, and what they do to NIS
-===============================
+Effect of faults on the NIS
+===========================
 
-The normalized innovation squared (NIS) says how surprising a measurement is to the filter. Faults
+The normalized innovation squared (NIS) measures how well a measurement fits the prediction. Faults
 change its distribution, and a gate acts on it.
 """
 
@@ -48,7 +48,7 @@ def fly(sensors, *faults):
 # ------------------------
 #
 # Without faults, NIS of a position is chi-square with three degrees of freedom. With five percent
-# of outliers, of 10 to 100 standard deviations, a second hump appears far to the right. The gate
+# of outliers, of 10 to 100 standard deviations, a second mode appears far to the right. The gate
 # of ``"rtk"`` is the quantile that one valid measurement in 10,000 exceeds.
 
 clean, _, _ = fly("rtk")
@@ -72,7 +72,7 @@ rejected = (gate == GateDecision.REJECTED).sum() / (gate != GateDecision.NONE).s
 print(f"rejected: {100 * rejected:.2f} % of the fixes")
 
 # %%
-# The gate is what makes the filter bear them:
+# With the gate, the filter tolerates them:
 
 rtk = quad_gym.sensor_suite("rtk")
 open_gate = rtk.replace(estimator=rtk.estimator.replace(false_alarm_probability=0.0))
@@ -84,8 +84,8 @@ print(f"without it {1e3 * open_error.mean():.1f} mm")
 # Jumps and ramps
 # ---------------
 #
-# A jump of the positions is noticed at once; a slow ramp passes any gate on single innovations at
-# first. ``"rtk"`` has a camera, whose features contradict GNSS: the estimate stays where it is.
+# A jump of the positions is detected at once; a slow ramp passes any gate on single innovations at
+# first. ``"rtk"`` has a camera, whose features contradict GNSS: the estimate does not follow.
 
 no_camera = rtk.replace(camera=None)
 figure, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5))

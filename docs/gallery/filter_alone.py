@@ -46,7 +46,7 @@ for _ in range(2000):
 # ----------
 #
 # It starts from the first fix. From then on, ``predict`` takes each IMU sample, and ``update``
-# takes whatever has been measured.
+# takes the available measurements.
 
 ukf = UnscentedKalmanFilter(sensors=suite)
 R_IG = ecef_to_enu(suite.gnss.reference_antenna_G)
@@ -68,8 +68,8 @@ for row in log[1:]:
 print(f"largest difference from the estimate of the flight: {max(differences):.1e} m")
 
 # %%
-# Its error, and what it claims
-# -----------------------------
+# Error and standard deviation
+# ----------------------------
 
 time = np.arange(1, len(log)) * suite.imu.dt
 figure, axes = plt.subplots(4, 1, sharex=True, figsize=(7, 7))

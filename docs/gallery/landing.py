@@ -18,8 +18,8 @@ from baselines.mlp import MlpPolicy
 from baselines.recipes import Recipe
 
 # %%
-# A step on the ground is paid where it is on the pad, and the way there a little. Touching the
-# ground faster than 0.5 m/s ends the episode, and with it all further pay.
+# Steps on the pad are rewarded, and the approach a little. Touching the ground faster than 0.5 m/s
+# ends the episode, and with it all further reward.
 
 
 class Landing(quad_gym.Task):
@@ -50,7 +50,7 @@ class Landing(quad_gym.Task):
 
 # %%
 # The actions are velocities. A million and a half steps take about a minute on two cores; the
-# policy that they lead to is kept beside this file.
+# resulting policy is stored next to this file.
 
 KEYWORDS = {
     "task": Landing(),
@@ -74,7 +74,7 @@ if not FILE.exists():
     model.policy().save(FILE)
 
 # %%
-# What it has learned, in 200 episodes with other seeds:
+# The trained policy in 200 episodes with other seeds:
 
 policy = MlpPolicy.load(FILE)
 envs = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=200, **KEYWORDS)

@@ -2,7 +2,7 @@
 Reward looking at markers
 =========================
 
-Without GNSS, the filter knows the position only as well as the camera sees markers. This task
+Without GNSS, the position estimate is only as good as the camera's view of the markers. This task
 rewards markers in view and a small covariance. Half of the vehicles start turned away from them.
 """
 

@@ -2,9 +2,9 @@
 Follow a moving target
 ======================
 
-Your own task: a target wanders, and the vehicle sees it with noise of 5 cm. A `quad_gym.Task` keeps
-the target of each flight, computes the reward, ends episodes, and adds the seen target to the
-observation.
+Your own task: a target wanders, and the vehicle observes it with noise of 5 cm. A `quad_gym.Task`
+keeps the target of each flight, computes the reward, ends episodes, and adds the observed target to
+the observation.
 """
 
 from pathlib import Path
@@ -48,8 +48,8 @@ class MovingTarget(quad_gym.Task):
 
 # %%
 # PPO learns to follow. The actions are velocities; a million steps take about a minute on two
-# cores, and the policy that they lead to is kept beside this file. The bounds are wider than those
-# of ``Hover``, because the target wanders more than 1.6 m away.
+# cores, and the resulting policy is stored next to this file. The bounds are wider than in
+# ``Hover``, because the target wanders more than 1.6 m away.
 
 KEYWORDS = {
     "task": MovingTarget(),
@@ -71,8 +71,8 @@ if not FILE.exists():
     model.policy().save(FILE)
 
 # %%
-# With other seeds, beside a controller that flies toward where the target is seen, in proportion.
-# The table of the observation says where that stands.
+# With other seeds, compared with a proportional controller on the observed target. The table of the
+# observation has the slice of the target.
 
 envs = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=100, **KEYWORDS)
 place = next(f.slice for f in envs.unwrapped.flights.table if f.name == "target")

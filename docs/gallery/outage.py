@@ -2,8 +2,8 @@
 Watch the filter through a GNSS outage
 ======================================
 
-GNSS fails for some seconds. A consistent filter knows how large its error may be. A filter that was
-misled during the outage notices it only when GNSS returns, and has to recover.
+GNSS fails for some seconds. The covariance of a consistent filter grows with its error. A filter
+that becomes inconsistent during the outage detects it only when GNSS returns, and has to recover.
 """
 
 import gymnasium
@@ -47,8 +47,8 @@ def fly(*faults):
 # ----------------------------------
 #
 # From 4 s to 8 s there are no fixes, and this vehicle has no camera. The filter continues with the
-# IMU alone. Its error grows, and so does the standard deviation that it claims: nearly all of the
-# 200 flights stay within three of them.
+# IMU alone. Its error grows, and so does its standard deviation: nearly all of the 200 flights stay
+# within three standard deviations.
 
 outage = GnssOutage(start=4.0, duration=4.0)
 errors, claimed, lost = fly(outage)
@@ -70,7 +70,7 @@ print(f"within 3 sigma: {100 * inside:.1f} % of all errors; lost filters: {100 *
 # -----------------------------
 #
 # Now the accelerometer's bias steps by 0.2 m/s² while there is no GNSS, ten times the standard
-# deviation that the filter assumes for it. The error grows far beyond what the filter claims. When
+# deviation that the filter assumes for it. The error grows far beyond the covariance. When
 # fixes return, they contradict the estimate so much that the gate rejects them. After ten
 # rejections in a row the filter inflates its covariance, and accepts the next fix.
 # ``info["filter_diverged"]`` is true while the filter's covariance does not explain its
@@ -96,9 +96,8 @@ print(f"lost filters: at most {100 * lost.max():.0f} %, at the end {100 * lost[-
 print(f"farther than 10 cm at the end: {100 * far:.1f} % of the flights")
 
 # %%
-# One recovery is not always enough. Where the new bias is still mostly unknown, the estimate drifts
-# off again, as the 95th percentile shows, until the filter inflates its covariance once more.
+# One recovery is not always enough. While the new bias is still uncertain, the estimate drifts off
+# again, as the 95th percentile shows, until the filter inflates its covariance once more.
 #
-# ``truncate_when_diverged=True`` truncates an episode when its filter is lost. See
-# :doc:`/sensors-and-filter` for the thresholds, and :doc:`/filter-equations` for what is
-# inflated.
+# ``truncate_when_diverged=True`` truncates an episode when its filter is flagged as diverged. See
+# :doc:`/filter-equations` for tests, thresholds and actions.

@@ -15,7 +15,7 @@ from baselines import PDPolicy
 
 # %%
 # The times at the points are chosen such that either the speed or the acceleration just reaches its
-# limit. ``check`` lists what the flight demands of the vehicle.
+# limit. ``check`` lists the demands on the vehicle.
 
 points = np.array([(0, 0, 1.5), (3, 1.5, 2), (3, -1.5, 1), (-3, 1.5, 2), (-3, -1.5, 1)])
 path = quad_gym.Trajectory.through(points, closed=True, max_speed=2.5, yaw="along")

@@ -2,7 +2,7 @@
 Evaluate a trained policy
 =========================
 
-Trained policies for most tasks come with the package. Here one of them is compared with tuned PD
+The package includes trained policies for most tasks. Here one of them is compared with tuned PD
 control, on the truth and on the estimate.
 """
 
@@ -17,8 +17,8 @@ EPISODES = 300
 
 # %%
 # ``load_policy`` checks that a policy fits the environment, and ``roll_out`` flies one episode in
-# each of its flights. Episode ``i`` has the seed ``seed + i``, so that all four cases meet the
-# same noise.
+# each environment. Episode ``i`` has the seed ``seed + i``, so that all four cases share the same
+# noise realization.
 
 results = {}
 for source in ("truth", "estimate"):
@@ -27,7 +27,7 @@ for source in ("truth", "estimate"):
         results[name, source] = roll_out(load_policy(name, envs), envs, seed=0)
 
 # %%
-# Every result has one number per episode; errors are those of the true position.
+# Every result has one number per episode; errors refer to the true position.
 
 print("policy     on        mean error  second half  estimation  crashed  return")
 for (name, source), episodes in results.items():
@@ -38,8 +38,8 @@ for (name, source), episodes in results.items():
     )
 
 # %%
-# The second half of each episode shows how well the figure of eight itself is flown; the first
-# half contains the way to it.
+# The second half of each episode measures the figure of eight itself; the first half contains the
+# approach.
 
 figure, axes = plt.subplots()
 labels = [f"{name}\non {source}" for name, source in results]

@@ -2,9 +2,9 @@
 Replay a log with irregular times
 =================================
 
-``replay`` takes a filter through the log of a flight: samples at irregular times, measurements that
-are late or missing. Here the log is that of a hobby vehicle with one GNSS antenna and no compass,
-so that nobody knows its heading until it moves.
+``replay`` runs a filter on the log of a flight: samples at irregular times, measurements that are
+late or missing. Here a hobby vehicle has one GNSS antenna and no magnetometer, so its heading is
+unknown until it moves.
 """
 
 import matplotlib.pyplot as plt
@@ -14,8 +14,8 @@ import quad_gym
 from quad_gym.estimation import replay
 
 # %%
-# A simulated flight takes the place of a real one. One row in a hundred gets lost, and fixes reach
-# the recorder 0.1 s to 0.15 s after their time stamps.
+# A simulated flight replaces a real one. One row in a hundred is dropped, and fixes reach the
+# recorder 0.1 s to 0.15 s after their time stamps.
 
 suite = quad_gym.sensor_suite("rtk").replace(camera=None)
 batch = quad_gym.FlightBatch(1, sensors=suite, gains="tuned")
@@ -44,8 +44,8 @@ result = replay(log, sensors=suite)
 print(f"heading known after {result.time[np.argmax(result.heading_known)]:.2f} s")
 
 # %%
-# The error of the position stays within three deviations, and the deviation of the heading, which
-# is that of a uniform one at first, falls as soon as the vehicle accelerates.
+# The position error stays within three standard deviations. The standard deviation of the heading,
+# uniform at first, falls as soon as the vehicle accelerates.
 
 position = np.array(truth)[np.rint(result.time / 0.005).astype(int)]
 figure, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5))

@@ -2,8 +2,8 @@
 Your own sensor suite
 =====================
 
-A sensor suite is a frozen dataclass. Take one that is near yours, replace what differs, and check
-that the filter still knows how good it is.
+A sensor suite is a frozen dataclass. Take the closest one, replace the fields that differ, and
+check that the filter is still consistent.
 """
 
 import gymnasium
@@ -21,7 +21,7 @@ from quad_gym.evaluation import roll_out
 # -----------------------------------
 #
 # We begin with ``"rtk"``: a receiver with half of its rate, a longer baseline, a camera that
-# looks at four markers only, and an IMU with three times the noise. The filter believes these
+# looks at four markers only, and an IMU with three times the noise. The filter assumes these
 # numbers, too.
 
 rtk = quad_gym.sensor_suite("rtk")
@@ -40,7 +40,7 @@ mine = rtk.replace(
 )
 
 # %%
-# Numbers that cannot be are refused by name:
+# Invalid values are refused by name:
 
 try:
     rtk.gnss.replace(rate=-5.0)
@@ -48,8 +48,8 @@ except ValueError as error:
     print(error)
 
 # %%
-# What it costs
-# -------------
+# Cost
+# ----
 
 for name, suite in (("rtk", "rtk"), ("mine", mine)):
     envs = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=200, sensors=suite)
@@ -60,12 +60,12 @@ for name, suite in (("rtk", "rtk"), ("mine", mine)):
     )
 
 # %%
-# Is its covariance right?
-# ------------------------
+# Consistency
+# -----------
 #
-# ``measure_consistency`` flies many vehicles that nothing stops, and compares errors with what
-# the filters claim. The normalized estimation error squared (NEES) of 15 states is 15 on average
-# in a consistent filter; the band holds the mean over all flights 95 times in 100.
+# ``measure_consistency`` flies many vehicles without early endings, and compares errors with the
+# covariances of the filters. The normalized estimation error squared (NEES) of 15 states is 15 on
+# average in a consistent filter; the band contains the mean over all flights 95 times in 100.
 
 batch = quad_gym.FlightBatch(
     200,
@@ -81,11 +81,10 @@ for sentence in findings.sentences().values():
     print(sentence)
 
 # %%
-# A band is missed now and then by chance. Biases hardly change in eight seconds, so that theirs
-# is missed at many instants at once when it is; fly more vehicles to be sure. The innovations of
-# the baseline are smaller than the filter claims, and not white: headings of ``"rtk"`` have a
-# constant error, which no average removes. The filter takes it for white noise that is as much
-# larger, so that the attitude's covariance is right.
+# Some values leave the band by chance. Biases hardly change in eight seconds, so their NEES then
+# stays outside for a long time; more vehicles give a better answer. The innovations of the baseline
+# are smaller than predicted, and not white: headings of ``"rtk"`` have a constant error, which no
+# average removes. The filter models it as larger white noise, so that the attitude is consistent.
 
 figure, axes = plt.subplots()
 draw_mean_square(axes, findings.nees["state"])

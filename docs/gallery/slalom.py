@@ -2,7 +2,7 @@
 A slalom between walls
 ======================
 
-Your own task among obstacles: three walls block the way, each with a gap whose place differs in
+Your own task among obstacles: three walls block the way, each with a gap at another place in
 each episode. PPO learns to fly through the gaps.
 """
 
@@ -53,7 +53,7 @@ class Slalom(quad_gym.Task):
 
 # %%
 # Actions are velocities. 1,200,000 steps take about a minute on two cores; the trained policy is
-# kept beside this file.
+# stored next to this file.
 
 KEYWORDS = {
     "task": Slalom(),

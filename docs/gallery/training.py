@@ -22,8 +22,7 @@ STEPS, FLIGHTS = 240_000, 128
 
 # %%
 # Flight ``i`` is seeded with ``seed + i``. Seeds from one billion on are for training; the
-# evaluation below uses others. The environment records episodes by itself; no ``Monitor`` is
-# needed.
+# evaluation below uses others. The environment records episodes without a ``Monitor``.
 
 env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=FLIGHTS, seed=10**9)
 model = PPO(
@@ -60,15 +59,15 @@ history = Errors()
 model.learn(STEPS, callback=history)
 
 # %%
-# The policy explores while it learns, so that it flies worse than it could.
+# The policy explores during training, so its returns are lower than without exploration.
 
 figure, axes = plt.subplots()
 axes.plot(history.steps, history.errors)
 axes.set(xlabel="steps", ylabel="mean position error while learning [m]", ylim=(0, None))
 
 # %%
-# Without exploration, on seeds that it has not seen, beside PD control and the policy that ships
-# with the package, which has learned for longer:
+# Without exploration, on new seeds, compared with PD control and with the included policy, which
+# was trained for longer:
 
 test = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=100)
 policies = {"this training": model, "tuned PD": load_policy("pd", test)}

@@ -19,9 +19,9 @@ from quad_gym.evaluation import roll_out
 FLIGHTS = 400
 
 # %%
-# ``world="breeze"`` has gusts, drag of the rotors, ground effect and a battery. ``randomization``
-# draws parameters anew for every episode, inside the kernels, from each flight's own random
-# stream. Controller and filter assume the nominal values.
+# ``world="breeze"`` has gusts, linear drag, ground effect and a battery. ``randomization`` draws
+# parameters for every episode from each flight's own random stream. Controller and filter assume
+# the nominal values.
 
 envs = gymnasium.make_vec(
     "QuadGym/Hover-v0",
@@ -40,7 +40,7 @@ for name, values in drawn.items():
     print(name, values[:3].round(2))
 
 # %%
-# PD control and the trained policy, neither of which knows the wind:
+# PD control and the trained policy; neither observes the wind:
 
 figure, (of_wind, of_mass) = plt.subplots(1, 2, figsize=(9, 4), sharey=True)
 for name in ("pd", "pretrained"):
@@ -61,8 +61,8 @@ of_wind.legend()
 # %%
 # Neither controller has an integral term, so a position error remains: it grows with the wind, and
 # with the difference of the mass from 0.78 kg. The error of the estimate hardly grows: the IMU
-# drives the filter, which uses no model of vehicle or air that could be wrong.
+# drives the filter, which uses no model of vehicle or air.
 #
 # With ``privileged=True``, observations include the wind and the drawn parameters for a critic.
-# With ``Randomization(..., known=True)``, filter and controller know the drawn parameters of
-# vehicle and sensors.
+# With ``Randomization(..., known=True)``, filter and controller use the drawn parameters of vehicle
+# and sensors.

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from docs.renewal.extracts import compile_seconds, interface_speeds, study_rows
 from docs.renewal.pages import console, table
 
 Texts = Callable[[Path, Sequence[str]], dict[str, str]]
@@ -64,10 +65,7 @@ def _policies(folder: Path, _: Sequence[str]) -> dict[str, str]:
             else:
                 row += [f"{1e3 * case['mean_error']:.1f} mm", f"{case['crash_rate']:.1%}"]
         rows.append(row)
-    heads = [
-        "id",
-        *(h for p in ("tuned PD", "the report's PD", "included") for h in (p, "crashed")),
-    ]
+    heads = ["id", "tuned PD", "crashed", "the report's PD", "crashed", "included", "crashed"]
     return {"policies": table(heads, rows)}
 
 
@@ -172,10 +170,16 @@ def _recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
 # ---- studies ------------------------------------------------------------------------------------
 
 
-def _study(name: str) -> Texts:
+def _study(name: str, *arms: str) -> Texts:
+    """The whole table, success and crashes of some arms, and single crash rates."""
+
     def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
-        found = {name: "\n" + (folder / "0/table.md").read_text(encoding="utf-8").strip() + "\n"}
-        for arm, row in _read(folder / "0/summary.json")["rows"].items():
+        summary = _read(folder / "0/summary.json")
+        found = {
+            name: "\n" + (folder / "0/table.md").read_text(encoding="utf-8").strip() + "\n",
+            f"{name}.short": study_rows(summary, "trained on", arms, ("success", "crashed")),
+        }
+        for arm, row in summary["rows"].items():
             percent = 100.0 * row["crashed"]["value"]
             found[f"{name}.{arm}.crashed"] = (
                 f"{percent:.1f} %" if percent < 10 else f"{percent:.0f} %"
@@ -185,12 +189,23 @@ def _study(name: str) -> Texts:
     return texts
 
 
+def _variants(name: str, head: str, *columns: str) -> Texts:
+    """Some columns of a study's table."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        return {f"{name}.short": study_rows(_read(folder / "0/summary.json"), head, (), columns)}
+
+    return texts
+
+
+def _compiling(folder: Path, printed: Sequence[str]) -> dict[str, str]:
+    seconds = compile_seconds(_read(folder / "0/benchmark.json"))
+    return {"speed.compile": seconds, **_console("speed_compile")(folder, printed)}
+
+
 def _film_and_figures(study: str, figure: str) -> dict[str, str]:
-    return {
-        "0/film.webp": f"docs/images/{study}_film.webp",
-        "0/learning.png": f"docs/images/{study}_learning.png",
-        f"0/{figure}.png": f"docs/images/{study}_{figure}.png",
-    }
+    names = ("film.webp", "learning.png", f"{figure}.png")
+    return {f"0/{name}": f"docs/images/{study}_{name}" for name in names}
 
 
 _EVALUATE = (
@@ -296,7 +311,10 @@ CATALOG = {
                 "std_certainty std_certainty_privileged"
             ],
             flights=("LookAround", "LookAround, truth"),
-            texts=_study("look_around"),
+            texts=_study(
+                "look_around",
+                *("pd_features_when_uncertain", "truth", "noisy", "std", "std_certainty"),
+            ),
             figures=_film_and_figures("look_around", "glance"),
         ),
         Result(
@@ -306,16 +324,17 @@ CATALOG = {
                 "--first-episode 100000 --episodes 1000"
             ],
             flights=("LookAround",),
-            texts=_study("miscalibrated"),
+            texts=_variants("miscalibrated", "condition", "success", "crashed", "error"),
         ),
         Result(
             name="stale_race",
             commands=[
                 "study stale_race --video webp --output OUT --first-episode 100000 --arms pd truth "
-                "residual std std_history truth_on_truth truth_stamped std_stamped"
+                "residual std std_history truth_on_truth truth_delay_compensated "
+                "std_delay_compensated"
             ],
             flights=("StaleRace", "StaleRace, truth"),
-            texts=_study("stale_race"),
+            texts=_study("stale_race", "pd", "truth", "residual", "std", "truth_delay_compensated"),
             figures=_film_and_figures("stale_race", "pace"),
         ),
         Result(
@@ -325,7 +344,7 @@ CATALOG = {
                 "--first-episode 100000"
             ],
             flights=("StaleRace",),
-            texts=_study("masked"),
+            texts=_variants("masked", "observed", "success", "crashed"),
         ),
         Result(
             name="outage_dash",
@@ -334,7 +353,7 @@ CATALOG = {
                 "pd_slow pd_waiting truth std std_privileged truth_on_truth"
             ],
             flights=("OutageDash", "OutageDash, truth"),
-            texts=_study("outage_dash"),
+            texts=_study("outage_dash", "pd", "pd_waiting", "truth", "std", "std_privileged"),
             figures=_film_and_figures("outage_dash", "pace"),
         ),
         Result(
@@ -364,9 +383,17 @@ CATALOG = {
                 name=f"speed_{section}",
                 commands=[f"benchmark --only {section} --output OUT"],
                 flights=(),
-                texts=_console(f"speed_{section}"),
+                texts=texts,
             )
-            for section in ("filter", "tick", "interfaces", "options", "compile")
+            for section, texts in {
+                "filter": _console("speed_filter"),
+                "tick": _console("speed_tick"),
+                "interfaces": lambda folder, _: interface_speeds(
+                    _read(folder / "0/benchmark.json")
+                ),
+                "options": _console("speed_options"),
+                "compile": _compiling,
+            }.items()
         ),
     )
 }

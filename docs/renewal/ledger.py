@@ -51,4 +51,7 @@ def stale(result: Result, entries: dict[str, Any]) -> bool:
 
 def texts(entries: dict[str, Any]) -> dict[str, str]:
     """All texts of all results, by the names of their marks."""
-    return {name: text for entry in entries.values() for name, text in entry["texts"].items()}
+    minutes = [entry["minutes"] for entry in entries.values()]
+    hours = "several" if None in minutes else f"{sum(minutes) / 60.0:.0f}"
+    found = {name: text for entry in entries.values() for name, text in entry["texts"].items()}
+    return found | {"total.hours": hours}

@@ -2,7 +2,7 @@
 
     quad-gym study                                   # LookAround, 5 seeds
     quad-gym study stale_race
-    quad-gym study outage_dash --arms truth estimate sigma --seeds 10
+    quad-gym study outage_dash --arms truth estimate std --seeds 10
     quad-gym study --video webp                      # with a film of two policies side by side
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from quad_gym.tasks import Task
 
 IDS = {f"QuadGym/{task.title().replace('_', '')}-v0": task for task in (*TASKS, *BENCHMARKS)}
-"""The registered environments and their tasks."""
+"""The registered environments: ids, and the tasks to which they belong."""
 
 _ENTRY_POINTS = {
     "entry_point": "quad_gym.envs.single:QuadEnv",
@@ -22,7 +22,7 @@ _ENTRY_POINTS = {
 
 
 def register_all() -> None:
-    """Make the ids known to Gymnasium, once."""
+    """Register all ids with Gymnasium, once."""
     for env_id, task in IDS.items():
         if env_id not in registry:
             register(env_id, **_ENTRY_POINTS, kwargs={"base": task})  # type: ignore[arg-type]
@@ -39,11 +39,11 @@ def register_task(
     Args:
         env_id: A new id, such as "Mine/Chase-v0".
         task: The task, see `quad_gym.Task`.
-        base: The id of the environment that it changes.
-        keywords: Those of `QuadEnv`, as defaults.
+        base: The id of the environment that the task changes.
+        keywords: Keywords of `QuadEnv`, as defaults.
 
     Raises:
-        ValueError: If the id is one of `IDS`, or `base` is none of them.
+        ValueError: If the id is one of `IDS`, or `base` is not one of them.
     """
     check.choice("base", base, tuple(IDS))
     if env_id in IDS:
@@ -53,7 +53,7 @@ def register_task(
 
 
 def keywords_of(env_id: str) -> dict[str, Any]:
-    """The keywords of an id, "base" among them: of one of `IDS`, or of `register_task`.
+    """Return the keywords of an id, "base" among them: of one of `IDS`, or of `register_task`.
 
     Raises:
         ValueError: If there is no such id.
@@ -69,7 +69,7 @@ def keywords_of(env_id: str) -> dict[str, Any]:
 
 
 def _meant(env_id: Any) -> str:
-    """The end of a message that refuses an id: the one that may be meant."""
+    """Return the end of a message that refuses an id, with the one that may be meant."""
     ours = _ENTRY_POINTS["entry_point"]
     registered = [name for name, spec in registry.items() if spec.entry_point == ours]
     id_of_task = {task: name for name, task in IDS.items()}
@@ -80,13 +80,13 @@ def _meant(env_id: Any) -> str:
 def make_sb3_vec_env(
     env_id: str, n_envs: int = 1, seed: int | None = None, **keywords: Any
 ) -> "QuadSB3VecEnv":
-    """N flights of an id as a Stable-Baselines3 vector environment.
+    """Make a Stable-Baselines3 vector environment of N flights.
 
     Args:
-        env_id: One of `IDS`, with or without the prefix "quad_gym:", or of `register_task`.
+        env_id: One of `IDS`, with or without the prefix "quad_gym:", or an id of `register_task`.
         n_envs: Number of flights.
-        seed: Seeds flight i with seed + i at the first reset.
-        keywords: Those of `QuadEnv`, and `threads`.
+        seed: Seed of the first reset: flight i has seed + i.
+        keywords: Keywords of `QuadEnv`, and `threads`.
 
     Returns:
         The environment, ready for any Stable-Baselines3 algorithm.

@@ -1,4 +1,4 @@
-"""Benchmark tasks: each is a built-in reference with sensors and a `Task` of its own."""
+"""Benchmark tasks: each is a built-in reference with its own sensors and `Task`."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -8,12 +8,12 @@ from quad_gym.params.task import TaskParams
 
 
 class Benchmark(NamedTuple):
-    """What a task is unless keywords say otherwise."""
+    """Definition of a benchmark task; keywords override it."""
 
     task: TaskParams
-    """its reference and its bounds"""
+    """reference and bounds of the task"""
     keywords: Mapping[str, Any]
-    """of the environment"""
+    """keywords of the environment"""
 
 
 BENCHMARKS = {
@@ -25,8 +25,8 @@ BENCHMARKS = {
             height=2.0,
             period=12.0,
             randomize_reference=True,
-            duration=15.0,  # a vehicle that never looks is lost by then
-            out_of_bounds=8.0,  # room to be mistaken, and to find oneself again
+            duration=15.0,  # the estimate of a vehicle that never looks has diverged by then
+            out_of_bounds=8.0,  # room for errors of the estimate, and for recovery
             min_height=-5.0,
         ),
         {"sensors": "one_wall", "task": "quad_gym.tasks.look_around:LookAround"},
@@ -40,7 +40,7 @@ BENCHMARKS = {
             duration=20.0,
             out_of_bounds=12.0,
             gate_count=8,
-            gate_radius=0.6,  # some times what the measurements are off by at racing speed
+            gate_radius=0.6,  # several times the delay error of the measurements at racing speed
         ),
         {"sensors": "stale", "task": "quad_gym.tasks.stale_race:StaleRace"},
     ),
@@ -50,13 +50,13 @@ BENCHMARKS = {
             start="hover",
             radius=60.0,  # the start of the course, which leads through the origin
             height=4.0,
-            duration=45.0,  # 27 s at the speed that is paid for, and 15 s for the longest outage
+            duration=45.0,  # 27 s at the rewarded speed, and 15 s for the longest outage
             out_of_bounds=300.0,
             min_height=0.0,
         ),
         {
             "sensors": "consumer",
-            "action": "velocity",  # what to decide is how far to go on, not how to stay upright
+            "action": "velocity",  # the decision is how far to go on, not how to stay upright
             "control_rate": 10.0,
             "world": "slalom",
             "faults": (GnssOutage(start=(2.0, 8.0), duration=(5.0, 15.0)),),
@@ -64,4 +64,4 @@ BENCHMARKS = {
         },
     ),
 }
-"""By name."""
+"""Benchmark tasks by name."""

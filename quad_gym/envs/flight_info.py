@@ -1,4 +1,4 @@
-"""What `info` says of a flight besides errors and endings: faults, and innovations."""
+"""Faults and innovations in `info`."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ Parts = dict[str, dict[str, NDArray[Any]]]
 
 
 def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
-    """What `info` holds as "faults" and "innovations" of all flights, each if there are any.
+    """Return the entries "faults" and "innovations" of `info` for all flights, if they have any.
 
     Args:
         batch: The flights.
-        bits: (n,) active faults, as of a flight's field "faults".
+        bits: (n,) active faults, as in a flight's field "faults".
     """
     found: Parts = {}
     if batch.faults:
@@ -28,7 +28,7 @@ def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
 
 
 def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
-    """The same of one flight, with truth values in place of arrays of one."""
+    """Return the entries of one flight, with booleans in place of arrays of one."""
     return {
         name: {
             key: values[flight] if values.ndim > 1 else bool(values[flight])
@@ -39,7 +39,7 @@ def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
 
 
 def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[np.intp]) -> None:
-    """Describe the present instant of some flights instead, where `info` has faults."""
+    """Describe the present instant of some flights instead, if `info` has faults."""
     if batch.faults:
         now = named_faults(batch.faults, batch.record("faults", flights))
         for name, values in now.items():
@@ -47,7 +47,7 @@ def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[n
 
 
 def final_parts(infos: dict[str, Any], batch: FlightBatch, over: NDArray[np.bool_]) -> Parts:
-    """Faults and innovations at the end of the episodes that are over, as `final_info` holds them.
+    """Return faults and innovations at the end of the episodes that are over, for `final_info`.
 
     Args:
         infos: Of the step, with the faults at its end.

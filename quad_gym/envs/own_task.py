@@ -1,4 +1,4 @@
-"""From the keyword `task` to flights with a user's task."""
+"""From the keyword `task` to flights with a user-defined task."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,19 +18,20 @@ Table = tuple[ObservationField, ...]
 def with_task(
     given: Any, make: "partial[FlightBatch]", table: Table
 ) -> "tuple[partial[FlightBatch], Table]":
-    """What makes the flights, and the table of their observation, with a user's task.
+    """Return the maker of flights with a user-defined task, and the table of their observation.
 
-    What `observe` returns is found by asking it once, of a flight of its own.
+    The parts that `observe` returns are found by calling it once, with a flight made for the
+    purpose.
 
     Args:
         given: See `resolve_task`.
-        make: Makes the flights without it.
-        table: Of their observation.
+        make: Makes the flights without the task.
+        table: Table of their observation.
 
     Raises:
-        ValueError: If it is no task, it cannot be flown with these sensors or in this world, or a
-            part of its observation has a shipped name.
-        TaskError: If its `reset` or `observe` fail.
+        ValueError: If `given` is not a task, does not fit these sensors or this world, or a part of
+            its observation has a built-in name.
+        TaskError: If its `reset` or `observe` fails.
     """
     task = resolve_task(given)
     task._require(make.keywords["sensors"], make.keywords["world"])
@@ -54,7 +55,7 @@ def with_task(
     rest = tuple(f for f in table if f.slice.start >= split)
     taken = ({field.name for field in (*kept, *rest)} | PRIVILEGED_NAMES) & set(sizes)
     if taken:
-        raise ValueError(f"observe must not return {min(taken)!r}, which is the shipped one's")
+        raise ValueError(f"observe must not return {min(taken)!r}, a name of a built-in part")
     described = {name: task.observes.get(name, ObservationSpec()) for name in sizes}
     own = [ObservationField(name, slice(0, sizes[name]), *described[name]) for name in sizes]
     parts = {n: Part(sizes[n], described[n].low, described[n].high) for n in sizes}

@@ -21,7 +21,7 @@ _OPTIONS = ("render_view", "render_size", "render_flights")
 
 
 def rendering_options(keywords: dict[str, Any]) -> dict[str, Any]:
-    """Take the keywords that say how to render out of those of an environment."""
+    """Remove the rendering keywords from the keywords of an environment, and return them."""
     return {name: keywords.pop(name) for name in _OPTIONS if name in keywords}
 
 
@@ -33,7 +33,7 @@ def rendering_of(
     render_size: tuple[int, int] | None = None,
     render_flights: Sequence[int] | None = None,
 ) -> "Rendering | None":
-    """What an environment renders with; None where it does not render.
+    """Return the renderer of an environment; None if it does not render.
 
     Raises:
         ValueError: If an argument is invalid.

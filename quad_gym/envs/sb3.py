@@ -28,25 +28,25 @@ if TYPE_CHECKING:
 
 
 class QuadSB3VecEnv(VecEnv):
-    """N flights for Stable-Baselines3, with the `Monitor`'s episode records built in.
+    """N flights for Stable-Baselines3, with the episode records of `Monitor` built in.
 
-    An episode's last `info` holds `terminal_observation`, `TimeLimit.truncated` and `episode` with
-    the return "r", the length "l", the time "t" since construction [s] and the mean true position
-    error "e" [m]. With `randomization` it also holds `drawn`, the parameters of that episode; so
-    do `reset_infos`. With `faults` and `innovations` every `info` and `reset_infos` hold these, as
-    in `QuadEnv`.
+    The last `info` of an episode holds `terminal_observation`, `TimeLimit.truncated` and `episode`
+    with the return "r", the length "l", the time "t" since construction [s] and the mean true
+    position error "e" [m]. With `randomization`, it also holds `drawn`, the parameters of that
+    episode, and so do `reset_infos`. With `faults` and `innovations`, every `info` and
+    `reset_infos` hold these, as in `QuadEnv`.
 
     Args:
         num_envs: Number of flights.
-        task: As of `QuadEnv`.
-        base: As of `QuadEnv`.
-        threads: Threads to use; None: as many as there are cores.
-        render_flights: Numbers of the flights that are rendered; None: all of them.
-        keywords: Those of `QuadEnv`; `render_mode` may be "human" or "rgb_array".
+        task: As in `QuadEnv`.
+        base: As in `QuadEnv`.
+        threads: Number of threads; None: one per core.
+        render_flights: Indices of the flights that are rendered; None: all flights.
+        keywords: Keywords of `QuadEnv`; `render_mode` may be "human" or "rgb_array".
 
     Raises:
-        TypeError: If a keyword is unknown; it is a ValueError, too.
-        ValueError: If a keyword is another task's, or its value is invalid.
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If a keyword belongs to another task, or its value is invalid.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class QuadSB3VecEnv(VecEnv):
         }
 
     def reset(self) -> Any:
-        """Begin an episode in every flight, with the seeds and options set before."""
+        """Begin an episode in every flight, with the seeds and options that have been set."""
         seeds = list(self._seeds)
         batch = self.flights.batch
         start = self._start_values()
@@ -98,7 +98,7 @@ class QuadSB3VecEnv(VecEnv):
         return self.flights.split(observations)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the coming step, (n, 4) in [-1, 1]; beyond is clipped."""
+        """Store the actions of the coming step, (n, 4) in [-1, 1]; larger values are clipped."""
         if not self._seeded:
             raise RuntimeError("call reset() before step()")
         self._pending = checked_actions(actions, (self.num_envs, 4))
@@ -140,7 +140,7 @@ class QuadSB3VecEnv(VecEnv):
         return self.flights.split(observations), rewards, done, infos
 
     def _episode_end(self, i: int, row: np.ndarray) -> dict[str, Any]:
-        """What the last `info` of an episode adds."""
+        """Return the entries that only the last `info` of an episode has."""
         final = self.flights.batch.final_observations[i].copy()
         steps = int(row[COLUMN["episode_steps"]])
         return {
@@ -159,10 +159,10 @@ class QuadSB3VecEnv(VecEnv):
         }
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed flight i with seed + i at the next reset; None takes fresh entropy.
+        """Seed flight i with seed + i at the next reset; None uses fresh entropy.
 
         Raises:
-            ValueError: If the seed is no whole number of at least 0.
+            ValueError: If the seed is not an integer of at least 0.
         """
         seed = check.seed("seed", seed)
         if seed is None:  # the base class would draw from NumPy's global generator
@@ -175,20 +175,20 @@ class QuadSB3VecEnv(VecEnv):
             self.rendering.close()
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
-        """With "rgb_array" a picture of all tiles; with "human" a window shows them by itself."""
+        """Return a picture of all tiles with "rgb_array"; with "human", a window shows them."""
         return None if self.render_mode == "human" else super().render(mode)
 
     # ---- the rest of the interface ------------------------------------------------------------
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of this environment, once per index: the flights share it."""
+        """Return an attribute of this environment once per index: all flights share it."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute; as the flights share it, only for all of them.
 
         Raises:
-            ValueError: If `indices` leaves flights out, or there is no such attribute.
+            ValueError: If `indices` leaves out flights, or there is no such attribute.
         """
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("indices must be None: the flights share their attributes")
@@ -214,19 +214,19 @@ class QuadSB3VecEnv(VecEnv):
         wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]],
         indices: VecEnvIndices = None,
     ) -> list[bool]:
-        """No flight is wrapped; but the records of a `Monitor` are there."""
+        """Return True for `Monitor`, whose records are built in; no flight has a wrapper."""
         from stable_baselines3.common.monitor import Monitor
 
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A frame of each flight that is rendered."""
+        """Return a frame of each flight that is rendered."""
         if self.rendering is None:
             return [None for _ in range(self.num_envs)]
         return list(self.rendering.frames())
 
     def _start_values(self) -> dict[str, Any]:
-        """The options of all flights as start values."""
+        """Return the options of all flights as start values."""
         chosen = [start_options(options) for options in self._options]
         names = {name for options in chosen for name in options}
         if not names:

@@ -38,24 +38,24 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     """A quadrotor that is controlled on estimated state.
 
     ## Description
-    A quadrotor (0.78 kg, four rotors with a lag of 0.05 s) flies a reference. GNSS, camera and IMU
-    measure it 200 times a second, an unscented Kalman filter fuses them, and the controller sees
-    what `observation` says: by default the filter's estimate. The reward, the endings and `info`
-    use the true state.
+    A quadrotor (0.78 kg, four rotors with a time constant of 0.05 s) flies a reference. By default,
+    GNSS, camera and IMU measure at 200 Hz, an unscented Kalman filter fuses the measurements, and
+    the controller observes the filter's estimate; `observation` selects other sources. Reward,
+    endings and `info` use the true state.
 
     | id | reference | start | time limit |
     |---|---|---|---|
     | `QuadGym/Hover-v0` | a point 4 m from the origin, 1 m high, looking at the origin | hovering near it | 10 s |
-    | `QuadGym/Circle-v0` | the report's: radius 4 m, period 10 s, height 1 m, looking at the center | on a launch pad below it, rotors stopped, or hovering (`start="mixed"`) | 10 s |
+    | `QuadGym/Circle-v0` | the circle of the laboratory report: radius 4 m, period 10 s, height 1 m, looking at the center | on a launch pad below it, rotors stopped, or hovering (`start="mixed"`) | 10 s |
     | `QuadGym/Lemniscate-v0` | a figure of eight, 6 m by 3 m, period 10 s, looking ahead | hovering near it | 10 s |
-    | `QuadGym/RandomTrajectory-v0` | smooth, new each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
-    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize_reference=True`: anywhere) | hovering near the origin | 20 s |
-    | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; unless given, a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; unless given, 10 s |
-    | `QuadGym/LookAround-v0` | that of `RandomTrajectory`; no GNSS, markers on one wall, a cost of looking at them | hovering near it | 15 s |
-    | `QuadGym/StaleRace-v0` | eight gates of 0.6 m; measurements come late to a filter that takes them for fresh | hovering near the origin | 20 s |
-    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west, on velocity commands; GNSS fails for 5 to 15 s | hovering before the first wall | 45 s |
+    | `QuadGym/RandomTrajectory-v0` | smooth, new in each episode; speed <= 2.5 m/s, acceleration <= 3 m/s^2 | hovering near it | 10 s |
+    | `QuadGym/Waypoints-v0` | five gates in order, at random within 3.5 m of the origin, looking east (`randomize_reference=True`: in any direction) | hovering near the origin | 20 s |
+    | `QuadGym/Trajectory-v0` | your own, `trajectory=`: a `quad_gym.Trajectory` or several, of which each episode draws one; by default a closed figure of eight through five points, looking ahead | hovering near its start | its duration, or one round; by default 10 s |
+    | `QuadGym/LookAround-v0` | as in `RandomTrajectory`; no GNSS, markers on one wall, looking at them costs reward | hovering near it | 15 s |
+    | `QuadGym/StaleRace-v0` | eight gates with a radius of 0.6 m; measurements arrive late, and the filter ignores their time stamps | hovering near the origin | 20 s |
+    | `QuadGym/OutageDash-v0` | a course of ten gaps between walls, from east to west, with velocity commands; GNSS fails for 5 to 15 s | hovering before the first wall | 45 s |
 
-    Reward and observation of the last three are specified in classes of their own:
+    The classes of the last three specify their observation and reward:
     `quad_gym.tasks.look_around.LookAround`, `stale_race.StaleRace` and `outage_dash.OutageDash`.
 
     ## Observation space
@@ -66,25 +66,24 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     |---|---|---|---|---|
     | 0:3 | position_error | reference minus position | m | B |
     | 3:6 | velocity_error | reference minus velocity | m/s | B |
-    | 6:9 | up | the vertical, upward | - | B |
-    | 9:12 | heading | the horizontal direction that body x is to point in | - | B |
+    | 6:9 | up | vertical direction, upward | - | B |
+    | 9:12 | heading | desired horizontal direction of body x | - | B |
     | 12:15 | body_rates | angular rate | rad/s | B |
     | 15:18 | reference_acceleration | acceleration of the reference | m/s^2 | B |
     | 18:21 | preview_1 | reference in 0.2 s (on a course: the gate after the next) minus the present one | m | B |
     | 21:24 | preview_2 | reference in 0.4 s (on a course: the gate after that) minus the present one | m | B |
-    | 24:28 | last_action | the action before, as commanded | - | - |
+    | 24:28 | last_action | previous action, as commanded | - | - |
 
-    The body frame is that of the attitude that the controller sees. `layout="absolute"` gives
-    position, velocity, rotation matrix, biases and reference in the inertial frame;
-    `observation="measurements"` gives the raw measurements of the step with flags (a measurement that
-    was not taken is zero, its flag too), of the IMU the last sample and the mean over the step, and
-    has that layout only.
-    `quad_gym.observation_layout(...)` returns any of these tables, with bounds; observations are
-    clipped to them.
+    The body frame is the one with the observed attitude. `layout="absolute"` gives position,
+    velocity, rotation matrix, biases and reference in the inertial frame.
+    `observation="measurements"` has its own layout: the raw measurements of the step with flags (a
+    measurement that was not taken is zero, and so is its flag), and from the IMU the last sample
+    and the mean over the step. `quad_gym.observation_layout(...)` returns each of these tables, and
+    the bounds to which observations are clipped.
 
     ## Action space
-    `Box(-1, 1, (4,))`; numbers beyond are clipped. The scales belong to the nominal vehicle. The
-    inner loops run at every tick (200 Hz) on what the controller sees, its gyro included.
+    `Box(-1, 1, (4,))`; larger values are clipped. The scales refer to the nominal vehicle. The
+    inner loops run at every tick (200 Hz) on the observed state and the gyro.
 
     | `action` | a[0] | a[1], a[2], a[3] |
     |---|---|---|
@@ -95,116 +94,115 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     | `"velocity"` | velocity ahead 5 m/s | to the left, up 5 m/s; yaw rate 3 rad/s |
 
     ## Reward
-    In each step, with the position error e [m], the alignment h of body x with the wanted heading
+    In each step, with the position error e [m], the alignment h of body x with the desired heading
     (1: aligned), the change of the action da and the body rates w:
 
         exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
 
-    At most 1.6, so a circle flown perfectly for 500 steps returns 800; an action that jumps from
-    corner to corner costs 0.32. `Waypoints` has progress instead of the two exponentials: the speed
-    toward the next gate [m/s], and 1 s^-1 times the control rate (50) for a gate passed.
-    `reward_per="second"` multiplies all of this by the control period, so that returns do not
+    The maximum is 1.6, so 500 steps of a perfect circle return 800; an action that jumps from
+    corner to corner costs 0.32. In `Waypoints`, progress replaces the two exponentials: the speed
+    toward the next gate [m/s], and 1 s^-1 times the control rate (50) for each gate passed.
+    `reward_per="second"` multiplies all rewards by the control period, so that returns do not
     depend on the control rate: 16 for a perfect circle.
 
     ## Episode end
     Terminated: farther than 3 m from the reference (`Hover`: 1.6 m, `LookAround`: 8 m, `Waypoints`
-    and `StaleRace`: 12 m, `OutageDash`: 300 m), tipped by more than 100 degrees, below -0.5 m
-    (`LookAround`: -5 m), through the last gate, or, in a world that has any, where the vehicle
-    touches an obstacle or leaves the geofence. Truncated: at the time limit, when the filter has
-    failed (`info["filter_status"]`), or with `truncate_when_diverged=True` when it finds that it is lost.
-    Where a step does both, both are true, as with Gymnasium's `TimeLimit`. `info["ending"]`, a
-    `quad_gym.Ending` that equals its name as text, says which, and names the termination where there
-    are both.
+    and `StaleRace`: 12 m, `OutageDash`: 300 m), tilted by more than 100 degrees, below -0.5 m
+    (`LookAround`: -5 m, `OutageDash`: 0 m), when the last gate is passed, or, in worlds that have
+    them, when the vehicle touches an obstacle or leaves the geofence. Truncated: at the time limit,
+    when the filter has failed numerically (`info["filter_status"]`), or, with
+    `truncate_when_diverged=True`, when its consistency monitor flags divergence. A step
+    can do both, as with Gymnasium's `TimeLimit`. `info["ending"]`, a `quad_gym.Ending` that equals
+    its name as text, is the reason, and the termination where there are both.
 
     ## Start
-    "ground": at rest at height 0 below the start of the reference, rotors stopped, level, looking
-    as wanted. A launch pad carries the vehicle until its thrust lifts it; with `pad=False`, as in
-    the report, it sinks while its rotors spin up. "hover": hovering, with standard deviations of
-    0.3 m, 0.03 m/s, 0.2 rad in yaw and 0.03 rad in tilt. "mixed": either, with probability 0.5: a
-    policy that has learned to hover learns to take off. "moving": as "hover", with a velocity of up
-    to 1.5 m/s and body rates of up to 2 rad/s on each axis, uniform. The filter starts from its
-    first fix in each, or with `filter_start="warm"` as if it had been running for 10 s, as before
-    any real take-off. `reset(options={"position": (3,), "velocity": (3,), "yaw": rad})` sets any of
-    these for one episode.
+    "ground": at rest at height 0 below the start of the reference, rotors stopped, level, with the
+    desired heading. A launch pad supports the vehicle until its thrust lifts it; with `pad=False`,
+    as in the report, it sinks while its rotors spin up. "hover": hovering, with standard deviations
+    of 0.3 m, 0.03 m/s, 0.2 rad in yaw and 0.03 rad in tilt. "mixed": one of these two, each with
+    probability 0.5; the hovering starts make take-off easier to learn. "moving": as "hover", with
+    uniformly drawn velocities of up to 1.5 m/s and body rates of up to 2 rad/s on each axis. The
+    filter always starts from its first fix, or, with `filter_start="warm"`, as if it had been
+    running for 10 s, as before any real take-off. `reset(options=...)` sets the "position" (3,),
+    the "velocity" (3,) or the "yaw" [rad] for one episode.
 
     ## Info
-    `position_error` and `estimation_error` [m], both against the true position; `ending`;
-    `filter_status`, 0 while all is well; `filter_diverged`, whether a filter that gates (any,
-    with `faults`, `truncate_when_diverged` or `innovations`) finds that its covariance does not explain what
-    it measures; `gates_passed`.
-    With `randomization` also `drawn`, the parameters of the episode by name. With `faults` also
-    `faults`: whether each is active now, by name. With `innovations=True` also `innovations`: the last innovations of the filter, their
-    squares (NIS) and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
+    `position_error` and `estimation_error` [m], the distances of the true position from the
+    reference and from the observed position; `ending`; `filter_status`, 0 without numerical
+    failures; `filter_diverged`, True if the filter's covariance does not explain its innovations,
+    which is monitored in filters with an innovation gate, and in any filter with `faults`,
+    `truncate_when_diverged` or `innovations`; `gates_passed`. With `randomization` also `drawn`,
+    the parameters of the episode by name. With `faults` also `faults`, True for each that is active
+    at present, by name. With `innovations=True` also `innovations`: the filter's last innovations,
+    their NIS and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
 
     ## World
-    By default the air is still and every episode flies the same vehicle with the same sensors.
+    By default the air is still, and vehicle and sensors are the same in all episodes.
     `world="breeze"` or a `quad_gym.WorldParams` adds steady wind, Dryden gusts (MIL-F-8785C),
     linear rotor drag, ground effect and a battery, walls, cylinders and a geofence;
     `randomization={"mass": Uniform(0.8, 1.2, relative=True), "wind_speed": Uniform(0.0, 5.0)}`
-    draws parameters anew for every episode. What can be drawn is listed in
-    `quad_gym.params.randomization.DRAWABLES`. The filter and the controller know of neither: they believe `vehicle` and `sensors` (with `Randomization(..., known=True)` they
-    know all but the wind and the ground). With `privileged=True` the truth ends with the wind in
-    the body frame and the draws, each less the middle of its distribution over its spread.
+    draws parameters in every episode (`quad_gym.params.randomization.DRAWABLES` lists them). Filter
+    and controller model neither: they assume `vehicle` and `sensors` (with
+    `Randomization(..., known=True)`, the true parameters, except for wind and ground). With
+    `privileged=True`, the truth ends with the wind in the body frame and the draws, each minus the
+    center of its distribution and divided by half of its range (normal: by its standard deviation).
 
     Args:
-        task: A task of your own, laid over that of the id (in place of the class of `LookAround`,
+        task: Your own task, laid over the task of the id (in place of the class of `LookAround`,
             `StaleRace` or `OutageDash`): a `quad_gym.Task`, its class, or "module:name" of either.
             Without an id, also the name of a kind of task, such as "hover".
-        base: The kind of task that yours is laid over; `gymnasium.make` fills it in from the id.
-            None: the circle.
-        observation: "estimate", "truth", "noisy" (truth plus independent noise of the size of the
-            converged filter's errors), or "measurements".
+        base: Kind of task under your own; `gymnasium.make` sets it from the id. None: the circle.
+        observation: "estimate", "truth", "noisy" (truth plus independent noise, as large as the
+            errors of the converged filter), or "measurements".
         action: "ctbr", "motor", "wrench", "attitude" or "velocity"; by default "velocity" on
             `OutageDash`, "ctbr" elsewhere.
         layout: "relative" or "absolute".
-        include_std: Append the square roots of the diagonal of the filter's covariance.
+        include_std: Append the standard deviations of the filter's covariance.
         privileged: Return a Dict of "policy" and "privileged" (the truth), for asymmetric critics.
-        sensors: "standard", "lab", "rtk", "consumer", "indoor", or a suite that belongs to one task
-            (see `quad_gym.params.suites`), or a `SensorSuite`; the default of `LookAround` is
-            "one_wall", that of `StaleRace` "stale", and that of `OutageDash` "consumer".
-            "standard" has the laboratory's sensors and a consistent filter; "lab" is the report's
-            form to the letter, whose filter is overconfident.
-        innovations: Whether `info` and `flights.batch.read` have the innovations of the filter
-            block by block; a filter that gates, or any with `faults` or `truncate_when_diverged`, keeps them
-            for the latter anyway.
-        vehicle: A preset by name, or `VehicleParams`.
-        action_params: Scales of the actions and bandwidths of the inner loops.
-        camera: Whether there is a camera.
-        estimator: "ukf" or "ekf", in place of the suite's.
-        filter_start: "cold": the filter starts from its first fix, or from the mark where there is
-            no GNSS; "warm": it has been running for 10 s before the episode and has converged.
-        control_rate: Actions per second, by default 10 on `OutageDash`, 50 elsewhere; divides the IMU
-            rate [Hz].
-        action_delay: How much later than commanded the vehicle carries out an action, in control
-            steps (whole ticks), at most 10; 0 by default. Until the first action arrives it carries
-            out zeros, which hover. `last_action` in the observation is the commanded one.
-        substeps: Runge-Kutta steps in a tick.
-        max_episode_steps: Time limit in steps, in place of the task's own, be it longer or shorter;
-            with a `duration` given, too, the earlier of both holds.
-        true_vehicle: What really flies, where the controller believes in `vehicle`.
-        true_sensors: What really measures, where the filter believes in `sensors`.
+        sensors: "standard" (the laboratory's sensors, a consistent filter), "lab" (exactly the
+            report's form, with an overconfident filter), "rtk", "consumer", "indoor", a suite for
+            one task (`quad_gym.params.suites`), a ".toml" file, or a `SensorSuite`; by default
+            "one_wall" on `LookAround`, "stale" on `StaleRace`, "consumer" on `OutageDash`.
+        innovations: Add the filter's innovations to `info` and `flights.batch.record`, block by
+            block; the latter always has them with a gate, `faults` or `truncate_when_diverged`.
+        vehicle: Name of a preset, or `VehicleParams`.
+        action_params: Scales of the actions, and bandwidths of the inner loops.
+        camera: False: leave out the camera of the sensors.
+        estimator: "ukf" or "ekf", in place of the estimator of the sensors.
+        filter_start: "cold": the filter starts from its first fix, or without GNSS from the marked
+            spot of `quad_gym.InitialPoseParams`; "warm": it has been running for 10 s before the
+            episode, and has converged.
+        control_rate: Actions per second, by default 10 on `OutageDash`, 50 elsewhere; must divide
+            the IMU rate [Hz].
+        action_delay: Delay from the command of an action to its execution, in control steps
+            (rounded to ticks), at most 10; 0 by default. Until the first action arrives, the vehicle executes
+            zeros, which hover. `last_action` in the observation is the commanded action.
+        substeps: Runge-Kutta steps per tick.
+        max_episode_steps: Time limit in steps, in place of the task's own, whether longer or
+            shorter; with a `duration` as well, the earlier of the two holds.
+        true_vehicle: True parameters of the vehicle; the controller assumes `vehicle`.
+        true_sensors: True parameters of the sensors; the filter assumes `sensors`.
         world: "calm", "breeze", "fresh_breeze", "slalom" (of `OutageDash`), or `WorldParams`.
-        randomization: What is drawn for every episode: distributions by name, or `Randomization`.
-        faults: What goes wrong with sensors (where any run) and rotors: names of presets, such as
-            "gnss_outage" or "gnss_outliers+rotor_loss", or faults; see `quad_gym.faults`.
-        keywords: Those of the task: radius, period, height, start, pad, reward_per, randomize_reference,
-            duration, out_of_bounds, min_height, truncate_when_diverged, max_tilt, max_speed, max_acceleration,
-            gate_count, gate_radius, preview, trajectory; see `quad_gym.TaskParams`.
+        randomization: Parameters drawn in every episode: distributions by name, or `Randomization`.
+        faults: Faults of sensors and rotors, see `quad_gym.faults`: names of presets, such as
+            "gnss_outage" or "gnss_outliers+rotor_loss", or instances.
+        keywords: Keywords of the task: radius, period, height, start, pad, reward_per,
+            randomize_reference, duration, out_of_bounds, min_height, truncate_when_diverged,
+            max_tilt, max_speed, max_acceleration, gate_count, gate_radius, preview, trajectory; see
+            `quad_gym.TaskParams`.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
         render_view: "fixed" shows the whole reference from outside, "chase" follows the vehicle.
         render_size: Width and height of a frame [pixels].
 
     Raises:
-        TypeError: If a keyword is unknown; it is a ValueError, too.
-        ValueError: If a keyword is another task's, or its value is invalid.
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If a keyword belongs to another task, or its value is invalid.
 
     ## Version history
-    - v0: before the first release, rewards became sums over steps of the order of one each (they
-      were times the control period: `reward_per="second"`), vehicles that start on the ground stand
-      on a launch pad (they fell while their rotors spun up: `pad=False`), half of the episodes of
-      the circle start hovering (all did on the ground: `start="ground"`), and those of `Hover` end
-      1.6 m from the point (they ended at 3 m: `out_of_bounds=3.0`). Stable-Baselines3's default
-      settings did not learn the circle before, and its SAC was not stable on `Hover`.
+    - v0: changes before the first release, with which Stable-Baselines3's default settings learn
+      `Circle`, and its SAC `Hover`: rewards of order one per step (before: `reward_per="second"`),
+      a launch pad (`pad=False`), hovering starts in half of the episodes of `Circle`
+      (`start="ground"`), episodes of `Hover` that end 1.6 m from the point (`out_of_bounds=3.0`).
     """
 
     metadata: dict[str, Any] = RENDERING_METADATA
@@ -230,12 +228,12 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's description of the environment, which knows the time limit in steps."""
+        """Gymnasium's description of the environment, with the time limit in steps."""
         return self._spec
 
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
-        """Take a description, and tell it the time limit: the environment's, no wrapper's."""
+        """Store a description with the time limit of the environment, not of a wrapper."""
         self._spec = with_limit(value, self.flights)
 
     def reset(
@@ -244,14 +242,15 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         """Begin an episode.
 
         Args:
-            seed: Seeds the flight's random stream; None goes on with the present one.
-            options: "position", "velocity" (3,) and "yaw" to start with, any of them.
+            seed: Seed of the flight's random stream; None: continue the present stream.
+            options: Initial "position" (3,) [m] and "velocity" (3,) [m/s] in I, and "yaw" [rad],
+                any of them.
 
         Returns:
             The observation and `info`.
 
         Raises:
-            ValueError: If an option is unknown or invalid, or the seed is no whole number of at
+            ValueError: If an option is unknown or invalid, or the seed is not an integer of at
                 least 0; nothing has changed then.
         """
         start = self.flights.start(options)
@@ -281,7 +280,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         """Fly one control period.
 
         Args:
-            action: (4,) in [-1, 1]; beyond is clipped.
+            action: (4,) in [-1, 1]; larger values are clipped.
 
         Returns:
             Observation, reward, terminated, truncated, `info`.
@@ -294,7 +293,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         numbers = checked_actions(action, (4,))
         if self._over or not self._seeded:
             raise gymnasium.error.ResetNeeded(
-                "call reset() before step(): there is no episode to fly"
+                "call reset() before step(): no episode is in progress"
             )
         batch = self.flights.batch
         observations = batch.step(numbers)
@@ -318,10 +317,10 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         return self.flights.split(observations[0]), row[_REWARD], terminated, truncated, info
 
     def render(self) -> Any:
-        """What `render_mode` asks for.
+        """Return the output that `render_mode` selects.
 
         Returns:
-            "rgb_array": the present instant as a frame (height, width, 3) of uint8;
+            "rgb_array": a frame (height, width, 3) of uint8 of the present instant;
             "rgb_array_list": a list with a frame of every instant since the last call or reset;
             "human", where a window shows every step by itself, and None: None.
 
@@ -346,7 +345,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
 
 def with_limit(spec: EnvSpec | None, flights: Flights) -> EnvSpec | None:
-    """A copy of Gymnasium's description that knows the time limit of the flights."""
+    """Return a copy of Gymnasium's description with the time limit of the flights."""
     if spec is None:
         return None
     described = copy.copy(spec)
@@ -355,16 +354,16 @@ def with_limit(spec: EnvSpec | None, flights: Flights) -> EnvSpec | None:
 
 
 ENTRY_POINT = "quad_gym.envs.single:QuadEnv"
-"""Where Gymnasium finds `QuadEnv`."""
+"""Entry point of `QuadEnv` in Gymnasium's registry."""
 
 
 def limit_asked_of_make() -> int | None:
-    """The `max_episode_steps` of the `gymnasium.make` that is making an environment, if any.
+    """Return the `max_episode_steps` of the `gymnasium.make` call in progress, if any.
 
-    Gymnasium keeps that argument to itself and wraps a `TimeLimit` around what it has made, which
-    can only cut an episode short: an environment with a time limit of its own would end before a
-    longer one, without a word. So it is read from the frame of `make`; the
-    wrapper then cuts at the same step as the environment.
+    Gymnasium does not pass this argument on. It wraps a `TimeLimit` around the environment, which
+    can only shorten episodes: an environment with its own time limit would end before a longer one
+    without notice. The argument is therefore read from the frame of `make`; the wrapper then ends
+    the episode at the same step as the environment.
     """
     frame = inspect.currentframe()
     while frame is not None:
@@ -379,14 +378,14 @@ def limit_asked_of_make() -> int | None:
 
 
 _MAKERS = ("limit_asked_of_make", "__init__")
-"""Names of the functions between `gymnasium.make` and the look at its frame."""
+"""Names of the functions between `gymnasium.make` and the inspection of its frame."""
 
 
 def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
-    """One seed per flight: seed + i for a number, the list itself for a list.
+    """Return one seed per flight: seed + i for a number, the list itself for a list.
 
     Raises:
-        ValueError: If a seed is no whole number of at least 0, or a list has another length.
+        ValueError: If a seed is not an integer of at least 0, or a list has another length.
     """
     if seed is None:
         return [None] * count

@@ -1,6 +1,6 @@
-"""Observation and action spaces, and the table of what an observation holds.
+"""Observation and action spaces, and the table of an observation's parts.
 
-`observation_layout` is the one description of an observation; the kernel `observe` writes in this
+`observation_layout` is the only description of an observation; the kernel `observe` writes in this
 order.
 """
 
@@ -35,14 +35,17 @@ class ObservationField(NamedTuple):
     """One named part of an observation."""
 
     name: str
+    """name of the part"""
     slice: slice
-    """where it lies in the (flat) observation"""
+    """elements of the flat observation"""
     unit: str
+    """unit of the elements, "-" without one"""
     frame: str
-    """I: inertial, B: body, "-": none"""
+    """frame of the elements: I: inertial, B: body, C: image, "-": none"""
     low: float
+    """lower bound, to which observations are clipped"""
     high: float
-    """bounds that observations are held within"""
+    """upper bound, to which observations are clipped"""
 
 
 _RELATIVE: tuple[Part, ...] = (
@@ -83,10 +86,11 @@ _PRIVILEGED: tuple[Part, ...] = (
     ("rotor_speeds", 4, "of hover", "-", 20.0),
 )
 PRIVILEGED_NAMES = frozenset(name for name, *_ in _PRIVILEGED)
-"""By these a table tells its privileged part: no part of a user's task has them."""
+"""Names by which the privileged part of a table is recognized; parts of a user's task must not have
+them."""
 _LAST_ACTION: Part = ("last_action", 4, "-", "-", 1.0)
 _FLAG = 0.0
-"""A bound of zero marks a flag, in [0, 1]."""
+"""Bound that marks a flag, in [0, 1]."""
 
 
 def _sensor_fields(
@@ -191,10 +195,10 @@ def observation_layout(
 def layout_bounds(
     table: tuple[ObservationField, ...],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(low, high) of every number of an observation, (n,) each.
+    """Return the bounds (low, high) of every number of an observation, (n,) each.
 
     Raises:
-        ValueError: If they are more than the kernels have room for.
+        ValueError: If there are more numbers than the kernels have room for.
     """
     if table[-1].slice.stop > MAX_OBSERVATION:
         raise ValueError(
@@ -208,7 +212,7 @@ def layout_bounds(
 
 
 def observation_space(table: tuple[ObservationField, ...]) -> spaces.Box | spaces.Dict:
-    """The space of a table: a Box, or a Dict of two where it has a privileged part."""
+    """Return the space of a table: a Box, or a Dict of two with a privileged part."""
     low, high = (bound.astype(np.float32) for bound in layout_bounds(table))
     split = policy_size(table)
     policy = spaces.Box(low[:split], high[:split], dtype=np.float32)
@@ -219,7 +223,7 @@ def observation_space(table: tuple[ObservationField, ...]) -> spaces.Box | space
 
 
 def policy_size(table: tuple[ObservationField, ...]) -> int:
-    """How many numbers of an observation are for the policy; the rest is privileged."""
+    """Return the number of elements of an observation for the policy; the rest is privileged."""
     for field in table:
         if field.name == _PRIVILEGED[0][0]:
             return int(field.slice.start)
@@ -227,5 +231,5 @@ def policy_size(table: tuple[ObservationField, ...]) -> int:
 
 
 def action_space() -> spaces.Box:
-    """Four numbers in [-1, 1]."""
+    """Return the space of actions: four numbers in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (4,), np.float32)

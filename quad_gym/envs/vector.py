@@ -35,24 +35,24 @@ _TERMINATED, _TRUNCATED = COLUMN["terminated"], COLUMN["truncated"]
 
 
 class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]]):
-    """N flights in one compiled call; flight i is that of a `QuadEnv` seeded with seed + i.
+    """N flights in one compiled call; flight i equals a `QuadEnv` seeded with seed + i.
 
-    Observations, actions, rewards, endings and keywords are those of `QuadEnv`. `info` holds arrays
-    (n,) of the same names, each with its mask `_name`; `drawn`, `faults` and `innovations` are
+    Observations, actions, rewards, endings and keywords are as in `QuadEnv`. `info` holds arrays
+    (n,) with the same names, each with its mask `_name`; `drawn`, `faults` and `innovations` are
     dictionaries of such arrays.
 
     Args:
         num_envs: Number of flights.
-        task: As of `QuadEnv`.
-        base: As of `QuadEnv`; `gymnasium.make_vec` fills it in from the id.
+        task: As in `QuadEnv`.
+        base: As in `QuadEnv`; `gymnasium.make_vec` sets it from the id.
         autoreset_mode: "NextStep" (default), "SameStep" or "Disabled", or the enum.
-        threads: Threads to use; None: as many as there are cores.
-        render_flights: Numbers of the flights that are rendered; None: all of them.
-        keywords: Those of `QuadEnv`.
+        threads: Number of threads; None: one per core.
+        render_flights: Indices of the flights that are rendered; None: all flights.
+        keywords: Keywords of `QuadEnv`.
 
     Raises:
-        TypeError: If a keyword is unknown; it is a ValueError, too.
-        ValueError: If a keyword is another task's, or its value is invalid.
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
+        ValueError: If a keyword belongs to another task, or its value is invalid.
     """
 
     def __init__(
@@ -89,12 +89,12 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's description of the environment, which knows the time limit in steps."""
+        """Gymnasium's description of the environment, with the time limit in steps."""
         return self._spec
 
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
-        """Take a description, and tell it the time limit: the environment's, no wrapper's."""
+        """Store a description with the time limit of the environment, not of a wrapper."""
         self._spec = with_limit(value, self.flights)
 
     def reset(
@@ -106,16 +106,18 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         """Begin episodes.
 
         Args:
-            seed: A number s seeds flight i with s + i; a list has one per flight; None goes on.
-            options: "reset_mask" (n,) bool: which flights; "position", "velocity" (3,) or (n, 3)
-                and "yaw" to start with.
+            seed: A number s: flight i has the seed s + i; a list: one seed per flight; None:
+                continue the present streams.
+            options: "reset_mask" (n,) bool: the flights to reset; initial "position" [m] and
+                "velocity" [m/s] in I, (3,) or (n, 3), and "yaw" [rad].
 
         Returns:
             Observations of all flights, and `info` of those that were reset.
 
         Raises:
-            ValueError: If an option is unknown or invalid, or the seeds do not fit.
-            TypeError: If `reset_mask` is no array of booleans.
+            ValueError: If an option is unknown, an option or a seed is invalid, or the number of
+                seeds is wrong.
+            TypeError: If `reset_mask` is not an array of booleans.
         """
         options = named_options(options)
         mask = self._checked_mask(options.pop("reset_mask", None))
@@ -156,7 +158,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         """Fly one control period.
 
         Args:
-            actions: (n, 4) in [-1, 1]; beyond is clipped.
+            actions: (n, 4) in [-1, 1]; larger values are clipped.
 
         Returns:
             Observations, rewards, terminated, truncated, `info`: new arrays.
@@ -198,11 +200,11 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         )
 
     def render(self) -> Any:
-        """What `render_mode` asks for, of the flights that `render_flights` chose.
+        """Return the output that `render_mode` selects, for the flights in `render_flights`.
 
         Returns:
             "rgb_array": a tuple with a frame (height, width, 3) of uint8 per flight, as Gymnasium's
-            wrappers want it (`quad_gym.rendering.tile` makes one picture of them);
+            wrappers require (`quad_gym.rendering.tile` makes one picture of them);
             "rgb_array_list": a list with a picture of all tiles for every instant since the last
             call or reset; "human", where a window shows the tiles by itself, and None: None.
 
@@ -226,7 +228,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             self.rendering.close()
 
     def _step_infos(self, results: NDArray[np.float64]) -> dict[str, Any]:
-        """Errors, endings and counters of the step."""
+        """Return errors, endings and counters of the step."""
         infos: dict[str, Any] = {
             "position_error": results[:, COLUMN["position_error"]].copy(),
             "estimation_error": results[:, COLUMN["estimation_error"]].copy(),
@@ -246,7 +248,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         return infos
 
     def _replace_by_start(self, infos: dict[str, Any], began: NDArray[np.intp]) -> None:
-        """Describe the new episode instead, of the flights where one began."""
+        """Describe the new episode instead, for the flights in which one began."""
         for name in ("position_error", "estimation_error", "filter_status"):
             infos[name][began] = self.flights.batch.record(name, began)
         infos["filter_diverged"][began] = self.flights.batch.record("diverged", began) > 0.0
@@ -255,14 +257,14 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         replace_faults(infos, self.flights.batch, began)
 
     def _drawn(self) -> dict[str, Any]:
-        """The draws of all flights, as `info` holds them; nothing where nothing is drawn."""
+        """Return the draws of all flights, as `info` holds them; empty without draws."""
         drawn = self.flights.batch.drawn()
         return {"drawn": drawn} if drawn else {}
 
     def _with_finals(
         self, infos: dict[str, Any], flown_with: dict[str, NDArray[np.float64]]
     ) -> dict[str, Any]:
-        """Move what ended into `final_obs` and `final_info`; describe the new episodes instead."""
+        """Move ended episodes to `final_obs` and `final_info`; describe the new ones instead."""
         over = self._over.copy()
         finals = self.flights.batch.final_observations
         final_obs = np.full(self.num_envs, None, object)
@@ -307,7 +309,7 @@ def _blank(values: NDArray[Any]) -> Any:
 
 
 def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Every array beside the mask of the environments that it speaks of."""
+    """Add to every array the mask of the environments for which it is valid."""
     masked = dict(infos)
     for name, values in infos.items():
         if isinstance(values, dict):
