@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def innovations_of(batch: "FlightBatch") -> dict[str, NDArray[Any]]:
-    """The last innovations of all flights, block by block.
+    """Return the last innovations of all flights, block by block.
 
     The blocks are position, baseline, velocity and features; then barometer and magnetometer, if
     the suite has such.
