@@ -1,4 +1,4 @@
-"""Rolling out a policy, with results episode by episode."""
+"""Evaluation of a policy: one episode in each flight, with results for each episode."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -14,11 +14,12 @@ from quad_gym.params import checks as check
 from quad_gym.records import Ending
 
 NO_CRASHES = (Ending.LAST_GATE, Ending.TASK)
-"""Endings of terminated episodes that are no crashes; what a task's own ending is, it knows."""
+"""Endings of terminated episodes that do not count as crashes: the last gate, and endings of a
+user-defined task."""
 
 
 class Policy(Protocol):
-    """Anything with the `predict` of Stable-Baselines3."""
+    """Any object with a method `predict` as in Stable-Baselines3."""
 
     def predict(
         self,
@@ -27,32 +28,33 @@ class Policy(Protocol):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """Actions for a batch of observations, and the state of a recurrent policy."""
+        """Return actions for a batch of observations, and the state of a recurrent policy."""
         ...
 
 
 class Episodes(NamedTuple):
-    """One number per episode, each an array (n,)."""
+    """Results of n episodes; each field is an array (n,)."""
 
     returns: NDArray[np.float64]
-    """sum of rewards"""
+    """Sums of rewards"""
     lengths: NDArray[np.int64]
     """steps"""
     mean_error: NDArray[np.float64]
-    """true position error, mean over the episode [m]"""
+    """True position error, mean over the episode [m]"""
     late_error: NDArray[np.float64]
-    """true position error, mean over the time limit's second half [m]; NaN if it ended before"""
+    """True position error, mean over the second half of the time limit [m]; NaN for episodes that
+    crashed or ended before the time limit"""
     estimation_error: NDArray[np.float64]
-    """distance of the seen from the true position, mean over the episode [m]"""
+    """Distance between observed and true position, mean over the episode [m]"""
     crashed: NDArray[np.bool_]
-    """whether it was terminated by a crash"""
+    """True for episodes that ended in a crash"""
     gates_passed: NDArray[np.int64]
-    """on a course of gates"""
+    """Number of gates passed on a course of gates"""
     ending: NDArray[Any]
-    """the ending as text"""
+    """name of the ending, as text"""
 
     def summary(self) -> dict[str, float]:
-        """Means over the episodes, and the share that crashed."""
+        """Means over the episodes, and the share of episodes that crashed, by name."""
         completed = self.late_error[~np.isnan(self.late_error)]
         return {
             "episodes": float(len(self.returns)),
@@ -66,7 +68,8 @@ class Episodes(NamedTuple):
 
 
 Watch = Callable[[int, FlightBatch, NDArray[np.bool_]], None]
-"""Called at the start (step 0) and after every step, with the flights and which still count."""
+"""Function called at the start (step 0) and after every step with the number of the step, the batch
+of flights, and a mask (n,) of the episodes in progress."""
 
 
 def roll_out(
@@ -76,19 +79,19 @@ def roll_out(
     seed: int = 0,
     watch: Watch | None = None,
 ) -> Episodes:
-    """Fly one episode in every flight of a vector environment; episode i is seeded with seed + i.
+    """Run one episode in each flight of a vector environment; episode i is seeded with seed + i.
 
     Args:
-        policy: Acts on batches of observations, deterministically.
+        policy: Policy, which acts deterministically on batches of observations.
         env: A `QuadVectorEnv`.
-        seed: Of the first episode.
-        watch: Called at the start and after every step, such as `recording.Tracer.add`.
+        seed: Seed of the first episode.
+        watch: Function called at the start and after every step, such as `recording.Tracer.add`.
 
     Returns:
-        One number per episode. Errors are against the true position.
+        Results of each episode. Errors refer to the true position.
 
     Raises:
-        ValueError: If `env` is no `QuadVectorEnv`, or its episodes have no time limit.
+        ValueError: If `env` is not a `QuadVectorEnv`, or its episodes have no time limit.
     """
     quads = env.unwrapped
     if not isinstance(quads, QuadVectorEnv):
@@ -144,7 +147,7 @@ def roll_out(
 
 
 def _info_of_step(info: dict[str, Any]) -> dict[str, Any]:
-    """What was judged of the step, also where a new episode has begun within it."""
+    """Replace `info` by `final_info` for flights whose next episode has begun in the step."""
     if "final_info" not in info:
         return info
     over, final = info["_final_info"], info["final_info"]
@@ -162,18 +165,18 @@ def evaluate(
     watch: Watch | None = None,
     **keywords: Any,
 ) -> Episodes:
-    """Fly a policy for some episodes of an environment.
+    """Evaluate a policy over a number of episodes of an environment.
 
     Args:
-        policy: Acts on batches of observations.
-        env_id: One of `quad_gym.IDS`, or of `quad_gym.register_task`.
-        episodes: How many.
-        seed: Of the first episode; episode i has seed + i.
-        watch: Called at the start and after every step, such as `recording.Tracer.add`.
-        keywords: Those of the environment.
+        policy: Policy, which acts deterministically on batches of observations.
+        env_id: Id from `quad_gym.IDS`, or one registered with `quad_gym.register_task`.
+        episodes: Number of episodes.
+        seed: Seed of the first episode; episode i has seed + i.
+        watch: Function called at the start and after every step, such as `recording.Tracer.add`.
+        keywords: Keywords of the environment.
 
     Returns:
-        One number per episode.
+        Results of each episode.
 
     Raises:
         ValueError: If an argument is invalid.

@@ -1,7 +1,7 @@
 """Figures that compare controllers: errors over time, learning curves, matrices, paths.
 
-As in `plots`: no window opens, colors are those of Okabe and Ito, and every curve has a line style
-of its own too.
+As in `plots`, no window opens and the palette is by Okabe and Ito. Each curve also has its own line
+style.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,16 +34,16 @@ _STYLES = (
     ("#CC79A7", (0, (5, 1))),
     ("#56B4E9", (0, (2, 1))),
 )
-"""Color and dashes of the curves, in order."""
+"""Colors and dash patterns of the curves, in order."""
 
 
 def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: str = "") -> Any:
-    """Errors over time: the median over episodes, and the middle nine tenths as a band.
+    """Make a figure of errors over time: median over episodes, and a band from 5 to 95 %.
 
     Args:
-        curves: Instants (k,) [s] and (3, k) 5th, 50th and 95th percentile [m] of each curve, by its
-            label; NaN: not flown.
-        title: Of the figure.
+        curves: For each label, times (k,) [s] and the 5th, 50th and 95th percentile of the errors,
+            (3, k) [m]; NaN: not flown.
+        title: Title of the figure.
 
     Returns:
         matplotlib Figure.
@@ -65,12 +65,12 @@ def error_over_time_figure(curves: Mapping[str, tuple[Floats, Floats]], title: s
 
 
 def draw_seeds(axes: Any, seeds: Sequence[tuple[Floats, Floats]], **style: Any) -> None:
-    """Draw one thin line a seed, and their median bold.
+    """Draw one thin line per seed, and a bold line for their median.
 
     Args:
-        axes: Where.
-        seeds: Abscissae (k,) and values (k,) of every seed; the median ends with the shortest.
-        style: Of the median, as matplotlib's `plot` takes it: color, linestyle, label.
+        axes: matplotlib Axes.
+        seeds: Abscissae (k,) and values (k,) of each seed; the median ends with the shortest curve.
+        style: Style of the median, keywords of matplotlib's `plot`: color, linestyle, label.
     """
     for x, y in seeds:
         axes.plot(x, y, color=style["color"], alpha=0.35, linewidth=0.8)
@@ -86,13 +86,13 @@ def learning_figure(
     *,
     unit: str = "million steps",
 ) -> Any:
-    """How errors fall while training: one thin line a seed, their median bold.
+    """Make a figure of errors during training: a thin line per seed, a bold one for the median.
 
     Args:
-        curves: Abscissae (k,) and errors (k,) [m] of every seed, by label.
-        levels: Horizontal lines to compare with [m], by label.
-        title: Of the figure.
-        unit: Of the abscissae.
+        curves: Abscissae (k,) and errors (k,) [m] of each seed, by label.
+        levels: Horizontal lines for comparison [m], by label.
+        title: Title of the figure.
+        unit: Unit of the abscissae.
 
     Returns:
         matplotlib Figure.
@@ -123,14 +123,14 @@ def matrix_figure(
     columns: Sequence[str],
     title: str = "",
 ) -> Any:
-    """A table whose cells are shaded by their value, on a logarithmic scale.
+    """Make a heat map: a table whose cells are colored by value, on a logarithmic scale.
 
     Args:
-        values: (rows, columns) [m]; NaN: not measured.
+        values: Values, (rows, columns) [m]; NaN: not measured.
         cells: Text of each cell.
         rows: Headings of the rows.
         columns: Headings of the columns.
-        title: Of the figure.
+        title: Title of the figure.
 
     Returns:
         matplotlib Figure.
@@ -155,11 +155,11 @@ def matrix_figure(
 
 
 def paths_figure(traces: Mapping[str, Trace], title: str = "") -> Any:
-    """Paths from above, side by side on one scale.
+    """Make a figure of paths from above, side by side on a common scale.
 
     Args:
-        traces: Flights, by their label.
-        title: Of the figure.
+        traces: Flights, by label.
+        title: Title of the figure.
 
     Returns:
         matplotlib Figure.
@@ -194,7 +194,7 @@ def _figure(size: tuple[float, float], title: str) -> tuple[Any, Any]:
 
 
 def legend_below(figure: Any, axes: Any) -> None:
-    """The legend of a picture under it, where no curve can be, in as many columns as fit."""
+    """Add a legend below the axes, with as many columns as fit."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     handles, labels = axes.get_legend_handles_labels()
@@ -207,7 +207,7 @@ def legend_below(figure: Any, axes: Any) -> None:
 
 
 def line_styles(count: int, *, skip: int = 0) -> list[tuple[str, Any]]:
-    """Colors and dashes of curves that stay apart, the first `skip` of them left out."""
+    """Distinct colors and dash patterns for curves, without the first `skip` of them."""
     return [_STYLES[(k + skip) % len(_STYLES)] for k in range(count)]
 
 

@@ -1,10 +1,14 @@
-"""Filter consistency: statistics over many flights, with the bands of a consistent filter.
+"""Filter consistency: statistics over many flights, compared with those of a consistent filter.
 
-If the covariance P is right, the normalized estimation error squared (NEES) e^T P^-1 e is
-chi-square with the number of its coordinates, so that its mean over n independent flights lies in a
-known band 95 times in 100, at each instant. So is the innovation squared (NIS) of a measurement,
-and innovations are white. The error e is truth minus estimate in the filter's
-error coordinates, with the truth from the simulator, not from the filter's model.
+If the covariance P is correct, the normalized estimation error squared (NEES) e^T P^-1 e has a
+chi-square distribution with as many degrees of freedom as coordinates, so that its mean over n
+independent flights is within a known band with a probability of 95 %, at each instant. The same
+holds for the normalized innovation squared (NIS) of a measurement, and innovations are white. The
+error e is truth minus estimate in the filter's error coordinates; the truth comes from the
+simulator, not from the filter's model.
+
+The criterion is practical: the mean must be within the 95 % band of a mean over at most 1,000
+flights (2.3 % about the expected value for 15 coordinates, 5 % for 3) at 90 % of the instants.
 
 Source: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
 Navigation, 2001, section 5.4.
@@ -38,24 +42,25 @@ PARTS = {
     "accel_bias": slice(9, 12),
     "gyro_bias": slice(12, 15),
 }
-"""The whole error state and its blocks of three, as of the covariance."""
+"""Parts of the error state, in the order of the covariance: all of it, and blocks of three."""
 
 CONSISTENT_SHARE = 0.9
-"""Share of instants in the 95 % band from which a filter is called consistent."""
+"""Share of instants that must be inside the band for a filter to be called consistent."""
 
 BAND_FLIGHTS = 1000
-"""Flights whose mean the band is for, where there are more. The means over more flights have less
-chance in them; they are then judged by how far off they are, some 2 % for the whole state, and not
-by whether enough flights can tell."""
+"""Highest number of flights for which the band is computed.
+
+With more flights the band is a fixed tolerance, 2.3 % for the whole state: with enough flights,
+deviations from the expected value would be significant even if they are negligible."""
 
 NEGLIGIBLE_CORRELATION = 0.02
-"""Of innovations: it does not matter, even where flights enough can tell it from zero."""
+"""Autocorrelation of innovations that is negligible even if it is statistically significant."""
 
 Floats = NDArray[np.float64]
 
 
 def flight_errors(batch: FlightBatch) -> Floats:
-    """(count, 15) errors of a batch's filters, in the coordinates of their covariances."""
+    """Errors of a batch's filters in the coordinates of their covariances, (count, 15)."""
     truth = {
         "position": batch.record("r"),
         "velocity": batch.record("v"),
@@ -74,15 +79,16 @@ def flight_errors(batch: FlightBatch) -> Floats:
 
 
 def start_matched(batch: FlightBatch, seed: int) -> None:
-    """Give all filters a start whose errors have the covariance that they claim at this instant.
+    """Give all filters initial errors drawn from their own covariances.
 
-    A first fix does not: a level attitude is assumed, and the covariance that goes with it is a
-    guess. While tilt and accelerometer bias look alike, that guess lives on for long. The estimates
-    become the truth less errors drawn from each filter's own covariance.
+    After a first fix, errors and covariance do not match: a level attitude is assumed with an
+    assumed uncertainty, which matters for as long as tilt and accelerometer bias cannot be
+    distinguished. Here the estimates become the truth minus errors drawn from each filter's
+    covariance.
 
     Args:
-        batch: The flights, just reset; only their estimates change.
-        seed: Of the draws.
+        batch: Flights that have just been reset; only their estimates are changed.
+        seed: Seed of the draws.
     """
     flights, factor = batch.count, batch.record("L")
     draws = np.random.default_rng(seed).normal(size=(flights, STATE_DIMENSION, 1))
@@ -105,18 +111,18 @@ def start_matched(batch: FlightBatch, seed: int) -> None:
 def mean_band(
     dimension: int, counts: ArrayLike, probability: float = 0.95
 ) -> tuple[Floats, Floats]:
-    """Where means of independent chi-square values lie, instant by instant.
+    """Probability bands of means of independent chi-square values, one band for each instant.
 
     Args:
         dimension: Degrees of freedom of one value.
-        counts: (t,) how many values each mean is of, at least 1.
-        probability: Of a mean to lie in its band; what is left is split evenly.
+        counts: Number of values in the mean at each instant, at least 1, (t,).
+        probability: Probability that a mean is inside its band; the tails are equal.
 
     Returns:
         Lower and upper ends, (t,) each.
 
     Raises:
-        ValueError: If a number is out of its range.
+        ValueError: If a number is out of range.
     """
     n = np.asarray(counts, np.float64)
     if not 0.0 < probability < 1.0:
@@ -131,23 +137,24 @@ def mean_band(
 
 @dataclass(frozen=True)
 class MeanSquare:
-    """A normalized square over time: means over flights, and the band of a consistent filter."""
+    """Mean NEES or NIS over flights as a function of time, with the band of a consistent filter."""
 
     name: str
+    """Name of the part of the state, or of the sensor"""
     dimension: int
-    """degrees of freedom: what the mean is about if the filter is consistent"""
+    """Degrees of freedom, which is the expected mean of a consistent filter"""
     time: Floats
-    """(t,) since the start [s]"""
+    """Time since the start, (t,) [s]"""
     mean: Floats
-    """(t,) over flights [-]"""
+    """Means over flights, (t,) [-]"""
     low: Floats
-    """(t,) lower end of the 95 % band"""
+    """Lower ends of the 95 % band of a mean over at most `BAND_FLIGHTS` flights, (t,)"""
     high: Floats
-    """(t,) its upper end"""
+    """Upper ends of this band, (t,)"""
 
     @property
     def share_inside(self) -> float:
-        """Share of instants whose mean lies in the band."""
+        """Share of instants whose mean is inside the band."""
         return float(((self.mean >= self.low) & (self.mean <= self.high)).mean())
 
     @property
@@ -156,15 +163,20 @@ class MeanSquare:
         return float(self.mean.mean())
 
     @property
+    def tolerance(self) -> float:
+        """Half width of the band relative to the expected mean, averaged over time."""
+        return float(0.5 * (self.high - self.low).mean() / self.dimension)
+
+    @property
     def consistent(self) -> bool:
-        """Whether the mean lies in the band at `CONSISTENT_SHARE` of the instants or more."""
+        """True if the mean is inside the band at `CONSISTENT_SHARE` of the instants or more."""
         return self.share_inside >= CONSISTENT_SHARE
 
     def since(self, start: float) -> "MeanSquare":
-        """The same from an instant on [s].
+        """Select the instants from `start` on [s].
 
         Raises:
-            ValueError: If nothing is left.
+            ValueError: If there are no such instants.
         """
         kept = self.time >= start - 1e-9
         if not kept.any():
@@ -174,24 +186,26 @@ class MeanSquare:
 
 
 def verdict(part: MeanSquare) -> str:
-    """One plain sentence on a mean square.
+    """Describe a mean square in one sentence.
 
-    The square root of mean over dimension is how many times as large as claimed the errors are.
+    Relative to the covariance, the errors are larger by the square root of mean over dimension.
     """
-    inside = f"inside its band at {100 * part.share_inside:.0f} % of the instants"
-    what = f"{part.name}: mean {part.overall:.2f} where {part.dimension} is right, {inside}"
+    inside = f"within {100 * part.tolerance:.2g} % of it at {100 * part.share_inside:.0f} %"
+    what = (
+        f"{part.name}: mean {part.overall:.2f}, expected {part.dimension}, {inside} of the instants"
+    )
     if part.consistent:
         return f"{what}: consistent."
     ratio = float(np.sqrt(part.overall / part.dimension))
     percent = f"{100.0 * abs(ratio - 1.0):.1f} %"
     if ratio < 1.0:
-        return f"{what}: too cautious, as errors are {percent} smaller than it claims."
-    size = f"{percent} larger than" if ratio < 2.0 else f"{ratio:.1f} times what"
-    return f"{what}: overconfident, as errors are {size} it claims."
+        return f"{what}: too cautious, errors are {percent} smaller than its covariance implies."
+    size = f"{percent} larger than" if ratio < 2.0 else f"{ratio:.1f} times as large as"
+    return f"{what}: overconfident, errors are {size} its covariance implies."
 
 
 class NeesRecorder:
-    """NEES of the state and its blocks, errors and claimed deviations, instant by instant."""
+    """Recorder of NEES, errors and standard deviations over time."""
 
     def __init__(self) -> None:
         self._time: list[float] = []
@@ -201,11 +215,11 @@ class NeesRecorder:
         self._count = 0
 
     def add(self, batch: FlightBatch, time: float) -> None:
-        """Take in the present instant of all flights.
+        """Record the present instant of all flights.
 
         Args:
-            batch: The flights, all of them since the same time.
-            time: Since their start [s].
+            batch: Flights, which must all have started at the same time.
+            time: Time since their start [s].
         """
         errors, P = flight_errors(batch), batch.covariance()
         self._count = batch.count
@@ -216,7 +230,7 @@ class NeesRecorder:
         self._sigmas.append(np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)))
 
     def nees(self) -> dict[str, MeanSquare]:
-        """NEES over time, by the names of `PARTS`."""
+        """Mean NEES over time of each part of the state, by the names of `PARTS`."""
         time, found = np.array(self._time), {}
         for name, part in PARTS.items():
             dimension = part.stop - part.start
@@ -225,7 +239,7 @@ class NeesRecorder:
         return found
 
     def errors(self) -> tuple[Floats, Floats]:
-        """(t, 15) root mean square errors over flights, and deviations that the filter claims."""
+        """Root mean square of errors and of standard deviations over flights, (t, 15) each."""
         return np.array(self._errors), np.array(self._sigmas)
 
 
@@ -236,39 +250,41 @@ SENSOR_BLOCKS = {
     "feature": tuple(range(FEATURE_BLOCKS, AID_BLOCKS)),
     **{aid.name.lower(): (AID_BLOCKS + aid,) for aid in Aid},
 }
-"""Blocks of the measurement by sensor. Features share an attitude and a position, so that only the
-first one seen is taken of each image: what is taken at one instant is independent then."""
+"""Blocks of the measurement by sensor. Errors of features in one image are correlated through
+attitude and position, so that only the first one is used: the values of an instant are independent.
+"""
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Autocorrelation of a sensor's innovations, each divided by its expected deviation."""
+    """Autocorrelation of a sensor's innovations, each over its expected standard deviation."""
 
     name: str
+    """Name of the sensor"""
     correlation: Floats
-    """(lags,) at 1, 2, ... measurements apart [-]"""
+    """Autocorrelation at lags of 1, 2, ... measurements, (lags,) [-]"""
     band: Floats
-    """(lags,) half width of the 95 % band of white innovations"""
+    """Half widths of the 95 % band of white innovations, (lags,)"""
 
     @property
     def largest(self) -> float:
-        """The correlation farthest from zero."""
+        """Autocorrelation with the largest magnitude."""
         return float(self.correlation[np.abs(self.correlation).argmax()])
 
     @property
     def white(self) -> bool:
-        """Whether no correlation is beyond its band by more than `NEGLIGIBLE_CORRELATION`."""
+        """True if no correlation exceeds its band by more than `NEGLIGIBLE_CORRELATION`."""
         return bool((np.abs(self.correlation) <= self.band + NEGLIGIBLE_CORRELATION).all())
 
 
 class InnovationRecorder:
-    """Normalized innovations squared (NIS) over time and their autocorrelation, sensor by sensor.
+    """Recorder of NIS over time and of the autocorrelation of innovations, for each sensor.
 
     Args:
-        batch: The flights, which keep their innovations.
-        bins: (k + 1,) ends of the spans of time over which NIS is averaged [s].
-        settle: Innovations before do not count for the autocorrelation [s].
-        lags: Up to how many measurements apart correlations are taken.
+        batch: Flights with `innovations=True`.
+        bins: Edges of the intervals of time over which NIS is averaged, (k + 1,) [s].
+        settle: Time before which innovations are left out of the autocorrelation [s].
+        lags: Largest lag of the autocorrelation, in measurements.
     """
 
     def __init__(
@@ -285,12 +301,12 @@ class InnovationRecorder:
         self._squares = {name: np.zeros(2) for name in SENSOR_BLOCKS}
 
     def add(self, batch: FlightBatch, time: float) -> None:
-        """Take in what was measured at the present instant, `time` after the start [s]."""
+        """Record the measurements of the present instant, `time` after the start [s]."""
         names = ("position", "baseline", "velocity", "feature", "aid")
         valid = np.column_stack([batch.record(f"{name}_valid") for name in names]) > 0.0
         if not valid.any():
             return
-        valid &= batch.record("gate") != GateDecision.UNSURE  # not made use of
+        valid &= batch.record("gate") != GateDecision.UNSURE  # the filter does not use these
         nis, innovation = batch.record("block_nis"), batch.record("innovation")
         white = innovation / batch.record("innovation_sigma")
         span = min(int(np.searchsorted(self._bins, time - 1e-9, "right")), self._bins.size - 1) - 1
@@ -305,7 +321,7 @@ class InnovationRecorder:
                     self._correlate(name, flights, white[flights, taken])
 
     def _correlate(self, name: str, flights: NDArray[np.intp], white: Floats) -> None:
-        """Multiply innovations with those of the same flights before them."""
+        """Multiply innovations by earlier ones of the flight, and add up the products."""
         past = self._past[name][:, flights]
         products = past * white
         self._products[name] += np.nansum(products, axis=(1, 2))
@@ -315,7 +331,7 @@ class InnovationRecorder:
         self._past[name][0, flights] = white
 
     def nis(self) -> dict[str, MeanSquare]:
-        """NIS over time, of the sensors that measured anything."""
+        """Mean NIS over time of each sensor that has measured, by name."""
         middle, found = 0.5 * (self._bins[1:] + self._bins[:-1]), {}
         for name, blocks in SENSOR_BLOCKS.items():
             some = self._counts[name] > 0
@@ -327,7 +343,7 @@ class InnovationRecorder:
         return found
 
     def whiteness(self) -> dict[str, Whiteness]:
-        """Autocorrelation of the innovations, of the sensors that measured often enough."""
+        """Autocorrelation of the innovations of each sensor that has measured often enough."""
         found = {}
         for name in SENSOR_BLOCKS:
             pairs, (total, number) = self._pairs[name], self._squares[name]

@@ -1,4 +1,4 @@
-"""Flights that test a filter's consistency, and their findings, in numbers and in words."""
+"""Flights that test a filter's consistency, with findings as numbers and as sentences."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from quad_gym.params.task import TaskParams
 
 
 def endless(task: TaskParams) -> TaskParams:
-    """A task in which nothing ends a flight, so that all flights last equally long."""
+    """Remove all endings from a task, so that all flights have the same length."""
     return task.replace(  # type: ignore[no-any-return]
         duration=0.0, out_of_bounds=1e9, min_height=-1e9, max_tilt=math.pi
     )
@@ -31,39 +31,40 @@ def endless(task: TaskParams) -> TaskParams:
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found about a filter."""
+    """Findings about the consistency of a filter."""
 
     nees: dict[str, MeanSquare]
-    """by the names of `quad_gym.analysis.consistency.PARTS`"""
+    """Mean NEES over time, by the names of `quad_gym.analysis.consistency.PARTS`"""
     nis: dict[str, MeanSquare]
-    """by sensor"""
+    """Mean NIS over time, by sensor"""
     whiteness: dict[str, Whiteness]
-    """of the innovations, by sensor"""
+    """Autocorrelation of the innovations, by sensor"""
     errors: Floats
-    """(t, 15) root mean square errors over flights"""
+    """Root mean square errors over flights, (t, 15)"""
     claimed: Floats
-    """(t, 15) root mean square deviations that the filters claim"""
+    """Root mean square of the filters' standard deviations over flights, (t, 15)"""
     tracking: TrackingSummary
-    """distance of the true position from the reference, (flights,) [m]"""
+    """Distance of the true position from the reference, (flights,) [m]"""
     astray: NDArray[np.bool_]
-    """(flights,) whether a flight was ever farther from its reference than `ASTRAY`"""
+    """True for flights that were ever farther than `ASTRAY` from their reference, (flights,)"""
     failed: int
-    """filters that failed in a cycle"""
+    """Number of filters with a numerical failure"""
     counted_as_noise: frozenset[str] = frozenset()
-    """sensors whose constant error the filter counts as white noise: their innovations are smaller
-    than it claims, and alike over time, while the state is consistent"""
+    """Sensors with a constant error that the filter models as white noise: their innovations are
+    smaller than the filter expects, and correlated over time, although the state is consistent"""
 
     def since(self, start: float) -> "Findings":
-        """What counts if the first instants do not: mean squares from `start` on [s]."""
+        """Select mean squares from `start` on [s], to leave out the first instants."""
         nees = {name: part.since(start) for name, part in self.nees.items()}
         nis = {name: part.since(start) for name, part in self.nis.items()}
         return replace(self, nees=nees, nis=nis)
 
     @property
     def consistent(self) -> bool:
-        """Whether everything is as a consistent filter's.
+        """True if NEES, NIS, whiteness and status are those expected of a consistent filter.
 
-        Of sensors whose constant error counts as noise, innovations must not be too large.
+        For sensors whose constant error is modeled as noise, innovations only must not be too
+        large.
         """
         apart = self.counted_as_noise
         squares = [*self.nees.values(), *(p for name, p in self.nis.items() if name not in apart)]
@@ -72,14 +73,14 @@ class Findings:
         return self.failed == 0 and white and small and all(part.consistent for part in squares)
 
     def sentences(self) -> dict[str, str]:
-        """Verdicts in plain English, by what they are on."""
-        why = " Expected: the filter counts a constant error as noise."
+        """Verdicts in plain English, by quantity."""
+        why = " Expected: the filter models a constant error as noise."
         known = dict.fromkeys(self.counted_as_noise, why)
         said = {f"nees_{name}": f"NEES of the {verdict(part)}" for name, part in self.nees.items()}
         for name, part in self.nis.items():
             said[f"nis_{name}"] = f"NIS of the {verdict(part)}{known.get(name, '')}"
         for name, white in self.whiteness.items():
-            largest = f"autocorrelation at most {white.largest:+.3f}"
+            largest = f"largest autocorrelation {white.largest:+.3f}"
             judged = "white" if white.white else "not white"
             told = f"Innovations of the {name}: {largest}: {judged}."
             said[f"innovations_{name}"] = told + known.get(name, "")
@@ -87,7 +88,7 @@ class Findings:
 
 
 ASTRAY = 5.0
-"""Distance from the reference beyond which a flight counts as astray [m]."""
+"""Distance from the reference beyond which a flight counts as lost [m]."""
 
 
 def measure_consistency(
@@ -100,24 +101,25 @@ def measure_consistency(
     matched: bool = False,
     progress: Callable[[float], Any] = lambda time: None,
 ) -> Findings:
-    """Fly, and compare errors and innovations with what the filters claim.
+    """Fly, and compare errors and innovations with the covariances of the filters.
 
     Args:
-        batch: Flights that nothing ends, see `endless`, which keep their innovations.
-        seeds: One per flight.
+        batch: Flights of a task without endings, see `endless`, with `innovations=True`.
+        seeds: Seeds of the flights.
         duration: Length of the flights [s].
-        every: Time between two looks at the errors [s].
-        settle: Innovations before do not count for their autocorrelation [s].
-        matched: Whether the filters start with errors drawn from their own covariance.
-        progress: Called now and then with the time flown [s].
+        every: Time between two evaluations of the errors [s].
+        settle: Time before which innovations are left out of the autocorrelation [s].
+        matched: True to start the filters with errors drawn from their own covariance.
+        progress: Function called repeatedly with the time flown so far [s].
 
     Raises:
-        ValueError: If duration and every are not positive, or a step is more than a tick.
+        ValueError: If `duration` or `every` is not positive, or the control rate of the batch is
+            not its IMU rate.
     """
     if not (duration > 0.0 and every > 0.0):
         raise ValueError(f"duration and every must be above 0, got {duration} and {every}")
     if batch.clocks.ticks_between("control") != 1:
-        raise ValueError("batch must be controlled at its IMU rate, so that nothing is missed")
+        raise ValueError("batch must be controlled at its IMU rate, so that no sample is missed")
     dt = batch.sensors.imu.dt
     steps, stride = round(duration / dt), max(1, round(every / dt))
     squares = NeesRecorder()
@@ -153,6 +155,6 @@ def measure_consistency(
 
 
 def _counted_as_noise(batch: FlightBatch) -> frozenset[str]:
-    """The sensors of `Findings.counted_as_noise`."""
+    """Sensors of `Findings.counted_as_noise`."""
     gnss = batch.sensors.gnss
     return frozenset({"baseline"} if gnss is not None and gnss.heading_errs else ())

@@ -1,10 +1,11 @@
-"""Figures of consistency: mean squares in their bands, errors beside claims, autocorrelations."""
+"""Figures of filter consistency: NEES and NIS, errors and standard deviations, autocorrelation."""
 
 from typing import Any
 
 import numpy as np
 
 from quad_gym.analysis.consistency import (
+    BAND_FLIGHTS,
     NEGLIGIBLE_CORRELATION,
     PARTS,
     Floats,
@@ -18,7 +19,7 @@ _TITLES = {
     "position": "position",
     "velocity": "velocity",
     "attitude": "attitude",
-    "accel_bias": "accelerometer bias",
+    "accel_bias": "accel. bias",
     "gyro_bias": "gyro bias",
 }
 _UNITS = {
@@ -28,10 +29,11 @@ _UNITS = {
     "accel_bias": ("mm/s²", 1e3),
     "gyro_bias": ("deg/h", np.degrees(3600.0)),
 }
+_TOLERANCE = f"tolerance (gray): 95 % band of a mean over at most {BAND_FLIGHTS:,} flights"
 
 
 def _grid(count: int, title: str, height: float = 2.1) -> tuple[Any, Any]:
-    """A figure of `count` pictures, three in a row; four are two by two."""
+    """Make a figure with `count` axes, three in a row; four are two by two."""
     require_matplotlib()
     from matplotlib.figure import Figure
 
@@ -48,12 +50,12 @@ def _grid(count: int, title: str, height: float = 2.1) -> tuple[Any, Any]:
 
 
 def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
-    """Draw a mean square over time with its band, and how often it lies inside.
+    """Draw a mean square over time with its band; the title states the share of instants inside.
 
     Args:
-        axes: Where to.
-        part: The mean square.
-        settle: Instants before do not count for the share in the title [s].
+        axes: matplotlib Axes.
+        part: Mean square.
+        settle: Time before which instants are left out of the numbers in the title [s].
     """
     axes.fill_between(part.time, part.low, part.high, color=PALE, linewidth=0.0)
     axes.axhline(part.dimension, color=GREY, linewidth=0.8)
@@ -62,17 +64,18 @@ def draw_mean_square(axes: Any, part: MeanSquare, settle: float = 0.0) -> None:
         axes.axvline(settle, color=VERMILLION, linewidth=0.8, linestyle=":")
     counted = part.since(settle)
     title = _TITLES.get(part.name, part.name)
-    axes.set_title(f"{title}: {counted.overall:.2f}, inside {100 * counted.share_inside:.0f} %")
+    inside = f"{100 * counted.share_inside:.0f} % within ±{100 * counted.tolerance:.2g} %"
+    axes.set_title(f"{title}: {counted.overall:.2f}, {inside}")
     reach = 3.0 * (part.high - part.low).max()
     gaps = np.abs(counted.mean - part.dimension)
-    limit = max(reach, 1.15 * float(np.percentile(gaps, 98.0)))  # not for the sake of one instant
+    limit = max(reach, 1.15 * float(np.percentile(gaps, 98.0)))  # regardless of outliers
     axes.set_ylim(max(0.0, part.dimension - limit), part.dimension + limit)
     axes.set_xlim(0.0, part.time[-1])
 
 
 def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
-    """NEES of the state and its blocks over time, each in its band."""
-    text = f"{title}\nMean NEES over flights (blue), in the 95 % band of a consistent filter (gray)"
+    """Figure of the mean NEES of the state and its blocks over time, with their tolerances."""
+    text = f"{title}\nMean NEES over flights (blue), and {_TOLERANCE}"
     figure, axes = _grid(len(parts), text)
     for axis, part in zip(axes, parts.values(), strict=True):
         draw_mean_square(axis, part, settle)
@@ -80,12 +83,13 @@ def nees_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -
 
 
 def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> Any:
-    """Root mean square errors (t, 15) over flights, and the deviations that the filter claims."""
+    """Figure of root mean square errors and standard deviations of the filter, (t, 15) each."""
     require_matplotlib()
     from matplotlib.ticker import LogLocator
 
     text = (
-        f"{title}\nError (blue) and what the filter claims (dashed), root mean square over flights"
+        f"{title}\nError (blue) and standard deviation of the filter (dashed), "
+        "root mean square over flights"
     )
     blocks = {name: part for name, part in PARTS.items() if name in _UNITS}
     figure, axes = _grid(len(blocks), text)
@@ -106,8 +110,8 @@ def errors_figure(time: Floats, errors: Floats, sigmas: Floats, title: str) -> A
 
 
 def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) -> Any:
-    """NIS of the sensors over time, each in its band."""
-    text = f"{title}\nMean NIS over flights (blue), in the 95 % band of a consistent filter (gray)"
+    """Figure of the mean NIS of the sensors over time, with their tolerances."""
+    text = f"{title}\nMean NIS over flights (blue), and {_TOLERANCE}"
     figure, axes = _grid(len(parts), text)
     for axis, part in zip(axes, parts.values(), strict=True):
         draw_mean_square(axis, part, settle)
@@ -115,8 +119,8 @@ def nis_figure(parts: dict[str, MeanSquare], title: str, settle: float = 0.0) ->
 
 
 def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
-    """Autocorrelation of the innovations of each sensor, with the band of white ones."""
-    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white ones (gray)"
+    """Figure of the autocorrelation of each sensor's innovations, with the band of white noise."""
+    text = f"{title}\nAutocorrelation of innovations, with the 95 % band of white noise (gray)"
     figure, axes = _grid(len(found), text)
     for axis, part in zip(axes, found.values(), strict=True):
         lags = np.arange(1, part.correlation.size + 1)
@@ -126,6 +130,6 @@ def whiteness_figure(found: dict[str, Whiteness], title: str) -> Any:
         axis.plot(lags, part.correlation, color=BLUE, marker="o", markersize=3.0, linestyle="none")
         limit = 1.2 * max(2.5 * NEGLIGIBLE_CORRELATION, np.abs(part.correlation).max())
         axis.set_ylim(-limit, limit)
-        axis.set_title(f"{_TITLES.get(part.name, part.name)}: at most {part.largest:+.3f}")
-        axis.set_xlabel("measurements apart")
+        axis.set_title(f"{_TITLES.get(part.name, part.name)}: largest {part.largest:+.3f}")
+        axis.set_xlabel("lag [measurements]")
     return figure

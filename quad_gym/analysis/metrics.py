@@ -1,9 +1,9 @@
-"""How well flights followed their reference, and how consistent their filters were.
+"""Metrics of tracking and of filter consistency.
 
 Errors of flights are arrays whose last axis is time; numbers over seeds are arrays with one entry
-a flight. The filter's error has 15 coordinates in the order of its covariance: position, velocity,
-attitude (the 3-1-2 Euler angles e with R_BI = R(e) R_hat), accelerometer bias, gyro bias; each is
-truth minus estimate.
+per flight. The filter's error has 15 coordinates in the order of its covariance: position,
+velocity, attitude (the 3-1-2 Euler angles e with R_BI = R(e) R_hat), accelerometer bias, gyro bias;
+each is truth minus estimate.
 """
 
 from collections.abc import Mapping
@@ -16,19 +16,19 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.rotations import dcm_to_euler
 
 STATE_DIMENSION = 15
-"""Coordinates of the filter's error."""
+"""Number of coordinates of the filter's error."""
 
 Floats = NDArray[np.float64]
 
 
 class Interval(NamedTuple):
-    """A range with a confidence or probability attached to it."""
+    """Range with an associated confidence or probability."""
 
     low: float
     high: float
 
     def holds(self, value: float) -> bool:
-        """Return True if a value lies in the range, its ends included."""
+        """Return True if a value is in the range, its ends included."""
         return self.low <= value <= self.high
 
 
@@ -37,28 +37,29 @@ class TrackingSummary:
     """Mean errors of flights."""
 
     mean: Floats
-    """(...,) mean over the flight [unit of the error]"""
+    """Means over whole flights, (...,) [unit of the error]"""
     last_half: Floats
-    """(...,) mean over its last half, where the start is forgotten [unit of the error]"""
+    """Means over the last half of flights, without the initial transient, (...,) [unit of the
+    error]"""
 
     def spreads(self, chosen: ArrayLike = True) -> "dict[str, Spread]":
-        """How both means are distributed over flights.
+        """Distributions of both means over flights, by name.
 
         Args:
-            chosen: (...,) bool, which flights count; True: all.
+            chosen: True for flights to include, (...,); True: all flights.
         """
         parts = {"mean": self.mean, "last_half": self.last_half}
         return {name: spread(values[np.asarray(chosen)]) for name, values in parts.items()}
 
 
 def tracking_summary(errors: ArrayLike) -> TrackingSummary:
-    """Mean error of each flight, over all of it and over its last half.
+    """Mean error of each flight, over the whole flight and over its last half.
 
     Args:
-        errors: (..., n) error at n instants that are equally far apart, such as meters.
+        errors: Errors at n equally spaced instants, (..., n), in any unit.
 
     Returns:
-        Means, (...,) each. The last half of an odd number of instants has the middle one.
+        Means, (...,) each. If n is odd, the last half includes the middle instant.
 
     Raises:
         ValueError: If there are no instants.
@@ -71,11 +72,11 @@ def tracking_summary(errors: ArrayLike) -> TrackingSummary:
 
 
 class RunningSummary:
-    """A `TrackingSummary` that is built up instant by instant and keeps nothing but sums.
+    """Recorder for a `TrackingSummary`, which stores only sums.
 
     Args:
         flights: Number of flights.
-        instants: Number of instants that a whole flight has.
+        instants: Number of instants of a complete flight.
     """
 
     def __init__(self, flights: int, instants: int) -> None:
@@ -84,11 +85,11 @@ class RunningSummary:
         self._sums, self._counts = np.zeros((2, flights)), np.zeros((2, flights))
 
     def add(self, error: ArrayLike, counts: ArrayLike = True) -> None:
-        """Take in the next instant.
+        """Add the next instant.
 
         Args:
-            error: (flights,) errors.
-            counts: (flights,) whether each of them counts; those of flights that have ended do not.
+            error: Errors, (flights,).
+            counts: True for flights to include, (flights,); False for flights that have ended.
         """
         counted = np.broadcast_to(np.asarray(counts, bool), self._sums[0].shape)
         value = np.where(counted, np.asarray(error, np.float64), 0.0)
@@ -98,7 +99,7 @@ class RunningSummary:
         self._instant += 1
 
     def result(self) -> TrackingSummary:
-        """Means so far, (flights,) each; NaN where nothing counted."""
+        """Means so far, (flights,) each; NaN for flights without instants."""
         means = np.full(self._sums.shape, np.nan)
         np.divide(self._sums, self._counts, out=means, where=self._counts > 0)
         return TrackingSummary(mean=means[0], last_half=means[1])
@@ -106,13 +107,13 @@ class RunningSummary:
 
 @dataclass(frozen=True)
 class Spread:
-    """Distribution of a number over seeds; all NaN where there are no seeds."""
+    """Distribution of a number over seeds; all values are NaN without seeds."""
 
     count: int
     """seeds"""
     mean: float
     sd: float
-    """standard deviation with n - 1; NaN for a single seed"""
+    """Sample standard deviation, with n - 1; NaN for a single seed"""
     median: float
     low: float
     """5th percentile"""
@@ -125,12 +126,12 @@ def spread(values: ArrayLike) -> Spread:
     """Mean, standard deviation and percentiles of one number per seed.
 
     Args:
-        values: (n,) one number a seed; n may be 0.
+        values: One number per seed, (n,); n may be 0.
     """
     x = np.asarray(values, np.float64).reshape(-1)
     if x.size == 0:
         return Spread(0, *[float("nan")] * 6)
-    # subtracting one of them first makes the spread of equal numbers exactly zero
+    # subtracting one value first makes the spread of equal numbers exactly zero
     sd = float((x - x[0]).std(ddof=1)) if x.size > 1 else float("nan")
     low, median, high = (float(p) for p in np.percentile(x, (5.0, 50.0, 95.0)))
     mean = float(x[0] + (x - x[0]).mean())
@@ -138,15 +139,15 @@ def spread(values: ArrayLike) -> Spread:
 
 
 def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats:
-    """The filter's error in the coordinates of its covariance.
+    """Error of the filter in the coordinates of its covariance.
 
     Args:
-        truth: "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI" (..., 3, 3);
-            position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
-        estimate: Likewise, by the filter.
+        truth: True "position", "velocity", "accel_bias", "gyro_bias" (..., 3) and "R_BI"
+            (..., 3, 3); position and velocity in I [m], [m/s], biases in B [m/s^2], [rad/s].
+        estimate: Estimates with the same names, shapes, units and frames.
 
     Returns:
-        (..., 15) truth minus estimate, the attitude as Euler angles e [rad] with R_BI = R(e) R_hat.
+        Truth minus estimate, (..., 15); attitude as Euler angles e [rad] with R_BI = R(e) R_hat.
 
     Raises:
         KeyError: If a quantity is missing.
@@ -162,14 +163,14 @@ def state_error(truth: Mapping[str, Any], estimate: Mapping[str, Any]) -> Floats
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
-    """Normalized estimation error squared, e^T P^-1 e; about n on average for a consistent filter.
+    """Normalized estimation error squared, e^T P^-1 e; n on average for a consistent filter.
 
     Args:
-        errors: (..., n) errors of the estimate.
-        covariances: (..., n, n) covariances that the filter claims, in the same coordinates.
+        errors: Errors of the estimate, (..., n).
+        covariances: Covariances of the filter in the same coordinates, (..., n, n).
 
     Returns:
-        (...,) without unit; chi-square distributed with n degrees of freedom if the filter is
+        NEES, (...,) [-]; chi-square distributed with n degrees of freedom if the filter is
         consistent.
 
     Raises:
@@ -192,15 +193,15 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Floats:
 
 
 def chi_square_band(dimension: int, count: int = 1, probability: float = 0.95) -> Interval:
-    """Where the mean of `count` independent NEES values lies if the filter is consistent.
+    """Probability band of the mean of `count` independent NEES values of a consistent filter.
 
     Args:
         dimension: Degrees of freedom of one value, 15 for the whole state.
-        count: How many independent values the mean is of.
-        probability: Of the mean to lie in the band; what is left is split evenly.
+        count: Number of independent values in the mean.
+        probability: Probability that the mean is inside the band; the tails are equal.
 
     Raises:
-        ValueError: If a number is out of its range.
+        ValueError: If a number is out of range.
     """
     _require_probability(probability)
     if dimension < 1 or count < 1:
@@ -213,14 +214,14 @@ def chi_square_band(dimension: int, count: int = 1, probability: float = 0.95) -
 
 
 def chi_square_quantile(dimension: int, probability: float) -> float:
-    """The NEES that a consistent filter stays below with a given probability.
+    """Quantile of the NEES of a consistent filter.
 
     Args:
         dimension: Degrees of freedom, 15 for the whole state.
-        probability: Between 0 and 1.
+        probability: Probability that the NEES is below the quantile, between 0 and 1.
 
     Raises:
-        ValueError: If a number is out of its range.
+        ValueError: If a number is out of range.
     """
     _require_probability(probability)
     if dimension < 1:

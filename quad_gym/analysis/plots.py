@@ -1,9 +1,9 @@
 """Figures of flights: path from above, height, and error over time.
 
-Every `draw_*` puts one picture on a matplotlib Axes, so pictures can be combined; every `*_figure`
-makes a figure of one. Figures are made without pyplot: no window opens, nothing needs to be closed,
-and a server without a display will do. Colors are those of Okabe and Ito, which people with a
-color vision deficiency can tell apart.
+Each function `draw_*` draws on a matplotlib Axes, so that drawings can be combined; each function
+`*_figure` makes a figure. Figures are made without pyplot: no window opens, no figure needs to be
+closed, and no display is required. The palette is by Okabe and Ito, which people with a color
+vision deficiency can distinguish.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
-"""Flown; heading; further curves."""
+"""Colors of the path flown, of the heading, and of further curves."""
 INK, GREY, PALE = "#222222", "#767676", "#DDDDDD"
-"""Text and the reference; axes; grid."""
+"""Colors of text and the reference, of axes, and of the grid."""
 
 _STYLE = {
     "font.size": 9.0,
@@ -71,37 +71,37 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """One flight, instant by instant."""
+    """One flight at n instants."""
 
     time: Floats
-    """(n,) since the start [s]"""
+    """Time since the start, (n,) [s]"""
     position: Floats
-    """(n, 3) true position of the center of mass in I [m]"""
+    """True position of the center of mass, (n, 3) in I [m]"""
     heading: Floats
-    """(n, 2) horizontal components of the body x axis in I [-]"""
+    """Horizontal components of the body x axis, (n, 2) in I [-]"""
     reference: Floats
-    """(n, 3) position of the reference in I [m]"""
+    """Position of the reference, (n, 3) in I [m]"""
     error: Floats
-    """(n,) distance of the true position from the reference [m]"""
+    """Distance of the true position from the reference, (n,) [m]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """A range of an error over many flights, instant by instant."""
+    """Range of an error over many flights at n instants."""
 
     low: Floats
-    """(n,) [m]"""
+    """Lower ends, (n,) [m]"""
     high: Floats
-    """(n,) [m]"""
+    """Upper ends, (n,) [m]"""
     label: str
-    """what the range is, for the legend"""
+    """Description of the range, for the legend"""
 
 
 def require_matplotlib() -> None:
-    """Check that figures can be made.
+    """Check that matplotlib is installed.
 
     Raises:
-        ImportError: If matplotlib is missing; the message says how to install it.
+        ImportError: If matplotlib is missing; the message explains how to install it.
     """
     try:
         import matplotlib.figure  # noqa: F401
@@ -113,7 +113,7 @@ def require_matplotlib() -> None:
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Use the house style for what is drawn and saved inside."""
+    """Context in which figures are drawn and saved in the project's style."""
     require_matplotlib()
     import matplotlib
 
@@ -124,21 +124,21 @@ def house_style() -> Iterator[None]:
 def heading_ticks(
     time: ArrayLike, position: ArrayLike, heading: ArrayLike, *, every: float, length: float
 ) -> Floats:
-    """Short lines from the path in the direction of the body x axis, seen from above.
+    """Ticks along a path in the direction of the body x axis, seen from above.
 
     Args:
-        time: (n,) increasing [s].
-        position: (n, 2) or (n, 3) in I [m]; only x and y count.
-        heading: (n, 2) horizontal components of the body x axis; its length does not matter.
-        every: Time between ticks [s]; the first stands at the start.
-        length: Of a tick [m].
+        time: Increasing times, (n,) [s].
+        position: Positions, (n, 2) or (n, 3) in I [m]; only x and y are used.
+        heading: Horizontal components of the body x axis, (n, 2) in I, of any length.
+        every: Time between ticks [s]; the first one is at the start.
+        length: Length of a tick [m].
 
     Returns:
-        (m, 2, 2) first and second end of each tick, in x and y of I [m].
+        Both ends of each tick, (m, 2, 2), x and y in I [m].
     """
     t, here = np.asarray(time, np.float64), np.asarray(position, np.float64)[:, :2]
     direction = np.asarray(heading, np.float64)
-    # half an instant's grace, so that rounding of times loses no tick
+    # half an instant of tolerance, so that rounding of times loses no tick
     grace = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
     wanted = t[0] + every * np.arange(1 + int((t[-1] - t[0] + grace) / every))
     chosen = np.minimum(np.searchsorted(t, wanted - grace), t.size - 1)
@@ -147,13 +147,13 @@ def heading_ticks(
 
 
 def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool = True) -> None:
-    """The flight from above, with the heading as ticks; both axes have one scale.
+    """Draw a flight from above, with ticks for the heading; both axes have the same scale.
 
     Args:
         axes: matplotlib Axes.
-        trace: The flight.
+        trace: Flight.
         tick_every: Time between heading ticks [s].
-        legend: Whether to explain it, where there is most room.
+        legend: True to add a legend.
     """
     from matplotlib.collections import LineCollection
 
@@ -178,10 +178,10 @@ def draw_path(axes: Any, trace: Trace, *, tick_every: float = 0.5, legend: bool 
 
 
 def path_handles(trace: Trace, *, tick_every: float = 0.5) -> list[Any]:
-    """What a legend of `draw_path` shows.
+    """Handles for a legend of `draw_path`.
 
     Args:
-        trace: A flight.
+        trace: Flight.
         tick_every: Time between heading ticks [s].
     """
     return [
@@ -193,17 +193,17 @@ def path_handles(trace: Trace, *, tick_every: float = 0.5) -> list[Any]:
 
 
 def _reference_style(trace: Trace) -> dict[str, Any]:
-    """Of a reference from above; one that rests has a marker, as its line has no length."""
+    """Style of a reference from above: a line, or a marker if the reference does not move."""
     rests = float(np.ptp(trace.reference[:, :2], axis=0).max()) < 1e-6
     return {**_REFERENCE, **(_REST if rests else {})}
 
 
 def draw_height(axes: Any, trace: Trace) -> None:
-    """Height over time, with the reference.
+    """Draw height over time, with the reference.
 
     Args:
         axes: matplotlib Axes.
-        trace: The flight.
+        trace: Flight.
     """
     axes.plot(trace.time, trace.position[:, 2], color=BLUE, linewidth=2.2)
     axes.plot(trace.time, trace.reference[:, 2], **_REFERENCE)
@@ -229,14 +229,14 @@ def draw_error(
     label: str = "one flight",
     limits: tuple[float, float] | None = None,
 ) -> None:
-    """Distance from the reference over time, on a logarithmic scale.
+    """Draw the distance from the reference over time, on a logarithmic scale.
 
     Args:
         axes: matplotlib Axes.
-        trace: The flight.
-        band: Range over many flights, drawn behind it.
+        trace: Flight.
+        band: Range over many flights, drawn behind the curve.
         label: Name of the flight in the legend.
-        limits: Lowest and highest error shown [m], to compare figures; None: as it comes.
+        limits: Lowest and highest error shown [m], to compare figures; None: chosen by matplotlib.
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -244,7 +244,7 @@ def draw_error(
     if band is not None:
         axes.fill_between(trace.time, band.low, band.high, color=ORANGE, alpha=0.45, linewidth=0)
         if np.allclose(band.low, band.high, equal_nan=True):
-            # a band without width would not be seen
+            # a band without width would be invisible
             axes.plot(trace.time, band.high, color=ORANGE, alpha=0.45, linewidth=6.0)
         handles.append(_patch(band.label, ORANGE))
     axes.plot(trace.time, trace.error, color=BLUE, linewidth=1.1)
@@ -260,9 +260,9 @@ def draw_error(
 
 
 def error_limits(traces: list[Trace], bands: list[Band]) -> tuple[float, float]:
-    """Limits of a logarithmic error axis that suit several figures [m].
+    """Common limits of the logarithmic error axes of several figures [m].
 
-    A flight may pass through its reference; its lowest percent does not stretch the axis.
+    The lowest percent of the errors is left out, because flights may pass through their reference.
     """
     curves = [trace.error for trace in traces] + [band.low for band in bands]
     low = min(float(np.nanpercentile(curve, 1.0)) for curve in curves)
@@ -272,12 +272,12 @@ def error_limits(traces: list[Trace], bands: list[Band]) -> tuple[float, float]:
 
 
 def path_figure(trace: Trace, title: str = "") -> Any:
-    """A figure of `draw_path`, as a matplotlib Figure."""
+    """Make a matplotlib Figure with `draw_path`."""
     return _one_picture((5.0, 5.0), title, lambda axes: draw_path(axes, trace))
 
 
 def height_figure(trace: Trace, title: str = "") -> Any:
-    """A figure of `draw_height`, as a matplotlib Figure."""
+    """Make a matplotlib Figure with `draw_height`."""
     return _one_picture((6.0, 3.4), title, lambda axes: draw_height(axes, trace))
 
 
@@ -289,7 +289,7 @@ def error_figure(
     label: str = "one flight",
     limits: tuple[float, float] | None = None,
 ) -> Any:
-    """A figure of `draw_error`, as a matplotlib Figure."""
+    """Make a matplotlib Figure with `draw_error`."""
     return _one_picture(
         (6.0, 3.4), title, lambda axes: draw_error(axes, trace, band, label=label, limits=limits)
     )
@@ -302,12 +302,12 @@ def overview_figure(
     title: str = "",
     label: str = "one flight",
 ) -> Any:
-    """One flight at a glance: its path, its height, and errors over time on one scale.
+    """Make an overview of a flight: path, height, and errors over time on a common scale.
 
     Args:
-        trace: The flight whose path and height are drawn.
-        errors: Flight and band of each picture of errors, by its title.
-        title: Of the path.
+        trace: Flight whose path and height are drawn.
+        errors: Flight and band of each plot of errors, by its title.
+        title: Title of the path.
         label: Name of a flight in the legends.
 
     Returns:
@@ -337,14 +337,14 @@ def overview_figure(
 
 
 def save_figure(figure: Any, stem: Path | str) -> list[Path]:
-    """Write a figure as PNG and SVG; the same figure gives the same bytes.
+    """Write a figure as PNG and SVG; equal figures give bitwise identical files.
 
     Args:
         figure: matplotlib Figure.
-        stem: Path without the ending.
+        stem: Path without file extension.
 
     Returns:
-        The two files.
+        Paths of the two files.
     """
     files = [Path(f"{stem}.{ending}") for ending in ("png", "svg")]
     with house_style():

@@ -1,6 +1,6 @@
-"""Fly a batch to the end and keep what tables and figures of a flight need.
+"""Recording of many flights, for tables and figures.
 
-Of each instant, only sums and percentiles over all flights are kept, so that a hundred thousand
+For each instant, only sums and percentiles over all flights are stored, so that a hundred thousand
 flights fit into memory.
 """
 
@@ -22,43 +22,43 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What came of a batch of flights; arrays have one entry a flight."""
+    """Results of a batch of n flights."""
 
     tracking: TrackingSummary
-    """distance of the true position from the reference [m]"""
+    """Distance of the true position from the reference, (n,) [m]"""
     estimation: TrackingSummary | None
-    """distance of the estimated from the true position [m]; None where nothing was estimated"""
+    """Distance between estimated and true position, (n,) [m]; None without a filter"""
     ending: NDArray[np.int64]
-    """why a flight ended early, see `Ending`; 0: it did not"""
+    """Reasons why flights ended early, (n,), see `Ending`; 0: completed"""
     ended_at: Floats
-    """when [s]; NaN: it did not"""
+    """Times at which flights ended early, (n,) [s]; NaN: completed"""
     trace: Trace
-    """the first flight, up to its ending"""
+    """First flight, up to its ending"""
     band: Band
-    """5th to 95th percentile of the tracking errors of the flights not yet ended"""
+    """5th to 95th percentile of the tracking errors of flights in progress"""
     nees_time: Floats
-    """(k,) instants at which the filter's consistency was looked at [s]"""
+    """Times at which NEES was computed, (k,) [s]"""
     nees: Floats
-    """(k, n) of the filter's whole state; NaN after an ending and where nothing was estimated"""
+    """NEES of the whole state, (k, n); NaN after an ending and without a filter"""
 
     @property
     def finished(self) -> NDArray[np.bool_]:
-        """Which flights flew to the end."""
+        """True for flights that were completed, (n,)."""
         return np.asarray(self.ending == Ending.NONE)
 
     @property
     def nees_last_half(self) -> Floats:
-        """NEES of all flights at all instants of the last half, (m,) without NaN."""
+        """NEES values of all flights in the last half of the time, (m,) without NaN."""
         late = self.nees[self.nees_time >= 0.5 * self.nees_time[-1]]
         return np.asarray(late[np.isfinite(late)])
 
     def count(self, *, filter_failed: bool) -> int:
-        """How many flights ended early because the filter failed, or else because they crashed."""
+        """Number of flights that ended early: by a failure of the filter, or else by a crash."""
         of_filter = self.ending == Ending.FILTER_FAILED
         return int((~self.finished & (of_filter == filter_failed)).sum())
 
     def ending_names(self) -> list[str]:
-        """Why each flight ended early, or "finished"."""
+        """Name of each flight's ending, or "finished"."""
         names = {int(e): str(e) for e in Ending} | {0: "finished"}
         return [names[int(code)] for code in self.ending]
 
@@ -71,19 +71,19 @@ def record_flights(
     nees_samples: int = 20,
     progress: Callable[[range], Iterable[int]] | None = None,
 ) -> Recording:
-    """Fly all flights of a batch that flies by itself, and record them.
+    """Fly and record all flights of a batch with built-in PD control.
 
-    A flight counts up to the step that ends its episode; that step and what follows do not count.
+    A flight is recorded up to the step before the one that ends its episode.
 
     Args:
         batch: Flights of `Control.PD` without autoreset.
-        seeds: One per flight.
-        steps: Control periods to fly.
-        nees_samples: Instants, evenly spread over the flight, at which NEES is computed.
-        progress: Wraps the range of instants, as `tqdm.tqdm` does.
+        seeds: Seeds of the flights.
+        steps: Number of control periods.
+        nees_samples: Number of evenly spaced instants at which NEES is computed.
+        progress: Function that wraps the range of instants, such as `tqdm.tqdm`.
 
     Returns:
-        The recording; the start counts as the first of `steps + 1` instants.
+        Recording of `steps + 1` instants, of which the start is the first.
     """
     count = batch.count
     times = np.arange(steps + 1, dtype=np.float64) / batch.clocks.control_rate
@@ -142,13 +142,13 @@ def record_flights(
 
 
 class Tracer:
-    """Keeps how episodes go on over time: the error of all, the paths of the first few.
+    """Recorder of episodes over time: the errors of all flights, and the paths of the first ones.
 
-    Hand its `add` to `evaluation.roll_out` as `watch`, of an environment that does not begin new
-    episodes within a step. Arrays have an entry for each instant, the start first.
+    Pass its method `add` to `evaluation.roll_out` as `watch`. The environment must not use
+    same-step autoreset. Arrays have one entry per instant, beginning with the start.
 
     Args:
-        paths: Flights whose path is kept.
+        paths: Number of flights whose paths are recorded.
     """
 
     def __init__(self, paths: int = 1) -> None:
@@ -160,7 +160,13 @@ class Tracer:
         self.control_rate = 0.0
 
     def add(self, step: int, batch: FlightBatch, flying: NDArray[np.bool_]) -> None:
-        """Keep the present instant of flights that are still flying."""
+        """Record the present instant of episodes in progress.
+
+        Args:
+            step: Number of the step; 0 at the start.
+            batch: Flights.
+            flying: True for episodes in progress, (n,).
+        """
         first = np.arange(min(self._paths, batch.count))
         if step == 0:
             self.control_rate = batch.clocks.control_rate
@@ -177,17 +183,17 @@ class Tracer:
 
     @property
     def time(self) -> Floats:
-        """(k,) instants [s]."""
+        """Times since the start, (k,) [s]."""
         return np.arange(len(self._errors)) / self.control_rate
 
     @property
     def errors(self) -> Floats:
-        """(k, n) true position error [m]; NaN after an episode's end."""
+        """True position errors, (k, n) [m]; NaN after the end of an episode."""
         return np.stack(self._errors)
 
     @property
     def percentiles(self) -> Floats:
-        """(3, k) 5th, 50th and 95th percentile of the error of the episodes not yet ended [m]."""
+        """5th, 50th and 95th percentile of the errors of episodes in progress, (3, k) [m]."""
         errors = self.errors
         found = np.full((3, len(errors)), np.nan)
         flown = np.isfinite(errors).any(axis=1)
@@ -195,7 +201,7 @@ class Tracer:
         return found
 
     def trace(self, flight: int) -> Trace:
-        """The path of one of the first flights, up to its end."""
+        """Path of one of the first flights, up to its end."""
         position = np.stack(self._positions)[:, flight]
         shown = np.isfinite(position[:, 0])
         assert self._references is not None
@@ -210,7 +216,7 @@ class Tracer:
 
 
 def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
-    """Normalized estimation error squared of the chosen flights at the present instant, (m,)."""
+    """Normalized estimation error squared of chosen flights at the present instant, (m,)."""
     names = {"position": "r", "velocity": "v", "accel_bias": "b_a", "gyro_bias": "b_g"}
     truth: dict[str, Any] = {word: batch.record(name)[chosen] for word, name in names.items()}
     estimate = {word: batch.record(f"{name}_hat")[chosen] for word, name in names.items()}
@@ -220,7 +226,7 @@ def nees_of_flights(batch: FlightBatch, chosen: NDArray[np.bool_]) -> Floats:
 
 
 def reference_of_flight(batch: FlightBatch, flight: int, times: Floats) -> Floats:
-    """Where the reference of a flight is at given times [s], (n, 3) in I [m]."""
+    """Reference positions of a flight at given times [s], (n, 3) in I [m]."""
     followed = batch.trajectory(flight)
     if followed is not None:
         trajectory, phase = followed

@@ -1,13 +1,12 @@
-"""What becomes of a filter after a fault: how soon it is right again, and whether it says so.
+"""Recovery of filters after faults, and detection of divergence.
 
-* **Right** is a flight whose nine errors of position, velocity and attitude have a normalized
-  square below the chi-square quantile that holds 99.73 % of a consistent filter's, as 3 sigma do of
-  a single number. Where that filter has 0.27 % of its flights outside at any instant, one has gone
-  astray that has more.
-* **Told** is a flight of which `filter_diverged` of `info` is true at the same instant.
-* **Far off** is one in which any of these errors exceeds six of its deviations. A missed alarm is a
-  flight that is far off for `MISSED_AFTER` on end and not told in all that time; a false alarm is
-  one that is told anew without a fault.
+* A flight is **consistent** (`right`) while the NEES of position, velocity and attitude is below
+  the 99.73 % chi-square quantile with nine degrees of freedom, which corresponds to 3 sigma of a
+  single number. A consistent filter exceeds it in 0.27 % of the flights at any instant.
+* A flight is **flagged** (`told`) while `info["filter_diverged"]` is true.
+* A flight has a **large error** (`far_off`) while any of these nine errors exceeds six standard
+  deviations. A missed alarm is a flight with large errors for `MISSED_AFTER` without interruption
+  that is not flagged in that time; a false alarm is a new flag without a fault.
 """
 
 from collections.abc import Sequence
@@ -21,53 +20,53 @@ from quad_gym.analysis.metrics import chi_square_quantile, nees
 from quad_gym.batch.flight_batch import FlightBatch
 
 RIGHT = 0.9973
-"""Share of a consistent filter's flights that are right at an instant: as 3 sigma."""
+"""Probability of the chi-square quantile below which a flight is consistent, as for 3 sigma."""
 FAR_OFF = 6.0
-"""Deviations."""
+"""Number of standard deviations beyond which an error counts as large."""
 MISSED_AFTER = 2.0
-"""Time that a flight may be far off without being told [s]."""
+"""Duration of large errors without a flag after which an alarm counts as missed [s]."""
 WANTED = 0.99
-"""Share of flights that are to be right or told."""
+"""Required share of flights that are consistent or flagged."""
 MOTION = slice(0, 9)
-"""Position, velocity and attitude."""
+"""Coordinates of position, velocity and attitude in the error state."""
 
 Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was seen of flights, instant by instant."""
+    """Consistency, flags and large errors of flights over time."""
 
     time: NDArray[np.float64]
-    """(t,) since the start [s]"""
+    """Time since the start, (t,) [s]"""
     right: Flags
-    """(t, flights)"""
+    """True while a flight is consistent, (t, flights)"""
     told: Flags
-    """(t, flights)"""
+    """True while a flight is flagged as diverged, (t, flights)"""
     far_off: Flags
-    """(t, flights)"""
+    """True while a flight has a large error, (t, flights)"""
 
     def share(self, flags: Flags, time: float) -> float:
-        """Share of flights at an instant."""
+        """Share of flights with a flag, (t, flights), at a time [s]."""
         return float(flags[self.index(time)].mean())
 
     def index(self, time: float) -> int:
-        """Number of the instant nearest to `time` [s]."""
+        """Index of the instant nearest to `time` [s]."""
         return int(np.abs(self.time - time).argmin())
 
     @property
     def silent(self) -> Flags:
-        """(t, flights) neither right nor told."""
+        """Undetected failures, (t, flights): True while neither consistent nor flagged."""
         return ~(self.right | self.told)
 
     def time_to(self, flags: Flags, since: float) -> float:
-        """How long after `since` it takes until `flags` hold for WANTED of the flights, for good.
+        """Time after `since` until `flags` hold permanently for the share `WANTED` of the flights.
 
-        Of some hundred flights of a filter that is right, chance alone has some outside now and
-        then: only an instant at which twice as many lack is one before the recovery.
+        Even of a consistent filter, some of a hundred flights occasionally exceed the quantile by
+        chance. Shares above 1 - 2 (1 - `WANTED`) therefore do not interrupt a recovery.
 
         Returns:
-            Time [s]; infinite if they never do.
+            Time [s]; infinite if the share is never reached.
         """
         after = self.time > since + 1e-9
         share = flags[after].mean(axis=1)
@@ -77,21 +76,21 @@ class Recovery:
         return float(self.time[after][enough[0]] - since) if enough.size else np.inf
 
     def missed_alarms(self) -> Flags:
-        """(flights,) which were far off for MISSED_AFTER on end without being told."""
+        """True for flights with large errors for `MISSED_AFTER` and no flag, (flights,)."""
         return longest(self.far_off & ~self.told) * self._every >= MISSED_AFTER - 1e-9
 
     def long_far_off(self) -> Flags:
-        """(flights,) which were far off for MISSED_AFTER on end, told or not."""
+        """True for flights with large errors for `MISSED_AFTER`, flagged or not, (flights,)."""
         return longest(self.far_off) * self._every >= MISSED_AFTER - 1e-9
 
     def alarms(self) -> int:
-        """How often flights were told anew."""
+        """Number of times that a flag was newly raised, in all flights together."""
         before = np.vstack([np.zeros_like(self.told[:1]), self.told[:-1]])
         return int((self.told & ~before).sum())
 
     @property
     def hours(self) -> float:
-        """Time flown by all flights together [h]."""
+        """Total flight time of all flights [h]."""
         return float(self.right.size * self._every / 3600.0)
 
     @property
@@ -100,7 +99,7 @@ class Recovery:
 
 
 def longest(flags: Flags) -> NDArray[np.int64]:
-    """(n,) the longest run of instants, the first axis, at which flags hold."""
+    """Longest run of instants (the first axis) at which flags hold, (n,)."""
     best = np.zeros(flags.shape[1:], np.int64)
     run = best.copy()
     for now in flags:
@@ -112,16 +111,16 @@ def longest(flags: Flags) -> NDArray[np.int64]:
 def follow_recovery(
     batch: FlightBatch, *, seeds: Sequence[int], duration: float, every: float = 0.1
 ) -> Recovery:
-    """Fly, and note which flights are right, told or far off.
+    """Fly, and record which flights are consistent, flagged, or have large errors.
 
     Args:
-        batch: Flights that nothing ends and whose filters watch their innovations.
-        seeds: One per flight.
+        batch: Flights of a task without endings, whose filters monitor their innovations.
+        seeds: Seeds of the flights.
         duration: Length of the flights [s].
-        every: Time between two looks [s].
+        every: Time between two evaluations [s].
 
     Raises:
-        ValueError: If there are fewer than two looks.
+        ValueError: If `duration` is shorter than two evaluations.
     """
     stride = max(1, round(every * batch.sensors.imu.rate))
     looks = round(duration * batch.sensors.imu.rate) // stride

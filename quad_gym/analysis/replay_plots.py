@@ -1,4 +1,4 @@
-"""The figure of a replayed log: estimates within their deviations, and innovations."""
+"""Figure of a replayed log: estimates with their standard deviations, and innovations."""
 
 from typing import Any
 
@@ -21,11 +21,11 @@ _SENSORS = {
 
 
 def draw_states(axes: Any, result: Replay, name: str) -> None:
-    """Draw position, velocity or attitude, with bands of two deviations.
+    """Draw position, velocity or attitude, with bands of two standard deviations.
 
     Args:
-        axes: Where to.
-        result: A replay.
+        axes: matplotlib Axes.
+        result: Result of a replay.
         name: "position", "velocity" or "attitude".
     """
     first = {"position": 0, "velocity": 3, "attitude": 6}[name]
@@ -49,7 +49,7 @@ def draw_states(axes: Any, result: Replay, name: str) -> None:
 
 
 def draw_nis(axes: Any, measured: Measured, title: str) -> None:
-    """Draw normalized innovations squared, what was left out, and where 99 of 100 should lie."""
+    """Draw normalized innovations squared, rejected measurements, and the 99 % quantile."""
     freedoms = measured.innovation.shape[1]
     bound = chi_square_quantile(freedoms, 0.99)
     known = np.isfinite(measured.nis)
@@ -58,23 +58,23 @@ def draw_nis(axes: Any, measured: Measured, title: str) -> None:
     axes.axhspan(0.0, bound, color=PALE, linewidth=0.0)
     dots: dict[str, Any] = {"linestyle": "none", "color": BLUE, "marker": ".", "markersize": 2.5}
     axes.plot(measured.time[taken], measured.nis[taken], **dots)
-    # what is beyond the picture stands at its edge
+    # values beyond the limits are drawn at the edge
     high = np.minimum(measured.nis[left_out], 0.97 * top)
     axes.plot(measured.time[left_out], high, "x", color=VERMILLION, markersize=5.0)
     mean = f", mean {measured.nis[taken].mean():.2f} of {freedoms}" if taken.any() else ""
-    axes.set_title(f"{title}{mean}; left out: {int(left_out.sum())}")
+    axes.set_title(f"{title}{mean}; rejected: {int(left_out.sum())}")
     axes.set_ylim(0.0, top)
 
 
 def replay_figure(result: Replay, title: str) -> Any:
-    """Position, velocity and attitude of a replay, and the NIS of each sensor.
+    """Make a figure of position, velocity and attitude of a replay, and the NIS of each sensor.
 
     Args:
-        result: A replay.
-        title: Of the figure.
+        result: Result of a replay.
+        title: Title of the figure.
 
     Returns:
-        A matplotlib Figure.
+        matplotlib Figure.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -101,6 +101,6 @@ def replay_figure(result: Replay, title: str) -> Any:
 
 
 def sensors_of(result: Replay) -> dict[str, Measured]:
-    """Innovations by sensor, those of all features together."""
+    """Innovations by sensor; the innovations of all features are combined."""
     kinds = by_sensor(result.measured)
     return {name: kinds[name] for name in _SENSORS if name in kinds}

@@ -1,4 +1,4 @@
-"""Output of experiments: tables on the screen, summaries as JSON, numbers as CSV."""
+"""Output of experiments: tables on the screen, JSON and CSV files."""
 
 import csv
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 
 
 def versions(*packages: str) -> dict[str, str | None]:
-    """Versions of Python, quad_gym and further packages; None for one that is not installed."""
+    """Versions of Python, quad_gym and further packages; None if a package is not installed."""
     found: dict[str, str | None] = {
         "python": platform.python_version(),
         "quad_gym": version("quad-gym"),
@@ -30,24 +30,24 @@ def versions(*packages: str) -> dict[str, str | None]:
 
 
 def short_name(policy: str) -> str:
-    """A policy's name for tables and pictures: of a file, its folder and its name."""
+    """Name of a policy for tables and figures; for a file, its folder and name."""
     path = Path(policy)
     return f"{path.parent.name}/{path.stem}".lstrip("/") if path.suffix else policy
 
 
 _made: list[Path] = []
-"""Folders that were made for files to come, each before those in which it is."""
+"""Folders made for later output, each one before its parents."""
 
 
 def require_writable(option: str, folder: Path) -> None:
-    """Make a folder if it is missing, and see that files can be written there.
+    """Create a folder if it is missing, and check that files can be written in it.
 
     Args:
-        option: What named it, such as "--output", for the message.
-        folder: The folder.
+        option: Option that specified it, such as "--output", for the message.
+        folder: Path of the folder.
 
     Raises:
-        OSError: If nothing can be written there.
+        OSError: If files cannot be written in it.
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
@@ -59,14 +59,14 @@ def require_writable(option: str, folder: Path) -> None:
 
 
 def remove_unused_folders() -> None:
-    """Remove the folders that `require_writable` has made and nothing was written to."""
+    """Remove folders that `require_writable` has created and that are still empty."""
     while _made:
         with suppress(OSError):  # not empty, or gone
             _made.pop(0).rmdir()
 
 
 def as_json(value: Any) -> Any:
-    """`value` in the types of JSON: dataclasses as objects, arrays as lists, NaN as null."""
+    """Convert a value to JSON types: dataclasses to objects, arrays to lists, NaN to null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: as_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -81,10 +81,10 @@ def as_json(value: Any) -> Any:
 
 
 def write_json(file: Path, value: Any) -> Path:
-    """Write `value` as JSON that people can read too.
+    """Write a value as indented JSON.
 
     Returns:
-        The file.
+        Path of the file.
     """
     text = json.dumps(as_json(value), indent=2, allow_nan=False, ensure_ascii=False)
     file.write_text(text + "\n", encoding="utf-8")
@@ -92,10 +92,14 @@ def write_json(file: Path, value: Any) -> Path:
 
 
 def write_csv(file: Path, columns: Mapping[str, Sequence[Any]]) -> Path:
-    """Write columns of equal length, by their headings; NaN and None as empty cells.
+    """Write columns of equal length as CSV; NaN and None become empty cells.
+
+    Args:
+        file: Path of the file.
+        columns: Values of each column, by heading.
 
     Returns:
-        The file.
+        Path of the file.
 
     Raises:
         ValueError: If the columns differ in length.
@@ -109,17 +113,17 @@ def write_csv(file: Path, columns: Mapping[str, Sequence[Any]]) -> Path:
 
 
 def text_table(groups: Mapping[str, Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
-    """A table for the screen; the first column is flush left, all others flush right.
+    """Format a table for the screen; the first column is left-aligned, others right-aligned.
 
     Args:
-        groups: Headings of columns, by the heading of their group.
-        rows: Cells, one for each column.
+        groups: Headings of the columns of each group, by heading of the group.
+        rows: Cells of each row, one per column.
     """
     headings = [heading for columns in groups.values() for heading in columns]
     widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
     spans, first = [], 0
     for group, columns in groups.items():
-        # a group is as wide as its heading at least; its last column takes what is missing
+        # a group is at least as wide as its heading; its last column is widened if necessary
         span = range(first, first + len(columns))
         width = sum(widths[k] for k in span) + 2 * (len(columns) - 1)
         widths[span[-1]] += max(0, len(group) - width)

@@ -1,4 +1,4 @@
-"""Figures of a study: returns while learning, and where policies look in one episode."""
+"""Figures of a study: returns during training, and single episodes of several policies."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,45 +23,45 @@ Floats = NDArray[np.float64]
 
 
 class Glance(NamedTuple):
-    """One episode of one policy, (t,) each."""
+    """Heading and errors of one policy in one episode of LookAround, (t,) each."""
 
     time: Floats
-    """[s]"""
+    """Time since the start [s]"""
     off_wall: Floats
-    """angle of body x from the direction of the features [rad]"""
+    """Angle of body x from the direction of the features [rad]"""
     off_reward: Floats
-    """angle of body x from the wanted heading [rad]"""
+    """Angle of body x from the desired heading [rad]"""
     sigma: Floats
-    """largest standard deviation of the position that the filter states [m]"""
+    """Largest standard deviation of the position according to the filter [m]"""
     estimation_error: Floats
-    """[m]"""
+    """Distance between estimated and true position [m]"""
     position_error: Floats
-    """[m]"""
+    """Distance of the true position from the reference [m]"""
 
 
 class Pace(NamedTuple):
-    """One episode of one policy in a race, (t,) each."""
+    """Speed and errors of one policy in one episode of a race, (t,) each."""
 
     time: Floats
-    """[s]"""
+    """Time since the start [s]"""
     speed: Floats
-    """[m/s]"""
+    """True speed [m/s]"""
     sigma: Floats
-    """largest standard deviation of the position that the filter states [m]"""
+    """Largest standard deviation of the position according to the filter [m]"""
     estimation_error: Floats
-    """[m]"""
+    """Distance between estimated and true position [m]"""
     outage: Floats | None = None
-    """1 where GNSS fails, else 0; None: it does not"""
+    """GNSS outage: 1 while GNSS fails, else 0; None: no outage"""
 
 
 def returns_figure(
     curves: Mapping[str, Sequence[tuple[Floats, Floats]]], levels: Mapping[str, float]
 ) -> Any:
-    """How returns on the estimate or the truth rise while training: each arm on what it learns on.
+    """Make a figure of returns during training, each arm evaluated on its own observations.
 
     Args:
-        curves: Million steps (k,) and mean returns (k,) of every seed, by label.
-        levels: Horizontal lines to compare with, by label.
+        curves: Training steps (k,) [million] and mean returns (k,) of each seed, by label.
+        levels: Horizontal lines for comparison, by label.
 
     Returns:
         matplotlib Figure.
@@ -86,11 +86,11 @@ def returns_figure(
 
 
 def glance_figure(episodes: Mapping[str, Glance], half_view: float) -> Any:
-    """Where policies look in the same episode, and what that does to the filter and the flight.
+    """Make a figure of policies' headings in one episode, with estimation and tracking errors.
 
     Args:
-        episodes: By the label of the policy.
-        half_view: Half of the camera's horizontal angle of view [rad].
+        episodes: Episodes, by label of the policy.
+        half_view: Half of the camera's horizontal field of view [rad].
 
     Returns:
         matplotlib Figure.
@@ -119,10 +119,10 @@ def glance_figure(episodes: Mapping[str, Glance], half_view: float) -> Any:
 
 
 def pace_figure(episodes: Mapping[str, Pace]) -> Any:
-    """How fast policies fly in the same episode, how sure the filter is, and how right.
+    """Make a figure of the speeds of policies in one episode, with estimation errors and 3 sigma.
 
     Args:
-        episodes: By the label of the policy.
+        episodes: Episodes, by label of the policy.
 
     Returns:
         matplotlib Figure.
@@ -159,7 +159,7 @@ def pace_figure(episodes: Mapping[str, Pace]) -> Any:
 
 
 def _draw_angles(axes: Any, episode: Glance, half_view: float) -> None:
-    """Where body x points, and where it should for the reward, as seen from the features."""
+    """Draw the direction of body x and the desired heading, relative to the features."""
     span = math.degrees(half_view)
     axes.axhspan(-span, span, color=ORANGE, alpha=0.25, linewidth=0, label="markers in view")
     wanted = _unbroken(np.degrees(episode.off_wall - episode.off_reward))
@@ -170,14 +170,14 @@ def _draw_angles(axes: Any, episode: Glance, half_view: float) -> None:
 
 
 def _draw_errors(axes: Any, episode: Glance) -> None:
-    """What the filter states, what is so, and how far off the vehicle is."""
+    """Draw the filter's standard deviation, the estimation error, and the tracking error."""
     _draw_knowledge(axes, episode)
     axes.plot(episode.time, episode.position_error, color=VERMILLION, label="error of the position")
     _mark_end(axes, episode.time, episode.position_error, "crash")
 
 
 def _draw_knowledge(axes: Any, episode: Glance | Pace) -> None:
-    """What the filter states of its error, and what is so."""
+    """Draw the filter's standard deviation and the estimation error."""
     axes.plot(episode.time, 3.0 * episode.sigma, color=PALE, label="_")
     axes.fill_between(
         episode.time, 1e-3, 3.0 * episode.sigma, color=GREEN, alpha=0.2, linewidth=0,
@@ -190,7 +190,7 @@ def _draw_knowledge(axes: Any, episode: Glance | Pace) -> None:
 
 
 def _mark_end(axes: Any, time: Floats, values: Floats, what: str) -> None:
-    """A line where an episode has ended, if it has."""
+    """Draw a line where an episode has ended early."""
     over = ~np.isfinite(values)
     if over.any():
         end = time[int(np.argmax(over))]
@@ -202,7 +202,7 @@ def _mark_end(axes: Any, time: Floats, values: Floats, what: str) -> None:
 
 
 def _unbroken(degrees: Floats) -> Floats:
-    """Angles in (-180, 180], with a gap where they pass from one end to the other."""
+    """Wrap angles to (-180, 180], with a gap (NaN) at each jump."""
     wrapped = (degrees + 180.0) % 360.0 - 180.0
     jumps = np.abs(np.diff(wrapped, append=wrapped[-1:])) > 180.0
     return np.where(jumps, np.nan, wrapped)

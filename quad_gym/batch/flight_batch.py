@@ -59,51 +59,53 @@ from quad_gym.records import (
 )
 
 _NO_BOUNDS = np.zeros(0)
-"""Fields that are NaN at first, all others are zero."""
+"""Bounds of a batch without observations."""
 _WORTH_NO_COPY = 1 << 16
-"""Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
+"""Size of observations [bytes] above which each step allocates memory, instead of copying."""
 
 
 class FlightBatch(FlightMemory):
     """N flights of one configuration, advanced together by compiled kernels.
 
-    A flight is nothing but its record: `snapshot` and `restore` copy arrays, and what a flight does
-    depends on its seed and its actions alone, not on the batch's size, its order or the number of
-    threads.
+    The record of a flight holds its complete state: `snapshot` and `restore` copy arrays, and a
+    flight depends only on its seed and its actions, not on the size of the batch, its order or the
+    number of threads.
 
     Args:
         count: Number of flights.
-        vehicle: The vehicle, or the name of a preset.
-        sensors: The sensor suite, or the name of a preset.
+        vehicle: Vehicle, or the name of a preset.
+        sensors: Sensor suite, or the name of a preset.
         gains: Gains of `Control.PD`, or the name of a preset.
-        action_params: Scaling of actions and bandwidths of the inner loops.
-        task: Reference, start and endings.
-        source: What the controller sees.
-        control: What an action means; `Control.PD` flies by itself.
-        control_rate: Actions per second, a whole division of the IMU rate [Hz].
-        substeps: Runge-Kutta steps in a tick.
-        action_delay: How much later than commanded an action is carried out, at most
-            MAX_ACTION_DELAY, in whole ticks [control steps]. Before, a vehicle hovers.
-        layout: What an observation holds.
-        include_std: Whether an observation holds the filter's standard deviations.
-        privileged: Whether an observation ends with the truth.
-        bounds: (low, high) of the observation, each (n,); None: the batch observes nothing.
-        autoreset: When a flight whose episode is over begins the next one.
-        run_filter: Whether sensors and filter run; None: where something needs them.
+        action_params: Scales of the actions, and bandwidths of the inner loops.
+        task: Reference, start and termination.
+        source: Source of the state that the controller observes.
+        control: Meaning of an action; `Control.PD` flies without actions.
+        control_rate: Actions per second; must divide the IMU rate [Hz].
+        substeps: Runge-Kutta steps per tick.
+        action_delay: Delay from the command of an action to its execution, rounded to whole ticks,
+            at most MAX_ACTION_DELAY [control steps]. Before the first action arrives, the vehicle
+            hovers.
+        layout: Layout of the observations.
+        include_std: True: append the filter's standard deviations to the observations.
+        privileged: True: append the truth to the observations.
+        bounds: (low, high) of the observations, each (n,); None: no observations.
+        autoreset: Start of the next episode after one has ended.
+        run_filter: True: sensors and filter run; None: they run if another argument needs them.
         filter_start: "cold": the filter starts from its first fix; "warm": it has converged in
             `quad_gym.batch.warm_start.WARM_UP` of hovering where the task begins, with errors drawn
             from the covariance that it has reached. See `quad_gym.batch.cold_start` for the bounds.
-        innovations: Whether to keep innovations and NIS block by block, for `read`: "innovation",
-            "innovation_sigma", "block_nis"; a gate keeps them anyway, and so does a filter that
-            meets `faults`, or whose task has `truncate_when_diverged`.
-        threads: Threads to use; None: as many as there are cores.
-        true_vehicle: The vehicle as it is, where it differs from the nominal one that the
-            controller knows.
-        true_sensors: The sensors as they are, where they differ from what the filter believes.
+        innovations: True: keep innovations and NIS block by block, for `record`: "innovation",
+            "innovation_sigma", "block_nis". Filters with an innovation gate, with `faults`, or with
+            `truncate_when_diverged` in their task always keep them.
+        threads: Number of threads; None: one per core.
+        true_vehicle: True parameters of the vehicle, if they differ from `vehicle`, which the
+            controller assumes.
+        true_sensors: True parameters of the sensors, if they differ from `sensors`, which the
+            filter assumes.
         world: Wind, gusts, drag, ground, battery, obstacles and geofence, or the name of a preset.
-        randomization: What is drawn anew for every episode, around `true_vehicle`, `true_sensors`
+        randomization: Parameters drawn in every episode, relative to `true_vehicle`, `true_sensors`
             and `world`: a `Randomization`, or distributions by name.
-        faults: What goes wrong: faults, or names of presets, see `quad_gym.faults`.
+        faults: Faults of sensors and rotors, or names of presets, see `quad_gym.faults`.
 
     Raises:
         ValueError: If an argument is invalid; nothing is allocated then.
@@ -269,17 +271,17 @@ class FlightBatch(FlightMemory):
         """Begin new episodes.
 
         Args:
-            seeds: One per flight, seeding it as Gymnasium seeds an environment; None in it: fresh
-                entropy.
-            keys: (count, 2) keys of the random streams, instead of seeds. Without either, streams
-                go on.
-            mask: (count,) bool: which flights; None: all.
-            position: (3,) or (count, 3) in I, to start with instead of a drawn one [m].
-            velocity: (3,) or (count, 3) in I, likewise [m/s].
-            yaw: Scalar or (count,), likewise [rad].
+            seeds: One seed per flight, used as Gymnasium uses an environment's; None for a flight:
+                fresh entropy.
+            keys: (count, 2) keys of the random streams, instead of seeds. Without either, the
+                streams continue.
+            mask: (count,) bool: the flights to reset; None: all of them.
+            position: (3,) or (count, 3) initial position in I, instead of a drawn one [m].
+            velocity: (3,) or (count, 3) initial velocity in I, instead of a drawn one [m/s].
+            yaw: Scalar or (count,) initial yaw, instead of a drawn one [rad].
 
         Returns:
-            (count, n_observation) float32 observations of the present instant, of all flights.
+            (count, n_observation) float32 observations of all flights at the present instant.
 
         Raises:
             ValueError: If the arguments do not fit the number of flights; nothing has changed then.
@@ -307,13 +309,13 @@ class FlightBatch(FlightMemory):
         """Fly one control period.
 
         Args:
-            actions: (count, 4) in [-1, 1], already checked; None keeps the present ones.
+            actions: (count, 4) in [-1, 1], not checked here; None: keep the present actions.
 
         Returns:
             (count, n_observation) float32 observations; `results` holds the rest.
 
         Raises:
-            ValueError: If flights have never been reset; it is a RuntimeError, too.
+            ValueError: If a flight has never been reset; the exception is also a RuntimeError.
         """
         if not self._begun:
             self._require_begun()
@@ -338,7 +340,7 @@ class FlightBatch(FlightMemory):
             self.final_innovations = innovations_of(self)
 
     def _require_begun(self) -> None:
-        """Refuse to step flights that have no state; looked at until all flights have one."""
+        """Refuse to step flights that have no state; checked until all flights have one."""
         waiting = (self._blocks["episode"] == 0.0) & (self._blocks["idle"] == 0.0)
         if waiting.any():
             raise check.NotResetError(
@@ -361,7 +363,7 @@ class FlightBatch(FlightMemory):
         return self._observations
 
     def _calls_of_threads(self) -> Calls:
-        """What the threads call the compiled code with."""
+        """Return the arguments with which the threads call the compiled code."""
         shared = {
             Call.RESETS: self._resets,
             Call.WORLD: self._world,
@@ -407,35 +409,35 @@ class FlightBatch(FlightMemory):
         return np.array(self._model["R_IG"][0, ..., 0])
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the threads, which a copy makes anew."""
+        """Return the state without the threads, which a copy starts again."""
         return self.__dict__ | {"_crew": None, "_calls": None}
 
     def trajectory(self, flight: int) -> tuple[Trajectory, float] | None:
-        """The trajectory of a flight's present episode, turned as it is flown, and its phase.
+        """Return the trajectory of a flight's present episode, as rotated for it, and its phase.
 
         Args:
-            flight: Its number.
+            flight: Index of the flight.
 
         Returns:
-            The trajectory and the time on it at which the episode began [s]; None where the task
-            has another reference.
+            The trajectory, and the time on it at which the episode began [s]; None if the task has
+            another reference.
         """
         return followed(self, flight)
 
     def limit(self, max_steps: int) -> None:
-        """Truncate episodes after this many steps; 0: never."""
+        """Truncate episodes after this many steps; 0: no limit."""
         self._settings["max_steps"] = check.whole("max_steps", max_steps, least=0)
 
     @property
     def max_steps(self) -> int:
-        """Steps after which an episode is truncated; 0: never."""
+        """Number of steps after which an episode is truncated; 0: no limit."""
         return int(self._settings["max_steps"][0])
 
     @property
     def results(self) -> NDArray[np.float64]:
-        """(count, 13) of the last step, in the columns of RESULTS; the next step overwrites it."""
+        """Results (count, 13) of the last step by RESULTS; the next step overwrites them."""
         return self._results[:, : self.count].T
 
     def result(self, name: str) -> NDArray[np.float64]:
-        """One column of `RESULTS` of the last step, as a new array (count,)."""
+        """Return one column of `RESULTS` of the last step, as a new array (count,)."""
         return self._results[RESULTS.index(name), : self.count].copy()

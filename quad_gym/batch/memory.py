@@ -1,4 +1,4 @@
-"""The records of many flights in memory: how they are read, kept and brought back."""
+"""The records of many flights in memory: reading, keeping and restoring them."""
 
 import hashlib
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ _PARTS_OF = {
     "gnss_drift_hat": ("slow_hat", (slice(0, 3),)),
     "L_drift": ("L_slow", (slice(0, 3), slice(0, 18))),
 }
-"""Parts of fields that have names: of suites whose GNSS positions drift."""
+"""Names of parts of fields, for suites with GNSS drift."""
 
 
 _NO_CONFIGURATION = ("paths", "pieces", "max_steps")
@@ -60,11 +60,11 @@ class FlightMemory:
     _world: NDArray[Any]
 
     def _allocate(self, room: Room, undrawn: NDArray[np.float64], configuration: int) -> None:
-        """Make the records of flights that have never been reset.
+        """Allocate the records of flights that have never been reset.
 
         Args:
-            room: Which fields they have.
-            undrawn: What the columns of "drawn" are where nothing is drawn.
+            room: The fields of the records.
+            undrawn: Values of the columns of "drawn" without draws.
             configuration: Their `configuration_digest`.
         """
         self._room, self._undrawn, self._begun = room, undrawn, False
@@ -82,13 +82,13 @@ class FlightMemory:
     # ---- reading ------------------------------------------------------------------------------
 
     def record(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """A field of the records by the name that kernels have for it, as a new array (n, ...).
+        """Return a field of the records by its name in the kernels, as a new array (n, ...).
 
-        `FlightBatch.read` has the quantities that users need, by their public names.
+        `FlightBatch.read` returns the quantities that users need, by their public names.
 
         Args:
             name: The field, such as "r" or "b_a_hat".
-            flights: Numbers of the flights; None: all of them.
+            flights: Indices of the flights; None: all of them.
 
         Raises:
             ValueError: If there is no such field, see `records.FLIGHT_FIELDS`.
@@ -106,14 +106,14 @@ class FlightMemory:
         return self._blocks[name][flights // WIDTH, ..., flights % WIDTH]
 
     def _unused(self, name: str, count: int) -> NDArray[Any]:
-        """A field that flights of this configuration do not use, and have no room for."""
+        """Return a field that this configuration does not use, and for which it has no room."""
         if name == "drawn":
             return np.tile(self._undrawn, (count, 1))
         base, shape = FLIGHT_BLOCK[name].base, FLIGHT_BLOCK[name].shape[:-1]
         return np.full((count, *shape), np.nan if name in _UNKNOWN else 0.0, base)
 
     def drawn(self) -> dict[str, NDArray[np.float64]]:
-        """Drawn parameters of the present episodes, by name: (count,) or (count, components)."""
+        """Return the drawn parameters of the present episodes by name: (count,) or (count, n)."""
         found = {}
         for name in self.randomization.names:
             values = np.moveaxis(self._blocks["drawn"][:, COLUMNS[name]], -1, 1)
@@ -125,9 +125,9 @@ class FlightMemory:
         return found
 
     def feature_places(self) -> NDArray[np.float64]:
-        """(count, m, 3) where the camera's features are in the present episodes, in I [m].
+        """Return the features of the camera in the present episodes, (count, m, 3) in I [m].
 
-        As the filter believes, which are the true ones where it knows the sensors.
+        These are the positions that the filter assumes; with `Randomization.known`, the true ones.
         """
         count = 0 if self.sensors.camera is None else len(self.sensors.camera.features_I)
         if self._room.holds("feature_place"):
@@ -137,26 +137,26 @@ class FlightMemory:
         return np.broadcast_to(nominal, (self.count, *nominal.shape))
 
     def active_faults(self) -> dict[str, NDArray[np.bool_]]:
-        """Which of the faults that can come are there now, by name: (count,) each."""
+        """Return which of the possible faults are active at present, by name: (count,) each."""
         return named_faults(self.faults, self.record("faults"))
 
     def covariance(self) -> NDArray[np.float64]:
-        """(count, 15, 15) covariances of the filters, in the order r, v, e, b_a, b_g."""
+        """Return the covariances (count, 15, 15) of the filters, in the order r, v, e, b_a, b_g."""
         factor = self.record("L")
         return factor @ factor.transpose(0, 2, 1)
 
     # ---- keeping ------------------------------------------------------------------------------
 
     def snapshot(self) -> NDArray[Any]:
-        """A copy of all flights; `restore` brings them back to this instant bit for bit."""
+        """Return a copy of all flights, with which `restore` restores this instant bitwise."""
         return self._blocks.copy()
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Bring all flights back to a snapshot of this batch, or of one like it.
+        """Restore all flights from a snapshot of this batch, or of another one like it.
 
         Raises:
-            ValueError: If the snapshot is of a batch of another size, or with other settings or
-                parameters; the time limit and the number of threads may be others.
+            ValueError: If the snapshot is from a batch of another size, or with other settings or
+                parameters. The time limit and the number of threads may differ.
         """
         fits = (
             isinstance(snapshot, np.ndarray)
@@ -167,19 +167,19 @@ class FlightMemory:
         )
         if not fits:
             raise ValueError(
-                f"snapshot must be that of a batch of {self.count} flights with the same task, "
+                f"snapshot must be from a batch of {self.count} flights with the same task, "
                 "vehicle, sensors, filter, world, randomization, faults, rates and observation"
             )
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset
 
     def copied_record(self, flight: int) -> NDArray[np.uint64]:
-        """The whole record of one flight at the present instant, for `with_records`."""
+        """Return the whole record of one flight at the present instant, for `with_records`."""
         block, lane = divmod(flight, WIDTH)
         return _lanes(self._blocks[block : block + 1])[0, :, lane].copy()
 
     def with_records(self, records: Sequence[NDArray[np.uint64]]) -> Self:
-        """Flights with copied records, to `read` from: not to be stepped or reset."""
+        """Return flights with copied records, to `read` from: not to be stepped or reset."""
         found = object.__new__(type(self))
         found.__dict__.update(self.__dict__)
         found.count = len(records)
@@ -195,14 +195,14 @@ class FlightMemory:
     def switch_sensors(
         self, *, gnss: bool | None = None, camera: bool | None = None, **aids: bool | None
     ) -> None:
-        """Let sensors of all flights fail, or measure again, from the next tick on.
+        """Switch sensors of all flights off, or on again, from the next tick on.
 
-        The filter goes on without them. A new episode begins with all sensors measuring.
+        The filter continues without them. A new episode begins with all sensors on.
 
         Args:
-            gnss: Whether GNSS measures; None: as it does now.
-            camera: Likewise.
-            aids: Likewise `barometer` and `magnetometer`, where the suite has them.
+            gnss: True: GNSS measures; False: it is off; None: as at present.
+            camera: True: the camera measures; False: it is off; None: as at present.
+            aids: The same for `barometer` and `magnetometer`, if the suite has them.
 
         Raises:
             ValueError: If an aiding sensor is unknown, or the suite lacks it.
@@ -216,19 +216,19 @@ class FlightMemory:
 
     @staticmethod
     def _switch(waits: NDArray[Any], sensor: str, measures: bool | None) -> None:
-        """Let a sensor be due again, or never; None: as it is."""
+        """Make a sensor due again, or never; None: leave it as it is."""
         if measures is not None and check.flag(sensor, measures):
             waits[np.isinf(waits)] = 0.0
         elif measures is not None:
             waits[:] = np.inf
 
     def switch_faults(self, active: bool) -> None:
-        """Let the faults of all flights come, or go, at the next tick, whatever their time is.
+        """Activate or deactivate the faults of all flights at the next tick, at any time.
 
-        They stay so to the end of the episode, but for those that come at a rate.
+        They stay so until the end of the episode, except for faults with a rate.
 
         Args:
-            active: Whether they come.
+            active: True: activate; False: deactivate.
         """
         check.flag("active", active)
         tick = self._blocks["tick"]
@@ -239,5 +239,5 @@ class FlightMemory:
 
 
 def _lanes(blocks: NDArray[Any]) -> NDArray[np.uint64]:
-    """The memory of blocks as words of eight bytes, which all fields have: (blocks, n, WIDTH)."""
+    """Return the memory of blocks in words of 8 bytes, as all fields have: (blocks, n, WIDTH)."""
     return blocks.view(np.uint64).reshape(len(blocks), -1, WIDTH)

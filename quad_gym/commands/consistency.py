@@ -38,7 +38,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from tyro.conf import arg
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
-from quad_gym.analysis.consistency import CONSISTENT_SHARE, MeanSquare
+from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSquare
 from quad_gym.analysis.consistency_flights import Findings, endless, measure_consistency
 from quad_gym.analysis.consistency_plots import (
     errors_figure,
@@ -287,7 +287,7 @@ def table_of(quantity: str, parts: dict[str, MeanSquare]) -> str:
         )
         for part in parts.values()
     ]
-    columns = ["over time", "at the end", "band", "inside"]
+    columns = ["over time", "at the end", "tolerance", "inside"]
     return text_table({quantity: ["of"], "mean over flights": columns}, rows)
 
 
@@ -297,12 +297,15 @@ def report_of(findings: Findings) -> str:
     if findings.nis:
         tables.append(table_of("NIS", findings.nis))
     lines = [
-        "The filter is consistent."
+        "The filter is consistent:"
         if findings.consistent
         else "The filter is not consistent in everything:",
         *(f"  {text}" for text in findings.sentences().values()),
-        f"  Filters that failed in a cycle: {findings.failed}. Flights astray: "
+        f"  Filters with a numerical failure: {findings.failed}. Flights lost: "
         f"{findings.astray.sum()}.",
+        f"Criterion: means within the tolerance, the 95 % band of a mean over at most "
+        f"{BAND_FLIGHTS:,} values, at {100 * CONSISTENT_SHARE:.0f} % of the instants or more; "
+        "white innovations; no failures.",
     ]
     return "\n\n".join([*tables, "\n".join(lines)])
 

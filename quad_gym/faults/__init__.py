@@ -1,6 +1,6 @@
-"""Faults of sensors and rotors, and when they occur; frozen parameters with sources.
+"""Faults of sensors and rotors, with their schedules: frozen parameters with sources.
 
-Every environment and `FlightBatch` take `faults=`: one fault, several, or the names of presets. ::
+All environments and `FlightBatch` take `faults=`: a fault, several, or names of presets. ::
 
     import gymnasium
     from quad_gym import FlightBatch
@@ -10,14 +10,14 @@ Every environment and `FlightBatch` take `faults=`: one fault, several, or the n
     gymnasium.make("QuadGym/Circle-v0", sensors="rtk", faults="gnss_outliers+rotor_loss")
     FlightBatch(1000, sensors="rtk", faults=(
         GnssOutage(start=20.0, duration=60.0),           # scheduled
-        CameraOcclusion(start=(18.0, 20.0), duration=62.0),  # from a drawn instant on
+        CameraOcclusion(start=(18.0, 20.0), duration=62.0),  # from a random instant on
         GnssOutliers(share=0.05, size=(10.0, 100.0)),    # all the time
         WrongAssociations(rate=0.1, duration=1.0),       # now and then: a Poisson process
     ))
 
-Which faults are active is told by `info["faults"]` (name: True or False), by
-`FlightBatch.active_faults()`, and by the fields of a flight's record, such as "fault_active",
-"outlier" and "feature_mistaken", for `FlightBatch.read`. Filter and controller are not told.
+The active faults are in `info["faults"]` (name: True or False), in `FlightBatch.active_faults()`,
+and in fields of a flight's record for `FlightBatch.record`, such as "fault_active", "outlier" and
+"feature_mistaken". They are hidden from filter and controller.
 """
 
 from quad_gym.faults import aids, base, camera, gnss, imu, vehicle
@@ -28,7 +28,7 @@ from quad_gym.faults.gnss import *
 from quad_gym.faults.imu import *
 from quad_gym.faults.vehicle import *
 
-# each file says what of it is public
+# each file lists its public names
 __all__ = (
     aids.__all__ + base.__all__ + camera.__all__ + gnss.__all__ + imu.__all__ + vehicle.__all__
 )

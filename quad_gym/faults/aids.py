@@ -11,13 +11,13 @@ __all__ = ["SensorLoss"]
 
 @dataclass(frozen=True, kw_only=True)
 class SensorLoss(Fault):
-    """An aiding sensor measures nothing, as while its bus fails.
+    """Loss of all measurements of an aiding sensor, as during a bus failure.
 
-    Of a magnetometer also as long as an autopilot distrusts it near iron.
+    A magnetometer is also lost while an autopilot rejects it near iron.
     """
 
     sensor: str
-    """which: "barometer" or "magnetometer\""""
+    """name of the lost sensor: "barometer" or "magnetometer\""""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -25,10 +25,10 @@ class SensorLoss(Fault):
 
     @property
     def kind(self) -> FaultKind:  # type: ignore[override]
-        """Such as BAROMETER_LOSS."""
+        """Kind of the fault, such as BAROMETER_LOSS."""
         return FaultKind[f"{self.sensor.upper()}_LOSS"]
 
     @property
     def needs(self) -> str:  # type: ignore[override]
-        """The sensor."""
+        """Field of the sensor in a suite."""
         return self.sensor

@@ -1,4 +1,4 @@
-"""What all faults share: when they come and go, their sizes and directions."""
+"""The base of all faults: start, duration and rate, sizes and directions."""
 
 import math
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from quad_gym.records import FaultKind
 __all__ = ["Fault", "Span", "ends"]
 
 _SENSORS = {"gnss": "GNSS"}
-"""Parts of a suite that take no article."""
+"""Parts of a suite that are named without an article."""
 
 Span = float | tuple[float, float]
-"""A number, or the ends of a range from which it is drawn uniformly each time a fault comes."""
+"""A number, or a range (low, high) from which it is drawn uniformly at each onset of a fault."""
 
 
 def ends(value: Span) -> tuple[float, float]:
-    """Both ends of a range; of a number, twice the number."""
+    """Return both ends of a range; for a number, the number twice."""
     return value if isinstance(value, tuple) else (value, value)
 
 
 def span(name: str, value: Any, *, least: float = 0.0, open_end: bool = False) -> Span:
-    """`value` as a finite number of at least `least`, or as a range (low, high) of such."""
+    """Return `value` as a finite number of at least `least`, or as a range (low, high)."""
     if isinstance(value, (tuple, list, np.ndarray)):
         if len(value) != 2:
             raise ValueError(f"{name} must be a number or (low, high), got {value!r}")
@@ -39,7 +39,7 @@ def span(name: str, value: Any, *, least: float = 0.0, open_end: bool = False) -
 
 
 def share_of_one(name: str, value: Any) -> float:
-    """`value` as a number above 0 and up to 1."""
+    """Return `value` as a number above 0 and up to 1."""
     share = check.positive(name, value)
     if share > 1.0:
         raise ValueError(f"{name} must be at most 1, got {value!r}")
@@ -48,26 +48,26 @@ def share_of_one(name: str, value: Any) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Fault(Checked):
-    """When a fault comes and goes; what it is, the kinds of faults below say.
+    """Schedule of a fault; its subclasses are the kinds of faults.
 
-    By default it lasts from the start of an episode to its end. All that is random is drawn inside
-    the kernels, from each flight's own stream. A flight has one fault of each kind, which may come
-    again and again (`rate`).
+    By default, a fault lasts from the start of an episode to its end. All random quantities are
+    drawn inside the kernels, from each flight's own stream. A flight has at most one fault of each
+    kind, which may recur (`rate`).
     """
 
     start: Span = 0.0
-    """when it comes, since the start of the episode [s]"""
+    """time of onset since the start of the episode [s]; a range: drawn uniformly"""
     duration: Span = math.inf
-    """how long it stays [s]"""
+    """time from onset to end [s]; a range: drawn uniformly at each onset"""
     rate: float = 0.0
-    """how often it comes while it is not there, in place of `start`: at random, as a Poisson
-    process [1/s]; 0: once, at `start`"""
+    """rate of onset while inactive, in place of `start`: a Poisson process [1/s]; 0: a single onset
+    at `start`"""
     probability: float = 1.0
-    """share of episodes in which it can come at all"""
+    """probability that the fault can occur in an episode"""
 
     kind: ClassVar[FaultKind]
     needs: ClassVar[str] = ""
-    """the part of a sensor suite that it concerns"""
+    """field of the sensor suite that the fault concerns"""
 
     def __post_init__(self) -> None:
         if type(self) is Fault:
@@ -85,41 +85,41 @@ class Fault(Checked):
 
     @property
     def name(self) -> str:
-        """As `info["faults"]` calls it."""
+        """Name of the fault in `info["faults"]`."""
         return self.kind.name.lower()
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of a fault beside its times.
+        """Numbers that the kernels read of a fault, in addition to its times.
 
-        Under "share", "size" (a Span) and "direction" what each kind has of its own; under any
-        other name a field of the settings record.
+        "share", "size" (a Span) and "direction" have their own places for each kind; any other name
+        is a field of the settings record.
         """
         return {}
 
     def check_suite(self, sensors: SensorSuite) -> None:
-        """Refuse a sensor suite that lacks what the fault concerns.
+        """Refuse a sensor suite that lacks the sensor of the fault.
 
         Raises:
-            ValueError: If it does.
+            ValueError: If the sensor is missing.
         """
         if self.needs and getattr(sensors, self.needs) is None:
             what = _SENSORS.get(self.needs, f"a {self.needs}")
             raise ValueError(
-                f"faults must concern sensors that there are: {type(self).__name__} needs {what}, "
+                f"faults must concern sensors of the suite: {type(self).__name__} needs {what}, "
                 f"which this sensor suite does not have"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectedFault(Fault):
-    """A fault with a size and a direction, drawn uniformly from all directions unless given."""
+    """A fault with a size and a direction, drawn uniformly from all directions by default."""
 
     direction: Vector | None = None
-    """(3,) along which it lies, of any length; None: drawn each time it comes"""
+    """(3,) direction of the fault, of any length; None: drawn at each onset"""
 
     size_field: ClassVar[str] = "size"
-    """which field is its size"""
+    """name of the field that holds the size"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -131,11 +131,11 @@ class DirectedFault(Fault):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
+        """Numbers that the kernels read of the fault."""
         return {"size": getattr(self, self.size_field), "direction": self.unit}
 
     @property
     def unit(self) -> np.ndarray:
-        """(3,) the given direction as a unit vector; zeros: drawn."""
+        """Given direction (3,) as a unit vector; zeros: drawn."""
         given = np.zeros(3) if self.direction is None else np.array(self.direction)
         return given / (norm(given) or 1.0)

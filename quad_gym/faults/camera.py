@@ -16,7 +16,8 @@ class CameraOcclusion(Fault):
     """Features that the camera does not see: something is in the way, or the image is dark."""
 
     share: float = 1.0
-    """of features, each hidden with this probability as long as the fault stays; 1: all"""
+    """probability that a feature is hidden, drawn for each feature at each onset; 1: all
+    features"""
 
     kind = FaultKind.CAMERA_OCCLUSION
     needs = "camera"
@@ -27,23 +28,23 @@ class CameraOcclusion(Fault):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
+        """Numbers that the kernels read of the fault."""
         return {"share": self.share}
 
 
 @dataclass(frozen=True, kw_only=True)
 class WrongAssociations(Fault):
-    """Features taken for others, in some of the images in which two or more are seen.
+    """Features mistaken for others, in some of the images with two or more visible features.
 
-    Matching by appearance without a geometric check leaves some percent wrong matches and more; see
-    M. A. Fischler and R. C. Bolles, Communications of the ACM 24(6), 1981, on why.
+    Matching by appearance without a geometric check leaves several percent wrong matches or more;
+    see M. A. Fischler and R. C. Bolles, Communications of the ACM 24(6), 1981, for the reasons.
     """
 
     share: float = 0.05
-    """of images, while the fault is active"""
+    """probability that an image has a wrong association while the fault is active"""
     how: str = "swap"
-    """"swap": two features, drawn among those seen, are swapped; "copy": one of them
-    is reported in the direction of the other, which keeps its own"""
+    """form of the error: "swap": two features, drawn among the visible ones, are swapped; "copy":
+    one of them is reported in the direction of the other, which is reported in its own"""
 
     kind = FaultKind.WRONG_ASSOCIATIONS
     needs = "camera"
@@ -58,11 +59,11 @@ class WrongAssociations(Fault):
         super().check_suite(sensors)
         if sensors.camera is not None and len(sensors.camera.features_I) < 2:
             raise ValueError(
-                "faults must concern sensors that there are: WrongAssociations needs a camera that "
-                "knows at least two features"
+                "faults must concern sensors of the suite: WrongAssociations needs a camera with "
+                "at least two features"
             )
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
+        """Numbers that the kernels read of the fault."""
         return {"share": self.share, "fault_swaps": self.how == "swap"}

@@ -11,10 +11,10 @@ __all__ = ["BaselineLoss", "GnssJump", "GnssOutage", "GnssOutliers", "GnssRamp"]
 
 @dataclass(frozen=True, kw_only=True)
 class GnssOutage(Fault):
-    """No fixes: neither position nor velocity nor baseline, as under a bridge or indoors.
+    """Loss of all fixes, of position, velocity and baseline, as under a bridge or indoors.
 
-    Outages of 30 s and a minute are the usual trial of inertial navigation: S. Godha and M. E.
-    Cannon, GPS Solutions 11(3), 2007. The fix that starts the filter is always there, and valid.
+    Outages of 30 s and of a minute are the usual test of inertial navigation: S. Godha and M. E.
+    Cannon, GPS Solutions 11(3), 2007. The fix that starts the filter is always available and valid.
     """
 
     kind = FaultKind.GNSS_OUTAGE
@@ -23,18 +23,19 @@ class GnssOutage(Fault):
 
 @dataclass(frozen=True, kw_only=True)
 class GnssOutliers(Fault):
-    """Some positions are far off, each for itself, as by signals that come by way of a wall.
+    """Positions with large, independent errors, as from signals reflected by a wall.
 
-    A position is an outlier with probability `share`, and then lies `size` standard deviations of a
-    fix off, in any direction; the slow error (`GnssParams.drift_sigma_I`) counts. Velocities and
-    baselines stay valid. Reflected signals err by tens of meters and more, ten times and a hundred
-    times a fix's usual error: L.-T. Hsu, GPS Solutions 22(1), 2018.
+    A position is an outlier with probability `share`. It is then displaced by `size` standard
+    deviations of a fix in a random direction; the standard deviation includes the drift
+    (`GnssParams.drift_sigma_I`). Velocities and baselines stay valid. Reflected signals have errors
+    of tens of meters and more, ten to a hundred times the usual error of a fix: L.-T. Hsu, GPS
+    Solutions 22(1), 2018.
     """
 
     share: float = 0.05
-    """of positions, while the fault is active"""
+    """probability that a position is an outlier while the fault is active"""
     size: Span = (10.0, 100.0)
-    """[standard deviations]"""
+    """size of an outlier [standard deviations of a fix]"""
 
     kind = FaultKind.GNSS_OUTLIERS
     needs = "gnss"
@@ -46,21 +47,21 @@ class GnssOutliers(Fault):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
+        """Numbers that the kernels read of the fault."""
         return {"share": self.share, "size": self.size}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GnssRamp(DirectedFault):
-    """Positions that drift away steadily, and jump back when the fault goes; velocities stay valid.
+    """A ramp in the positions, which jump back when the fault ends; velocities stay valid.
 
-    As a spoofer drags a vehicle along, slowly enough not to be noticed: A. J. Kerns, D. P. Shepard,
-    J. A. Bhatti and T. E. Humphreys, J. Field Robotics 31(4), 2014. No gate on single innovations
-    finds a ramp that is slow enough.
+    A spoofer drags a vehicle along in this way, slowly enough to stay undetected: A. J. Kerns, D.
+    P. Shepard, J. A. Bhatti and T. E. Humphreys, J. Field Robotics 31(4), 2014. No gate on single
+    innovations detects a ramp that is slow enough.
     """
 
     speed: Span = (0.1, 0.5)
-    """[m/s]"""
+    """rate of the ramp [m/s]"""
 
     kind = FaultKind.GNSS_RAMP
     needs = "gnss"
@@ -69,13 +70,13 @@ class GnssRamp(DirectedFault):
 
 @dataclass(frozen=True, kw_only=True)
 class GnssJump(DirectedFault):
-    """Positions that are off by a constant, as when carrier-phase ambiguities are fixed wrongly.
+    """A constant position offset, as when carrier-phase ambiguities are fixed wrongly.
 
-    Then the offset is some multiples of the carrier's wavelength, 0.19 m on L1.
+    The offset is then a small multiple of the carrier's wavelength, 0.19 m on L1.
     """
 
     size: Span = (0.19, 0.95)
-    """[m]; one to five wavelengths"""
+    """length of the offset [m]; default: one to five wavelengths"""
 
     kind = FaultKind.GNSS_JUMP
     needs = "gnss"
@@ -83,7 +84,7 @@ class GnssJump(DirectedFault):
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineLoss(Fault):
-    """No baseline, while positions go on, as when the secondary antenna is shaded."""
+    """Loss of the baseline while positions continue, as with a shaded secondary antenna."""
 
     kind = FaultKind.BASELINE_LOSS
     needs = "gnss"

@@ -13,44 +13,44 @@ __all__ = ["AccelBiasStep", "GyroBiasStep", "ImuSaturation"]
 
 @dataclass(frozen=True, kw_only=True)
 class AccelBiasStep(DirectedFault):
-    """A step of the accelerometer's true bias, in addition to its slow wandering; B axes.
+    """A step of the accelerometer's true bias in B, in addition to its random drift.
 
-    Consumer parts are off by up to 50 milli-g (TDK ICM-20948 data sheet); a knock or a change of
-    temperature moves them by some of that, our judgment.
+    Consumer parts have biases of up to 50 milli-g (TDK ICM-20948 data sheet); a shock or a change
+    of temperature moves them by a fraction of that; engineering judgment.
     """
 
     size: Span = (0.05, 0.2)
-    """[m/s^2]"""
+    """length of the step [m/s^2]"""
 
     kind = FaultKind.ACCEL_BIAS_STEP
 
 
 @dataclass(frozen=True, kw_only=True)
 class GyroBiasStep(DirectedFault):
-    """A step of the gyro's true bias, likewise.
+    """A step of the gyro's true bias in B, in addition to its random drift.
 
-    Consumer parts are off by up to 5 deg/s (TDK ICM-20948 data sheet); some tenths of that, our
-    judgment.
+    Consumer parts have biases of up to 5 deg/s (TDK ICM-20948 data sheet); the default is some
+    tenths of that; engineering judgment.
     """
 
     size: Span = (math.radians(0.2), math.radians(1.0))
-    """[rad/s]"""
+    """length of the step [rad/s]"""
 
     kind = FaultKind.GYRO_BIAS_STEP
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImuSaturation(Fault):
-    """Samples end at the IMU's ranges; the default is the smallest of a consumer part.
+    """Saturation of samples at the IMU's ranges, by default the smallest ones of a consumer part.
 
-    TDK ICM-20948 data sheet: 2, 4, 8 or 16 g; 250, 500, 1000 or 2000 deg/s. The gyro's reading that
-    the inner loops use saturates, too.
+    TDK ICM-20948 data sheet: 2, 4, 8 or 16 g; 250, 500, 1000 or 2000 deg/s. The gyro samples of the
+    inner loops saturate, too.
     """
 
     accel_range: float = 2.0 * 9.80665
-    """per axis [m/s^2]"""
+    """largest specific force along each axis, in either direction [m/s^2]"""
     gyro_range: float = math.radians(250.0)
-    """per axis [rad/s]"""
+    """largest angular rate about each axis, in either direction [rad/s]"""
 
     kind = FaultKind.IMU_SATURATION
 
@@ -60,5 +60,5 @@ class ImuSaturation(Fault):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
+        """Numbers that the kernels read of the fault."""
         return {"imu_range": (self.accel_range, self.gyro_range)}

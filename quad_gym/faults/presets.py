@@ -1,4 +1,4 @@
-"""Faults by name, and what the keyword `faults` may hold."""
+"""Faults by name, and the values of the keyword `faults`."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -30,7 +30,7 @@ FaultsGiven = str | Fault | Iterable[str | Fault] | None
 """A fault, the name of a preset or several joined by "+", several of both, or None."""
 
 _SOON = (2.0, 5.0)
-"""An instant [s] at which vehicles have left the ground and most of an episode lies ahead."""
+"""Times [s] at which vehicles have left the ground and most of an episode lies ahead."""
 _A_WHILE = (2.0, 5.0)
 """Some seconds [s]: a bridge, a tree, a shadow; our judgment, for episodes of 10 s."""
 
@@ -52,24 +52,25 @@ PRESETS: dict[str, tuple[Fault, ...]] = {
         for sensor in AID_PARAMS
     },
 }
-"""Faults by name, made for episodes of ten seconds and more."""
+"""Presets of faults by name, for episodes of ten seconds and more."""
 
 ALL = "all"
-"""The name of all of them that a sensor suite can have."""
+"""Name of all presets that a sensor suite can have."""
 
 
 def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
-    """What the keyword `faults` means, in the order of `FaultKind`.
+    """Return the faults that the keyword `faults` selects, in the order of `FaultKind`.
 
     Args:
         given: See `FaultsGiven`; "all" stands for every preset that the suite can have.
-        sensors: The suite that they affect.
+        sensors: The suite that the faults affect.
 
     Returns:
-        One fault of each kind at most.
+        At most one fault of each kind.
 
     Raises:
-        ValueError: If a name is unknown, a kind comes twice, or the suite lacks what one concerns.
+        ValueError: If a name is unknown, a kind is given twice, or the suite lacks the sensor of a
+            fault.
     """
     if isinstance(given, (str, Fault)) or given is None:
         given = () if given is None else (given,)
@@ -84,8 +85,8 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
                 raise ValueError(f"faults must be faults or names of presets, got {fault!r}")
             if found[fault.kind] is not None:
                 raise ValueError(
-                    f"faults must hold one of a kind, got two {type(fault).__name__}; one that "
-                    "comes again and again has a rate"
+                    f"faults must hold one of each kind, got two {type(fault).__name__}; a fault "
+                    "that recurs has a rate"
                 )
             fault.check_suite(sensors)
             found[fault.kind] = fault
@@ -93,21 +94,21 @@ def faults_of(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
 
 
 def needs_sensors(fault: Fault) -> bool:
-    """Whether a fault concerns measurements alone, and nothing where no sensors run."""
+    """Return True for a fault of measurements, without effect where no sensors run."""
     return not isinstance(fault, (PositionJump, RotorLoss))
 
 
 def felt_without_sensors(given: FaultsGiven, sensors: SensorSuite) -> tuple[Fault, ...]:
-    """Those of the faults that affect the vehicle itself, so that they are felt on the truth.
+    """Return the faults that affect the vehicle itself, and thus also control on the truth.
 
-    For comparisons of control on the estimate, which all of the faults affect, with control on the
-    truth, which sensor faults do not concern.
+    For comparisons of control on the estimate, which all faults affect, with control on the truth,
+    which faults of sensors do not.
     """
     return tuple(fault for fault in faults_of(given, sensors) if not needs_sensors(fault))
 
 
 def _named(names: str, sensors: SensorSuite) -> Iterable[Fault]:
-    """The faults of presets joined by "+"."""
+    """Yield the faults of presets joined by "+"."""
     for name in names.split("+"):
         if name == ALL:
             everything = (fault for preset in PRESETS.values() for fault in preset)
@@ -125,11 +126,11 @@ def _possible(fault: Fault, sensors: SensorSuite) -> bool:
 
 
 def named_faults(faults: Iterable[Fault], bits: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
-    """Which faults are active, by name.
+    """Return the state of each fault, active or not, by name.
 
     Args:
-        faults: Those that can come.
-        bits: (...,) sums of 2^FaultKind over the active ones, as of a flight's field "faults".
+        faults: The faults that can occur.
+        bits: (...,) sums of 2^FaultKind over the active ones, as in a flight's field "faults".
     """
     whole = bits.astype(np.int64)
     return {fault.name: (whole >> fault.kind) % 2 > 0 for fault in faults}

@@ -12,32 +12,33 @@ __all__ = ["PositionJump", "RotorLoss"]
 
 @dataclass(frozen=True, kw_only=True)
 class PositionJump(DirectedFault):
-    """The vehicle itself is displaced at once, unfelt by the IMU; it happens when the fault comes.
+    """Sudden displacement of the vehicle at the onset of the fault, without any acceleration.
 
-    No real vehicle jumps, but its filter may find that the world is not where it was: a reference
-    station or a map that was moved, a vehicle carried while its IMU was off. It is the trial of a
-    filter's way back. A jump of the measurements alone is `GnssJump`. The default sizes
-    reach beyond the bounds of `Hover`, 1.6 m; give that environment `out_of_bounds=3.0`.
+    No real vehicle jumps, but its surroundings may not be where its filter assumes them: a
+    reference station or a map was moved, or the vehicle was carried while its IMU was off. The
+    fault tests whether a filter recovers. `GnssJump` moves only the measurements. The default sizes
+    exceed the bounds of `Hover`, 1.6 m; use `out_of_bounds=3.0` with that environment.
     """
 
     size: Span = (1.0, 2.0)
-    """[m]"""
+    """length of the displacement [m]"""
 
     kind = FaultKind.POSITION_JUMP
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotorLoss(Fault):
-    """One rotor loses a share of its thrust and torque, as with a chipped blade; 1: all of it.
+    """Loss of a fraction of one rotor's thrust and torque, as with a chipped blade; 1: total loss.
 
     Flying on three rotors is possible, but not with the controllers here: S. Sun, G. Cioffi, C. de
     Visser and D. Scaramuzza, IEEE Robotics and Automation Letters 6(2), 2021.
     """
 
     share: Span = (0.1, 0.3)
-    """lost, at most 1; our judgment of what chipped blades cost"""
+    """fraction of thrust and torque that is lost, at most 1 [-]; engineering judgment for chipped
+    blades"""
     rotor: int | None = None
-    """0 to 3; None: drawn each time it comes"""
+    """index of the rotor, 0 to 3; None: drawn at each onset"""
 
     kind = FaultKind.ROTOR_LOSS
 
@@ -53,6 +54,6 @@ class RotorLoss(Fault):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What kernels read of it."""
+        """Numbers that the kernels read of the fault."""
         pick = (0.0, 1.0) if self.rotor is None else ((self.rotor + 0.5) / 4.0, 0.0)
         return {"size": self.share, "fault_pick": pick}

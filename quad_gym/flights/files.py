@@ -1,16 +1,16 @@
-"""Files of a `Flight`: a NumPy archive that keeps every bit, and tables for other programs.
+"""Files of a `Flight`: a bitwise exact NumPy archive, and tables for other programs.
 
 The archive (`.npz`, readable by `numpy.load` alone) holds
 
-| entry | what |
+| entry | contents |
 |---|---|
-| `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and what the scene has in single numbers |
+| `header` | JSON text: "format" (always "quad_gym flight"), "version" (1), "task", "observation", "about", and the scalars of the scene |
 | `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.record.COLUMNS` |
 | `scene/NAME` | one float64 array per array of `quad_gym.flights.flight_scene.FlightScene` |
 
-A table has the same columns with one number each, vectors as `_x`, `_y`, `_z` (`_w`, `_x`, `_y`,
-`_z` for quaternions, `_1` ... where there are no axes), and in place of the covariance the square
-roots of its diagonal as `sigma_...`.
+A table has these columns with one number each: vectors as `_x`, `_y`, `_z` (quaternions as `_w`,
+`_x`, `_y`, `_z`; without axes, `_1` ...), and the standard deviations of the covariance as
+`sigma_...` in place of the covariance.
 """  # noqa: E501 - a table
 
 import csv
@@ -37,13 +37,13 @@ _STATES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 
 
 def save_flight(flight: Flight, path: Path) -> Path:
-    """Write the archive; the file is complete or not there.
+    """Write the archive; a file appears only when it is complete.
 
     Returns:
         The file.
 
     Raises:
-        TypeError: If `about` holds something that JSON does not know.
+        TypeError: If `about` holds a value without a JSON type.
     """
     header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "about": flight.about}
     arrays: dict[str, Any] = {
@@ -142,7 +142,7 @@ def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
 
 
 def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
-    """The columns of a flight with one number a row each, by their names in a table."""
+    """Return the columns of a flight with one number per row, by their names in a table."""
     found: dict[str, NDArray[np.float64]] = {}
     for column in COLUMNS:
         values = flight[column.name]
@@ -162,7 +162,7 @@ def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
 
 
 def _parts(column: Column, count: int) -> Sequence[str]:
-    """What the numbers of a row of a column are called."""
+    """Return the names of the numbers in a row of a column."""
     if column.name == "gnss_decision":
         return "position", "baseline", "velocity"
     if column.name in ("action", "rotor_speeds", "feature_decision"):
@@ -171,7 +171,7 @@ def _parts(column: Column, count: int) -> Sequence[str]:
 
 
 def write_flight_csv(flight: Flight, path: Path) -> Path:
-    """Write the table as CSV; what is missing is an empty cell, and numbers keep every bit.
+    """Write the table as CSV, with all digits; missing values are empty cells.
 
     Returns:
         The file.
@@ -187,7 +187,7 @@ def write_flight_csv(flight: Flight, path: Path) -> Path:
 
 
 def flight_frame(flight: Flight) -> "pandas.DataFrame":
-    """The table as a pandas DataFrame, indexed by time.
+    """Return the table as a pandas DataFrame, indexed by time.
 
     Raises:
         ImportError: If pandas is not installed.

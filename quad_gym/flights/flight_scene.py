@@ -1,4 +1,4 @@
-"""`FlightScene`: place and vehicle of a flight, which a picture needs besides the rows."""
+"""`FlightScene`: place and vehicle of a flight, which pictures need in addition to the rows."""
 
 import functools
 from dataclasses import dataclass, field
@@ -13,72 +13,72 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlightScene:
-    """What stays as it is during a flight."""
+    """Constants of a flight: vehicle, sensors, reference and surroundings."""
 
     task: str
     """kind of task"""
     observation: str
-    """what the controller saw: "truth", "estimate", "noisy" or "measurements" """
+    """source of the controller's observations: "truth", "estimate", "noisy" or "measurements\""""
     control_rate: float
-    """rows per second [Hz]"""
+    """control rate, rows per second [Hz]"""
     rotor_positions_B: Floats
-    """(4, 3) [m]"""
+    """(4, 3) positions of the rotor hubs in B [m]"""
     max_rotor_speed: float
-    """[rad/s]"""
+    """rotor speed at full voltage [rad/s]"""
     hover_rotor_speed: float
-    """[rad/s]"""
+    """rotor speed in hover [rad/s]"""
     antennas_B: Floats
-    """(2, 3) primary and secondary antenna [m]; NaN: there is no GNSS"""
+    """(2, 3) positions of the primary and the secondary antenna in B [m]; NaN: missing"""
     camera_B: Floats
-    """(3,) projection center [m]; NaN: there is no camera"""
+    """(3,) projection center in B [m]; NaN: no camera"""
     R_CB: Floats
-    """(3, 3) body to camera"""
+    """(3, 3) rotation from body to camera"""
     camera_rate: float
-    """images per second [Hz]; 0: there is no camera"""
+    """images per second [Hz]; 0: no camera"""
     focal_length: float
-    """[pixels]"""
+    """focal length [pixels]"""
     half_image: Floats
-    """(2,) half the image's width and height [pixels]"""
+    """(2,) half width and half height of the image [pixels]"""
     features_I: Floats
-    """(n, 3) [m]"""
+    """(n, 3) positions of the features in I [m]"""
     gates_I: Floats
-    """(n, 3) centers of the course's gates; (0, 3) on other tasks [m]"""
+    """(n, 3) centers of the course's gates in I; (0, 3) for other tasks [m]"""
     gate_radius: float
-    """[m]"""
+    """distance from the center of a gate below which the gate is passed [m]"""
     reference_omega: float
     """fundamental frequency of the reference [rad/s]"""
     reference_center: Floats
-    """(3,) its constant term [m]"""
+    """(3,) constant term of the reference in I [m]"""
     reference_cos: Floats
-    """(k, 3) its cosine coefficients [m]"""
+    """(k, 3) cosine coefficients of the reference in I [m]"""
     reference_sin: Floats
-    """(k, 3) its sine coefficients [m]"""
+    """(k, 3) sine coefficients of the reference in I [m]"""
     obstacles: Floats = field(default_factory=lambda: np.zeros((0, 9)))
-    """(n, 9) shape (see `records.Shape`), center in I, half length, thickness and height (of a
-    cylinder: radius, radius, half height), level direction of the length [m]"""
+    """(n, 9) obstacles: shape (see `records.Shape`), center in I, half length, half thickness and
+    half height (cylinder: radius, radius, half height), horizontal direction of the length [m]"""
     geofence_I: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """(2, 3) lowest and highest corner of the geofence; (0, 3): there is none [m]"""
+    """(2, 3) lowest and highest corner of the geofence in I; (0, 3): no geofence [m]"""
     trajectory_times: Floats = field(default_factory=lambda: np.zeros(0))
-    """(m + 1,) of the segments of a trajectory, the reference then; (0,): there is none [s]"""
+    """(m + 1,) times of the segments of a trajectory as the reference; (0,): no trajectory [s]"""
     trajectory_coefficients: Floats = field(default_factory=lambda: np.zeros((8, 0, 4)))
-    """(8, m, 4) of `quad_gym.Trajectory`, turned as it is flown"""
+    """(8, m, 4) coefficients as in `quad_gym.Trajectory`, rotated as in the flight"""
     trajectory_closed: bool = False
-    """whether it repeats"""
+    """True: the trajectory repeats"""
     trajectory_phase: float = 0.0
-    """time on it at which the episode begins [s]"""
+    """time on the trajectory at which the episode begins [s]"""
 
     @property
     def has_camera(self) -> bool:
-        """Whether there is a camera with a feature to see."""
+        """True if there is a camera, with at least one feature."""
         return len(self.features_I) > 0
 
     @property
     def has_gnss(self) -> bool:
-        """Whether there is GNSS."""
+        """True if there is GNSS."""
         return bool(np.isfinite(self.antennas_B[0]).all())
 
     def reference(self, times: Floats) -> Floats:
-        """Where the reference is at times [s], (n, 3) in I [m]: a series or a trajectory."""
+        """Return the position (n, 3) of the reference in I [m] at times [s]."""
         if len(self.trajectory_times):
             return self._trajectory(np.atleast_1d(times) + self.trajectory_phase)
         harmonics = np.arange(1, len(self.reference_cos) + 1)
@@ -88,7 +88,7 @@ class FlightScene:
 
     @property
     def reference_period(self) -> float:
-        """Time after which the reference repeats, or ends [s]; 0: it stands still."""
+        """Time after which the reference repeats, or ends [s]; 0: it is a fixed point."""
         if len(self.trajectory_times):
             return float(self.trajectory_times[-1])
         moves = bool(np.any(self.reference_cos) or np.any(self.reference_sin))
@@ -96,7 +96,7 @@ class FlightScene:
 
     @property
     def pieces(self) -> int:
-        """Straight lines that show the whole reference."""
+        """Number of straight lines that show the whole reference."""
         return max(160, min(8 * len(self.trajectory_times), 2000))
 
     @functools.cached_property
@@ -108,15 +108,15 @@ class FlightScene:
         )
 
     def project_features(self, position: Floats, R_BI: Floats) -> Floats:
-        """Where the features are in the image of a camera at a pose.
+        """Project the features into the image of a camera at a pose.
 
         Args:
-            position: (..., 3) of the center of mass in I [m].
-            R_BI: (..., 3, 3) inertial to body.
+            position: (..., 3) position of the center of mass in I [m].
+            R_BI: (..., 3, 3) rotation from inertial to body.
 
         Returns:
-            (..., n, 2) pixels from the image's center; NaN for a feature that is behind the camera.
-            Those outside the image are not left out.
+            (..., n, 2) pixels from the center of the image, also outside the image; NaN for a
+            feature behind the camera.
         """
         X_B = (self.features_I - position[..., np.newaxis, :]) @ np.swapaxes(R_BI, -1, -2)
         X_C = (X_B - self.camera_B) @ self.R_CB.T
@@ -125,10 +125,10 @@ class FlightScene:
         return np.asarray(self.focal_length * X_C[..., :2] / depth)
 
     def frustum_corners(self, position: Floats, R_BI: Floats, depth: float) -> Floats:
-        """Projection center and the image's four corners at a depth along the optical axis, in I.
+        """Return the projection center, and the image's corners at a depth along the optical axis.
 
         Returns:
-            (5, 3) [m].
+            (5, 3) in I [m].
         """
         x, y = self.half_image / self.focal_length
         corners_C = depth * np.array([[x, y, 1.0], [-x, y, 1.0], [-x, -y, 1.0], [x, -y, 1.0]])

@@ -1,7 +1,7 @@
-"""`Flight`: what happened in one flight, instant by instant, to keep, export, look at and replay.
+"""`Flight`: the record of one flight, instant by instant, to keep, export, inspect and replay.
 
-A flight has one row per control step, the start included; `COLUMNS` says what a row holds. Where
-something was not measured since the last row, or nothing was estimated, a row holds NaN.
+A flight has one row per control step and one for the start; `COLUMNS` describes a row. Quantities
+that were not measured since the previous row, or not estimated, are NaN.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ class Column(NamedTuple):
 
     name: str
     shape: tuple[int, ...]
-    """of one row; FEATURES stands for the number of the camera's features"""
+    """shape of one row; FEATURES stands for the number of the camera's features"""
     unit: str
     frame: str
     """I: inertial (east, north, up), B: body, C: image; "-": none"""
@@ -56,36 +56,36 @@ COLUMNS = (
     Column("wind", (3,), "m/s", "I", "velocity of the air"),
     Column("faults", (), "bits", "-", "active at the present instant: the sum of 2^`FaultKind`"),
     # the filter
-    Column("estimated_position", (3,), "m", "I", "the filter's"),
-    Column("estimated_velocity", (3,), "m/s", "I", "the filter's"),
-    Column("estimated_quaternion", (4,), "-", "B to I", "the filter's, as a quaternion"),
-    Column("estimated_accel_bias", (3,), "m/s^2", "B", "the filter's"),
-    Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's"),
-    Column("covariance", (15, 15), "mixed", "mixed", "of position, velocity, attitude error, accelerometer and gyro bias"),
-    Column("filter_status", (), "bits", "-", "failures of the filter so far, see `FilterStatus`"),
-    Column("filter_diverged", (), "0 or 1", "-", "whether the covariance does not explain the last innovations"),
+    Column("estimated_position", (3,), "m", "I", "the filter's estimate of `position`"),
+    Column("estimated_velocity", (3,), "m/s", "I", "the filter's estimate of `velocity`"),
+    Column("estimated_quaternion", (4,), "-", "B to I", "the filter's estimate of `quaternion`"),
+    Column("estimated_accel_bias", (3,), "m/s^2", "B", "the filter's estimate of `accel_bias`"),
+    Column("estimated_gyro_bias", (3,), "rad/s", "B", "the filter's estimate of `gyro_bias`"),
+    Column("covariance", (15, 15), "mixed", "mixed", "the filter's covariance of position, velocity, attitude error, accelerometer and gyro bias"),
+    Column("filter_status", (), "bits", "-", "numerical failures of the filter so far, see `FilterStatus`"),
+    Column("filter_diverged", (), "0 or 1", "-", "1: the covariance does not explain the last innovations"),
     Column("nees", (), "-", "-", "normalized estimation error squared; 15 on average if the filter is consistent"),
     Column("nis", (), "-", "-", "normalized innovation squared of the last update"),
     Column("nis_dimension", (), "-", "-", "measurements in the last update"),
-    # what the controller saw
-    Column("observed_position", (3,), "m", "I", "position that the controller believed in"),
-    Column("observed_quaternion", (4,), "-", "B to I", "attitude that the controller believed in"),
+    # the state that the controller observed
+    Column("observed_position", (3,), "m", "I", "position from the controller's source"),
+    Column("observed_quaternion", (4,), "-", "B to I", "attitude from the controller's source"),
     # the last measurements since the row before
     Column("gyro", (3,), "rad/s", "B", "angular rate"),
     Column("accel", (3,), "m/s^2", "B", "specific force"),
     Column("gnss_position", (3,), "m", "I", "primary antenna"),
     Column("gnss_baseline", (3,), "m", "I", "primary to secondary antenna"),
     Column("gnss_velocity", (3,), "m/s", "I", "of the primary antenna, where the receiver gives it"),
-    Column("gnss_decision", (3,), "-", "-", "what the filter made of position, baseline and velocity, see `GateDecision`; 0: it has no gate"),
+    Column("gnss_decision", (3,), "-", "-", "gate decisions on position, baseline and velocity, see `GateDecision`; 0: no gate"),
     Column("pixels", (FEATURES, 2), "pixels", "C", "features, from the image's center"),
-    Column("feature_decision", (FEATURES,), "-", "-", "what the filter made of them, likewise"),
+    Column("feature_decision", (FEATURES,), "-", "-", "gate decision on each feature, see `GateDecision`"),
     # the task
-    Column("action", (4,), "-", "-", "that led to this row, in [-1, 1]"),
-    Column("reference_position", (3,), "m", "I", "where the vehicle should be; on a course, the next gate"),
-    Column("gates_passed", (), "-", "-", "on a course of gates"),
-    Column("reward", (), "-", "-", "of the step that led to this row"),
+    Column("action", (4,), "-", "-", "action that led to this row, in [-1, 1]"),
+    Column("reference_position", (3,), "m", "I", "position of the reference; on a course, the next gate"),
+    Column("gates_passed", (), "-", "-", "gates passed so far"),
+    Column("reward", (), "-", "-", "reward of the step that led to this row"),
     Column("position_error", (), "m", "-", "distance of the true position from the reference"),
-    Column("estimation_error", (), "m", "-", "distance of the seen from the true position"),
+    Column("estimation_error", (), "m", "-", "distance of the observed from the true position"),
 )
 # fmt: on
 
@@ -94,7 +94,7 @@ _READ = tuple(
     for column in COLUMNS
     if column.name in QUANTITIES and column.name != "reference_position"
 )
-"""Columns that a batch of flights has as they stand."""
+"""Columns that are quantities of a batch without changes."""
 
 _WITH_FILTER = (
     *(name for name in _READ if QUANTITIES[name].filtered),
@@ -109,9 +109,9 @@ class Flight:
 
     Args:
         rows: (n,) records with the fields of `COLUMNS`.
-        scene: Where it takes place.
-        about: What else is worth knowing, such as seed and policy; of the types of JSON. Pictures
-            are titled with its "task", if it has one.
+        scene: Vehicle, sensors, reference and surroundings.
+        about: Additional information, such as seed and policy, in JSON types. Its "task", if any,
+            is the title of pictures.
     """
 
     rows: NDArray[Any]
@@ -126,11 +126,11 @@ class Flight:
 
     @property
     def estimated(self) -> bool:
-        """Whether a filter ran."""
+        """True if a filter ran."""
         return bool(np.isfinite(self.rows["estimated_position"][-1]).all())
 
     def until(self, time: float) -> "Flight":
-        """The flight up to a time [s], without copying; at least its first row."""
+        """Return the flight up to a time [s], without copying; at least its first row."""
         count = int(np.searchsorted(self.rows["time"], time + 1e-9, side="right"))
         return dataclasses.replace(self, rows=self.rows[: max(count, 1)])
 
@@ -142,7 +142,7 @@ class Flight:
 
     @classmethod
     def load(cls, path: Path | str) -> "Flight":
-        """Read what `save` wrote, bit for bit.
+        """Read a file that `save` has written; the result is bitwise identical.
 
         Raises:
             ValueError: If the file is damaged, of another kind, or of an unknown version.
@@ -158,7 +158,7 @@ class Flight:
         return write_flight_csv(self, Path(path))
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """The same table as a pandas DataFrame, indexed by time.
+        """Return the table of `to_csv` as a pandas DataFrame, indexed by time.
 
         Raises:
             ImportError: If pandas is not installed.
@@ -168,10 +168,10 @@ class Flight:
         return flight_frame(self)
 
     def to_rerun(self) -> "rerun.RecordingStream":
-        """A recording for the Rerun viewer: 3D, the camera's image and plots on one time line.
+        """Return a recording for the Rerun viewer: 3D, camera image and plots on one timeline.
 
         `flight.to_rerun().spawn()` opens the viewer; `flight.to_rerun().save("flight.rrd")` writes
-        a file for it. See `quad_gym.flights.rerun` for what it holds.
+        a file for it. `quad_gym.flights.rerun` lists the contents.
 
         Raises:
             ImportError: If rerun-sdk is not installed.
@@ -182,19 +182,19 @@ class Flight:
 
 
 def row_dtype(features: int) -> np.dtype[Any]:
-    """The record of a row, with a camera that knows so many features."""
+    """Return the data type of a row for a number of features."""
     return np.dtype(
         [(c.name, "f8", tuple(features if n == FEATURES else n for n in c.shape)) for c in COLUMNS]
     )
 
 
 class FlightRecorder:
-    """Keeps one flight of a batch; it reads the batch and never changes it.
+    """Recorder of one flight of a batch; it reads the batch and never changes it.
 
     Args:
         batch: The flights.
-        flight: Which of them.
-        about: Kept with the flight.
+        flight: Index of the recorded flight.
+        about: Information to be stored with the flight.
 
     Raises:
         ValueError: If there is no such flight.
@@ -218,10 +218,10 @@ class FlightRecorder:
 
     @property
     def flight(self) -> Flight:
-        """What was kept since the start of the present episode; it goes on sharing memory.
+        """The flight since the start of the present episode; it shares memory with the recorder.
 
         Raises:
-            ValueError: If nothing was kept yet.
+            ValueError: If nothing has been recorded yet.
         """
         if self._scene is None:
             raise ValueError("there is no flight yet: reset the environment first")
@@ -229,7 +229,7 @@ class FlightRecorder:
         return Flight(self._rows[: self._count], self._scene, self._about)
 
     def keep(self) -> None:
-        """Keep the present instant; the first of an episode begins a new flight."""
+        """Record the present instant; the first instant of an episode begins a new flight."""
         tick = self._batch.record("tick", self._which)[0]
         if tick == 0.0 or self._scene is None:
             self._rows, self._count = np.zeros_like(self._rows), 0  # earlier flights live on
@@ -238,7 +238,7 @@ class FlightRecorder:
         self._copies.append(self._batch.copied_record(int(self._which[0])))
 
     def _fill_rows(self, scene: FlightScene) -> None:
-        """Make rows of the copies."""
+        """Convert the copies to rows."""
         if not self._copies:
             return
         batch, self._copies = self._batch.with_records(self._copies), []
@@ -286,7 +286,7 @@ class FlightRecorder:
         )
 
     def _obstacles(self) -> Floats:
-        """(n, 9) those of the present episode, see `FlightScene`."""
+        """Return the obstacles (n, 9) of the present episode, see `FlightScene`."""
         obstacles, centers = self._batch.world.obstacles, self._read("obstacle_center")
         rows = [
             (float(o.shape), *center, *o.half_size, *o.axis)
@@ -295,7 +295,7 @@ class FlightRecorder:
         return np.array(rows).reshape(-1, 9)
 
     def _trajectory_of_episode(self) -> dict[str, Any]:
-        """The scene's fields of a trajectory, where the task follows one."""
+        """Return the scene's fields of a trajectory, if the task follows one."""
         found = self._batch.trajectory(int(self._which[0]))
         if found is None:
             return {}
@@ -314,8 +314,8 @@ def _fill(row: Any, batch: FlightBatch, which: NDArray[np.intp], scene: FlightSc
     Args:
         row: Record with the fields of `COLUMNS`.
         batch: The flights.
-        which: (1,) which of them.
-        scene: Of its episode.
+        which: (1,) index of the flight.
+        scene: Scene of its episode.
     """
     for name in _READ:
         if batch.run_filter or name not in _WITH_FILTER:
@@ -340,12 +340,12 @@ def _fill_covariance(row: Any, factor: Floats, R_hat: Floats) -> None:
     try:
         truth["R_BI"] = quaternion_to_dcm(row["quaternion"])
         row["nees"] = nees(state_error(truth, estimate), row["covariance"])
-    except ValueError:  # a state that is not finite, or a singular covariance: nothing to say
+    except ValueError:  # a state that is not finite, or a singular covariance
         row["nees"] = np.nan
 
 
 def _fill_decisions(row: Any, gate: Floats) -> None:
-    """Decisions of the filter's gate, NaN where nothing was measured."""
+    """Fill in the decisions of the filter's gate; NaN without a measurement."""
     for block, name in enumerate(("gnss_position", "gnss_baseline", "gnss_velocity")):
         row["gnss_decision"][block] = np.nan if np.isnan(row[name]).all() else gate[block]
     seen = np.isfinite(row["pixels"]).all(axis=1)

@@ -4,12 +4,12 @@ from enum import IntEnum, IntFlag
 
 
 class FilterStatus(IntFlag):
-    """What has gone wrong in a filter since its start; 0 when nothing has."""
+    """Numerical failures of a filter since its start; 0: none."""
 
     PREDICTION_FAILED = 1
     """The predicted covariance was not positive definite; the filter kept its last good state."""
     UPDATE_FAILED = 2
-    """A measurement update was not finite; the filter kept the state before it."""
+    """The result of a measurement update was not finite; the filter kept the state before it."""
 
 
 class FilterForm(IntFlag):
@@ -34,37 +34,48 @@ class FilterForm(IntFlag):
 
 
 class GateDecision(IntEnum):
-    """What became of a block of the last measurement."""
+    """Decision of the innovation gate on a block of the last measurement."""
 
     NONE = 0
     """not measured since the start of the episode"""
     ACCEPTED = 1
+    """used in the update"""
     REJECTED = 2
+    """left out of the update, with an innovation beyond the gate"""
     FAILED = 3
-    """the update that it was part of failed as a whole, see FilterStatus"""
+    """part of an update that failed as a whole, see `FilterStatus`"""
     UNSURE = 4
-    """a feature left out, as its direction was predicted too vaguely for a linear model"""
+    """a feature that was left out, with a predicted direction too uncertain for a linear model"""
 
 
 class Source(IntEnum):
-    """Where the controller's view of the state comes from."""
+    """Source of the state that the controller observes."""
 
     TRUTH = 0
+    """the true state"""
     ESTIMATE = 1
+    """the filter's estimate"""
     NOISY = 2
+    """the true state with independent noise"""
     MEASUREMENTS = 3
+    """the raw measurements"""
 
 
 class Control(IntEnum):
-    """What the four numbers of an action mean."""
+    """Meaning of the four numbers of an action."""
 
     MOTOR = 0
+    """Voltages of the four motors."""
     WRENCH = 1
+    """Thrust and torque."""
     CTBR = 2
+    """Collective thrust and body rates."""
     ATTITUDE = 3
+    """Thrust, roll, pitch and yaw rate."""
     VELOCITY = 4
+    """Velocity ahead, to the left and up, and yaw rate."""
     PD = 5
-    """No action: the report's controller follows the reference at every tick."""
+    """No action: the report's PD controller follows the reference at every tick."""
 
 
 class Sensor(IntEnum):
@@ -118,7 +129,7 @@ class Act(IntEnum):
     JUDGE = 3
     """keep the innovation and mask it beyond the gate"""
     DOUBT = 4
-    """add to the covariance of what may be wrong"""
+    """raise the variances of the states that may be wrong"""
     ALIGN = 5
     """give the filter's start its heading, where `heading_aid` of the settings says so"""
 
@@ -171,18 +182,27 @@ class Ending(IntEnum):
     """
 
     NONE = 0
+    """the episode has not ended"""
     TIME_LIMIT = 1
+    """the time limit was reached"""
     OUT_OF_BOUNDS = 2
+    """the vehicle was too far from the reference, or its state was not finite"""
     TIPPED_OVER = 3
+    """the vehicle was tilted too far"""
     BELOW_MIN_HEIGHT = 4
+    """the vehicle was too low, or crashed on ground that supports vehicles"""
     LAST_GATE = 5
+    """the last gate was passed"""
     FILTER_FAILED = 6
+    """the filter failed numerically, see `FilterStatus`"""
     FILTER_DIVERGED = 7
+    """the filter's consistency monitor flagged divergence"""
     TASK = 8
-    """a user's task says so, see `quad_gym.Task`"""
+    """a user-defined task ended the episode, see `quad_gym.Task`"""
     COLLISION = 9
     """the vehicle touched an obstacle"""
     LEFT_GEOFENCE = 10
+    """the vehicle left the geofence"""
 
     def __str__(self) -> str:
         return self.name.lower()

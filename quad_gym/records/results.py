@@ -1,10 +1,10 @@
-"""What a step returns for every flight."""
+"""Results of a step for every flight."""
 
 from enum import IntEnum
 
 
 class Result(IntEnum):
-    """The rows of what a step returns, by their place."""
+    """Rows of the results of a step, by their index."""
 
     REWARD = 0
     TERMINATED = 1
@@ -22,4 +22,4 @@ class Result(IntEnum):
 
 
 RESULTS = tuple(result.name.lower() for result in Result)
-"""Their names."""
+"""Names of the columns of the results of a step."""

@@ -1,9 +1,9 @@
-"""Pictures of flights: live, from a record, as frames and videos, and in a window; on pygame.
+"""Pictures of flights: live, from a record, as frames and videos, and in a window; uses pygame.
 
-`gymnasium.make(..., render_mode="rgb_array")` is the usual way in. Here are the parts: `Renderer`
-draws a `quad_gym.Flight`, `tile` puts frames side by side, `record_flight` flies a policy and keeps
-the flight, `save_video` writes a flight as a video, and `record_video` does both;
-`save_side_by_side` writes flights of one episode beside each other.
+`gymnasium.make(..., render_mode="rgb_array")` is the usual interface. Its parts: `Renderer` draws a
+`quad_gym.Flight`, `tile` puts frames side by side, `record_flight` flies a policy and returns the
+flight, `save_video` writes a flight as a video, and `record_video` does both; `save_side_by_side`
+writes flights of one episode side by side.
 """
 
 from quad_gym.rendering.live import RENDER_MODES, Rendering

@@ -15,9 +15,9 @@ from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.renderer import VIEWS, Renderer, checked_size, tile
 
 RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
-"""What Gymnasium's `render_mode` may be, besides None."""
+"""Values of Gymnasium's `render_mode`, besides None."""
 WINDOW_RATE = 50.0
-"""The most pictures a second that a window shows [Hz]."""
+"""Largest number of pictures per second in a window [Hz]."""
 
 _INVISIBLE = ("offscreen", "dummy")
 """Drivers that SDL falls back on where there is no display: their windows cannot be seen."""
@@ -82,15 +82,15 @@ class Window:
 
 
 class Rendering:
-    """What an environment needs to render: it keeps its flights and draws them when asked.
+    """Rendering of an environment: it records the flights, and draws them on request.
 
     It reads the batch and never changes it. Pygame is imported with the first picture, so that
     environments can be made without it: Stable-Baselines3 asks for "rgb_array" by default.
 
     Args:
-        batch: The environment's flights.
+        batch: Flights of the environment.
         mode: One of `RENDER_MODES`.
-        flights: Which flights are shown; None: all of them.
+        flights: Indices of the flights to show; None: all of them.
         view: "fixed" or "chase".
         size: Width and height of each picture [pixels].
 
@@ -125,10 +125,10 @@ class Rendering:
         self._title = f"quad_gym: {batch.task.kind}"
 
     def observe(self, *, reset: bool = False) -> None:
-        """Take notice of the present instant, after every reset and every step.
+        """Record the present instant; to be called after every reset and every step.
 
         Args:
-            reset: Whether it follows a reset of the environment.
+            reset: True after a reset of the environment.
         """
         for recorder in self._recorders:
             recorder.keep()
@@ -140,7 +140,7 @@ class Rendering:
             self._show(at_once=reset)
 
     def frames(self) -> tuple[NDArray[np.uint8], ...]:
-        """Pictures of the present instant, one per flight that is shown.
+        """Return pictures of the present instant, one per shown flight.
 
         Raises:
             ValueError: If there is no flight yet.
@@ -152,17 +152,17 @@ class Rendering:
         return tuple(renderer.draw(recorder.flight) for renderer, recorder in pairs)
 
     def taken_frames(self) -> list[tuple[NDArray[np.uint8], ...]]:
-        """Pictures of every instant since the last call or reset, for "rgb_array_list"."""
+        """Return pictures of all instants since the last call or reset, for "rgb_array_list"."""
         frames, self._frames = self._frames, []
         return frames
 
     def taken_tiles(self) -> list[NDArray[np.uint8]]:
-        """Likewise, with the pictures of an instant tiled."""
+        """Return the pictures of `taken_frames`, tiled to one picture per instant."""
         return [tile(list(frames)) for frames in self.taken_frames()]
 
     @property
     def flights(self) -> list[Flight]:
-        """What was kept of the flights that are shown, since the start of their episodes."""
+        """The shown flights, since the start of their episodes."""
         return [recorder.flight for recorder in self._recorders]
 
     def close(self) -> None:

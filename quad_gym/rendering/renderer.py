@@ -25,14 +25,14 @@ from quad_gym.rendering.scene import Scene, ellipsoid_scale
 from quad_gym.rendering.strip import Box, Strip
 
 VIEWS = ("fixed", "chase")
-"""Where a flight can be looked at from."""
+"""Views of a flight."""
 LEAST_WIDTH, LEAST_HEIGHT = 320, 240
 STALE_FIX = 0.5
-"""Seconds without a fix that are worth a word."""
+"""Time without a fix that is worth a note [s]."""
 
 
 class Renderer:
-    """Draws flights.
+    """Renderer of recorded flights.
 
     Args:
         view: "fixed" (the whole reference from outside) or "chase" (from behind the vehicle).
@@ -58,7 +58,7 @@ class Renderer:
         self._fixed: View
 
     def draw(self, flight: Flight) -> NDArray[np.uint8]:
-        """The last instant of a flight; `flight.until(t)` shows it at a time t.
+        """Draw the last instant of a flight; `flight.until(t)` ends at a time t.
 
         Args:
             flight: The flight.
@@ -213,7 +213,7 @@ def checked_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def tile(frames: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Frames of one size side by side, in a grid as square as can be; missing ones are white."""
+    """Return frames of one size in a grid that is as square as possible, padded with white."""
     columns = int(np.ceil(np.sqrt(len(frames))))
     rows = -(-len(frames) // columns)
     height, width = frames[0].shape[:2]

@@ -58,11 +58,11 @@ class Side:
     """One of the flights.
 
     Args:
-        flight: From its start to its ending.
-        label: Who flies, for people.
-        ending: How it ended, for people, such as "collision".
-        crashed: Whether that was a crash.
-        course: Of a course, what is passed and how many there are, such as ("gates", 8).
+        flight: The flight, from its start to its ending.
+        label: Name of the policy, for readers.
+        ending: Ending of the episode, for readers, such as "collision".
+        crashed: True if the ending was a crash.
+        course: Name and number of the objects passed on a course, such as ("gates", 8).
     """
 
     flight: Flight
@@ -73,11 +73,11 @@ class Side:
 
     @property
     def end(self) -> float:
-        """When it ended [s]."""
+        """Time at which the flight ended [s]."""
         return float(self.flight["time"][-1])
 
     def last_words(self) -> str:
-        """What is to be said once it is over."""
+        """Return the text that is shown after the end of the flight."""
         words = self.ending.replace("_", " ")
         if self.crashed:
             return f"crashed at {self.end:.1f} s: {words}"
@@ -85,13 +85,13 @@ class Side:
 
 
 class SideBySide:
-    """Draws flights of one episode beside each other; those that are over stay as they ended.
+    """Renderer of flights of one episode, side by side; ended flights stay at their last instant.
 
     Args:
         sides: The flights, from left to right.
 
     Raises:
-        ValueError: If there is none, or no filter ran.
+        ValueError: If there is no flight, or one without a filter.
         ImportError: If pygame is not installed.
     """
 
@@ -111,7 +111,7 @@ class SideBySide:
         ]
 
     def draw(self, time: float) -> NDArray[np.uint8]:
-        """The picture at a time [s], (height, width, 3) red, green, blue."""
+        """Draw a picture (height, width, 3) of red, green, blue at a time [s]."""
         parts = [half.draw(time) for half in self._halves]
         for part in parts[1:]:
             part[:, :2] = GREY
@@ -273,14 +273,14 @@ def save_side_by_side(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write flights of one episode as a film, side by side; it ends with the last of them.
+    """Write flights of one episode as a video, side by side; it ends with the longest flight.
 
     Args:
         sides: The flights, from left to right.
-        path: Of the file, as `save_video` takes it.
-        fps: Pictures a second.
-        speed: Seconds of flight per second of the film.
-        progress: Wraps the times of the pictures, as `tqdm.tqdm` does.
+        path: Path of the file, as in `save_video`.
+        fps: Pictures per second.
+        speed: Seconds of flight per second of video.
+        progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
 
     Returns:
         The file.

@@ -1,4 +1,4 @@
-"""Flights as videos: fly a policy, keep the flight, and write what it looks like."""
+"""Flights as videos: fly a policy, record the flight, and write a video of it."""
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -13,7 +13,7 @@ from quad_gym.params import checks as check
 from quad_gym.rendering.renderer import Renderer, checked_size
 
 VIDEO_ENDINGS = (".mp4", ".gif", ".webp")
-"""Kinds of video that can be written."""
+"""File name endings of the videos that can be written."""
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 
@@ -25,15 +25,15 @@ def record_flight(
     about: dict[str, Any] | None = None,
     **keywords: Any,
 ) -> Flight:
-    """Fly a policy for one episode and keep it.
+    """Fly a policy for one episode and return the flight.
 
     Args:
-        policy: Anything with the `predict` of Stable-Baselines3; it acts on a batch of one
+        policy: Any object with the `predict` method of Stable-Baselines3; it acts on a batch of one
             observation, as in `quad_gym.evaluation.roll_out`.
         env_id: One of `quad_gym.IDS`.
-        seed: Of the episode.
-        about: Kept with the flight, beside the id and the seed.
-        keywords: Those of the environment.
+        seed: Seed of the episode.
+        about: Information to be stored with the flight, in addition to the id and the seed.
+        keywords: Keywords of the environment.
 
     Returns:
         The flight, from its start to the ending of the episode.
@@ -52,7 +52,7 @@ def flight_of(
     seed: int = 0,
     about: dict[str, Any] | None = None,
 ) -> Flight:
-    """Fly a policy for one episode of a vector environment of one flight, and keep it.
+    """Fly a policy for one episode of a vector environment with one flight, and return the flight.
 
     Raises:
         ValueError: If the episode would have no end, or `env` is not such an environment.
@@ -79,7 +79,7 @@ def flight_of(
 def times_of(
     end: float, fps: float, speed: float, progress: Progress | None = None
 ) -> Iterable[float]:
-    """When the pictures of a video are taken [s], the end among them.
+    """Return the times of the pictures of a video [s], the end included.
 
     Raises:
         ValueError: If `fps` or `speed` is not positive.
@@ -100,16 +100,16 @@ def save_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a flight as MP4 (H.264), or as an animated GIF or WebP, by the file's ending.
+    """Write a flight as MP4 (H.264), animated GIF or WebP, depending on the file name's ending.
 
     Args:
         flight: The flight.
-        path: Of the file; missing folders are made.
+        path: Path of the file; missing folders are made.
         view: "fixed" or "chase".
         size: Width and height [pixels].
-        fps: Pictures a second.
-        speed: Seconds of flight per second of video: below 1 for slow motion.
-        progress: Wraps the times of the pictures, as `tqdm.tqdm` does.
+        fps: Pictures per second.
+        speed: Seconds of flight per second of video; below 1 for slow motion.
+        progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
 
     Returns:
         The file.
@@ -142,19 +142,19 @@ def record_video(
     """Fly a policy for one episode and write a video of it: `record_flight`, then `save_video`.
 
     Args:
-        policy: As for `record_flight`.
+        policy: As in `record_flight`.
         env_id: One of `quad_gym.IDS`.
-        path: Of the video (.mp4, .gif or .webp).
-        seed: Of the episode.
+        path: Path of the video (.mp4, .gif or .webp).
+        seed: Seed of the episode.
         view: "fixed" or "chase".
         size: Width and height [pixels].
-        fps: Pictures a second.
+        fps: Pictures per second.
         speed: Seconds of flight per second of video.
-        progress: Wraps the times of the pictures, as `tqdm.tqdm` does.
-        keywords: Those of the environment.
+        progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
+        keywords: Keywords of the environment.
 
     Returns:
-        The flight, to be saved or looked into.
+        The flight, to be saved or inspected.
 
     Raises:
         ValueError: If an argument is invalid.
@@ -167,7 +167,7 @@ def record_video(
 
 
 def checked_video_path(path: Path | str) -> Path:
-    """The path of a video that can be written here.
+    """Return the path of a video that can be written here.
 
     Raises:
         ValueError: If its ending is unknown.
@@ -189,16 +189,17 @@ def checked_video_path(path: Path | str) -> Path:
 def write_frames(
     frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, lossless: bool = False
 ) -> None:
-    """Write pictures (height, width, 3) of one size as a video, by the file's ending.
+    """Write pictures (height, width, 3) as a video, depending on the file name's ending.
 
-    The file gets its name when it is complete: where writing is interrupted, there is none, and a
-    file that was there before stays as it is.
+    The file gets its name when it is complete: if writing is interrupted, there is none, and an
+    earlier file stays as it is.
 
     Args:
-        frames: The pictures.
-        path: Of the file; missing folders are made.
-        fps: Pictures a second.
-        lossless: Of WebP: keep every pixel. Where most of the picture rests that takes less room.
+        frames: The pictures, all of one size.
+        path: Path of the file; missing folders are made.
+        fps: Pictures per second.
+        lossless: WebP only: keep every pixel, which takes less space if most of the picture is at
+            rest.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.stem}.part{path.suffix}")

@@ -36,7 +36,7 @@ def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
     done = run(tmp_path, "--estimator", "ekf")
     assert done.returncode == 0, done.stderr
     assert "NEES" in done.stdout
-    assert "Filters that failed in a cycle: 0." in done.stdout
+    assert "Filters with a numerical failure: 0." in done.stdout
     for name in ("nees.png", "nees.svg", "errors.png", "nis.svg", "whiteness.png"):
         assert (tmp_path / name).stat().st_size > 5000
     found = json.loads((tmp_path / "consistency.json").read_text())

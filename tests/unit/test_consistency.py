@@ -1,5 +1,7 @@
 """Statistics of consistency, on errors whose distribution is known."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -52,11 +54,15 @@ def drawn(factor, instants=400, flights=500):
 def test_a_consistent_filter_is_called_consistent_and_others_by_how_much_they_err():
     consistent = drawn(1.0)
     assert consistent.consistent
-    assert verdict(consistent).endswith(": consistent.")
+    assert re.fullmatch(
+        r"state: mean 1[45]\.\d\d, expected 15, within 3\.2 % of it at 9\d % of the instants: "
+        r"consistent\.",
+        verdict(consistent),
+    )
     for factor, words in (
-        (1.1, "overconfident, as errors are 10"),
-        (0.9, "too cautious, as errors are 10"),
-        (2.5, "overconfident, as errors are 2.5 times what it claims"),
+        (1.1, "overconfident, errors are 10"),
+        (0.9, "too cautious, errors are 10"),
+        (2.5, "overconfident, errors are 2.5 times as large as its covariance implies"),
     ):
         part = drawn(factor)
         assert not part.consistent

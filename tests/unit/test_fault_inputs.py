@@ -45,7 +45,7 @@ BLIND = LAB.replace(camera=None)
         (lambda: faults_of("gnss_outtage", LAB), "faults must be one of none, gnss_outage"),
         (lambda: faults_of(3, LAB), "faults must be faults or names of presets, got 3"),
         (lambda: faults_of([3], LAB), "faults must be faults or names of presets, got 3"),
-        (lambda: faults_of([GnssOutage(), "gnss_outage"], LAB), "one of a kind, got two Gnss"),
+        (lambda: faults_of([GnssOutage(), "gnss_outage"], LAB), "one of each kind, got two Gnss"),
         (
             lambda: faults_of(GnssOutage(), quad_gym.sensor_suite("indoor").simplified()),
             "needs GNSS",
