@@ -170,10 +170,10 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
         call_stage(stages, _BEGIN_IMPERFECT, flight, world, model, settings, work, 0)
     if settings.run_filter and settings.aids > 0:
         call_aids(flight, world, model, settings, work, stages, _BEGIN_AID)
-    if settings.air:
-        call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.faults:
         call_stage(stages, _BEGIN_FAULTS, flight, world, model, settings, work, 0)
+    if settings.air:  # after the faults, which give back a rotor that the last episode had lost
+        call_stage(stages, _BEGIN_IN_AIR, flight, world, model, settings, work, 0)
     if settings.grounded:
         call_stage(stages, _BEGIN_GROUND, flight, world, model, settings, work, 0)
     if settings.contacts:

@@ -120,6 +120,8 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
     flight.filter_status = select(mask, np.uint64(0), flight.filter_status)
     flight.prediction_failures = select(mask, 0.0, flight.prediction_failures)
     flight.update_failures = select(mask, 0.0, flight.update_failures)
+    flight.nis = select(mask, 0.0, flight.nis)
+    flight.nis_dimension = select(mask, 0.0, flight.nis_dimension)
     begin_recovery(flight, mask)
 
     L = flight.L
