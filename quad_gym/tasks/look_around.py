@@ -11,6 +11,8 @@ from quad_gym.tasks.rewards import Crash, Heading, Term, Tracking
 from quad_gym.tasks.task import ObservationSpec, Task
 
 if TYPE_CHECKING:
+    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.params.world import WorldParams
     from quad_gym.tasks.view import View
 
 WIDE_WEIGHT, NEAR_WEIGHT = 0.1, 0.1
@@ -74,18 +76,19 @@ class LookAround(Task):
             - check.number("crash_cost", crash_cost, least=0.0) * Crash()
         )
 
+    def _require(self, sensors: "SensorSuite", world: "WorldParams") -> None:
+        if sensors.camera is None:
+            raise ValueError(
+                "sensors must have a camera for LookAround, which observes the direction of the "
+                "markers, got none: choose sensors that have one, and no camera=False"
+            )
+
     def reward(self, view: "View") -> NDArray[np.float64]:
         """Return the reward described in the class, (n,)."""
         return self.pieces(view)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
-        """Return `features_direction`, the unit vector to the center of the markers, (n, 3) in B.
-
-        Raises:
-            ValueError: If the vehicle has no camera, and therefore no markers.
-        """
-        if view.features.shape[1] == 0:
-            raise ValueError("LookAround needs a camera, expected camera=True, got False")
+        """Return `features_direction`, the unit vector to the center of the markers, (n, 3) in B."""
         gap = view.features.mean(axis=1) - view.observed.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
         return {"features_direction": (view.observed.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}

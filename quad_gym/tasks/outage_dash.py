@@ -12,6 +12,8 @@ from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, Term
 from quad_gym.tasks.task import ObservationSpec, Task
 
 if TYPE_CHECKING:
+    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.params.world import WorldParams
     from quad_gym.tasks.draws import FlightRandom
     from quad_gym.tasks.view import View
 
@@ -141,6 +143,14 @@ class OutageDash(Task):
         self._weight = check.number("progress_weight", progress_weight, least=0.0)
         self._crash_cost = check.number("crash_cost", crash_cost, least=0.0)
 
+    def _require(self, sensors: "SensorSuite", world: "WorldParams") -> None:
+        walls = world.obstacles
+        if len(walls) < 2 or len(walls) % 2 or not all(isinstance(wall, Wall) for wall in walls):
+            raise ValueError(
+                "world must have pairs of walls for OutageDash, as those of world='slalom', got "
+                f"{len(walls)} obstacles"
+            )
+
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Add up the rewards for progress, `view.state.earned` (n,), and count gaps."""
         view.state.earned = view.state.earned + self._weight * view.period * westward(view)
@@ -182,14 +192,8 @@ class OutageDash(Task):
 
 
 def gaps_of(view: "View") -> Gaps:
-    """Find the gaps between pairs of walls; of each pair, the northern wall is listed first.
-
-    Raises:
-        ValueError: If the obstacles of the world are not pairs of walls.
-    """
+    """Find the gaps between pairs of walls; of each pair, the northern wall is listed first."""
     walls = view.world.obstacles
-    if len(walls) < 2 or len(walls) % 2 or not all(isinstance(wall, Wall) for wall in walls):
-        raise ValueError('OutageDash needs pairs of walls, as in world="slalom"')
     half = np.array([wall.half_size[1] for wall in walls])
     middle = view.obstacles
     north, south = middle[:, ::2, 1] - half[::2], middle[:, 1::2, 1] + half[1::2]

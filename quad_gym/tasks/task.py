@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
+    from quad_gym.params.sensors import SensorSuite
+    from quad_gym.params.world import WorldParams
     from quad_gym.tasks.draws import FlightRandom
     from quad_gym.tasks.view import View
 
@@ -164,6 +166,9 @@ class Task:
     def observe(self, view: "View") -> Any:
         """Return the task's observation: numbers (n,) or (n, k), or a dictionary of such arrays."""
         return {}
+
+    def _require(self, sensors: "SensorSuite", world: "WorldParams") -> None:
+        """Refuse, by a ValueError, sensors or a world that a built-in task cannot be flown with."""
 
     def has(self, method: str) -> bool:
         """Return True if the task overrides a method."""

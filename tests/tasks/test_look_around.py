@@ -155,9 +155,11 @@ def test_it_takes_other_weights_sensors_and_tasks():
             LookAround(crash_cost=bad)
 
 
-def test_without_a_camera_it_is_refused():
-    with pytest.raises(quad_gym.TaskError, match="LookAround needs a camera"):
-        gymnasium.make(ID, camera=False).reset()
+@pytest.mark.parametrize("keywords", [{"camera": False}, {"sensors": "consumer"}], ids=str)
+def test_sensors_without_a_camera_are_refused(keywords):
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(ValueError, match="sensors must have a camera for LookAround"):
+            make(ID, **keywords)
 
 
 def test_a_users_task_can_be_based_on_it():

@@ -238,8 +238,10 @@ def test_rules_that_need_what_is_not_shown_are_refused():
 
 
 def test_worlds_without_gaps_and_wrong_weights_are_refused():
-    with pytest.raises(quad_gym.TaskError, match="OutageDash needs pairs of walls"):
-        make(1, world="calm")
+    cylinders = quad_gym.WorldParams(obstacles=(quad_gym.Cylinder(center_I=(0.0, 0.0, 1.0)),) * 2)
+    for world in ("calm", cylinders):
+        with pytest.raises(ValueError, match="world must have pairs of walls for OutageDash"):
+            make(1, world=world)
     for bad in (-1.0, np.inf, "much"):
         with pytest.raises(ValueError, match="progress_weight must be"):
             OutageDash(progress_weight=bad)
