@@ -288,17 +288,35 @@ def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldPar
     def least(name: str) -> float:
         return float(table.low[COLUMNS[name]].min())
 
-    mass = float(table.high[COLUMNS["mass"]][0])
+    def most(name: str) -> float:
+        return float(table.high[COLUMNS[name]].max())
+
+    mass = most("mass")
     full = least("max_voltage")
     if world.battery is not None:
         full *= _open_circuit(world.battery, least("battery_charge"))
     speed = least("motor_speed_per_volt") * full
-    thrust = 4.0 * least("thrust_coefficient") * least("rotor_efficiency") * speed**2
+    lift = 4.0 * least("thrust_coefficient") * least("rotor_efficiency")
+    thrust = lift * speed**2
     if mass * vehicle.gravity >= thrust:
         raise ValueError(
             f"randomization must leave the vehicle able to hover: at worst it weighs "
             f"{mass * vehicle.gravity:.1f} N and its rotors lift {thrust:.1f} N; limit mass, "
             "max_voltage, motor_speed_per_volt, thrust_coefficient or rotor_efficiency"
+        )
+    if world.battery is None:
+        return
+    speed = math.sqrt(mass * vehicle.gravity / lift)
+    torque = 4.0 * least("rotor_efficiency") * most("torque_coefficient") * speed**2
+    power = torque * speed / world.battery.motor_efficiency
+    # U (U0 - U) / R is what it delivers at U: the most at half of U0, unless hovering takes more U
+    voltage = max(speed / least("motor_speed_per_volt"), 0.5 * full)
+    largest = voltage * (full - voltage) / power
+    if most("battery_resistance") > largest:
+        raise ValueError(
+            f"BatteryParams.resistance must be at most {largest:.3g} ohm, or randomization of "
+            f"'battery_resistance', to deliver the {power:.3g} W that hovering takes at worst, got "
+            f"{most('battery_resistance'):g} ohm"
         )
 
 

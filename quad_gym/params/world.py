@@ -25,7 +25,12 @@ class BatteryParams(Checked):
 
     With the charge s in [0, 1], `s' = -P / energy` and `P = sum(kN W_i^3) / motor_efficiency`; the
     open-circuit voltage is `U0 = max_voltage (empty_voltage + (1 - empty_voltage) s)`, and the
-    motors get at most U with `U = U0 - resistance P / U`. At s = 0 the battery cuts off.
+    motors get at most U with `U = U0 - resistance P / U`. The battery delivers at most
+    `U0^2 / (4 resistance)`, at U = U0 / 2. The rotors take `P = V I` at the voltage
+    `V = W / motor_speed_per_volt` of steady speeds, and the motors get at most the V at which V I
+    is what the battery delivers at most: rotors that want more slow down to where they take that.
+    At s = 0 the battery cuts off. A resistance with which it cannot deliver what hovering takes is
+    refused.
     """
 
     energy: float = 88e3

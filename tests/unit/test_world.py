@@ -236,13 +236,15 @@ def test_the_accelerometer_feels_what_the_air_does():
 
 
 def battery_law(charge, speeds, battery, vehicle=LAB):
-    """U from U = U0 - R P / U, the larger root."""
-    power = vehicle.torque_coefficient * (speeds**3).sum() / battery.motor_efficiency
+    """U from U = U0 - R P / U, the larger root, or less where V I is all that there is."""
+    torque = vehicle.torque_coefficient * speeds**2 / battery.motor_efficiency
+    power, current = torque @ speeds, vehicle.motor_speed_per_volt * torque.sum()
     empty = battery.empty_voltage
     U0 = vehicle.max_voltage * (empty + (1 - empty) * charge)
-    if 4 * battery.resistance * power > U0**2:
-        return U0 / 2, power
-    return max(np.roots([1.0, -U0, battery.resistance * power]).real), power
+    most = U0**2 / (4.0 * battery.resistance)
+    power = min(power, most)
+    loaded = max(np.roots([1.0, -U0, battery.resistance * power]).real)
+    return (min(loaded, most / current) if current else loaded), power
 
 
 def test_the_battery_gives_what_it_has_and_no_more():
@@ -261,18 +263,73 @@ def test_the_battery_gives_what_it_has_and_no_more():
     assert taken > 0.0
 
 
-def test_rotors_settle_where_the_loaded_battery_holds_them():
-    battery = BatteryParams(energy=1e12, resistance=0.3)
-    vehicle = LAB.replace(mass=6.0)  # hovers at 8.1 V, so that full action asks for 12 V
+@pytest.mark.parametrize("resistance", [0.005, 0.02])
+def test_rotors_settle_where_the_loaded_battery_holds_them(resistance):
+    battery = BatteryParams(energy=1e12, resistance=resistance)
+    vehicle = LAB.replace(mass=3.3)  # hovers at 6.03 V, so that full action asks for 12 V
     batch, _ = motors_only(WorldParams(battery=battery), vehicle=vehicle)
     flown(batch, np.ones((1, 4)), 3.0)
 
     def excess(speed):
         return 200.0 * battery_law(1.0, np.full(4, speed), battery)[0] - speed
 
-    settled = brentq(excess, 600.0, 2400.0)
+    settled = brentq(excess, 600.0, 0.999 * most_power_speed(resistance))
     np.testing.assert_allclose(batch.record("rotor_speeds")[0], settled, rtol=1e-6)
     assert settled < 2200.0
+
+
+def most_power_speed(resistance):
+    """Speed at which four rotors take U0^2 / (4 R), of a full battery."""
+    power = LAB.max_voltage**2 / (4.0 * resistance)
+    return np.cbrt(power * BatteryParams().motor_efficiency / (4.0 * LAB.torque_coefficient))
+
+
+@pytest.mark.parametrize("resistance", [0.05, 0.1, 0.2, 0.24])
+def test_rotors_that_want_more_power_than_there_is_settle_where_they_take_it_all(resistance):
+    battery = BatteryParams(energy=1e12, resistance=resistance)
+    batch, _ = motors_only(WorldParams(battery=battery))
+    settled = most_power_speed(resistance)
+    assert HOVER_SPEED < settled < 2.0 * HOVER_SPEED  # which is what full action asks for
+    flown(batch, np.ones((1, 4)), 3.0)
+    np.testing.assert_allclose(batch.record("rotor_speeds")[0], settled, rtol=1e-9)
+    assert batch.record("voltages")[0].max() < LAB.max_voltage / 2.0
+
+
+def test_faster_rotors_than_there_is_power_for_slow_down_and_drain_what_there_is():
+    resistance = 0.2
+    battery = BatteryParams(energy=1e6, resistance=resistance)
+    batch, _ = motors_only(WorldParams(battery=battery), speed=2.0 * HOVER_SPEED)
+    speeds, charges = [batch.record("rotor_speeds")[0, 0]], [batch.record("charge")[0]]
+    for _ in range(20):
+        batch.step(np.ones((1, 4)))
+        speeds.append(batch.record("rotor_speeds")[0, 0])
+        charges.append(batch.record("charge")[0])
+    assert (np.diff(speeds) < 0.0).all()
+    assert speeds[-1] > most_power_speed(resistance)
+    U0 = 12.0 * (0.83 + 0.17 * np.array(charges[:-1]))
+    np.testing.assert_allclose(-np.diff(charges) * 1e6 / 0.005, U0**2 / 0.8, rtol=1e-9)
+
+
+def test_a_resistance_with_which_it_cannot_hover_is_refused():
+    power = 4.0 * LAB.torque_coefficient * HOVER_SPEED**3 / 0.75
+    limit = 12.0**2 / (4.0 * power)
+    for resistance in (1.001 * limit, 5.0, 1e6):
+        world = WorldParams(battery=BatteryParams(resistance=resistance))
+        with pytest.raises(ValueError, match=r"BatteryParams.resistance must be at most 0.24"):
+            FlightBatch(1, world=world)
+        with pytest.raises(ValueError, match="randomization of 'battery_resistance'"):
+            FlightBatch(
+                1,
+                world=WorldParams(battery=BatteryParams()),
+                randomization={"battery_resistance": Uniform(0.01, resistance)},
+            )
+    batch, action = motors_only(
+        WorldParams(battery=BatteryParams(energy=1e12, resistance=0.999 * limit)),
+        voltage=LAB.hover_voltage,
+        speed=HOVER_SPEED,
+    )
+    flown(batch, action, 5.0)
+    np.testing.assert_allclose(batch.record("rotor_speeds")[0], HOVER_SPEED, rtol=1e-9)
 
 
 def test_an_empty_battery_cuts_off():

@@ -160,15 +160,24 @@ def fly_through_air(flight, p, settings):
 
 
 @kernel
-def battery_voltage(charge, power, p):
-    """Voltage U of the battery under an electrical power P: U = U0 - R P / U.
+def battery_voltage(charge, power, current, p):
+    """Largest voltage of the motors, and the power that the battery delivers.
 
-    Beyond the most that it can deliver, U0^2 / (4 R), the voltage stays at U0 / 2. An empty battery
-    cuts off.
+    U = U0 - R P / U, and at most the V with V I = U0^2 / (4 R), the most that the battery can
+    deliver. An empty battery cuts off.
+
+    Args:
+        charge: Of the battery, 1: full.
+        power: P, what the rotors take at their present speeds [W].
+        current: I, the same over their voltage, with which it grows [A].
+        p: True parameters.
     """
     U0 = p.max_voltage * (p.battery_empty + (1.0 - p.battery_empty) * charge)
-    loaded = 0.5 * (U0 + math.sqrt(maximum(U0 * U0 - 4.0 * p.battery_resistance * power, 0.0)))
-    return select(charge > 0.0, loaded, 0.0)
+    R = p.battery_resistance
+    loaded = 0.5 * (U0 + math.sqrt(maximum(U0 * U0 - 4.0 * R * power, 0.0)))
+    loaded = minimum(loaded, 0.25 * U0 * U0 / maximum(R * current, 1e-300))
+    delivered = minimum(power, 0.25 * U0 * U0 / maximum(R, 1e-300))
+    return select(charge > 0.0, loaded, 0.0), delivered
 
 
 @kernel
@@ -177,12 +186,14 @@ def supply(flight, p, settings):
     limit = p.max_voltage
     if settings.supply == Supply.BATTERY:
         W = load4(flight.rotor_speeds)
-        power = 0.0 * W[0]
+        power, current = 0.0 * W[0], 0.0 * W[0]
         for i in range(4):
-            power = power + p.effectiveness[0, i] * p.kN * W[i] * W[i] * W[i]
-        power = power / p.motor_efficiency
-        limit = battery_voltage(flight.charge, power, p)
-        flight.charge = maximum(flight.charge - p.dt * power / p.battery_energy, 0.0)
+            torque = p.effectiveness[0, i] * p.kN * W[i] * W[i]
+            power = power + torque * W[i]
+            current = current + torque * p.motor_gain
+        power, current = power / p.motor_efficiency, current / p.motor_efficiency
+        limit, delivered = battery_voltage(flight.charge, power, current, p)
+        flight.charge = maximum(flight.charge - p.dt * delivered / p.battery_energy, 0.0)
     for i in range(4):
         flight.voltages[i] = minimum(flight.voltages[i], limit)
 
