@@ -32,7 +32,8 @@ from quad_gym.packing.world import pack_options, pack_places
 from quad_gym.params import checks as check
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
-from quad_gym.params.randomization import DrawingTable, Given, Randomization, check_draws
+from quad_gym.params.draw_limits import check_draws
+from quad_gym.params.randomization import DrawingTable, Given, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams, check_limit

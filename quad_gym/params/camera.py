@@ -57,7 +57,8 @@ class CameraParams(Checked):
             self._check(check.positive, "max_range")
         self._check(check.phase, "phase")
         self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
-        self._check(check.vector, "position_B", "attitude", length=3)
+        self._check(check.place, "position_B")
+        self._check(check.vector, "attitude", length=3)
         self._check(check.vector, "image_size", length=2)
         if min(self.image_size) <= 0.0:
             raise ValueError(

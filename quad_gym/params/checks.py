@@ -19,6 +19,10 @@ SMALLEST = 1e-15
 """No quantity that has to be positive is smaller; its square is still far from underflow."""
 
 
+FARTHEST_ON_VEHICLE = 100.0
+"""No part of a vehicle is farther from its center of mass [m]."""
+
+
 class UnknownKeywordError(TypeError, ValueError):
     """A keyword that nothing has; as Python's own a TypeError, and a ValueError as all checks."""
 
@@ -206,6 +210,16 @@ def _sized(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     if values.size and np.abs(values).max() > LARGEST:
         raise ValueError(f"{name} must be at most {LARGEST:g} either way, got {values}")
     return values
+
+
+def place(name: str, value: Any) -> tuple[float, ...]:
+    """`value` as a place on the vehicle, (3,) in B."""
+    found = vector(name, value, 3)
+    if max(map(abs, found)) > FARTHEST_ON_VEHICLE:
+        raise ValueError(
+            f"{name} must be on the vehicle, within {FARTHEST_ON_VEHICLE:g} m, got {found}"
+        )
+    return found
 
 
 def matrix(name: str, value: Any, rows: int | None, columns: int) -> tuple[tuple[float, ...], ...]:

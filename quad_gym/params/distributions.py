@@ -10,6 +10,9 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 from quad_gym.records import LOG_UNIFORM, NORMAL, UNIFORM
 
+FARTHEST = 8.3
+"""Standard deviations beyond which no draw lies: its probability is a multiple of 2^-53."""
+
 
 class Affine(NamedTuple):
     """A distribution in the form that the kernel reads; u is uniform on (0, 1)."""
@@ -140,8 +143,9 @@ class Normal(Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Bounds of the truncated distribution."""
-        return self.low, self.high
+        """Bounds of the truncated distribution, or the least and the largest draw without any."""
+        reach = FARTHEST * self.sigma
+        return max(self.low, self.mean - reach), min(self.high, self.mean + reach)
 
     @property
     def center_and_spread(self) -> tuple[float, float]:

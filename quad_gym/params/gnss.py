@@ -16,6 +16,24 @@ HEADING_MEMORY = 60.0
 """Time over which a filter does not average out the constant heading error of a baseline [s]."""
 
 
+LEAST_BASELINE = 1e-3
+"""Antennas are farther apart than this [m]."""
+
+
+def check_baseline(name: str, baseline: np.ndarray) -> None:
+    """Refuse antennas at one place.
+
+    Args:
+        name: Of both antennas.
+        baseline: (3,) from one to the other [m].
+
+    Raises:
+        ValueError: If they are.
+    """
+    if np.linalg.norm(baseline) < LEAST_BASELINE:
+        raise ValueError(f"{name} must be apart, by at least {LEAST_BASELINE:g} m")
+
+
 @dataclass(frozen=True, kw_only=True)
 class GnssParams(Checked):
     """GNSS: position of the primary antenna and, with a second antenna, the baseline between them.
@@ -73,29 +91,30 @@ class GnssParams(Checked):
             raise ValueError(
                 f"GnssParams.drift_sigma_I must be at least 0, got {self.drift_sigma_I}"
             )
-        self._check(
-            check.vector,
-            *self._antennas,
-            "reference_antenna_G",
-            "position_sigma_I",
-            length=3,
-        )
+        self._check(check.place, *self._antennas)
+        self._check(check.vector, "reference_antenna_G", "position_sigma_I", length=3)
         if min(self.position_sigma_I) <= 0.0:
             raise ValueError(
                 f"GnssParams.position_sigma_I must be greater than 0, got {self.position_sigma_I}"
             )
-        for name in self._antennas:
-            if np.abs(getattr(self, name)).max() > 100.0:
-                raise ValueError(
-                    f"GnssParams.{name} must be on the vehicle, within 100 m, got "
-                    f"{getattr(self, name)}"
-                )
-        if self.has_baseline and np.linalg.norm(self.baseline_B) < 1e-3:
-            raise ValueError("GnssParams.secondary_antenna_B must be apart from primary_antenna_B")
+        if self.has_baseline:
+            check_baseline("GnssParams.secondary_antenna_B and primary_antenna_B", self.baseline_B)
         if np.linalg.norm(self.reference_antenna_G) < 1e6:
             raise ValueError(
                 "GnssParams.reference_antenna_G must be a place on the Earth in ECEF meters, "
                 f"got {self.reference_antenna_G}"
+            )
+
+    def require_filter(self) -> None:
+        """Refuse positions with hardly any noise, by the square of which a filter divides.
+
+        Raises:
+            ValueError: If they have.
+        """
+        if min(self.position_sigma_I) < 1e-9:
+            raise ValueError(
+                "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
+                f"{self.position_sigma_I}"
             )
 
     @property

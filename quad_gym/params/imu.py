@@ -75,7 +75,7 @@ class ImuParams(Checked):
         self._check(check.positive, "accel_bias_tau", "gyro_bias_tau")
         self._check(check.positive, "accel_noise_density", "gyro_noise_density")
         self._check(check.positive, "accel_bias_sigma", "gyro_bias_sigma")
-        self._check(check.vector, "lever_arm_B", length=3)
+        self._check(check.place, "lever_arm_B")
         self._check(check.choice, "samples", choices=("instant", "average"))
 
     @property

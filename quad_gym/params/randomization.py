@@ -15,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.clocks import Clocks
 from quad_gym.params.distributions import Distribution, Uniform
+from quad_gym.params.draw_limits import check_bounds, check_hovering
 from quad_gym.params.sensors import SensorSuite
-from quad_gym.params.vehicle import LEAST_MOMENT, RK4_LIMIT, VehicleParams, check_lag, check_moments
-from quad_gym.params.world import BatteryParams, WorldParams
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, LOG_UNIFORM, NORMAL, UNIFORM, Drawable
-
-FAST = 100.0
-"""Speed that no vehicle reaches [m/s]."""
 
 FEATURE_DRAWS = ("features_yaw", "features_shift_I", "feature_offsets_I")
 """Draws that move the camera's features, to positions that the filter uses, too."""
@@ -147,9 +144,16 @@ class DrawingTable:
                     parts = parts * len(sensors.camera.features_I)
                 for k, part in enumerate(parts):
                     self._fill(drawable, first + k, part, nominal[first + k])
-        _check_hovering(self, vehicle, world)
-        if "inertia" in self.names:
-            _check_inertia(self)
+        check_bounds(self, vehicle, sensors, world)
+        check_hovering(self, vehicle, world)
+
+    def least(self, name: str) -> float:
+        """Return the least draw of any component of a parameter."""
+        return float(self.low[COLUMNS[name]].min())
+
+    def most(self, name: str) -> float:
+        """Return the largest draw of any component of a parameter."""
+        return float(self.high[COLUMNS[name]].max())
 
     def mean_square(self, name: str) -> NDArray[np.float64]:
         """Return the mean squares (size,) of a parameter's components over their distributions."""
@@ -188,17 +192,6 @@ class DrawingTable:
                 f"randomization of {name!r} must stay {_range_in_words(drawable)}, got "
                 f"{part!r}, which reaches from {low:g} to {high:g}"
             )
-        reached = max((abs(bound) for bound in (low, high) if math.isfinite(bound)), default=0.0)
-        farthest = _FARTHEST.get(name, check.LARGEST)
-        if reached > farthest:
-            raise ValueError(
-                f"randomization of {name!r} must stay within {farthest:g} {drawable.unit} either "
-                f"way, got {part!r}"
-            )
-        if name == "inertia" and low < LEAST_MOMENT:
-            raise ValueError(
-                f"randomization of {name!r} must stay above {LEAST_MOMENT:g} kg m^2, got {part!r}"
-            )
         self.kind[column], self.a[column], self.b[column], self.c[column], self.d[column] = (
             part.placed(factor, shift)
         )
@@ -206,18 +199,6 @@ class DrawingTable:
         center, spread = part.center_and_spread
         self.center[column] = factor * center + shift
         self.spread[column] = abs(factor * spread) or 1.0
-
-
-_FARTHEST = {
-    "center_of_mass_B": 10.0,
-    "start_position_I": 1e6,
-    "start_velocity_I": 1e4,
-    "start_body_rates": 1e3,
-    "features_yaw": 1e4,
-    "features_shift_I": 1e4,
-    "feature_offsets_I": 1e4,
-}
-"""Largest magnitudes of draws where larger numbers are mistakes."""
 
 
 def _range_in_words(drawable: Drawable) -> str:
@@ -280,116 +261,3 @@ def nominal_values(
                 values[COLUMNS[drawable.name]] = found
                 break
     return values
-
-
-def _check_hovering(table: DrawingTable, vehicle: VehicleParams, world: WorldParams) -> None:
-    """Refuse a randomization whose worst case cannot carry its weight."""
-
-    def least(name: str) -> float:
-        return float(table.low[COLUMNS[name]].min())
-
-    def most(name: str) -> float:
-        return float(table.high[COLUMNS[name]].max())
-
-    mass = most("mass")
-    full = least("max_voltage")
-    if world.battery is not None:
-        full *= _open_circuit(world.battery, least("battery_charge"))
-    speed = least("motor_speed_per_volt") * full
-    lift = 4.0 * least("thrust_coefficient") * least("rotor_efficiency")
-    thrust = lift * speed**2
-    if mass * vehicle.gravity >= thrust:
-        raise ValueError(
-            f"randomization must leave the vehicle able to hover: at worst it weighs "
-            f"{mass * vehicle.gravity:.1f} N and its rotors lift {thrust:.1f} N; limit mass, "
-            "max_voltage, motor_speed_per_volt, thrust_coefficient or rotor_efficiency"
-        )
-    if world.battery is None:
-        return
-    speed = math.sqrt(mass * vehicle.gravity / lift)
-    torque = 4.0 * least("rotor_efficiency") * most("torque_coefficient") * speed**2
-    power = torque * speed / world.battery.motor_efficiency
-    # U (U0 - U) / R is what it delivers at U: the most at half of U0, unless hovering takes more U
-    voltage = max(speed / least("motor_speed_per_volt"), 0.5 * full)
-    largest = voltage * (full - voltage) / power
-    if most("battery_resistance") > largest:
-        raise ValueError(
-            f"BatteryParams.resistance must be at most {largest:.3g} ohm, or randomization of "
-            f"'battery_resistance', to deliver the {power:.3g} W that hovering takes at worst, got "
-            f"{most('battery_resistance'):g} ohm"
-        )
-
-
-def check_draws(
-    table: DrawingTable, vehicle: VehicleParams, world: WorldParams, clocks: Clocks
-) -> None:
-    """Refuse rotors that are too fast, or drag that is too large, for the integration.
-
-    Args:
-        table: The distributions.
-        vehicle: The vehicle without draws.
-        world: The world without draws.
-        clocks: Rates, for the duration of a Runge-Kutta step.
-
-    Raises:
-        ValueError: If the nominal values or any draw are refused.
-    """
-    _check_drag(table, vehicle, world, clocks)
-    name = "motor_time_constant"
-    if name in table.names:
-        least = float(table.low[COLUMNS[name]].min())
-        check_lag(f"randomization of {name!r} at its smallest draw", least, clocks)
-    else:
-        check_lag(name, vehicle.motor_time_constant, clocks)
-
-
-def _check_drag(
-    table: DrawingTable, vehicle: VehicleParams, world: WorldParams, clocks: Clocks
-) -> None:
-    """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
-
-    def most(name: str) -> float:
-        """Return the largest draw; for a normal without bounds, six standard deviations."""
-        columns = COLUMNS[name]
-        high, low = table.high[columns], table.low[columns]
-        far = np.abs(table.center[columns]) + 6.0 * table.spread[columns]
-        reached = np.maximum(np.abs(high), np.abs(low))
-        return float(np.where(np.isinf(reached), far, reached).max())
-
-    wind = sum(most(f"wind_{part}") for part in ("east", "north", "up", "speed"))
-    speed = FAST + wind + float(np.linalg.norm(world.wind_I)) + most("gust_wind_speed")
-    disc = most("drag_coefficient") * vehicle.disc_area * vehicle.air_density * speed
-    rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
-    drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
-    columns = COLUMNS["mass"]
-    mass = float(table.low[columns][0])
-    if "mass" in table.names:  # six standard deviations of a normal with far bounds
-        mass = max(mass, float((table.center[columns] - 6.0 * table.spread[columns])[0]))
-    step = 1.0 / (clocks.imu_rate * clocks.substeps)
-    if step * drag > RK4_LIMIT * mass:
-        raise ValueError(
-            f"drag must slow the vehicle down by less than {RK4_LIMIT * mass / step:.3g} N s/m, "
-            f"where the integration is stable, got {drag:.3g} N s/m at {speed:.3g} m/s (by mass, "
-            "drag_coefficient, disc_area, air_density, linear_drag_B, rotor_drag_B, wind_I and "
-            "gust_wind_speed)"
-        )
-
-
-def _check_inertia(table: DrawingTable) -> None:
-    """Refuse a range of moments of inertia all of which no body has.
-
-    A range in which some draws break the rule that each moment is at most the sum of the other two
-    is accepted: components are drawn independently, so 20 % either way of a flat vehicle includes
-    such draws, and they fly as well as any. See `params.check_moments`.
-    """
-    columns = COLUMNS["inertia"]
-    low, high = table.low[columns], table.high[columns]
-    for k in range(3):
-        most = np.where(np.arange(3) == k, low, high)  # the others as large as they can be
-        if 2.0 * low[k] > most.sum() * (1.0 + 1e-9):
-            check_moments("randomization of 'inertia' at its most favorable draw", most)
-
-
-def _open_circuit(battery: BatteryParams, charge: float) -> float:
-    """Return the voltage of an unloaded battery as a fraction of a full battery's."""
-    return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge

@@ -174,11 +174,8 @@ class SensorSuite(Checked):
             ValueError: If the filter would use means over a tick as samples at its start, or divide
                 by the square of almost no noise.
         """
-        if self.gnss is not None and min(self.gnss.position_sigma_I) < 1e-9:
-            raise ValueError(
-                "GnssParams.position_sigma_I must be at least 1e-9 m for a filter, got "
-                f"{self.gnss.position_sigma_I}"
-            )
+        if self.gnss is not None:
+            self.gnss.require_filter()
         if self.imu.samples == "average" and self.estimator.integration == "euler":
             raise ValueError(
                 "sensors must have FilterParams.integration='midpoint' with ImuParams.samples="

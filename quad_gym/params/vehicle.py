@@ -19,6 +19,10 @@ from quad_gym.params.gravity import GRAVITY
 LEAST_MOMENT = 1e-9
 """Moment of inertia below which numbers are mistakes; a quadrotor of 10 g has 1e-6 [kg m^2]."""
 
+LEAST_GYRATION = 1.0 / 30.0
+"""Radius of gyration over the distance of the rotors, below which numbers are mistaken: the rotors
+would turn the vehicle faster than a tick resolves. Quadrotors have 0.2 to 0.8."""
+
 MAX_LIFT = 1000.0
 """Thrust-to-weight ratio above which numbers are mistakes; racing drones reach 15."""
 
@@ -88,24 +92,20 @@ class VehicleParams(Checked):
         inertia = np.array(self.inertia)
         if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
             raise ValueError("VehicleParams.inertia must be symmetric")
-        smallest = np.linalg.eigvalsh(inertia)[0]
-        if 0.0 < smallest < LEAST_MOMENT:
-            raise ValueError(
-                f"VehicleParams.inertia must be at least {LEAST_MOMENT:g} kg m^2 about every "
-                f"axis, got {smallest:g} kg m^2"
-            )
-        if smallest <= 1e-9 * abs(inertia).max():
+        moments = np.linalg.eigvalsh(inertia)
+        if moments[0] <= 1e-9 * abs(inertia).max():
             raise ValueError(
                 "VehicleParams.inertia must be positive definite, got a smallest eigenvalue of "
-                f"{smallest:g}"
+                f"{moments[0]:g}"
             )
-        check_moments("VehicleParams.inertia", np.linalg.eigvalsh(inertia))
+        check_moments("VehicleParams.inertia", moments)
         if self.hover_voltage >= self.max_voltage:
             raise ValueError(
                 f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: it takes "
                 f"{self.hover_voltage:.3g} V of {self.max_voltage:g} V (by mass, gravity, "
                 "thrust_coefficient, motor_speed_per_volt and max_voltage)"
             )
+        check_gyration("VehicleParams.inertia", moments, self.mass, self.rotor_positions_B)
         if 4.0 * self.max_rotor_force > MAX_LIFT * self.mass * self.gravity:
             raise ValueError(
                 f"VehicleParams.thrust_coefficient must lift at most {MAX_LIFT:g} times the weight "
@@ -167,6 +167,27 @@ def check_moments(name: str, moments: ArrayLike) -> None:
         raise ValueError(
             f"{name} must belong to a body: no moment can be larger than the sum of the other "
             f"two, got {', '.join(f'{value:g}' for value in values)} kg m^2"
+        )
+
+
+def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike) -> None:
+    """Refuse moments of inertia that are too small for the mass and the size of the vehicle.
+
+    Args:
+        name: What they belong to.
+        moments: (3,) about three orthogonal axes [kg m^2].
+        mass: Of the vehicle [kg].
+        rotors: (4, 3) rotor hubs relative to the center of mass [m].
+
+    Raises:
+        ValueError: If one is smaller than that of LEAST_GYRATION.
+    """
+    reach = float(np.linalg.norm(rotors, axis=1).max())
+    smallest = max(LEAST_MOMENT, mass * (LEAST_GYRATION * reach) ** 2)
+    if np.min(moments) < smallest:
+        raise ValueError(
+            f"{name} must be at least {smallest:.3g} kg m^2 about every axis, with a mass of "
+            f"{mass:g} kg and rotor_positions_B {reach:.3g} m away, got {np.min(moments):g} kg m^2"
         )
 
 

@@ -193,7 +193,7 @@ def test_a_record_has_the_features_of_its_episode():
     [
         ({"features_yaw": Uniform(-1.0, 1.0)}, {"sensors": INDOOR.replace(camera=None)}, "camera"),
         ({"feature_offsets_I": (Uniform(0, 1), None)}, {}, "feature_offsets_I.*3 of them"),
-        ({"features_shift_I": Uniform(0.0, 1e6)}, {}, "features_shift_I.*within"),
+        ({"features_shift_I": Uniform(0.0, 1e6)}, {}, "features_shift_I.*at most"),
         ({"features_yaw": Uniform(0.5, 1.0, relative=True)}, {}, "features_yaw.*relative"),
     ],
 )

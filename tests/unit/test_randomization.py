@@ -247,12 +247,12 @@ def test_a_flight_that_draws_a_parameter_is_the_flight_that_has_it(name):
 @pytest.mark.parametrize("name", ["max_voltage", "battery_resistance", "battery_charge"])
 def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
     task = quad_gym.TaskParams(kind="hover", start="hover", duration=0.0, out_of_bounds=1e3)
-    heavy = {"vehicle": LAB.replace(mass=6.0), "control": Control.MOTOR, "task": task}
-    given = Uniform(0.01, 0.05) if name == "battery_resistance" else some_distribution(name)
+    heavy = {"vehicle": LAB.replace(mass=2.5), "control": Control.MOTOR, "task": task}
+    given = Uniform(0.01, 0.03) if name == "battery_resistance" else some_distribution(name)
     drawing = FlightBatch(2, **heavy, world=WORLD, randomization={name: given})
     drawing.reset(seeds=(2, 3))
     vehicle, _, world = told(name, np.atleast_1d(drawing.record(name)[1]))
-    telling = FlightBatch(1, **heavy, world=world, true_vehicle=vehicle.replace(mass=6.0))
+    telling = FlightBatch(1, **heavy, world=world, true_vehicle=vehicle.replace(mass=2.5))
     telling.reset(seeds=[3])
     for _ in range(100):
         drawing.step(np.ones((2, 4)))

@@ -20,12 +20,13 @@ SUITE = quad_gym.sensor_suite("lab")
         ({"mass": None}, "'mass' must be a distribution"),
         ({"inertia": (Uniform(1, 2), Uniform(1, 2))}, "'inertia' must be a distribution or 3"),
         ({"inertia": (Uniform(1, 2), 3.0, None)}, "'inertia' must hold distributions"),
-        ({"mass": Uniform(0.0, 1.0)}, "'mass' must stay above 0 kg"),
-        ({"mass": Uniform(-0.5, 0.5, relative=True)}, "'mass' must stay above 0"),
-        ({"mass": Normal(0.8, 0.1)}, "'mass' must stay above 0"),
-        ({"mass": Uniform(0.5, 20.0)}, "able to hover"),
-        ({"mass": Uniform(1.0, 20.0, relative=True)}, "able to hover"),
-        ({"max_voltage": Uniform(1.0, 12.0)}, "able to hover"),
+        ({"mass": Uniform(0.0, 1.0)}, "'mass' .* reaches 0: .*mass must be greater than 0"),
+        ({"mass": Uniform(-0.5, 0.5, relative=True)}, "'mass' .*mass must be greater than 0"),
+        ({"mass": Normal(0.8, 0.1)}, "'mass' .* reaches -0.03: .*mass must be greater than 0"),
+        ({"mass": Uniform(0.5, 20.0)}, "'mass' .*light enough to hover"),
+        ({"mass": Uniform(1.0, 20.0, relative=True)}, "'mass' .*light enough to hover"),
+        ({"max_voltage": Uniform(1.0, 12.0)}, "'max_voltage' .*light enough to hover"),
+        ({"max_voltage": Uniform(4, 12), "mass": Uniform(1, 2)}, "must leave .* able to hover"),
         ({"rotor_efficiency": Uniform(0.01, 1.0)}, "able to hover"),
         ({"battery_charge": Uniform(0.5, 1.5)}, "'battery_charge' needs a battery"),
         ({"wind_up": Uniform(0.5, 1.5, relative=True)}, "nominal value is 0"),
@@ -81,3 +82,71 @@ def test_what_is_not_drawn_cannot_be_read():
     batch = FlightBatch(1, randomization={"mass": Uniform(0.6, 0.9)})
     with pytest.raises(ValueError, match="one of the drawn mass"):
         batch.record("inertia")
+
+
+SIGMAS = ("accel_noise_density", "gyro_noise_density", "accel_bias_sigma", "gyro_bias_sigma")
+SIGMAS = (*SIGMAS, "position_sigma_I", "baseline_sigma", "pixel_sigma")
+
+
+@pytest.mark.parametrize("name", SIGMAS)
+def test_a_drawn_deviation_of_zero_is_refused_as_the_parameter_refuses_it(name):
+    with pytest.raises(ValueError, match=rf"randomization of '{name}'.*Params.{name} must be"):
+        FlightBatch(1, randomization={name: Uniform(0.0, 0.0)})
+    FlightBatch(1, randomization={name: Uniform(1e-6, 1e-6)})
+
+
+def test_drawn_positions_with_hardly_any_noise_are_refused_as_a_filter_refuses_them():
+    with pytest.raises(ValueError, match=r"'position_sigma_I'.* at least 1e-9 m for a filter"):
+        FlightBatch(1, randomization={"position_sigma_I": Uniform(1e-12, 1e-3)})
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter"),
+    [
+        ("primary_antenna_B", "GnssParams.primary_antenna_B"),
+        ("secondary_antenna_B", "GnssParams.secondary_antenna_B"),
+        ("lever_arm_B", "ImuParams.lever_arm_B"),
+        ("camera_position_B", "CameraParams.position_B"),
+    ],
+)
+def test_a_drawn_place_off_the_vehicle_is_refused_as_the_parameter_refuses_it(name, parameter):
+    for far in (Uniform(0.0, 101.0), (None, Uniform(-1e15, 0.0), None), Normal(0.0, 20.0)):
+        with pytest.raises(ValueError, match=rf"{parameter} must be on the vehicle, within 100 m"):
+            FlightBatch(1, randomization={name: far})
+    FlightBatch(1, randomization={name: Normal(0.0, 1e-4, offset=True)})
+
+
+def test_antennas_whose_draws_may_come_together_are_refused():
+    gnss, near = SUITE.gnss, Uniform(-0.1, 0.1, offset=True)
+    there = tuple(Uniform(x, x) for x in gnss.primary_antenna_B)
+    for draws in (
+        {"secondary_antenna_B": there},
+        {"primary_antenna_B": near, "secondary_antenna_B": near},
+    ):
+        with pytest.raises(ValueError, match=r"secondary_antenna_B.* must be apart"):
+            FlightBatch(1, randomization=draws)
+    FlightBatch(1, randomization={"primary_antenna_B": near})
+
+
+@pytest.mark.parametrize(
+    ("draws", "message"),
+    [
+        ({"inertia": Uniform(1e-7, 1e-6)}, "'inertia' .* inertia must be at least"),
+        ({"inertia": LogUniform(0.03, 1.0, relative=True)}, "'inertia' .* with a mass of 0.78 kg"),
+        ({"center_of_mass_B": Uniform(-5.0, 5.0)}, "'center_of_mass_B' .* between the rotors"),
+        ({"center_of_mass_B": (Uniform(0.0, 0.21), None, None)}, "between the rotors"),
+        ({"gust_wind_speed": Uniform(0.0, 201.0)}, "WorldParams.gust_wind_speed must be at most"),
+        ({"wind_up": Uniform(0.0, 201.0)}, "WorldParams.wind_I must be at most 200 m/s"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_draws_that_no_vehicle_flies_with_are_refused(draws, message):
+    with pytest.raises(ValueError, match=message):
+        FlightBatch(1, randomization=draws)
+
+
+def test_a_vehicle_whose_mass_is_all_in_its_middle_is_refused():
+    with pytest.raises(
+        ValueError, match=r"VehicleParams.inertia must be at least 7.64e-05 kg m\^2"
+    ):
+        quad_gym.VehicleParams(inertia=((1e-6, 0, 0), (0, 1e-6, 0), (0, 0, 2e-6)))

@@ -1,0 +1,215 @@
+"""Which draws are possible: within the bounds of the parameters, able to hover, and stable."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.params.clocks import Clocks
+from quad_gym.params.gnss import check_baseline
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.vehicle import (
+    RK4_LIMIT,
+    VehicleParams,
+    check_gyration,
+    check_lag,
+    check_moments,
+)
+from quad_gym.params.world import BatteryParams, WorldParams
+from quad_gym.records import COLUMNS
+
+if TYPE_CHECKING:
+    from quad_gym.params.randomization import DrawingTable
+
+FAST = 100.0
+"""Speed that no vehicle reaches [m/s]."""
+
+_OF_PARTS = {"battery_charge": "charge", "battery_resistance": "resistance"}
+_OF_PARTS |= {"camera_position_B": "position_B"}
+"""Names in their dataclasses of what has another name among draws."""
+
+
+def check_bounds(
+    table: "DrawingTable", vehicle: VehicleParams, sensors: SensorSuite, world: WorldParams
+) -> None:
+    """Refuse draws that the parameters themselves refuse.
+
+    Args:
+        table: The draws.
+        vehicle: The vehicle without draws.
+        sensors: The sensors without draws.
+        world: The world without draws.
+
+    Raises:
+        ValueError: If the least or the largest draws of a parameter are beyond its bounds.
+    """
+    parts = (vehicle, world, world.battery, sensors.imu, sensors.gnss, sensors.camera)
+    present = [part for part in parts if part is not None]
+    for name in table.names:
+        field = _OF_PARTS.get(name, name)
+        owner = next((part for part in present if hasattr(part, field)), None)
+        for ends in (table.low[COLUMNS[name]], table.high[COLUMNS[name]]):
+            try:
+                if name == "inertia":
+                    check_gyration("inertia", ends, vehicle.mass, vehicle.rotor_positions_B)
+                elif name == "center_of_mass_B":
+                    _check_center(ends, vehicle)
+                elif name.startswith("wind_") and name != "wind_direction":
+                    world.replace(wind_I=_wind(name, float(ends[0]), world))
+                elif owner is not None:
+                    value: Any = float(ends[0]) if ends.size == 1 else tuple(ends.tolist())
+                    drawn = owner.replace(**{field: value})
+                    if name == "position_sigma_I":
+                        drawn.require_filter()
+            except ValueError as error:
+                reached = ", ".join(f"{end:g}" for end in ends)
+                raise ValueError(
+                    f"randomization of {name!r} must stay within the bounds of what it draws, and "
+                    f"reaches {reached}: {error}"
+                ) from None
+    if "inertia" in table.names:
+        _check_inertia(table)
+    antennas = {"primary_antenna_B", "secondary_antenna_B"} & set(table.names)
+    if antennas and sensors.gnss is not None and sensors.gnss.has_baseline:
+        _check_antennas(table)
+
+
+def _wind(name: str, value: float, world: WorldParams) -> tuple[float, float, float]:
+    """Return the wind in I with a draw of one component, or of the horizontal speed."""
+    east, north, up = world.wind_I
+    winds = {
+        "wind_east": (value, north, up),
+        "wind_north": (east, value, up),
+        "wind_up": (east, north, value),
+        "wind_speed": (value, 0.0, up),
+    }
+    return winds[name]
+
+
+def _check_center(place: NDArray[np.float64], vehicle: VehicleParams) -> None:
+    """Refuse a center of mass beyond the rotors, which could not balance the vehicle."""
+    reach = np.abs(vehicle.rotor_positions_B).max(axis=0)
+    reach[2] = np.linalg.norm(vehicle.rotor_positions_B, axis=1).max()
+    if (np.abs(place) >= reach).any():
+        raise ValueError(
+            "the center of mass must lie between the rotors, within "
+            f"{', '.join(f'{r:g}' for r in reach)} m"
+        )
+
+
+def _check_antennas(table: "DrawingTable") -> None:
+    """Refuse antennas whose draws may come together."""
+    one, other = COLUMNS["primary_antenna_B"], COLUMNS["secondary_antenna_B"]
+    gap = np.maximum(table.low[one] - table.high[other], table.low[other] - table.high[one])
+    check_baseline(
+        "randomization of 'primary_antenna_B' and 'secondary_antenna_B'", np.maximum(gap, 0.0)
+    )
+
+
+def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldParams) -> None:
+    """Refuse draws whose worst case cannot carry its weight, or has no power to.
+
+    Args:
+        table: The draws.
+        vehicle: The vehicle without draws.
+        world: The world without draws.
+
+    Raises:
+        ValueError: If there are such.
+    """
+    least, most = table.least, table.most
+    mass = most("mass")
+    full = least("max_voltage")
+    if world.battery is not None:
+        full *= _open_circuit(world.battery, least("battery_charge"))
+    speed = least("motor_speed_per_volt") * full
+    lift = 4.0 * least("thrust_coefficient") * least("rotor_efficiency")
+    thrust = lift * speed**2
+    if mass * vehicle.gravity >= thrust:
+        raise ValueError(
+            f"randomization must leave the vehicle able to hover: at worst it weighs "
+            f"{mass * vehicle.gravity:.1f} N and its rotors lift {thrust:.1f} N; limit mass, "
+            "max_voltage, motor_speed_per_volt, thrust_coefficient or rotor_efficiency"
+        )
+    if world.battery is None:
+        return
+    speed = math.sqrt(mass * vehicle.gravity / lift)
+    torque = 4.0 * least("rotor_efficiency") * most("torque_coefficient") * speed**2
+    power = torque * speed / world.battery.motor_efficiency
+    # U (U0 - U) / R is what it delivers at U: the most at half of U0, unless hovering takes more U
+    voltage = max(speed / least("motor_speed_per_volt"), 0.5 * full)
+    largest = voltage * (full - voltage) / power
+    if most("battery_resistance") > largest:
+        raise ValueError(
+            f"BatteryParams.resistance must be at most {largest:.3g} ohm, drawn or not, to deliver "
+            f"the {power:.3g} W that hovering takes at worst, got {most('battery_resistance'):g} "
+            "ohm (by mass, thrust_coefficient, torque_coefficient, motor_efficiency, max_voltage, "
+            "battery_charge and battery_resistance)"
+        )
+
+
+def check_draws(
+    table: "DrawingTable", vehicle: VehicleParams, world: WorldParams, clocks: Clocks
+) -> None:
+    """Refuse rotors that are too fast, or drag that is too large, for the integration.
+
+    Args:
+        table: The draws.
+        vehicle: The vehicle without draws.
+        world: The world without draws.
+        clocks: Rates, for the duration of a Runge-Kutta step.
+
+    Raises:
+        ValueError: If the nominal values or any draw are refused.
+    """
+    _check_drag(table, vehicle, world, clocks)
+    name = "motor_time_constant"
+    if name in table.names:
+        check_lag(f"randomization of {name!r} at its smallest draw", table.least(name), clocks)
+    else:
+        check_lag(name, vehicle.motor_time_constant, clocks)
+
+
+def _check_drag(
+    table: "DrawingTable", vehicle: VehicleParams, world: WorldParams, clocks: Clocks
+) -> None:
+    """Refuse drag that slows the vehicle down within a Runge-Kutta step, which would diverge."""
+
+    def most(name: str) -> float:
+        return max(-table.least(name), table.most(name))
+
+    wind = sum(most(f"wind_{part}") for part in ("east", "north", "up", "speed"))
+    speed = FAST + wind + float(np.linalg.norm(world.wind_I)) + most("gust_wind_speed")
+    disc = most("drag_coefficient") * vehicle.disc_area * vehicle.air_density * speed
+    rotor_speeds = 4.0 * most("motor_speed_per_volt") * most("max_voltage")
+    drag = disc + most("linear_drag_B") + most("rotor_drag_B") * rotor_speeds
+    mass = table.least("mass")
+    step = 1.0 / (clocks.imu_rate * clocks.substeps)
+    if step * drag > RK4_LIMIT * mass:
+        raise ValueError(
+            f"drag must slow the vehicle down by less than {RK4_LIMIT * mass / step:.3g} N s/m, "
+            f"where the integration is stable, got {drag:.3g} N s/m at {speed:.3g} m/s (by mass, "
+            "drag_coefficient, disc_area, air_density, linear_drag_B, rotor_drag_B, wind_I and "
+            "gust_wind_speed)"
+        )
+
+
+def _check_inertia(table: "DrawingTable") -> None:
+    """Refuse a range of moments of inertia all of which no body has.
+
+    A range in which some draws break the rule that each moment is at most the sum of the other two
+    is accepted: components are drawn independently, so 20 % either way of a flat vehicle includes
+    such draws, and they fly as well as any. See `params.check_moments`.
+    """
+    columns = COLUMNS["inertia"]
+    low, high = table.low[columns], table.high[columns]
+    for k in range(3):
+        most = np.where(np.arange(3) == k, low, high)  # the others as large as they can be
+        if 2.0 * low[k] > most.sum() * (1.0 + 1e-9):
+            check_moments("randomization of 'inertia' at its most favorable draw", most)
+
+
+def _open_circuit(battery: BatteryParams, charge: float) -> float:
+    """Return the voltage of an unloaded battery as a fraction of a full battery's."""
+    return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge
