@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.batch import quantities
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.following import check_trajectories, followed
-from quad_gym.batch.memory import FlightMemory
+from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.standing import check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
@@ -238,7 +238,8 @@ class FlightBatch(FlightMemory):
             )
         self._stages, self._entries = needed_stages(self._settings[0]), [FLY]
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
-        self._allocate(room_of(used_parts(self._settings[0])), draws.low)
+        configuration = configuration_digest(self._settings, model, true, *self._paths)
+        self._allocate(room_of(used_parts(self._settings[0])), draws.low, configuration)
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         padded = len(self._blocks) * WIDTH
         self._actions = np.zeros((padded, 4))

@@ -1,5 +1,6 @@
 """The records of many flights in memory: how they are read, kept and brought back."""
 
+import hashlib
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -30,6 +31,24 @@ _PARTS_OF = {
 """Parts of fields that have names: of suites whose GNSS positions drift."""
 
 
+_NO_CONFIGURATION = ("paths", "pieces", "max_steps")
+"""Settings that are addresses, or that `FlightBatch.limit` changes."""
+
+
+def configuration_digest(*records: NDArray[Any]) -> int:
+    """Digest of the records that say what flights are and do, as a word.
+
+    Args:
+        records: Settings, parameters, trajectories.
+    """
+    digest = hashlib.blake2b(digest_size=8)
+    for record in records:
+        for name in record.dtype.names or ():
+            if name not in _NO_CONFIGURATION:
+                digest.update(np.ascontiguousarray(record[name]).tobytes())
+    return int.from_bytes(digest.digest(), "little")
+
+
 class FlightMemory:
     """The records of `count` flights, in blocks of WIDTH."""
 
@@ -40,18 +59,20 @@ class FlightMemory:
     _model: NDArray[Any]
     _world: NDArray[Any]
 
-    def _allocate(self, room: Room, undrawn: NDArray[np.float64]) -> None:
+    def _allocate(self, room: Room, undrawn: NDArray[np.float64], configuration: int) -> None:
         """Make the records of flights that have never been reset.
 
         Args:
             room: Which fields they have.
             undrawn: What the columns of "drawn" are where nothing is drawn.
+            configuration: Their `configuration_digest`.
         """
         self._room, self._undrawn, self._begun = room, undrawn, False
         self._blocks = aligned_zeros(-(-self.count // WIDTH), room.dtype)
         lanes = np.arange(len(self._blocks) * WIDTH).reshape(-1, WIDTH)
         self._blocks["idle"] = lanes >= self.count
         self._blocks["needs_reset"] = 1.0
+        self._blocks["configuration"] = configuration
         for name in _UNKNOWN:
             if room.holds(name):
                 self._blocks[name] = np.nan
@@ -131,19 +152,24 @@ class FlightMemory:
         return self._blocks.copy()
 
     def restore(self, snapshot: NDArray[Any]) -> None:
-        """Bring all flights back to a snapshot of this batch, or of one of the same size.
+        """Bring all flights back to a snapshot of this batch, or of one like it.
 
         Raises:
-            ValueError: If the snapshot is of another size or kind.
+            ValueError: If the snapshot is of a batch of another size, or with other settings or
+                parameters; the time limit and the number of threads may be others.
         """
         fits = (
             isinstance(snapshot, np.ndarray)
             and snapshot.dtype == self._blocks.dtype
             and snapshot.shape == self._blocks.shape
             and np.array_equal(snapshot["idle"], self._blocks["idle"])
+            and np.array_equal(snapshot["configuration"], self._blocks["configuration"])
         )
         if not fits:
-            raise ValueError(f"snapshot must be that of a batch of {self.count} flights")
+            raise ValueError(
+                f"snapshot must be that of a batch of {self.count} flights with the same task, "
+                "vehicle, sensors, filter, world, randomization, faults, rates and observation"
+            )
         self._blocks[:] = snapshot
         self._begun = False  # it may have been taken before a reset
 

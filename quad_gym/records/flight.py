@@ -142,6 +142,8 @@ _CORE_FIELDS = (
     Field("gnss_wait", (), "ticks", "until GNSS measures next"),
     Field("camera_wait", (), "ticks", "until the camera measures next"),
     Field("feature_fresh", (MAX_FEATURES,), "0 or 1", "whether a feature was seen since the last step"),
+    # to which batches a snapshot belongs
+    Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
 )
 _FILTER_FIELDS = (
     # the last measurements

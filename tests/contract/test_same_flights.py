@@ -21,7 +21,9 @@ SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 """Episodes end by the time limit and by tipping over, at different steps in different flights."""
 
 LAB = quad_gym.sensor_suite("lab")
-SLOW = quad_gym.sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
+STANDARD = quad_gym.sensor_suite("standard")
+SLOW = STANDARD.with_rates(gnss=10.0, camera=25.0)
+QUIETER = STANDARD.replace(camera=STANDARD.camera.replace(pixel_sigma=19.0))
 AVERAGES = LAB.replace(
     imu=LAB.imu.replace(samples="average"),
     estimator=LAB.estimator.replace(integration="midpoint"),
@@ -243,3 +245,39 @@ def test_a_snapshot_of_another_batch_is_refused():
         small.flights.batch.restore(large.flights.batch.snapshot())
     with pytest.raises(ValueError, match="snapshot"):
         small.flights.batch.restore(np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("task", "keywords"),
+    [
+        ("circle", {}),
+        ("waypoints", {}),
+        ("hover", {"estimator": "ekf"}),
+        ("hover", {"sensors": "lab"}),
+        ("hover", {"sensors": QUIETER}),
+        ("hover", {"control_rate": 100}),
+        ("hover", {"autoreset_mode": "SameStep"}),
+        ("hover", {"world": quad_gym.WorldParams(wind_I=(1.0, 0.0, 0.0))}),
+        ("hover", {"randomization": {"motor_time_constant": quad_gym.Uniform(0.04, 0.06)}}),
+        ("hover", {"randomization": {"mass": quad_gym.Uniform(0.7, 0.9)}}),
+    ],
+    ids=str,
+)
+def test_a_snapshot_of_another_configuration_is_refused(task, keywords):
+    drawn = {"randomization": {"mass": quad_gym.Uniform(0.7, 0.8)}}
+    mine = QuadVectorEnv(2, "hover", **(drawn if "randomization" in keywords else {})).flights.batch
+    other = QuadVectorEnv(2, task, **keywords).flights.batch
+    mine.reset(seeds=[1, 2])
+    before = mine.snapshot()
+    other.reset(seeds=[1, 2])
+    with pytest.raises(ValueError, match="snapshot must be that of a batch of 2 flights with the"):
+        mine.restore(other.snapshot())
+    assert mine.snapshot().tobytes() == before.tobytes()
+
+
+def test_a_snapshot_is_that_of_any_time_limit_and_number_of_threads():
+    mine = QuadVectorEnv(9, "hover", threads=1, max_episode_steps=7).flights.batch
+    other = QuadVectorEnv(9, "hover", threads=2).flights.batch
+    other.reset(seeds=range(9))
+    mine.restore(pickle.loads(pickle.dumps(other.snapshot())))
+    assert_same(mine.read("position"), other.read("position"))

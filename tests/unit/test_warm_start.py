@@ -147,7 +147,7 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
         "doubt_tick",
     }
     seen = {"r_seen", "v_seen", "R_seen", "w_seen", "estimation_error", "gate"}
-    fixes = {"position_valid", "baseline_valid", "velocity_valid"}
+    fixes = {"position_valid", "baseline_valid", "velocity_valid", "configuration"}
     for field in FLIGHT_FIELDS:
         if field.name not in estimates | seen | fixes:
             np.testing.assert_array_equal(
