@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from quad_gym.batch import quantities
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.following import check_trajectories, followed
+from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
 from quad_gym.batch.standing import check_standing
 from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
@@ -165,6 +166,8 @@ class FlightBatch(FlightMemory):
         self.sensors.require_like(true_sensors)
         self.faults = faults_of(faults, true_sensors)
         self.innovations = check.flag("innovations", innovations)
+        self._begins_after_step = self.innovations and autoreset == Autoreset.SAME_STEP
+        self.final_innovations: dict[str, NDArray[Any]] = {}
         check.flag("include_std", include_std)
         check.flag("privileged", privileged)
         check.choice("filter_start", filter_start, FILTER_STARTS)
@@ -205,7 +208,8 @@ class FlightBatch(FlightMemory):
             layout=Layout(layout),
             include_std=include_std,
             privileged=privileged,
-            autoreset=Autoreset(autoreset),
+            # the kernels would begin an episode before anybody reads the last one's innovations
+            autoreset=Autoreset.DISABLED if self._begins_after_step else Autoreset(autoreset),
             run_filter=run_filter,
             innovations=run_filter and watches,
             lever_drawn=self.randomization.known
@@ -311,7 +315,24 @@ class FlightBatch(FlightMemory):
         if not self._begun:
             self._require_begun()
         self._actions[: self.count] = self.record("action") if actions is None else actions
-        return self._run(Command.STEP)
+        observations = self._run(Command.STEP)
+        if self._begins_after_step:
+            over = self._flights_over()
+            if over.any():
+                self.final_observations[over] = observations[over]
+                self._keep_innovations()
+                self._resets[:] = over
+                return self._run(Command.RESET)
+        return observations
+
+    def _flights_over(self) -> NDArray[np.bool_]:
+        """(count,) which flights have ended their episode in the last step."""
+        return np.asarray(self.result("terminated") + self.result("truncated") > 0.0)
+
+    def _keep_innovations(self) -> None:
+        """Keep the innovations of episodes that are over, before others begin in the same step."""
+        if self.innovations:
+            self.final_innovations = innovations_of(self)
 
     def _require_begun(self) -> None:
         """Refuse to step flights that have no state; looked at until all flights have one."""

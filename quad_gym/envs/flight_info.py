@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.innovations import innovations_of
 from quad_gym.faults.presets import named_faults
-from quad_gym.packing.aids import blocks_of
 
 Parts = dict[str, dict[str, NDArray[Any]]]
 
@@ -25,33 +25,6 @@ def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
     if batch.innovations:
         found["innovations"] = innovations_of(batch)
     return found
-
-
-def innovations_of(batch: FlightBatch) -> dict[str, NDArray[Any]]:
-    """Return the last innovations of all flights, block by block.
-
-    The blocks are position, baseline, velocity and features, followed by barometer and magnetometer
-    if the suite has them.
-
-    Returns:
-        Arrays (n, blocks, ...): "measured" (True if measured since the last step); "innovation" and
-        "sigma" (its standard deviation predicted by the filter), three numbers each, of which a
-        direction uses two; "nis"; "gate", see `quad_gym.records.GateDecision`; "rejections" in this
-        episode. NaN: not measured yet.
-    """
-    blocks = list(blocks_of(batch.sensors))
-    position, baseline = batch.record("position_fresh"), batch.record("baseline_fresh")
-    has_velocity = batch.sensors.gnss is not None and batch.sensors.gnss.velocity_sigma is not None
-    others = batch.record("feature_fresh"), batch.record("aid_fresh")
-    measured = np.column_stack([position, baseline, position * has_velocity, *others])
-    return {
-        "measured": measured[:, blocks] > 0.0,
-        "innovation": batch.record("innovation")[:, blocks],
-        "sigma": batch.record("innovation_sigma")[:, blocks],
-        "nis": batch.record("block_nis")[:, blocks],
-        "gate": batch.record("gate")[:, blocks].astype(np.int64),
-        "rejections": batch.record("rejections")[:, blocks].astype(np.int64),
-    }
 
 
 def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
@@ -73,9 +46,18 @@ def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[n
             infos["faults"][name][flights] = values
 
 
-def final_faults(infos: dict[str, Any], over: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the faults at the end of the episodes that are over, as `final_info` holds them."""
-    if "faults" not in infos:
-        return {}
-    faults = infos["faults"].items()
-    return {"faults": {name: values & over for name, values in faults if name[0] != "_"}}
+def final_parts(infos: dict[str, Any], batch: FlightBatch, over: NDArray[np.bool_]) -> Parts:
+    """Return faults and innovations at the end of episodes that are over, as in `final_info`.
+
+    Args:
+        infos: Infos of the step, with the faults at its end.
+        batch: The flights, in which new episodes have begun.
+        over: Whether the episode of each flight is over, (n,).
+    """
+    found: Parts = {}
+    if "faults" in infos:
+        faults = infos["faults"].items()
+        found["faults"] = {name: values & over for name, values in faults if name[0] != "_"}
+    if batch.innovations:
+        found["innovations"] = batch.final_innovations
+    return found

@@ -35,8 +35,7 @@ class QuadSB3VecEnv(VecEnv):
     with the return "r", the length "l", the time "t" since construction [s] and the mean true
     position error "e" [m]. With `randomization`, it also holds `drawn`, the parameters of that
     episode, and so do `reset_infos`. With `faults` and `innovations`, every `info` and
-    `reset_infos` hold these, as in `QuadEnv`, except that the last `info` of an episode has no
-    innovations, as the filter has already started the next one.
+    `reset_infos` hold these, as in `QuadEnv`.
 
     Args:
         num_envs: Number of flights.
@@ -135,8 +134,9 @@ class QuadSB3VecEnv(VecEnv):
             for i, info in enumerate(infos):
                 info |= info_of_flight(more, i)
         for i in np.flatnonzero(done).tolist():
-            infos[i].pop("innovations", None)
             infos[i] |= self._episode_end(i, results[i]) | drawn_info(flown_with, i)
+            if batch.innovations:
+                infos[i] |= info_of_flight({"innovations": batch.final_innovations}, i)
         rewards = results[:, COLUMN["reward"]].astype(np.float32)
         return self.flights.split(observations), rewards, done, infos
 

@@ -17,7 +17,7 @@ from quad_gym.envs.configuration import (
     checked_actions,
     named_options,
 )
-from quad_gym.envs.flight_info import final_faults, flight_info, replace_faults
+from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.single import seeds_of, with_limit
 from quad_gym.envs.spaces import action_space
@@ -279,7 +279,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             for name, values in infos.items()
             if not (name.startswith("_") or isinstance(values, dict))
         }
-        final_info |= final_faults(infos, over)
+        final_info |= final_parts(infos, self.flights.batch, over)
         if flown_with:
             final_info["drawn"] = flown_with
         self._replace_by_start(infos, np.flatnonzero(over))

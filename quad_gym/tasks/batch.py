@@ -178,7 +178,8 @@ class TaskBatch(ReadableBatch):
             self.view.builtin.read()
         ended = self._settle()
         if ended and self._same_step:
-            over = self.result("terminated") + self.result("truncated") > 0.0
+            over = self._flights_over()
+            self._keep_innovations()
             self._finals[over] = observations[over]
             shipped = self._begin(over, {}, super().reset(mask=over))
             observations[over] = self._observed(shipped)[over]

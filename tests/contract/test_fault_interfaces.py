@@ -125,6 +125,39 @@ def test_info_tells_every_interface_the_innovations():
     assert 0 < rejected < measured / 5
 
 
+@pytest.mark.parametrize("own_task", [None, quad_gym.Task()], ids=["built-in", "own"])
+def test_the_innovations_of_an_episodes_last_step_are_told_where_the_next_begins_in_it(own_task):
+    keywords = {"sensors": "rtk", "innovations": True, "task": own_task, "base": "hover", **SHORT}
+    env = QuadVectorEnv(3, autoreset_mode="SameStep", **keywords)
+    sb3_id, told = "QuadGym/Hover-v0", 0
+    if own_task is not None:
+        sb3_id = "Test/Watched-v0"
+        quad_gym.register_task(sb3_id, own_task, "QuadGym/Hover-v0")
+    sb3_keywords = {name: keywords[name] for name in ("sensors", "innovations", *SHORT)}
+    sb3 = quad_gym.make_sb3_vec_env(sb3_id, 3, seed=7, **sb3_keywords)
+    singles = [QuadEnv("hover", **sb3_keywords) for _ in range(3)]
+    env.reset(seed=7)
+    sb3.reset()
+    for i, single in enumerate(singles):
+        single.reset(seed=7 + i)
+    for k in range(STEPS):
+        actions = np.stack([actions_of(i, STEPS)[k] for i in range(3)])
+        info, sb3_infos = env.step(actions)[4], sb3.step(actions)[3]
+        for i, single in enumerate(singles):
+            *_, terminated, truncated, mine = single.step(actions[i])
+            assert_same(mine["innovations"], sb3_infos[i]["innovations"])
+            if terminated or truncated:
+                told += 1
+                final = info["final_info"]["innovations"]
+                for name, values in mine["innovations"].items():
+                    np.testing.assert_array_equal(values, final[name][i])
+                    assert final[f"_{name}"][i]
+                mine = single.reset()[1]
+            for name, values in mine["innovations"].items():
+                np.testing.assert_array_equal(values, info["innovations"][name][i])
+    assert told > 3
+
+
 def test_bad_faults_are_refused_by_every_interface():
     for make in (
         lambda **k: QuadEnv("hover", **k),

@@ -1,0 +1,38 @@
+"""The last innovations of flights, block by block."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym.packing.aids import blocks_of
+
+if TYPE_CHECKING:
+    from quad_gym.batch.flight_batch import FlightBatch
+
+
+def innovations_of(batch: "FlightBatch") -> dict[str, NDArray[Any]]:
+    """Return the last innovations of all flights, block by block.
+
+    The blocks are position, baseline, velocity and features, followed by barometer and magnetometer
+    if the suite has them.
+
+    Returns:
+        Arrays (n, blocks, ...): "measured" (True if measured since the last step); "innovation" and
+        "sigma" (its standard deviation predicted by the filter), three numbers each, of which a
+        direction uses two; "nis"; "gate", see `quad_gym.records.GateDecision`; "rejections" in this
+        episode. NaN: not measured yet.
+    """
+    blocks = list(blocks_of(batch.sensors))
+    position, baseline = batch.record("position_fresh"), batch.record("baseline_fresh")
+    has_velocity = batch.sensors.gnss is not None and batch.sensors.gnss.velocity_sigma is not None
+    others = batch.record("feature_fresh"), batch.record("aid_fresh")
+    measured = np.column_stack([position, baseline, position * has_velocity, *others])
+    return {
+        "measured": measured[:, blocks] > 0.0,
+        "innovation": batch.record("innovation")[:, blocks],
+        "sigma": batch.record("innovation_sigma")[:, blocks],
+        "nis": batch.record("block_nis")[:, blocks],
+        "gate": batch.record("gate")[:, blocks].astype(np.int64),
+        "rejections": batch.record("rejections")[:, blocks].astype(np.int64),
+    }
