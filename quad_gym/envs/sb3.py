@@ -146,7 +146,7 @@ class QuadSB3VecEnv(VecEnv):
         steps = int(row[COLUMN["episode_steps"]])
         return {
             "terminal_observation": self.flights.split(final),
-            "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > 0.0),
+            "TimeLimit.truncated": bool(row[COLUMN["truncated"]] > row[COLUMN["terminated"]]),
             "ending": ENDINGS[int(row[COLUMN["ending"]])],
             "ending_code": int(row[COLUMN["ending"]]),
             "filter_status": int(row[COLUMN["filter_status"]]),

@@ -112,8 +112,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     (`LookAround`: -5 m, `OutageDash`: 0 m), when the last gate is passed, or, in worlds that have
     them, when the vehicle touches an obstacle or leaves the geofence. Truncated: at the time limit,
     when the filter has failed numerically (`info["filter_status"]`), or, with
-    `truncate_when_diverged=True`, when its consistency monitor flags divergence. `info["ending"]`
-    names the reason.
+    `truncate_when_diverged=True`, when its consistency monitor flags divergence. A crash in the
+    last step of the time limit is both, as with Gymnasium's `TimeLimit`. `info["ending"]` names the
+    reason, of both that of the termination.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, with the

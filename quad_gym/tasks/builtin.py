@@ -44,13 +44,7 @@ class Builtin(Group):
         With `truncate_when_diverged` also where the filter has diverged. It may be True together
         with `terminated`.
         """
-        flights = self._flights
-        over = self._result("filter_status") > 0.0
-        if flights.max_steps:
-            over |= self._result("episode_steps") >= flights.max_steps
-        if flights.task.truncate_when_diverged:
-            over |= self._result("filter_diverged") > 0.0
-        return over & ~flights.began
+        return self._result("truncated") > 0.0
 
     @Lazy
     def ending(self) -> NDArray[np.int64]:

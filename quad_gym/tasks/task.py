@@ -159,7 +159,7 @@ class Task:
     def truncated(self, view: "View") -> NDArray[np.bool_]:
         """Return True for episodes that are cut short, such as by the time limit, (n,).
 
-        If both are True, the episode counts as terminated.
+        An episode can be both terminated and truncated.
         """
         return view.builtin.truncated  # type: ignore[no-any-return]
 

@@ -137,7 +137,7 @@ def test_stable_baselines3_sees_the_same_flights(n_envs):
         np.testing.assert_array_equal(reward, expected[1][k + 1].astype(np.float32))
         np.testing.assert_array_equal(done, expected[2][k + 1] | expected[3][k + 1])
         cut = [info["TimeLimit.truncated"] for info in infos]
-        np.testing.assert_array_equal(cut, expected[3][k + 1])
+        np.testing.assert_array_equal(cut, expected[3][k + 1] & ~expected[2][k + 1])
 
 
 def digest():

@@ -46,10 +46,9 @@ def expected_endings(said, plain):
     late, failed = plain.result("episode_steps") >= LIMIT, plain.result("filter_status") > 0.0
     terminated = said.terminated if "terminated" in said.methods else crashed
     truncated = said.truncated if "truncated" in said.methods else late | failed
-    truncated = truncated & ~terminated
-    why = np.where(terminated | truncated, float(Ending.TASK), 0.0)
-    why[truncated & late] = Ending.TIME_LIMIT
-    why[truncated & failed] = Ending.FILTER_FAILED
+    why, cut = np.where(terminated | truncated, float(Ending.TASK), 0.0), truncated & ~terminated
+    why[cut & late] = Ending.TIME_LIMIT
+    why[cut & failed] = Ending.FILTER_FAILED
     why = np.where(terminated & crashed, plain.result("ending"), why)
     return terminated, truncated, why
 

@@ -71,7 +71,6 @@ def judge_contacts(flight, active):
     flight.ending = select(left & flying, _LEFT_GEOFENCE, flight.ending)
     flight.ending = select(hit & short_of_goal, _COLLISION, flight.ending)
     flight.terminated = select(over, 1.0, flight.terminated)
-    flight.truncated = select(over, 0.0, flight.truncated)
 
 
 @stage

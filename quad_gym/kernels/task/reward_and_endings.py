@@ -78,7 +78,7 @@ def judge(flight, p, settings, active):
     failed = logical_not(flight.filter_status == 0)
     over = (settings.max_steps > 0.0) & (flight.step >= settings.max_steps)
     ended = (settings.truncate_when_diverged > 0.0) & (flight.diverged > 0.0)
-    truncated = active & (over | failed | ended) & logical_not(terminated)
+    truncated = active & (over | failed | ended)
 
     ending = select(over, _TIME_LIMIT, 0.0)
     ending = select(ended, _FILTER_DIVERGED, ending)

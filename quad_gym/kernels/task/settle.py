@@ -30,7 +30,7 @@ class Verdict(IntEnum):
 
 _REWARD, _EPISODE_RETURN = int(Result.REWARD), int(Result.EPISODE_RETURN)
 _TERMINATED, _TRUNCATED = int(Result.TERMINATED), int(Result.TRUNCATED)
-_ENDING, _EPISODE_STEPS = int(Result.ENDING), int(Result.EPISODE_STEPS)
+_ENDING = int(Result.ENDING)
 _FILTER_STATUS, _FILTER_DIVERGED = int(Result.FILTER_STATUS), int(Result.FILTER_DIVERGED)
 _TASK, _TIME_LIMIT = float(Ending.TASK), float(Ending.TIME_LIMIT)
 _FAILED, _LOST = float(Ending.FILTER_FAILED), float(Ending.FILTER_DIVERGED)
@@ -104,13 +104,10 @@ def _write_endings(call, verdict, settings):
     terminated, truncated = _result(call, _TERMINATED), _result(call, _TRUNCATED)
     ending, began = _result(call, _ENDING), _bytes_at(verdict[_BEGAN], count)
     status, lost = _result(call, _FILTER_STATUS), _result(call, _FILTER_DIVERGED)
-    steps = _result(call, _EPISODE_STEPS)
     for flight in range(count):
-        crashed, done = terminated[flight] > 0.0, terminated[flight] + truncated[flight] > 0.0
-        timed_out = settings.max_steps > 0.0 and steps[flight] >= settings.max_steps
-        is_lost = settings.truncate_when_diverged > 0.0 and lost[flight] > 0.0
-        built_in_cut = timed_out or is_lost or status[flight] > 0.0
-        flies, ends, is_cut = began[flight] == 0, crashed, built_in_cut
+        crashed, built_in_cut = terminated[flight] > 0.0, truncated[flight] > 0.0
+        done, flies = crashed or built_in_cut, began[flight] == 0
+        ends, is_cut = crashed, built_in_cut
         if terminates:
             ends = terminating[flight] > 0
             if crashed and not ends:  # but nobody flies on in a state that is not finite
@@ -118,13 +115,14 @@ def _write_endings(call, verdict, settings):
         if truncates:
             is_cut = truncating[flight] > 0
         ends = ends and flies
-        is_cut = is_cut and flies and not ends
+        is_cut = is_cut and flies
         if not (done or ends or is_cut):
             continue  # almost always
         why = _TASK if ends or is_cut else 0.0
         if ends and crashed:
             why = ending[flight]
-        elif is_cut and built_in_cut:
+        elif is_cut and built_in_cut and not ends:
+            is_lost = settings.truncate_when_diverged > 0.0 and lost[flight] > 0.0
             why = _FAILED if status[flight] > 0.0 else _LOST if is_lost else _TIME_LIMIT
         block, lane = _block(call, flight), flight % WIDTH
         block.terminated[lane] = terminated[flight] = 1.0 if ends else 0.0

@@ -347,7 +347,6 @@ def judge_landing(flight, active):
     over, flying = active & (flight.crashed > 0.0), logical_not(flight.terminated > 0.0)
     flight.ending = select(over & flying, _ON_THE_GROUND, flight.ending)
     flight.terminated = select(over, 1.0, flight.terminated)
-    flight.truncated = select(over, 0.0, flight.truncated)
 
 
 @stage
