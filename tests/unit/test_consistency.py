@@ -128,7 +128,7 @@ class Measured:
             "gate": np.full(blocks, float(GateDecision.NONE)),
         }
 
-    def read(self, name):
+    def record(self, name):
         return self.fields[name]
 
 

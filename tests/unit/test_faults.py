@@ -338,7 +338,7 @@ def test_a_weak_rotor_takes_its_share_of_thrust_and_torque_away(rotor, randomiza
         assert (which == rotor).all()
     each = np.arange(100)
     force = vehicle.thrust_coefficient * speeds[each, which] ** 2 * lost
-    mass = vehicle.mass if randomization is None else calm.record("mass")
+    mass = vehicle.mass if randomization is None else calm.read("mass")
     dv = -(force / mass * DT)[:, np.newaxis] * z_I
     np.testing.assert_allclose(faulty.record("v") - calm.record("v"), dv, rtol=0.05, atol=2e-3)
     arm = np.array(vehicle.rotor_positions_B)[which]

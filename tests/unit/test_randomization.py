@@ -115,9 +115,9 @@ def test_bounds_hold_to_the_last_bit(low, width, sigma, kind):
         given = Normal(low + 0.3 * width, sigma, low, high + 1e-3)
     elif kind == 3:
         given = Uniform(low, high, offset=True)
-    batch = FlightBatch(16, source=Source.TRUTH, randomization={"wind_up": given}, threads=1)
+    batch = FlightBatch(16, source=Source.TRUTH, randomization={"start_yaw": given}, threads=1)
     batch.reset(seeds=range(16))
-    values = batch.record("wind_up")
+    values = batch.read("start_yaw")
     assert (given.support[0] <= values).all()
     assert (values <= given.support[1]).all()
 
@@ -132,8 +132,8 @@ def test_a_parameter_does_not_depend_on_which_others_are_drawn():
     )
     few.reset(seeds=range(12))
     many.reset(seeds=range(12))
-    np.testing.assert_array_equal(few.record("mass"), many.record("mass"))
-    assert len(np.unique(many.record("inertia"))) == 36
+    np.testing.assert_array_equal(few.read("mass"), many.read("mass"))
+    assert len(np.unique(many.read("inertia"))) == 36
 
 
 def test_a_component_without_a_distribution_stays():
@@ -141,7 +141,7 @@ def test_a_component_without_a_distribution_stays():
         5, source=Source.TRUTH, randomization={"lever_arm_B": (None, Uniform(0.1, 0.2), None)}
     )
     batch.reset(seeds=range(5))
-    lever_arm = batch.record("lever_arm_B")
+    lever_arm = batch.read("lever_arm_B")
     np.testing.assert_array_equal(lever_arm[:, [0, 2]], 0.0)
     assert len(np.unique(lever_arm[:, 1])) == 5
 
@@ -231,7 +231,7 @@ TOLD = [d.name for d in DRAWABLES if d.name not in OTHERS and not d.name.startsw
 @pytest.mark.parametrize("name", TOLD)
 def test_a_flight_that_draws_a_parameter_is_the_flight_that_has_it(name):
     batch = flown(seeds=(2, 3), world=WORLD, randomization={name: some_distribution(name)})
-    value = np.atleast_1d(batch.record(name)[1])
+    value = np.atleast_1d(batch.read(name)[1])
     nominal = nominal_values(LAB, SUITE, WORLD)[COLUMNS[name]]
     assert (value != nominal).any()
     vehicle, sensors, world = told(name, value)
@@ -251,7 +251,7 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
     given = Uniform(0.01, 0.03) if name == "battery_resistance" else some_distribution(name)
     drawing = FlightBatch(2, **heavy, world=WORLD, randomization={name: given})
     drawing.reset(seeds=(2, 3))
-    vehicle, _, world = told(name, np.atleast_1d(drawing.record(name)[1]))
+    vehicle, _, world = told(name, np.atleast_1d(drawing.read(name)[1]))
     telling = FlightBatch(1, **heavy, world=world, true_vehicle=vehicle.replace(mass=2.5))
     telling.reset(seeds=[3])
     for _ in range(100):
@@ -269,7 +269,7 @@ def test_a_heavy_vehicle_reaches_the_voltage_that_is_drawn(name):
 def test_what_is_known_is_what_filter_and_controller_believe(name):
     given = Randomization({name: some_distribution(name)}, known=True)
     batch = flown(seeds=(2, 3), world=WORLD, randomization=given)
-    vehicle, sensors, world = told(name, np.atleast_1d(batch.record(name)[1]))
+    vehicle, sensors, world = told(name, np.atleast_1d(batch.read(name)[1]))
     assert_alike(batch, flown(vehicle=vehicle, sensors=sensors, world=world), flight=1)
 
 
@@ -285,7 +285,7 @@ def test_each_rotor_has_its_efficiency():
     plain.reset(seeds=[1])
     batch.reset(seeds=[1])
     start_v = plain.record("v")[0]
-    efficiency, W = batch.record("rotor_efficiency")[0], batch.record("rotor_speeds")[0]
+    efficiency, W = batch.read("rotor_efficiency")[0], batch.record("rotor_speeds")[0]
     batch.step(np.zeros((1, 4)))
     v, w, R = batch.record("v")[0], batch.record("w")[0], batch.record("R_seen")[0]
     forces = efficiency * LAB.thrust_coefficient * W**2
@@ -298,7 +298,7 @@ def test_each_rotor_has_its_efficiency():
 def test_a_camera_turned_in_its_mount_sees_what_a_turned_camera_sees():
     batch = flown(ticks=0, randomization={"camera_rotation": Uniform(-0.1, 0.1),
                                           "pixel_sigma": Uniform(1e-9, 1e-9)})  # fmt: skip
-    turn = euler_to_dcm(batch.record("camera_rotation")[0])
+    turn = euler_to_dcm(batch.read("camera_rotation")[0])
     camera = SUITE.camera
     R_BI = quad_gym.rotations.quaternion_to_dcm(batch.record("q"))[0]
     for i, X in enumerate(camera.features_I):
@@ -346,13 +346,13 @@ def test_a_start_that_the_caller_gives_stays():
 def test_a_snapshot_keeps_what_was_drawn():
     keywords = {"world": WORLD, "randomization": {"mass": Uniform(0.6, 0.9)}}
     batch = flown(20, range(11), **keywords)
-    instant, mass = batch.snapshot(), batch.record("mass")
+    instant, mass = batch.snapshot(), batch.read("mass")
     for _ in range(20):
         batch.step()
     future = batch.snapshot()
     fresh = flown(1, range(50, 61), **keywords)
     fresh.restore(instant)
-    np.testing.assert_array_equal(fresh.record("mass"), mass)
+    np.testing.assert_array_equal(fresh.read("mass"), mass)
     for _ in range(20):
         fresh.step()
     assert fresh.snapshot().tobytes() == future.tobytes()
