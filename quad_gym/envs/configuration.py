@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch.beginnings import check_in_bounds
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.standing import check_pad
 from quad_gym.batch.starts import checked_start
@@ -304,7 +305,12 @@ class Flights:
         """
         chosen = start_options(options)
         position, velocity, yaw = (chosen.get(name) for name in ("position", "velocity", "yaw"))
-        checked_start(self.batch.count, position, velocity, yaw, self.task, self.batch.world)
+        given = checked_start(
+            self.batch.count, position, velocity, yaw, self.task, self.batch.world
+        )
+        ends_by_itself = "terminated" in getattr(self.batch, "methods", ())  # a user's task
+        if position is not None and given is not None and not ends_by_itself:
+            check_in_bounds(self.task, given[:, :3])
         return chosen
 
     def split(self, observations: NDArray[np.float32]) -> Any:

@@ -235,7 +235,8 @@ class QuadSB3VecEnv(VecEnv):
             return {}
         if any(set(options) != names for options in chosen):
             raise ValueError("options must hold the same names for every environment")
-        return {name: np.array([options[name] for options in chosen]) for name in names}
+        start = {name: np.array([options[name] for options in chosen]) for name in names}
+        return self.flights.start(start)
 
     def _infos_of_start(self) -> list[dict[str, Any]]:
         batch = self.flights.batch

@@ -346,7 +346,7 @@ def test_the_longest_observation_fits_and_ends_with_the_draws():
 
 def test_every_observation_fits():
     table = quad_gym.observation_layout(
-        "sensors",
+        "measurements",
         include_std=True,
         privileged=True,
         feature_count=MAX_FEATURES,

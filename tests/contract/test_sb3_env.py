@@ -128,18 +128,18 @@ def test_flight_i_is_seeded_with_seed_plus_i():
 
 def test_options_hold_for_the_next_reset_only():
     env = make(3)
-    env.set_options({"position": [3.0, 1.0, 2.0], "yaw": 1.0})
+    env.set_options({"position": [3.5, 1.0, 1.5], "yaw": 1.0})
     env.reset()
-    np.testing.assert_array_equal(env.flights.batch.record("r"), np.tile([3.0, 1.0, 2.0], (3, 1)))
+    np.testing.assert_array_equal(env.flights.batch.record("r"), np.tile([3.5, 1.0, 1.5], (3, 1)))
     env.reset()
-    assert (env.flights.batch.record("r") != [3.0, 1.0, 2.0]).all()
+    assert (env.flights.batch.record("r") != [3.5, 1.0, 1.5]).all()
 
 
 def test_options_may_be_given_one_by_one():
     env = make(2)
-    env.set_options([{"position": [1.0, 0.0, 1.0]}, {"position": [0.0, 1.0, 2.0]}])
+    env.set_options([{"position": [4.0, 0.0, 1.5]}, {"position": [4.0, 1.0, 2.0]}])
     env.reset()
-    np.testing.assert_array_equal(env.flights.batch.record("r"), [[1.0, 0.0, 1.0], [0.0, 1.0, 2.0]])
+    np.testing.assert_array_equal(env.flights.batch.record("r"), [[4.0, 0.0, 1.5], [4.0, 1.0, 2.0]])
 
 
 def test_unknown_options_change_nothing():

@@ -327,12 +327,12 @@ def test_a_limit_that_is_invalid_is_refused(steps):
 
 def test_options_set_the_start_of_one_episode_for_all_or_one_by_one():
     env = QuadVectorEnv(3, "hover", max_episode_steps=1)
-    start = {"position": [1.0, 2.0, 3.0], "velocity": [0.1, 0.2, 0.3]}
+    start = {"position": [4.5, 0.5, 1.5], "velocity": [0.1, 0.2, 0.3]}
     env.reset(seed=1, options=start)
     batch = env.flights.batch
     np.testing.assert_array_equal(batch.record("r"), np.tile(start["position"], (3, 1)))
     np.testing.assert_array_equal(batch.record("v"), np.tile(start["velocity"], (3, 1)))
-    each = np.arange(9.0).reshape(3, 3) / 2.0
+    each = [4.0, 0.0, 1.0] + np.arange(9.0).reshape(3, 3) / 10.0
     env.reset(options={"position": each, "yaw": np.array([0.1, 0.2, 0.3])})
     np.testing.assert_array_equal(batch.record("r"), each)
     env.step(np.zeros((3, 4)))
