@@ -57,8 +57,9 @@ from quad_gym.records import (
     room_of,
 )
 
+MOST_FLIGHTS = 10**7
+"""Of a batch."""
 _NO_BOUNDS = np.zeros(0)
-"""Fields that are NaN at first, all others are zero."""
 _WORTH_NO_COPY = 1 << 16
 """Bytes of observations beyond which new memory is taken for each step, in place of a copy."""
 
@@ -137,7 +138,7 @@ class FlightBatch(FlightMemory):
         randomization: Randomization | Mapping[str, Given] | None = None,
         faults: FaultsGiven = None,
     ) -> None:
-        self.count = check.whole("count", count, most=10**7)
+        self.count = check.whole("count", count, most=MOST_FLIGHTS)
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
         self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
