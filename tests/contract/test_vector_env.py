@@ -330,7 +330,9 @@ def test_a_number_of_environments_that_is_invalid_is_refused_by_its_name(count):
 
 
 def test_threads_of_a_single_environment_are_refused_with_where_they_belong():
-    with pytest.raises(TypeError, match=r"^threads is not a keyword of a single environment.*make_vec takes it"):
+    with pytest.raises(
+        TypeError, match=r"^threads is not a keyword of a single environment.*make_vec takes it"
+    ):
         gymnasium.make("QuadGym/Hover-v0", threads=2)
 
 
