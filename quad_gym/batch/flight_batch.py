@@ -58,7 +58,7 @@ from quad_gym.records import (
 )
 
 MOST_FLIGHTS = 10**7
-"""Of a batch."""
+"""Largest number of flights in a batch."""
 _NO_BOUNDS = np.zeros(0)
 _WORTH_NO_COPY = 1 << 16
 """Bytes of observations beyond which new memory is taken for each step, in place of a copy."""

@@ -36,10 +36,10 @@ _NO_CONFIGURATION = ("paths", "pieces", "max_steps")
 
 
 def configuration_digest(*records: NDArray[Any]) -> int:
-    """Digest of the records that say what flights are and do, as a word.
+    """Return a digest of the settings and parameters of flights, as a word.
 
     Args:
-        records: Settings, parameters, trajectories.
+        records: Records of settings, parameters and trajectories.
     """
     digest = hashlib.blake2b(digest_size=8)
     for record in records:

@@ -114,7 +114,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     when the filter has failed numerically (`info["filter_status"]`), or, with
     `truncate_when_diverged=True`, when its consistency monitor flags divergence. A crash in the
     last step of the time limit is both, as with Gymnasium's `TimeLimit`. `info["ending"]` names the
-    reason, of both that of the termination.
+    reason, and a crash before the time limit.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, with the

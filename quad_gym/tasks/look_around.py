@@ -88,7 +88,7 @@ class LookAround(Task):
         return self.pieces(view)
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
-        """Return `features_direction`, the unit vector to the center of the markers, (n, 3) in B."""
+        """Return `features_direction`, the unit vector to the markers' center, (n, 3) in B."""
         gap = view.features.mean(axis=1) - view.observed.position
         gap /= np.maximum(np.sqrt((gap * gap).sum(axis=1, keepdims=True)), 1e-9)
         return {"features_direction": (view.observed.R_BI @ gap[:, :, np.newaxis])[:, :, 0]}
