@@ -1,4 +1,4 @@
-"""Where the reference of an episode may begin, and starts that are out of bounds of it."""
+"""Distances of given starts from the positions at which a reference may begin."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,14 @@ Floats = NDArray[np.float64]
 
 
 def check_in_bounds(task: TaskParams, places: Floats) -> None:
-    """Refuse starts with which an episode ends in its first step, wherever its reference begins.
+    """Refuse starts with which an episode would end in its first step.
 
     Args:
-        task: With its reference and its bounds.
-        places: (n, 3) in I [m].
+        task: The task, with its reference and its bounds.
+        places: Positions (n, 3) in I [m].
 
     Raises:
-        ValueError: If one is farther than `out_of_bounds` from every place where it may begin.
+        ValueError: If one is farther than `out_of_bounds` from every beginning of a reference.
     """
     distance = distance_from_reference(task, places)
     worst = int(distance.argmax())
@@ -30,7 +30,7 @@ def check_in_bounds(task: TaskParams, places: Floats) -> None:
 
 
 def distance_from_reference(task: TaskParams, places: Floats) -> Floats:
-    """(n,) distances of places (n, 3) in I from the nearest one where the reference may begin."""
+    """Return distances (n,) of positions (n, 3) in I from the nearest beginning of a reference."""
     radius, height = task.radius, task.height
     if task.kind == "trajectory":
         each = [_from_trajectory(path, task, places) for path in task.trajectories]
@@ -48,14 +48,14 @@ def distance_from_reference(task: TaskParams, places: Floats) -> Floats:
 
 
 def _from_ring(places: Floats, radii: tuple[float, float], heights: tuple[float, float]) -> Floats:
-    """(n,) distances from what lies between two radii from the vertical axis and two heights."""
+    """Return distances (n,) from the region between two radii and two heights."""
     level, z = np.hypot(places[:, 0], places[:, 1]), places[:, 2]
     aside = np.maximum(np.maximum(radii[0] - level, level - radii[1]), 0.0)
     return np.hypot(aside, np.maximum(np.maximum(heights[0] - z, z - heights[1]), 0.0))
 
 
 def _from_trajectory(path: Trajectory, task: TaskParams, places: Floats) -> Floats:
-    """(n,) distances from where a trajectory may begin, turned by any angle where it is drawn."""
+    """Return distances (n,) from the beginnings of a trajectory, which may be turned by any angle."""
     if not task.randomize_reference:
         return np.linalg.norm(places - path(0.0), axis=1)
     points = path(path.instants(200)) if path.closed else path(0.0)[np.newaxis]

@@ -58,8 +58,9 @@ from quad_gym.records import (
     room_of,
 )
 
+MOST_FLIGHTS = 10**7
+"""Largest number of flights in a batch."""
 _NO_BOUNDS = np.zeros(0)
-"""Bounds of a batch without observations."""
 _WORTH_NO_COPY = 1 << 16
 """Size of observations [bytes] above which each step allocates memory, instead of copying."""
 
@@ -140,7 +141,7 @@ class FlightBatch(FlightMemory):
         randomization: Randomization | Mapping[str, Given] | None = None,
         faults: FaultsGiven = None,
     ) -> None:
-        self.count = check.whole("count", count, most=10**7)
+        self.count = check.whole("count", count, most=MOST_FLIGHTS)
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
         self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains

@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 def innovations_of(batch: "FlightBatch") -> dict[str, NDArray[Any]]:
     """Return the last innovations of all flights, block by block.
 
-    The blocks are position, baseline, velocity and features; then barometer and magnetometer, if
-    the suite has such.
+    The blocks are position, baseline, velocity and features, followed by barometer and magnetometer
+    if the suite has them.
 
     Returns:
-        Arrays (n, blocks, ...): "measured" (since the last step), "innovation" and "sigma" (what
-        the filter expected), three numbers each, of which a direction has two; "nis"; "gate", see
-        `quad_gym.records.GateDecision`; "rejections" in this episode. NaN: not measured yet.
+        Arrays (n, blocks, ...): "measured" (True if measured since the last step); "innovation" and
+        "sigma" (its standard deviation predicted by the filter), three numbers each, of which a
+        direction uses two; "nis"; "gate", see `quad_gym.records.GateDecision`; "rejections" in this
+        episode. NaN: not measured yet.
     """
     blocks = list(blocks_of(batch.sensors))
     position, baseline = batch.record("position_fresh"), batch.record("baseline_fresh")

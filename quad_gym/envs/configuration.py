@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.batch.beginnings import check_in_bounds
-from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.batch.flight_batch import MOST_FLIGHTS, FlightBatch
 from quad_gym.batch.standing import check_pad
 from quad_gym.batch.starts import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
@@ -143,6 +143,7 @@ class Flights:
         base: str | None = None,
         **keywords: Any,
     ) -> None:
+        check.whole("num_envs", count, most=MOST_FLIGHTS)
         name, own_task = kind_and_task(task, base)
         self.name = name
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
@@ -356,7 +357,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         given = np.asarray(actions)
     except ValueError:
         raise ValueError(f"action must be {shape} numbers, got {actions!r}") from None
-    if given.dtype.kind not in "biuf":
+    if given.dtype.kind not in "biuf" or np.ma.is_masked(actions):
         raise ValueError(f"action must be {shape} numbers, got {actions!r}")
     numbers = given.astype(np.float64)
     if numbers.shape != shape:
@@ -368,9 +369,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
     """Whether actions need neither a check nor clipping; NaN and infinity are not within bounds."""
-    if not (
-        isinstance(actions, np.ndarray) and actions.dtype.kind == "f" and actions.shape == shape
-    ):
+    if not (type(actions) is np.ndarray and actions.dtype.kind == "f" and actions.shape == shape):
         return False
     if actions.ndim == 1:  # a few numbers are sooner looked at than handed to NumPy
         return all(-1.0 <= number <= 1.0 for number in actions.tolist())

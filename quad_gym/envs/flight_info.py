@@ -47,12 +47,12 @@ def replace_faults(infos: dict[str, Any], batch: FlightBatch, flights: NDArray[n
 
 
 def final_parts(infos: dict[str, Any], batch: FlightBatch, over: NDArray[np.bool_]) -> Parts:
-    """Return faults and innovations at the end of the episodes that are over, for `final_info`.
+    """Return faults and innovations at the end of episodes that are over, as in `final_info`.
 
     Args:
-        infos: Of the step, with the faults at its end.
+        infos: Infos of the step, with the faults at its end.
         batch: The flights, in which new episodes have begun.
-        over: (n,).
+        over: Whether the episode of each flight is over, (n,).
     """
     found: Parts = {}
     if "faults" in infos:

@@ -29,8 +29,8 @@ def with_task(
         table: Table of their observation.
 
     Raises:
-        ValueError: If `given` is not a task, does not fit these sensors or this world, or a part of
-            its observation has a built-in name.
+        ValueError: If `given` is not a task, it cannot be flown with these sensors or in this
+            world, or a part of its observation has a built-in name.
         TaskError: If its `reset` or `observe` fails.
     """
     task = resolve_task(given)

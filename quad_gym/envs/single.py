@@ -215,6 +215,11 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         render_mode: str | None = None,
         **keywords: Any,
     ) -> None:
+        if "threads" in keywords:
+            raise check.UnknownKeywordError(
+                "threads is not a keyword of a single environment, which has one (unexpected keyword "
+                "argument 'threads'); gymnasium.make_vec takes it"
+            )
         look = rendering_options(keywords)
         keywords.setdefault("max_episode_steps", limit_asked_of_make())
         self.flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **keywords)

@@ -229,6 +229,11 @@ class Player:
                 fix["magnetometer"] = self.streams["magnetometer"].values["magnetometer"][
                     self.field
                 ]
+        if self.start.get("course") and "gnss_velocity_G" not in {**fix, **self.start}:
+            why = "the first fix of the log has none"
+            if not self.takes_velocity:
+                why = "the sensors take none: GnssParams.velocity_sigma is None"
+            raise ValueError(f"a start by its course must have a GNSS velocity, but {why}")
         time = float(stream.time[k])
         self.filter.initialize(**{**fix, **self.start, "time": time})
         self._go_on()

@@ -1,11 +1,13 @@
 """Replay: a filter processes a log as it would have processed the flight."""
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from quad_gym.estimation.filters import UnscentedKalmanFilter
 from quad_gym.estimation.plausibility import problems_of
 from quad_gym.estimation.player import ESTIMATORS, Player
 from quad_gym.estimation.results import Replay
@@ -65,5 +67,20 @@ def replay(
         if origin is not None:
             gnss = suite.gnss.replace(reference_antenna_G=tuple(origin.tolist()))
             suite = suite.replace(gnss=gnss)
-    result = Player(whole, suite, estimator, dict(start or {}), reported_noise, window).play()
+    result = Player(whole, suite, estimator, _named(start), reported_noise, window).play()
     return replace(result, problems=problems_of(whole, body, suite, result))
+
+
+def _named(start: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A start as keywords of `initialize`, or with a position as those that the player checks.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if start is not None and not isinstance(start, Mapping):
+        raise ValueError(f"start must be values by name, or None, got {start!r}")
+    given = dict(start or {})
+    if "position" not in given:
+        known = inspect.signature(UnscentedKalmanFilter.initialize).parameters
+        check.keywords(given, [name for name in known if name != "self"], "start")
+    return given

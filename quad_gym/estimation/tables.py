@@ -211,5 +211,6 @@ def _ecef_of(places: Floats | None) -> Floats:
     found = np.full_like(places, np.nan)
     for k in np.flatnonzero(np.isfinite(places).all(axis=1)):
         lat, lon, height = places[k]
+        check.number("gnss_lat [deg]", float(lat), least=-90.0, most=90.0)
         found[k] = geodetic_to_ecef(np.radians(lat), np.radians(lon), height)
     return found

@@ -143,7 +143,7 @@ class Normal(Distribution):
 
     @property
     def support(self) -> tuple[float, float]:
-        """Bounds of the truncated distribution, or of the possible draws without a truncation."""
+        """Bounds of the truncated distribution, or the least and the largest draw without any."""
         reach = FARTHEST * self.sigma
         return max(self.low, self.mean - reach), min(self.high, self.mean + reach)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from quad_gym.params.randomization import DrawingTable
 
 FAST = 100.0
-"""Vehicles fly slower than this [m/s]."""
+"""Speed that no vehicle reaches [m/s]."""
 
 _OF_PARTS = {"battery_charge": "charge", "battery_resistance": "resistance"}
 _OF_PARTS |= {"camera_position_B": "position_B"}
@@ -76,7 +76,7 @@ def check_bounds(
 
 
 def _wind(name: str, value: float, world: WorldParams) -> tuple[float, float, float]:
-    """Wind in I of which one component, or the horizontal speed, is drawn."""
+    """Return the wind in I with a draw of one component, or of the horizontal speed."""
     east, north, up = world.wind_I
     winds = {
         "wind_east": (value, north, up),
@@ -155,13 +155,13 @@ def check_draws(
     """Refuse rotors that are too fast, or drag that is too large, for the integration.
 
     Args:
-        table: What is drawn.
-        vehicle: As it is without draws.
-        world: Likewise.
-        clocks: Say how long a Runge-Kutta step is.
+        table: The draws.
+        vehicle: The vehicle without draws.
+        world: The world without draws.
+        clocks: Rates, for the duration of a Runge-Kutta step.
 
     Raises:
-        ValueError: If they are, or may be drawn so.
+        ValueError: If the nominal values or any draw are refused.
     """
     _check_drag(table, vehicle, world, clocks)
     name = "motor_time_constant"
@@ -199,8 +199,8 @@ def _check_inertia(table: "DrawingTable") -> None:
     """Refuse a range of moments of inertia all of which no body has.
 
     A range in which some draws break the rule that each moment is at most the sum of the other two
-    is taken: components are drawn independently, so that 20 % either way of flat vehicles has such
-    draws, and they fly as well as any. See `params.check_moments`.
+    is accepted: components are drawn independently, so 20 % either way of a flat vehicle includes
+    such draws, and they fly as well as any. See `params.check_moments`.
     """
     columns = COLUMNS["inertia"]
     low, high = table.low[columns], table.high[columns]
@@ -211,5 +211,5 @@ def _check_inertia(table: "DrawingTable") -> None:
 
 
 def _open_circuit(battery: BatteryParams, charge: float) -> float:
-    """Voltage of an unloaded battery over that of a full one."""
+    """Return the voltage of an unloaded battery as a fraction of a full battery's."""
     return battery.empty_voltage + (1.0 - battery.empty_voltage) * charge

@@ -19,11 +19,11 @@ class GroundParams(Checked):
     Four feet and the four rotor hubs can touch it. Contact is a constraint on velocities that is
     solved once per tick: the plane stops points that would move below it and pushes but never
     pulls; impacts are inelastic, and friction is Coulomb friction. After the tick of an impact,
-    points of a vehicle that rotates fast may be millimeters below the plane. The contact has no
-    stiffness, so every step size is stable (J. J. Moreau, "Unilateral contact and dry friction in
-    finite freedom dynamics", 1988; D. E. Stewart, J. C. Trinkle, "An implicit time-stepping scheme
-    for rigid body dynamics with inelastic collisions and Coulomb friction", Int. J. Numerical
-    Methods in Engineering 39, 1996).
+    points of a tumbling vehicle may be 15 mm below the plane, and with a friction of 5, 5 cm. The
+    contact has no stiffness, so every step size is stable (J. J. Moreau, "Unilateral contact
+    and dry friction in finite freedom dynamics", 1988; D. E. Stewart, J. C. Trinkle, "An implicit
+    time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb friction",
+    Int. J. Numerical Methods in Engineering 39, 1996).
     """
 
     feet_B: Matrix = (

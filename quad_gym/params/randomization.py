@@ -148,11 +148,11 @@ class DrawingTable:
         check_hovering(self, vehicle, world)
 
     def least(self, name: str) -> float:
-        """The least draw of any component of a parameter."""
+        """Return the least draw of any component of a parameter."""
         return float(self.low[COLUMNS[name]].min())
 
     def most(self, name: str) -> float:
-        """The largest draw of any component of a parameter."""
+        """Return the largest draw of any component of a parameter."""
         return float(self.high[COLUMNS[name]].max())
 
     def mean_square(self, name: str) -> NDArray[np.float64]:

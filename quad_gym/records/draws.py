@@ -17,7 +17,7 @@ class Drawable(NamedTuple):
     unit: str
     meaning: str
     least: float = -math.inf
-    """smallest value that makes sense, of what has no bounds as a parameter by itself"""
+    """smallest value that makes sense, where the parameter itself has no bounds"""
     above: float = -math.inf
     """value that it has to exceed"""
     most: float = math.inf

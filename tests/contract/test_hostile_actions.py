@@ -53,6 +53,12 @@ def refuses(env, action):
     assert state_of(env) == before
 
 
+def test_a_masked_action_is_refused():
+    masked = np.ma.masked_array(np.zeros(4), mask=[0, 0, 1, 0])
+    refuses(make("single"), masked)
+    refuses(make("vector"), np.ma.stack([masked] * COUNT))
+
+
 HOSTILE_ROWS = {
     "NaN": np.array([0.0, np.nan, 0.0, 0.0]),
     "infinity": np.array([np.inf, 0.0, 0.0, 0.0]),

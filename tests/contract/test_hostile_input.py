@@ -113,7 +113,7 @@ INTERFACES = {"make": fly_make, "make_vec": fly_make_vec, "make_sb3_vec_env": fl
 def test_keywords_of_environments(interface, name):
     if name == "render_mode":
         pytest.skip("Gymnasium itself has a say in that keyword")
-    if (name == "threads" and interface == "make") or name.startswith("render"):
+    if name.startswith("render"):
         pytest.skip("another keyword's business")
     task = ONE_TASK.get(name, "Circle")
     for value in [*NUMBERS[:: 1 + (interface != "make")], *OTHERS]:

@@ -323,6 +323,20 @@ def test_a_limit_that_is_invalid_is_refused(steps):
         QuadVectorEnv(2, "hover", max_episode_steps=steps)
 
 
+@pytest.mark.parametrize("count", [0, -1, 1.5, "two", 10**8])
+def test_a_number_of_environments_that_is_invalid_is_refused_by_its_name(count):
+    for make in (gymnasium.make_vec, quad_gym.make_sb3_vec_env):
+        with pytest.raises(ValueError, match=r"^num_envs must be"):
+            make("QuadGym/Hover-v0", count)
+
+
+def test_threads_of_a_single_environment_are_refused_with_where_they_belong():
+    with pytest.raises(
+        TypeError, match=r"^threads is not a keyword of a single environment.*make_vec takes it"
+    ):
+        gymnasium.make("QuadGym/Hover-v0", threads=2)
+
+
 # ---- options -------------------------------------------------------------------------------------
 
 

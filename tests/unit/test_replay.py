@@ -265,6 +265,11 @@ def test_starts_may_be_told(table):
 # ---- what is refused -----------------------------------------------------------------------------
 
 
+def latitude(degrees):
+    """Columns of fixes there."""
+    return {"gnss_lat": np.full(4, degrees), "gnss_lon": np.zeros(4), "gnss_alt": np.zeros(4)}
+
+
 def small(**changes):
     """A log of four rows."""
     time = np.array([0.0, 0.01, 0.02, 0.03])
@@ -297,6 +302,8 @@ def small(**changes):
         ({"pixel_0_u": np.zeros(4), "pixel_0_v": np.zeros(4)}, "12 features of the suite, got 1"),
         ({"time": np.array([0.0, 0.01, 1.5, 1.51])}, "at most 1 s apart, got none from 0.010 s"),
         ({"time": np.array([0.0, np.nan, 0.02, 0.03])}, "must increase|must be finite"),
+        ({"gnss_enu": None, **latitude(200.0)}, r"^gnss_lat \[deg\] must be at most 90, got 200"),
+        ({"gnss_enu": None, **latitude(-90.5)}, r"^gnss_lat \[deg\] must be at least -90, got"),
     ],
 )  # fmt: skip
 def test_bad_logs_raise_by_name(changes, message):
@@ -313,11 +320,22 @@ def test_bad_logs_raise_by_name(changes, message):
         ({"body": "ned"}, "body must be one of"),
         ({"window": -1.0}, "window"),
         ({"reported_noise": 1}, "reported_noise"),
-        ({"start": {"nose": 1.0}}, "nose"),
+        ({"start": {"nose": 1.0}}, "^nose is not a keyword of start"),
+        ({"start": {"headings": 1.0}}, "^headings is not a keyword of start.*did you mean heading"),
+        ({"start": "x"}, "^start must be values by name, or None, got 'x'"),
+        ({"start": 1.0}, "^start must be values by name"),
+        (
+            {"start": {"course": True}, "sensors": "lab"},
+            "sensors take none: GnssParams.velocity_si",
+        ),
+        (
+            {"start": {"course": True}},
+            "must have a GNSS velocity, but the first fix of the log has",
+        ),
     ],
 )
 def test_bad_options_raise_by_name(options, message):
-    with pytest.raises((ValueError, TypeError), match=message):
+    with pytest.raises(ValueError, match=message):
         replay(small(), **{"sensors": RTK} | options)
 
 

@@ -168,8 +168,8 @@ def battery_voltage(charge, power, current, p):
 
     Args:
         charge: Of the battery, 1: full.
-        power: P, what the rotors take at their present speeds [W].
-        current: I, the same over their voltage, with which it grows [A].
+        power: P, electrical power of the rotors at their present speeds [W].
+        current: I, power over voltage of rotors at steady speeds [A].
         p: True parameters.
     """
     U0 = p.max_voltage * (p.battery_empty + (1.0 - p.battery_empty) * charge)
