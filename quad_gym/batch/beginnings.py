@@ -55,7 +55,7 @@ def _from_ring(places: Floats, radii: tuple[float, float], heights: tuple[float,
 
 
 def _from_trajectory(path: Trajectory, task: TaskParams, places: Floats) -> Floats:
-    """Return distances (n,) from the beginnings of a trajectory, which may be turned by any angle."""
+    """Return distances (n,) from the beginnings of a trajectory, at any drawn heading."""
     if not task.randomize_reference:
         return np.linalg.norm(places - path(0.0), axis=1)
     points = path(path.instants(200)) if path.closed else path(0.0)[np.newaxis]

@@ -36,24 +36,6 @@ _NO_CONFIGURATION = ("paths", "pieces", "max_steps")
 
 
 def configuration_digest(*records: NDArray[Any]) -> int:
-    """Digest of the records that say what flights are and do, as a word.
-
-    Args:
-        records: Settings, parameters, trajectories.
-    """
-    digest = hashlib.blake2b(digest_size=8)
-    for record in records:
-        for name in record.dtype.names or ():
-            if name not in _NO_CONFIGURATION:
-                digest.update(np.ascontiguousarray(record[name]).tobytes())
-    return int.from_bytes(digest.digest(), "little")
-
-
-_NO_CONFIGURATION = ("paths", "pieces", "max_steps")
-"""Settings that are addresses, or that `FlightBatch.limit` changes."""
-
-
-def configuration_digest(*records: NDArray[Any]) -> int:
     """Return a digest of the settings and parameters of flights, as a word.
 
     Args:
