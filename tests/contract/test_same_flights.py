@@ -270,7 +270,7 @@ def test_a_snapshot_of_another_configuration_is_refused(task, keywords):
     mine.reset(seeds=[1, 2])
     before = mine.snapshot()
     other.reset(seeds=[1, 2])
-    with pytest.raises(ValueError, match="snapshot must be that of a batch of 2 flights with the"):
+    with pytest.raises(ValueError, match="snapshot must be from a batch of 2 flights with the"):
         mine.restore(other.snapshot())
     assert mine.snapshot().tobytes() == before.tobytes()
 
