@@ -1,9 +1,9 @@
-"""Pictures of flights: live, from a record, as frames and videos, and in a window; uses pygame.
+"""Rendering of flights with pygame: frames, videos, and a window.
 
-`gymnasium.make(..., render_mode="rgb_array")` is the usual interface. Its parts: `Renderer` draws a
-`quad_gym.Flight`, `tile` puts frames side by side, `record_flight` flies a policy and returns the
+`gymnasium.make(..., render_mode="rgb_array")` is the usual interface. `Renderer` draws a
+`quad_gym.Flight`, `tile` arranges frames in a grid, `record_flight` runs a policy and returns the
 flight, `save_video` writes a flight as a video, and `record_video` does both; `save_side_by_side`
-writes flights of one episode side by side.
+writes several flights of one episode into one video.
 """
 
 from quad_gym.rendering.live import RENDER_MODES, Rendering

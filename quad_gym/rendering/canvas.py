@@ -1,8 +1,8 @@
-"""A canvas to draw on: smooth lines, translucent areas and text, on pygame's software surfaces.
+"""Canvas with smooth lines, translucent areas and text, on pygame's software surfaces.
 
 No window, display or audio device is opened, and no environment variable is needed or set: a
-surface is memory. Lines and areas are drawn twice as large and shrunk, which smooths them; text is
-drawn at its own size, which keeps it sharp.
+surface is memory. Lines and areas are drawn at twice their size and then halved for anti-aliasing;
+text is drawn at its own size, which keeps it sharp.
 """
 
 import contextlib
@@ -31,24 +31,25 @@ VERMILLION: Color = (198, 81, 0)
 GREEN: Color = (0, 145, 80)
 PURPLE: Color = (190, 90, 150)
 PALE_PURPLE: Color = (218, 176, 204)
-"""After those of Okabe and Ito, which people with a color vision deficiency can tell apart; darker
-than theirs, to stand out from a pale ground, and shifted so that they stay apart for everyone."""
+"""Colors based on the palette of Okabe and Ito, which people with a color vision deficiency can
+distinguish; they are darker, for contrast on a pale ground, and shifted to remain distinct."""
 
 OVERSAMPLING = 2
 _RGBX = (0xFF, 0xFF00, 0xFF0000, 0)
 _RGBA = (0xFF, 0xFF00, 0xFF0000, 0xFF000000)
-"""A pixel's bytes in memory: red, green, blue, and one that is not used, or the opacity. Pygame
-blends surfaces of one order thirty times as fast as those of different ones."""
+"""Bytes of a pixel in memory: red, green, blue, and an unused one, or the opacity. Pygame blends
+surfaces thirty times as fast if their bytes have the same order."""
 _CROSS = np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
 _FAR = 20000.0
-"""Pixels beyond are moved here, as pygame's integers end."""
+"""Limit of coordinates [pixels], to which points beyond are moved, because pygame's integers
+overflow."""
 
 
 def load_pygame() -> Any:
-    """The module pygame, without its greeting.
+    """Import pygame without its greeting.
 
     Raises:
-        ImportError: If it is missing; the message says how to install it.
+        ImportError: If it is missing; the message explains how to install it.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):
@@ -62,11 +63,11 @@ def load_pygame() -> Any:
 
 
 class Canvas:
-    """A picture that is being drawn.
+    """Picture to draw on.
 
     Args:
-        width: [pixels].
-        height: [pixels].
+        width: Width [pixels].
+        height: Height [pixels].
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -89,30 +90,30 @@ class Canvas:
     # ---- lines and areas ----------------------------------------------------------------------
 
     def clear(self, color: Color, top: float = 0.0, bottom: float = np.inf) -> None:
-        """Begin anew, within `inside`, between two heights [pixels]."""
+        """Clear the picture within `inside`, between two heights [pixels]."""
         n = OVERSAMPLING
         first, last = (round(n * min(max(y, 0.0), self.height)) for y in (top, bottom))
         self._large.fill(color, (0, first, n * self.width, last - first))
 
     def keep_background(self) -> None:
-        """Remember what has been drawn so far, for pictures that begin alike."""
+        """Store the picture so far, as the background of later pictures."""
         self._background = self._large.copy()
 
     def show_background(self, top: float = 0.0) -> None:
-        """Begin with what was remembered, from a height downward [pixels]."""
+        """Copy the stored background, from a height downward [pixels]."""
         first = round(OVERSAMPLING * top)
         box = (0, first, OVERSAMPLING * self.width, OVERSAMPLING * self.height - first)
         self._large.blit(self._background, (0, first), box)
 
     def line(self, points: Floats, color: Color, width: float = 1.0, closed: bool = False) -> None:
-        """A line through points (n, 2) [pixels]; it is interrupted where they are NaN."""
+        """Draw a line through points (n, 2) [pixels], interrupted at points that are NaN."""
         for run in _runs(points):
             if len(run) > 1:
                 thickness = max(1, round(OVERSAMPLING * width))
                 self._pygame.draw.lines(self._large, color, closed, _large(run), thickness)
 
     def segments(self, segments: Floats, color: Color, width: float = 1.0) -> None:
-        """Lines (n, 2, 2) from point to point [pixels]."""
+        """Draw line segments (n, 2, 2) [pixels]."""
         thickness = max(1, round(OVERSAMPLING * width))
         for start, end in _large(segments):
             self._pygame.draw.line(self._large, color, start, end, thickness)
@@ -120,7 +121,7 @@ class Canvas:
     def dashes(
         self, points: Floats, color: Color, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
     ) -> None:
-        """A dashed line through points (n, 2) [pixels]."""
+        """Draw a dashed line through points (n, 2) [pixels]."""
         for run in _runs(points):
             if len(run) < 2:
                 continue
@@ -132,12 +133,12 @@ class Canvas:
                 return np.stack([np.interp(distance, length, run[:, k]) for k in range(2)], axis=-1)
 
             center = along(begin + 0.5 * dash) / (self.width, self.height)
-            begin = begin[(abs(center - 0.5) < 0.55).all(axis=1)]  # most may lie outside
+            begin = begin[(abs(center - 0.5) < 0.55).all(axis=1)]  # most may be outside
             both = np.stack([begin, np.minimum(begin + dash, length[-1])], axis=1)
             self.segments(along(both), color, width)
 
     def polygon(self, points: Floats, color: Color, opacity: float = 1.0) -> None:
-        """A filled polygon with corners (n, 2) [pixels]; nothing if one of them is NaN."""
+        """Draw a filled polygon with corners (n, 2) [pixels], unless one of them is NaN."""
         if len(points) < 3 or not np.isfinite(points).all():
             return
         corners = _large(points)
@@ -154,7 +155,7 @@ class Canvas:
             self._large.blit(self._layer, box, box)
 
     def disc(self, at: Floats, radius: float, color: Color, width: float = 0.0) -> None:
-        """A disc, or a ring of a width [pixels], around a point (2,)."""
+        """Draw a disc, or a ring of a given width [pixels], around a point (2,)."""
         if np.isfinite(at).all():
             n = OVERSAMPLING
             (center,) = _large(at[np.newaxis])
@@ -162,7 +163,7 @@ class Canvas:
             self._pygame.draw.circle(self._large, color, center, max(1.0, n * radius), ring)
 
     def crosses(self, at: Floats, size: float, color: Color, width: float = 1.5) -> None:
-        """Diagonal crosses at points (n, 2) [pixels]; none where they are NaN."""
+        """Draw diagonal crosses at points (n, 2) [pixels] that are not NaN."""
         shown = at[np.isfinite(at).all(axis=1)]
         self.segments(
             (shown[:, np.newaxis, np.newaxis] + size * _CROSS).reshape(-1, 2, 2), color, width
@@ -171,20 +172,20 @@ class Canvas:
     def box(
         self, left: float, top: float, width: float, height: float, color: Color, line: float = 0.0
     ) -> None:
-        """A filled rectangle, or its border [pixels]."""
+        """Draw a filled rectangle, or its border with a line width `line` [pixels]."""
         n = OVERSAMPLING
         rectangle = [round(n * x) for x in (left, top, width, height)]
         self._pygame.draw.rect(self._large, color, rectangle, round(n * line))
 
     def inside(self, box: tuple[float, float, float, float] | None) -> None:
-        """Draw nothing outside a rectangle of left, top, width, height from now on; None: all."""
+        """Clip drawing to a rectangle (left, top, width, height) from now on; None: no clipping."""
         n = OVERSAMPLING
         self._large.set_clip(None if box is None else [round(n * x) for x in box])
 
     # ---- text ---------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Shrink what has been drawn; after this there is only text to come."""
+        """Halve the picture; only text can be drawn after this."""
         halve(_words(self._large), _words(self.surface))
 
     def veil(self, left: float, top: float, width: float, height: float) -> None:
@@ -197,10 +198,10 @@ class Canvas:
     def text(
         self, words: str, x: float, y: float, size: int, color: Color = INK, anchor: float = 0.0
     ) -> int:
-        """Write words with their upper left corner, or `anchor` of their width, at x and y.
+        """Write a text with its upper left corner at x and y, shifted left by `anchor` widths.
 
         Returns:
-            Their width [pixels].
+            Width of the text [pixels].
         """
         image = self._word(words, size, color)
         if np.isfinite(x) and np.isfinite(y):
@@ -209,11 +210,11 @@ class Canvas:
         return int(image.get_width())
 
     def width_of(self, words: str, size: int) -> int:
-        """Width of words [pixels]."""
+        """Width of a text [pixels]."""
         return int(self._word(words, size, INK).get_width())
 
     def fitting(self, wordings: Sequence[str], size: int, width: float) -> str:
-        """The first of the wordings that is no wider than `width` [pixels], or the last of all."""
+        """First of the wordings that is no wider than `width` [pixels], or the last one."""
         fits = (words for words in wordings if self.width_of(words, size) <= width)
         return next(fits, wordings[-1])
 
@@ -236,7 +237,7 @@ class Canvas:
         return self._words[key]
 
     def pixels(self) -> NDArray[np.uint8]:
-        """The finished picture, (height, width, 3): a new array."""
+        """Finished picture as a new array, (height, width, 3)."""
         self._packed.blit(self.surface, (0, 0))
         raw = np.frombuffer(self._packed.get_buffer(), np.uint8)
         rows = raw.reshape(self.height, self._packed.get_pitch())[:, : 3 * self.width]
@@ -244,19 +245,19 @@ class Canvas:
 
 
 def _words(surface: Any) -> NDArray[np.uint32]:
-    """A surface's pixels as words of four bytes, (height, width): its memory, not a copy."""
+    """Pixels of a surface as words of four bytes, (height, width), without a copy."""
     words = np.frombuffer(surface.get_view("0"), np.uint32)
     return words.reshape(surface.get_height(), surface.get_width())
 
 
 def _large(points: Floats) -> Any:
-    """Points in the pixels of the large surface."""
+    """Convert points to pixels of the large surface."""
     return (OVERSAMPLING * points).clip(-_FAR, _FAR).tolist()
 
 
 def _runs(points: Floats) -> list[Floats]:
-    """The pieces of a line between its NaN."""
-    if np.isfinite(points.sum()):  # as nearly always
+    """Pieces of a line between points that are NaN."""
+    if np.isfinite(points.sum()):  # the usual case
         return [points]
     good = np.isfinite(points).all(axis=-1)
     edges = np.flatnonzero(np.diff(good)) + 1

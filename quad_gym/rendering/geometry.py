@@ -1,4 +1,4 @@
-"""The geometry of pictures: a viewing camera, outlines of ellipsoids; NumPy alone.
+"""Geometry of pictures in NumPy: a viewing camera, and outlines of ellipsoids.
 
 A viewing camera's axes are x to the right, y down and z into the picture, in pixels from the
 picture's upper left corner.
@@ -15,43 +15,43 @@ from quad_gym.rotations import quaternion_to_dcm
 Floats = NDArray[np.float64]
 
 NEAR = 0.05
-"""Nothing closer to a viewing camera than this is drawn [m]."""
+"""Distance from the viewing camera below which objects are not drawn [m]."""
 
 
 AROUND = 6.0
-"""Obstacles farther from reference and start than this need not be seen by a fixed view [m]."""
+"""Distance from reference and start within which a fixed view must show obstacles [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A perspective view of the inertial frame."""
+    """Perspective view of the inertial frame."""
 
     eye: Floats
-    """(3,) in I [m]"""
+    """Position of the viewer, (3,) in I [m]"""
     R_VI: Floats
-    """(3, 3) inertial to viewing axes; rows: right, down, into the picture, in I"""
+    """Rotation from I to viewing axes, (3, 3); rows: right, down, into the picture, in I"""
     focal: float
-    """focal length [pixels]"""
+    """Focal length [pixels]"""
     center: Floats
-    """(2,) pixel of the optical axis"""
+    """Pixel of the optical axis, (2,)"""
 
     def in_view(self, points: Floats) -> Floats:
-        """(..., 3) points of I in viewing axes [m]."""
+        """Transform points (..., 3) from I to viewing axes [m]."""
         return np.asarray((points - self.eye) @ self.R_VI.T)
 
     def flatten(self, points_V: Floats) -> Floats:
-        """(..., 2) pixels of points (..., 3) in viewing axes that lie in front of the camera."""
+        """Pixels (..., 2) of points (..., 3) in viewing axes, all in front of the viewer."""
         return self.center + self.focal * points_V[..., :2] / points_V[..., 2:]
 
     def project(self, points: Floats) -> tuple[Floats, Floats]:
-        """Pixels (..., 2) and depths (...,) of points (..., 3) in I; NaN where not in front."""
+        """Pixels (..., 2) and depths (...,) of points (..., 3) in I; NaN behind the viewer."""
         points_V = self.in_view(np.asarray(points, np.float64))
         depth = points_V[..., 2]
         safe = np.where(depth[..., np.newaxis] > NEAR, points_V, np.nan)
         return self.flatten(safe), depth
 
     def segments(self, starts: Floats, ends: Floats) -> Floats:
-        """Pixels (m, 2, 2) of line segments (n, 3), cut off where they come too near."""
+        """Pixels (m, 2, 2) of line segments (n, 3), clipped where they are too near."""
         both = self.in_view(np.stack([starts, ends], axis=1))
         in_front = both[..., 2] > NEAR
         if in_front.all():
@@ -65,7 +65,7 @@ class View:
         return self.flatten(np.where(in_front, both, cut))
 
     def outline(self, corners: Floats) -> Floats:
-        """Pixels (m, 2) of a flat polygon with corners (n, 3), cut off where it comes too near."""
+        """Pixels (m, 2) of a flat polygon with corners (n, 3), clipped where it is too near."""
         points = self.in_view(corners)
         depth = points[:, 2] - NEAR * 1.001
         if (depth > 0.0).all():
@@ -81,17 +81,17 @@ class View:
 
     @property
     def horizon(self) -> float:
-        """The row of pixels at which level lines end; a view without roll has one [pixels]."""
+        """Row of the horizon [pixels], for views without roll."""
         down, level = self.R_VI[2, 2], float(np.hypot(*self.R_VI[2, :2]))
         return float(self.center[1] + self.focal * down / max(level, 1e-9))
 
     def scale_at(self, point: Floats) -> float:
-        """Pixels per meter across the line of sight at a point in I."""
+        """Scale perpendicular to the line of sight at a point in I [pixels/m]."""
         return self.focal / max(float(self.in_view(point)[2]), NEAR)
 
 
 def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> View:
-    """The view from `eye` toward `target`, with the vertical upright."""
+    """View from `eye` toward `target`, with the vertical upright."""
     into = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(into, (0.0, 0.0, 1.0))
     length = np.linalg.norm(right)
@@ -102,15 +102,15 @@ def look_at(eye: Floats, target: Floats, focal: float, center: Floats) -> View:
 def fit_view(
     points: Floats, azimuth: float, elevation: float, focal: float, low: Floats, high: Floats
 ) -> View:
-    """The closest view from a direction that shows all points within a rectangle of pixels.
+    """Closest view from a given direction that shows all points within a rectangle of pixels.
 
     Args:
-        points: (n, 3) in I [m].
+        points: Points to show, (n, 3) in I [m].
         azimuth: Direction from the points to the eye, from east toward north [rad].
-        elevation: Of that direction above the horizon [rad].
+        elevation: Elevation of this direction above the horizon [rad].
         focal: Focal length [pixels].
-        low: (2,) upper left corner of the rectangle [pixels].
-        high: (2,) its lower right corner [pixels].
+        low: Upper left corner of the rectangle, (2,) [pixels].
+        high: Lower right corner of the rectangle, (2,) [pixels].
     """
     c = np.cos(elevation)
     backward = np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
@@ -123,27 +123,27 @@ def fit_view(
     for k in range(2):
         slope = half[k] / focal
         right, left = (p[:, k] - slope * p[:, 2]).max(), (p[:, k] + slope * p[:, 2]).min()
-        eye[k] = (right + left) / 2  # the eye that sees both edges from the same distance
+        eye[k] = (right + left) / 2  # both edges at equal distances
         edges.append(-(right - left) / 2 / slope)
     eye[2] = min(edges)
     return View(eye @ axes, axes, focal, center)
 
 
 def fixed_view(flight: Flight, width: float, height: float, also: Floats | None = None) -> View:
-    """A view that shows the whole reference, the start and what the camera looks at.
+    """View that shows the whole reference, the start, and the markers for the camera.
 
     Args:
-        flight: The flight.
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
-        also: (n, 3) further points to show, in I [m].
+        flight: Flight to show.
+        width: Width of the picture [pixels].
+        height: Height of the picture [pixels].
+        also: Further points to show, (n, 3) in I [m].
     """
     scene, start = flight.scene, flight["position"][0]
     times = np.linspace(0.0, scene.reference_period or 1.0, max(64, scene.pieces // 4))
     around = [scene.reference(times), start[np.newaxis], scene.gates_I, scene.features_I]
-    around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # what lies below
+    around += [np.concatenate(around[:3]) * (1.0, 1.0, 0.0)]  # points on the ground below
     points = np.concatenate(around)
-    if len(scene.obstacles):  # all of them within the geofence, or else those around
+    if len(scene.obstacles):  # all within the geofence, or else those nearby
         low, high = points.min(axis=0) - AROUND, points.max(axis=0) + AROUND
         low, high = scene.geofence_I if len(scene.geofence_I) else (low, high)
         places = np.clip(scene.obstacles[:, 1:4], low, high)
@@ -159,9 +159,9 @@ def fixed_view(flight: Flight, width: float, height: float, also: Floats | None 
 
 
 def chase_view(flight: Flight, width: float, height: float) -> View:
-    """A view from behind and above the vehicle, a little to its right, that turns with it gently.
+    """View from behind and above the vehicle, a little to its right, that follows it smoothly.
 
-    It depends on the last half second alone, so a replay shows what was seen live.
+    It depends only on the last half second, so a replay is identical to the live view.
     """
     recent = flight.rows[-max(2, round(0.5 * flight.scene.control_rate)) :]
     here = np.array(recent["position"][-1])
@@ -175,10 +175,10 @@ def chase_view(flight: Flight, width: float, height: float) -> View:
 
 
 def course_view(flight: Flight, width: float, height: float) -> View:
-    """A view along a course of obstacles, from behind and above the vehicle, that keeps its line.
+    """View along a course of obstacles, from behind and above the vehicle.
 
-    It moves with the true position along the course and does not turn, so that a vehicle that
-    leaves the course's line is seen to leave it.
+    It moves with the true position along the course and does not turn, so that sideways motion of
+    the vehicle remains visible.
     """
     start = np.array(flight["position"][0]) * (1.0, 1.0, 0.0)
     ahead = flight.scene.obstacles[:, 1:4].mean(axis=0) * (1.0, 1.0, 0.0) - start
@@ -190,27 +190,27 @@ def course_view(flight: Flight, width: float, height: float) -> View:
 
 
 def ellipsoid_axes(covariance: Floats, sigmas: float) -> Floats:
-    """The half-axes of an ellipsoid of a (3, 3) covariance: eigenvectors times sigmas sqrt(value).
+    """Half-axes of the ellipsoid of a (3, 3) covariance: eigenvectors times sigmas sqrt(value).
 
     Returns:
-        (3, 3) one half-axis a row, the shortest first [unit of the covariance's root].
+        Half-axes in rows, the shortest first, (3, 3) [square root of the covariance's unit].
     """
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((sigmas * np.sqrt(np.maximum(values, 0.0)) * vectors).T)
 
 
 def ellipsoid_outline(center: Floats, axes: Floats, view: View, count: int = 48) -> Floats:
-    """The outline of an ellipsoid in perspective, (count, 2) pixels; (0, 2) if it is too near.
+    """Outline of an ellipsoid in perspective, (count, 2) pixels; (0, 2) if it is too near.
 
-    In dual form the ellipsoid is [[A - c c^T, -c], [-c^T, -1]] with A the sum of the outer products
-    of its half-axes; the camera matrix takes it to the dual conic of its outline (R. Hartley, A.
-    Zisserman, Multiple View Geometry, 2003, section 8.3).
+    In dual form the ellipsoid is [[A - c c^T, -c], [-c^T, -1]], where A is the sum of the outer
+    products of its half-axes; the camera matrix maps it to the dual conic of its outline (R.
+    Hartley, A. Zisserman, Multiple View Geometry, 2003, section 8.3).
 
     Args:
-        center: (3,) in I [m].
-        axes: (3, 3) half-axes in I, one a row [m].
-        view: The view.
-        count: Points on the outline.
+        center: Center, (3,) in I [m].
+        axes: Half-axes in rows, (3, 3) in I [m].
+        view: View to project to.
+        count: Number of points on the outline.
     """
     c = view.in_view(center)
     half = axes @ view.R_VI.T

@@ -1,4 +1,4 @@
-"""The history below a scene: errors and standard deviation of the position over a whole episode."""
+"""Plot below a scene: errors and standard deviation of the position over a whole episode."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,22 +20,22 @@ _FAULT: Color = (232, 232, 232)
 
 
 def position_sigma(flight: Flight) -> Floats:
-    """(n,) largest standard deviation of the position that the filter states, by axis [m]."""
+    """Largest standard deviation of the position along an axis, (n,) [m]."""
     variances = np.diagonal(flight["covariance"][:, :3, :3], axis1=1, axis2=2)
     return np.asarray(np.sqrt(variances.max(axis=1)))
 
 
 class History:
-    """Draws errors over the time of a whole episode, up to the last row of a flight.
+    """Plot of errors over a whole episode, up to the last row of a flight.
 
     Args:
-        canvas: To draw on.
-        box: Where.
-        flight: All of it.
-        end: Of the time axis [s].
-        size: Of the text [pixels].
-        course: Of a course, what is passed and how many there are; there, the distance from the
-            reference is no error, and progress and speed are shown in its place.
+        canvas: Canvas to draw on.
+        box: Rectangle of the plot.
+        flight: Complete flight.
+        end: End of the time axis [s].
+        size: Size of the text [pixels].
+        course: Name and number of the objects passed on a course. Progress and speed then replace
+            the distance from the reference.
     """
 
     def __init__(
@@ -55,8 +55,8 @@ class History:
         if course is None:
             self._curves.append(("position error", flight["position_error"], BLUE))
         self._curves += [
-            ("filter's sigma", position_sigma(flight), INK),
-            ("estimate's error", flight["estimation_error"], VERMILLION),
+            ("filter sigma", position_sigma(flight), INK),
+            ("estimation error", flight["estimation_error"], VERMILLION),
         ]
         label = 10.0 + max(canvas.width_of(words, size - 2) for words in ERRORS.ticks.values())
         top = box.top + canvas.line_height(size) + 12.0
@@ -108,6 +108,6 @@ class History:
 
 
 def _runs(active: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and one after the last index of each stretch that is active."""
+    """First index of each active interval, and the index after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

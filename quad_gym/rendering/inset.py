@@ -1,4 +1,4 @@
-"""The inset: the image plane of the vehicle's camera, with the features in it."""
+"""Inset with the image plane of the vehicle's camera and the features in it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ Floats = NDArray[np.float64]
 
 
 def place_in_inset(pixels: Floats, scene: FlightScene, box: Box) -> Floats:
-    """Where pixels of the camera, from its image's center, are in the inset.
+    """Convert image coordinates of the camera to pixels of the inset.
 
-    The image is turned upright: half a turn, where the camera's y axis points up in the body.
+    The image is shown upright: it is turned by half a turn if the camera's y axis points up.
 
     Args:
-        pixels: (..., 2).
-        scene: Of the flight.
-        box: The inset, as wide and high as the image in proportion.
+        pixels: Image coordinates relative to the image center, (..., 2) [pixels].
+        scene: Scene of the flight.
+        box: Inset, with the proportions of the image.
     """
     turn = -1.0 if scene.R_CB[1, 2] > 0.0 else 1.0
     center = np.array([box.left + box.width / 2, box.top + box.height / 2])
@@ -29,16 +29,16 @@ def place_in_inset(pixels: Floats, scene: FlightScene, box: Box) -> Floats:
 
 
 def inset_box(scene: FlightScene, right: float, top: float, width: float) -> Box:
-    """A box in the proportions of the image, by its right edge, top and width."""
+    """Box with the proportions of the image, given its right edge, top and width."""
     height = width * float(scene.half_image[1] / scene.half_image[0])
     return Box(right - width, top, width, height)
 
 
 def last_image(flight: Flight) -> NDArray[np.void]:
-    """The row of the last image, which is shown until the next one is due.
+    """Row of the last image, which is shown until the next one is due.
 
-    Where cameras are slower than control most rows have no image; if the last one held no feature,
-    this is the present row.
+    If the camera rate is lower than the control rate, most rows have no image. If the last image
+    had no feature, this is the present row.
     """
     scene = flight.scene
     held = max(1, round(scene.control_rate / scene.camera_rate))
@@ -48,24 +48,24 @@ def last_image(flight: Flight) -> NDArray[np.void]:
 
 
 def rejected_features(row: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Which features of a row the filter's gate has left out, (n,)."""
+    """True for features of a row that the innovation gate has rejected, (n,)."""
     return np.asarray(row["feature_decision"] == GateDecision.REJECTED)
 
 
 class Inset:
-    """Draws the camera's image for the last row of a flight.
+    """Image of the camera for the last row of a flight.
 
     Args:
-        canvas: To draw on.
-        box: Where.
-        size: Of the text [pixels].
+        canvas: Canvas to draw on.
+        box: Rectangle of the inset.
+        size: Size of the text [pixels].
     """
 
     def __init__(self, canvas: Canvas, box: Box, size: int) -> None:
         self._canvas, self._box, self._size = canvas, box, size
 
     def draw(self, flight: Flight) -> None:
-        """Measured features as crosses, those that the estimate predicts as rings."""
+        """Draw measured features as crosses, and features predicted from the estimate as rings."""
         canvas, box, scene, image = self._canvas, self._box, flight.scene, last_image(flight)
         canvas.box(box.left, box.top, box.width, box.height, WHITE)
         x, y = box.left + box.width / 2, box.top + box.height / 2
@@ -84,7 +84,7 @@ class Inset:
         canvas.box(box.left, box.top, box.width, box.height, GREY, 1.0)
 
     def write(self, flight: Flight) -> None:
-        """Name the features and say what the picture is."""
+        """Write a title and the numbers of the features."""
         canvas, box, image = self._canvas, self._box, last_image(flight)
         seen = np.isfinite(image["pixels"]).all(axis=1)
         wordings = ["camera"] if seen.any() else ["camera: no feature in view", "no feature"]

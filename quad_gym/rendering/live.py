@@ -20,15 +20,15 @@ WINDOW_RATE = 50.0
 """Largest number of pictures per second in a window [Hz]."""
 
 _INVISIBLE = ("offscreen", "dummy")
-"""Drivers that SDL falls back on where there is no display: their windows cannot be seen."""
+"""Drivers that SDL uses without a display; their windows are invisible."""
 
 
 class Window:
-    """A window on the screen that shows frames at their pace.
+    """Window on the screen that shows frames in real time.
 
     Args:
         size: Width and height [pixels].
-        title: Of the window.
+        title: Title of the window.
 
     Raises:
         RuntimeError: If there is no display to open a window on. A driver without a display, such
@@ -52,17 +52,17 @@ class Window:
         self.closed = False
 
     def show(self, frame: NDArray[np.uint8], seconds: float) -> None:
-        """Show a frame, and wait until the one before it has been seen for its time [s]."""
+        """Show a frame after the previous one has been visible for its duration [s]."""
         if self.closed:
             return
         image = self._pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB")
         self._screen.blit(image, (0, 0))
         time.sleep(max(0.0, self._due - time.monotonic()))
         self._pygame.display.flip()
-        self._due = max(self._due, time.monotonic() - 0.1) + seconds  # what is late is not made up
+        self._due = max(self._due, time.monotonic() - 0.1) + seconds  # delays are not caught up
 
     def pressed_keys(self) -> list[str]:
-        """Names of the keys pressed since the last call; a closed window is noticed here too."""
+        """Names of the keys pressed since the last call; also detects a closed window."""
         pressed: list[str] = []
         if self.closed:
             return pressed
@@ -75,7 +75,7 @@ class Window:
         return pressed
 
     def close(self) -> None:
-        """Close the window; closing twice is fine."""
+        """Close the window, if it is open."""
         if not self.closed:
             self._pygame.display.quit()
             self.closed = True
@@ -162,11 +162,11 @@ class Rendering:
 
     @property
     def flights(self) -> list[Flight]:
-        """The shown flights, since the start of their episodes."""
+        """Shown flights, since the start of their episodes."""
         return [recorder.flight for recorder in self._recorders]
 
     def close(self) -> None:
-        """Close the window; closing twice is fine."""
+        """Close the window, if it is open."""
         self._closed = True
         if self._window is not None:
             self._window.close()

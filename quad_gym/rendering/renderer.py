@@ -1,4 +1,4 @@
-"""`Renderer`: from a flight to a picture of its last instant."""
+"""`Renderer`: pictures of the last instant of a flight."""
 
 from typing import Any
 
@@ -25,10 +25,10 @@ from quad_gym.rendering.scene import Scene, ellipsoid_scale
 from quad_gym.rendering.strip import Box, Strip
 
 VIEWS = ("fixed", "chase")
-"""Views of a flight."""
+"""Names of the views of a flight."""
 LEAST_WIDTH, LEAST_HEIGHT = 320, 240
 STALE_FIX = 0.5
-"""Time without a fix that is worth a note [s]."""
+"""Time without a fix after which a warning is shown [s]."""
 
 
 class Renderer:
@@ -54,17 +54,17 @@ class Renderer:
         strip = Box(0.0, self._scene_height, width, height - self._scene_height)
         self._strip = Strip(self._canvas, strip, self._text)
         self._scene: FlightScene | None = None
-        """of the flight that the kept view and background belong to"""
+        """Scene of the flight to which the stored view and background belong."""
         self._fixed: View
 
     def draw(self, flight: Flight) -> NDArray[np.uint8]:
         """Draw the last instant of a flight; `flight.until(t)` ends at a time t.
 
         Args:
-            flight: The flight.
+            flight: Flight to draw.
 
         Returns:
-            (height, width, 3) red, green, blue.
+            Picture in red, green, blue, (height, width, 3).
         """
         canvas, (width, _), small = self._canvas, self.size, self._text - 2
         scene = Scene(canvas, flight, self._view_of(flight), self.view == "chase")
@@ -101,7 +101,7 @@ class Renderer:
         return self._fixed
 
     def _draw_background(self, flight: Flight, scene: Scene) -> None:
-        """What does not change: of a fixed view everything, of a chase the strip."""
+        """Draw the unchanging parts: of a fixed view the whole background, of a chase the strip."""
         known, moves = self._scene is flight.scene, self.view == "chase"
         if known:
             self._canvas.show_background(self._scene_height if moves else 0.0)
@@ -115,7 +115,7 @@ class Renderer:
             self._canvas.keep_background()
 
     def _write_legend(self, flight: Flight) -> None:
-        """What, when, what the colors mean, and what is wrong, in the upper left corner."""
+        """Write task, time, legend and warnings in the upper left corner."""
         canvas, scene, now = self._canvas, flight.scene, flight.rows[-1]
         large, small = self._text + 2, self._text - 1
         name = str(flight.about.get("task", scene.task)).replace("_", " ")
@@ -133,7 +133,7 @@ class Renderer:
                 words = "GNSS fix (gray: rejected)" if refused else "GNSS fix"
                 entries.append((words, PURPLE))
         elif scene.observation == "noisy":
-            entries.append(("what the controller sees", VERMILLION))
+            entries.append(("observed position", VERMILLION))
         policy, warnings = flight.about.get("policy"), self._warnings(flight)
         flown_by = [f"flown by {short_name(str(policy))}"] if policy else []
         lines = [title, *flown_by, *[words for words, _ in entries], *warnings]
@@ -179,7 +179,7 @@ class Renderer:
 
 
 def active_faults(flight: Flight) -> list[str]:
-    """Names, for people, of the faults at the last instant of a flight."""
+    """Readable names of the faults at the last instant of a flight."""
     active = int(flight.rows[-1]["faults"])
     return [_spoken(kind) for kind in FaultKind if active >> kind & 1]
 
@@ -198,10 +198,11 @@ _SEEN = {
 
 
 def checked_size(size: tuple[int, int]) -> tuple[int, int]:
-    """A picture's width and height [pixels].
+    """Check width and height of a picture [pixels].
 
     Raises:
-        ValueError: If they are not whole, too small to be read, or odd, which videos do not take.
+        ValueError: If they are not integers, too small for the text, or odd, which video formats do
+            not support.
     """
     if not isinstance(size, (tuple, list)) or len(size) != 2:
         raise ValueError(f"render_size must be a width and a height, got {size!r}")

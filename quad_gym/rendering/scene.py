@@ -1,4 +1,4 @@
-"""The scene: ground, reference, vehicle, estimate, fixes and features, in perspective."""
+"""Scene in perspective: ground, reference, vehicle, estimate, fixes and features."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,13 @@ from quad_gym.rotations import quaternion_to_dcm
 Floats = NDArray[np.float64]
 
 TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
-"""How long trails and fixes stay, and how far ahead the reference is drawn boldly."""
+"""Durations of trails, of fixes, and of the part of the reference ahead that is drawn bold [s]."""
 TRAIL_POINTS = 180
 SIGMAS = 3.0
 ELLIPSOID_SCALES = (50.0, 20.0, 10.0, 5.0, 2.0, 1.0)
-"""How many times its size an ellipsoid may be drawn."""
+"""Factors by which an ellipsoid may be magnified."""
 ELLIPSOID_LIMIT, SCALE_SECONDS = 0.5, 3.0
-"""Largest half-axis that is drawn, over so much of the past [m], [s]."""
+"""Largest half-axis of a magnified ellipsoid [m], over this duration of the past [s]."""
 ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
 """[m]"""
 
@@ -52,26 +52,26 @@ _NORTHWARD = [
     for s in (-1, 1)
 ]
 _GRID = np.stack([np.concatenate([ends, ends[:, [1, 0, 2]]]) for ends in _NORTHWARD])
-"""Starts and ends of the lines on the ground, one meter apart, (2, n, 3)."""
+"""Start and end points of the lines on the ground, one meter apart, (2, n, 3)."""
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 25)
 _RING = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros_like(_CIRCLE)], axis=1)
 
 SOLID, GLASS = 0.55, 0.12
-"""Opacity of obstacles behind the vehicle, and of those before it."""
+"""Opacity of obstacles behind the vehicle, and in front of it."""
 EDGES = (
     *((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3)),
     *((2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7)),
 )
-"""Of a box whose corners are numbered in binary: x, y, z."""
+"""Edges of a box whose corners are numbered in binary: x, y, z."""
 
 Label = tuple[str, Floats, tuple[int, int, int]]
-"""Words, where (2,), color."""
+"""Text, its position (2,) and its color."""
 
 
 def ellipsoid_scale(flight: Flight) -> float:
-    """How much larger than it is the ellipsoid is drawn, so that it can be seen but fills no room.
+    """Factor by which the ellipsoid is magnified, so that it is visible but not too large.
 
-    It depends on the largest standard deviation of the last seconds, so it changes seldom.
+    It depends on the largest standard deviation of the last seconds, so it rarely changes.
     """
     recent = flight.rows[-max(1, round(SCALE_SECONDS * flight.scene.control_rate)) :]
     variances = np.diagonal(recent["covariance"][:, :3, :3], axis1=1, axis2=2)
@@ -82,15 +82,15 @@ def ellipsoid_scale(flight: Flight) -> float:
 
 
 class Scene:
-    """Draws the last row of a flight, as a view shows it.
+    """Drawing of the last row of a flight in a view.
 
     Args:
-        canvas: To draw on.
-        flight: The flight; its last row is the present.
-        view: Where from.
-        moving: Whether the view follows the vehicle, so that the ground must, too.
-        magnified: Whether a small ellipsoid is drawn larger than it is, see `ellipsoid_scale`.
-        spacing: Of the grid on the ground [m].
+        canvas: Canvas to draw on.
+        flight: Flight whose last row is the present.
+        view: View to draw.
+        moving: True if the view follows the vehicle, so that the grid on the ground must, too.
+        magnified: True to magnify small ellipsoids, see `ellipsoid_scale`.
+        spacing: Distance between the grid lines on the ground [m].
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Scene:
         self.labels: list[Label] = []
 
     def draw_background(self) -> None:
-        """Draw what stays as it is during a flight: ground, axes, and a path that does not move."""
+        """Draw the parts that do not change during a flight: ground, axes, and a fixed path."""
         self._ground()
         scene = self._scene
         if scene.reference_period and not len(scene.gates_I):
@@ -140,7 +140,7 @@ class Scene:
         n = GRID_HALF_SIZE
         shift = np.zeros(3)
         wide = bool((np.abs(self._scene.obstacles[:, 1:3]) > n).any())
-        if self._moving or wide:  # over a plane without an end, with the grid around the vehicle
+        if self._moving or wide:  # an infinite plane, with the grid around the vehicle
             shift[:2] = self._spacing * np.round(self._now["position"][:2] / self._spacing)
             canvas.clear(SKY, bottom=view.horizon)
             canvas.clear(GROUND, top=view.horizon)
@@ -189,16 +189,16 @@ class Scene:
             self.labels.append((str(k + 1), view.project(gate)[0] - (0.0, 6.0), ink))
 
     def _obstacles(self, before_vehicle: bool) -> None:
-        """Draw obstacles that are nearer than the vehicle to the eye, or those that are not.
+        """Draw the obstacles in front of the vehicle, or the obstacles behind it.
 
-        Those before it are drawn as if of glass, so that they hide nothing.
+        Obstacles in front are nearly transparent, so that they do not hide the vehicle.
         """
         view, canvas = self._view, self._canvas
         far = np.linalg.norm(self._now["position"] - view.eye)
         chosen = []
         for obstacle in self._scene.obstacles:
             faces = faces_of(obstacle, view.eye)
-            # a wall is long: the point of it that is nearest to the eye counts
+            # walls are long: use the point that is nearest to the eye
             distance = min(float(np.linalg.norm(face - view.eye, axis=1).min()) for face in faces)
             if (distance < far) == before_vehicle:
                 chosen.append((distance, faces))
@@ -227,10 +227,10 @@ class Scene:
             self._canvas.segments(self._view.segments(foot[np.newaxis], r_I[np.newaxis]), GREY, 0.7)
 
     def _trail(self, column: str) -> Floats:
-        """Pixels of the last seconds of a position, thinned out evenly."""
+        """Pixels of a position over the last seconds, evenly subsampled."""
         count, wanted = len(self._flight.rows), round(TRAIL_SECONDS * self._scene.control_rate)
         stride = -(-wanted // TRAIL_POINTS)
-        # rows are counted from the flight's start, so that a trail does not flicker
+        # rows are counted from the start of the flight to prevent flicker of the trail
         first = -(-max(0, count - wanted) // stride) * stride
         rows = np.append(np.arange(first, count - 1, stride), count - 1)
         return self._view.project(self._flight.rows[column][rows])[0]
@@ -246,14 +246,14 @@ class Scene:
         scene, view, canvas = self._scene, self._view, self._canvas
         if not scene.has_camera:
             return
-        if not self._flight.estimated:  # nothing measures, but the features stand there
+        if not self._flight.estimated:  # no camera measures, but the features exist
             self._features(np.zeros(len(scene.features_I), bool))
             return
         r_I = self._now["position"]
         corners = scene.frustum_corners(r_I, self._R_BI, FRUSTUM_DEPTH)
         apex = np.repeat(corners[:1], 4, axis=0)
         image = view.segments(corners[1:], np.roll(corners[1:], -1, axis=0))
-        if len(image) == 4 and not self._moving:  # from near it would cover what lies behind
+        if len(image) == 4 and not self._moving:  # from near it would hide too much
             canvas.polygon(image[:, 0], LIGHT_BLUE, 0.14)
         canvas.segments(view.segments(apex, corners[1:]), LIGHT_BLUE)
         canvas.segments(image, LIGHT_BLUE, 1.3)
@@ -291,7 +291,7 @@ class Scene:
         self._canvas.crosses(places[-1:], 4.0, color, 2.0)
         if ages[-1] < 0.3 and len(places) < 0.5 * FIX_SECONDS * self._scene.control_rate:
             radius = 6.0 + 40.0 * float(ages[-1])
-            self._canvas.disc(places[-1], radius, color, 1.5)  # a ripple, where fixes are few
+            self._canvas.disc(places[-1], radius, color, 1.5)  # a ripple if fixes are rare
 
     # ---- the vehicle and the estimate ---------------------------------------------------------
 
@@ -318,7 +318,7 @@ class Scene:
             canvas.segments(view.segments(believed - axes, believed + axes), VERMILLION, 0.8)
         self._body(np.array(believed), self._attitude(attitude), ghost=True)
         if self._flight.estimated and scale > 1.0:
-            # the error on the scale of the ellipsoid, so that one can see whether it is inside
+            # the error has the scale of the ellipsoid, which shows if the truth is inside
             error = believed + scale * (self._now["position"] - believed)
             canvas.segments(view.segments(believed[np.newaxis], error[np.newaxis]), INK, 1.4)
             at = view.project(error)[0]
@@ -329,7 +329,7 @@ class Scene:
         self._body(np.array(self._now["position"]), self._R_BI, ghost=False)
 
     def _body(self, r_I: Floats, R_BI: Floats, ghost: bool) -> None:
-        """Arms and rotors; a ghost is drawn in outline."""
+        """Draw arms and rotors; a ghost is drawn in outline."""
         view, canvas, scene = self._view, self._canvas, self._scene
         hubs_B = scene.rotor_positions_B
         hubs = r_I + hubs_B @ R_BI

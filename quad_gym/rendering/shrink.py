@@ -1,4 +1,4 @@
-"""Shrinking a picture to half its size: the mean of two by two pixels, which smooths its edges."""
+"""Anti-aliasing: halving a picture by the mean of two by two pixels."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ _TWO, _EIGHT = np.uint32(2), np.uint32(8)
 def halve(large: Any, small: Any) -> None:
     """Write the rounded means of two by two pixels.
 
-    A pixel is a word of four bytes. Two of them at a time are summed in the halves of a word.
+    A pixel is a word of four bytes, of which two at a time are summed in the halves of a word.
 
     Args:
-        large: (2 height, 2 width) uint32.
-        small: (height, width) uint32, overwritten.
+        large: Picture to halve, (2 height, 2 width) uint32.
+        small: Result, (height, width) uint32, overwritten.
     """
     for i in range(small.shape[0]):
         for j in range(small.shape[1]):

@@ -1,4 +1,4 @@
-"""Flights side by side: the same episode, flown by different policies, as one film."""
+"""Videos of one episode flown by several policies, side by side."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -35,30 +35,30 @@ Floats = NDArray[np.float64]
 SIDE = (480, 440)
 """Width and height of one flight [pixels]."""
 HOLD = 1.5
-"""How long the last picture stays [s], so that one can read how both flights ended."""
+"""Duration of the last picture, to read how the flights ended [s]."""
 
 COURSE_GRID = 4.0
-"""Between the lines on the ground along a course [m]: closer ones, which pass, double a film."""
+"""Distance between grid lines along a course [m]; more lines would double the file size."""
 
 _BAND, _PLOT = 50.0, 118.0
 """Heights above and below the scene [pixels]."""
 _TEXT, _SMALL = 19, 17
 _TINTS: tuple[Color, ...] = ((228, 230, 234), (214, 236, 229))
-"""Grounds of the labels, in turn."""
+"""Background colors of the labels, in turn."""
 WEDGE = 2.5
-"""How far the camera's field of view is drawn [m]."""
+"""Distance to which the camera's field of view is drawn [m]."""
 _SHOWN = 9.0
-"""Positions farther from the start along an axis need not be seen by a fixed view [m]."""
+"""Distance from the start along an axis up to which a fixed view must show positions [m]."""
 _FAR = 30.0
-"""Vehicles with fewer pixels per meter are marked by a disc, as little is seen of them."""
+"""Scale below which a vehicle is marked by a disc, because it is hardly visible [pixels/m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the flights.
+    """One flight of a video side by side.
 
     Args:
-        flight: The flight, from its start to its ending.
+        flight: Flight, from its start to its ending.
         label: Name of the policy, for readers.
         ending: Ending of the episode, for readers, such as "collision".
         crashed: True if the ending was a crash.
@@ -88,7 +88,7 @@ class SideBySide:
     """Renderer of flights of one episode, side by side; ended flights stay at their last instant.
 
     Args:
-        sides: The flights, from left to right.
+        sides: Flights, from left to right.
 
     Raises:
         ValueError: If there is no flight, or one without a filter.
@@ -119,7 +119,7 @@ class SideBySide:
 
 
 class _Half:
-    """Draws one of the flights: who flies, the scene, and the errors over the whole episode."""
+    """Drawing of one flight: its label, the scene, and the errors over the whole episode."""
 
     def __init__(self, side: Side, end: float, points: Floats, tint: Color) -> None:
         self._side, self._points, self._tint = side, points, tint
@@ -131,7 +131,7 @@ class _Half:
         self._fixed: View | None = None
 
     def draw(self, time: float) -> NDArray[np.uint8]:
-        """The picture at a time [s]."""
+        """Draw the picture at a time [s]."""
         canvas, box, width = self._canvas, self._scene, SIDE[0]
         flight = self._side.flight.until(time)
         view = self._view(flight)
@@ -169,7 +169,7 @@ class _Half:
 
     @property
     def _moves(self) -> bool:
-        """Whether the view goes along, as a course of obstacles is too long for one picture."""
+        """True if the view moves, because a course of obstacles is too long for one picture."""
         return len(self._side.flight.scene.obstacles) > 0
 
     def _view(self, flight: Flight) -> View:
@@ -177,21 +177,21 @@ class _Half:
         if self._moves:
             view = course_view(flight, box.width, box.height)
         elif self._fixed is None:
-            high = box.height - 34.0  # what ends the flight is written below
+            high = box.height - 34.0  # the ending is written below
             view = self._fixed = fixed_view(flight, box.width, high, self._points)
         else:
             view = self._fixed
         return dataclasses.replace(view, center=view.center + np.array([0.0, box.top]))
 
     def _mark(self, flight: Flight, view: View) -> None:
-        """Mark truth and estimate where they are small."""
+        """Mark truth and estimate where they are hardly visible."""
         now = flight.rows[-1]
         if view.scale_at(np.array(now["position"])) < _FAR:
             self._canvas.disc(view.project(now["estimated_position"])[0], 6.0, VERMILLION, 2.0)
             self._canvas.disc(view.project(now["position"])[0], 4.0, BLUE)
 
     def _wedge(self, flight: Flight, view: View) -> None:
-        """Draw the level slice of what the camera sees, as far as WEDGE."""
+        """Draw a horizontal slice of the camera's field of view, up to `WEDGE`."""
         now = flight.rows[-1]
         R_BI = quaternion_to_dcm(now["quaternion"])
         apex, a, b, c, d = flight.scene.frustum_corners(now["position"], R_BI, WEDGE)
@@ -212,7 +212,7 @@ class _Half:
         canvas.text(clock, width - 10.0, 0.5 * (_BAND - step) + 2.0, _TEXT, INK, 1.0)
 
     def _write_legend(self, flight: Flight) -> None:
-        """What the colors mean, and what is wrong, in the scene's upper left corner."""
+        """Write legend and warnings in the upper left corner of the scene."""
         canvas, scene = self._canvas, flight.scene
         entries: list[tuple[str, Color]] = [("truth", BLUE), ("estimate, 3 sigma", VERMILLION)]
         if not self._moves:
@@ -237,7 +237,7 @@ class _Half:
             y += step
 
     def _write_end(self) -> None:
-        """Say across the lower edge of the scene that the flight is over, and how it ended."""
+        """Write the ending of the flight across the lower edge of the scene."""
         canvas, box = self._canvas, self._scene
         words, height = self._side.last_words(), canvas.line_height(_TEXT) + 8
         width = canvas.width_of(words, _TEXT) + 24
@@ -248,7 +248,7 @@ class _Half:
 
 
 def _wrapped(canvas: Canvas, words: str, size: int, width: float) -> list[str]:
-    """Words in lines no wider than `width` [pixels]: after commas, or else between any words."""
+    """Wrap a text to lines of at most `width` [pixels], after commas or else between words."""
     if canvas.width_of(words, size) <= width:
         return [words]
     parts = [part + "," for part in words.split(", ")]
@@ -276,18 +276,18 @@ def save_side_by_side(
     """Write flights of one episode as a video, side by side; it ends with the longest flight.
 
     Args:
-        sides: The flights, from left to right.
+        sides: Flights, from left to right.
         path: Path of the file, as in `save_video`.
         fps: Pictures per second.
         speed: Seconds of flight per second of video.
         progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
 
     Returns:
-        The file.
+        Path of the file.
 
     Raises:
         ValueError: If an argument is invalid.
-        ImportError: If a library that draws or writes is not installed.
+        ImportError: If a library for drawing or writing is not installed.
     """
     target = checked_video_path(path)
     film = SideBySide(sides)

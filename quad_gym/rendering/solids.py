@@ -1,4 +1,4 @@
-"""Obstacles as polygons: the faces of walls and cylinders that a viewer sees; NumPy alone."""
+"""Obstacles as polygons: visible faces of walls and cylinders, in NumPy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,18 +8,18 @@ from quad_gym.records import Shape
 Floats = NDArray[np.float64]
 
 SIDES = 20
-"""Of the prism that a cylinder is drawn as."""
+"""Number of sides of the prism that represents a cylinder."""
 
 
 def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:
-    """The faces of an obstacle that are turned to the eye.
+    """Faces of an obstacle that are turned to the eye.
 
     Args:
-        obstacle: (9,) a row of `FlightScene.obstacles`.
-        eye: (3,) in I [m].
+        obstacle: Row of `FlightScene.obstacles`, (9,).
+        eye: Position of the viewer, (3,) in I [m].
 
     Returns:
-        Polygons, (corners, 3) each, in I [m]; all faces, if the eye is inside.
+        Polygons, (corners, 3) each, in I [m]; all faces if the eye is inside.
     """
     shape, center, half, (c, s) = obstacle[0], obstacle[1:4], obstacle[4:7], obstacle[7:]
     if shape == Shape.CYLINDER:
@@ -42,7 +42,7 @@ def faces_of(obstacle: Floats, eye: Floats) -> list[Floats]:
 
 
 def _faces(face: Floats, center: Floats, eye: Floats) -> bool:
-    """Whether a face of a convex body is turned to the eye."""
+    """True if a face of a convex body is turned to the eye."""
     normal = np.cross(face[1] - face[0], face[2] - face[1])
     outward = normal * np.sign(normal @ (face.mean(axis=0) - center))
     return bool(outward @ (eye - face[0]) > 0.0)

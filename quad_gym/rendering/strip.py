@@ -1,4 +1,4 @@
-"""The strip below the scene: errors, the filter's consistency and the rotors over time."""
+"""Strip below the scene: errors, filter consistency and rotor speeds over time."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -23,12 +23,12 @@ from quad_gym.rendering.canvas import (
 Floats = NDArray[np.float64]
 
 WINDOW_SECONDS = 10.0
-"""How much of the past a plot shows."""
+"""Duration of the past that a plot shows [s]."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle [pixels]."""
+    """Rectangle [pixels]."""
 
     left: float
     top: float
@@ -38,15 +38,15 @@ class Box:
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot of columns over time, on a logarithmic scale."""
+    """Plot of columns over time, on a logarithmic scale."""
 
     curves: tuple[tuple[str, str, Color], ...]
-    """column, name and color of each curve"""
+    """Column, name and color of each curve"""
     low: float
     high: float
     ticks: dict[float, str]
     share: float
-    """of the strip's width"""
+    """Share of the strip's width"""
 
 
 ERRORS = Plot(
@@ -68,12 +68,12 @@ PLOTS = (ERRORS, CONSISTENCY)
 
 @cache
 def nees_band() -> Interval:
-    """Where 95 % of a consistent filter's NEES lie."""
+    """95 % band of the NEES of a consistent filter."""
     return chi_square_band(STATE_DIMENSION)
 
 
 def format_length(meters: float) -> str:
-    """A length for people, in millimeters to meters."""
+    """Format a length in millimeters, centimeters or meters."""
     if not np.isfinite(meters):
         return "-"
     if meters < 0.01:
@@ -84,26 +84,26 @@ def format_length(meters: float) -> str:
 
 
 def height_on(plot: Plot, value: Floats | float, box: Box) -> Floats:
-    """Where values stand in a plot's box, between its bottom and its top [pixels]."""
+    """Vertical position of values in a plot's box [pixels]."""
     logs = np.log10(np.clip(value, plot.low, plot.high))
     share = (logs - np.log10(plot.low)) / (np.log10(plot.high) - np.log10(plot.low))
     return np.asarray(box.top + box.height * (1.0 - share))
 
 
 def shows(flight: Flight, column: str) -> bool:
-    """Whether a curve has anything to say: on the truth, nothing is estimated."""
+    """True if a curve has values: without a filter, some have none."""
     if column == "nees":
         return flight.estimated
     return column != "estimation_error" or flight.scene.observation != "truth"
 
 
 class Strip:
-    """Draws the strip for the last row of a flight.
+    """Strip for the last row of a flight.
 
     Args:
-        canvas: To draw on.
-        box: Where.
-        size: Of the text [pixels].
+        canvas: Canvas to draw on.
+        box: Rectangle of the strip.
+        size: Size of the text [pixels].
     """
 
     def __init__(self, canvas: Canvas, box: Box, size: int) -> None:
@@ -121,7 +121,7 @@ class Strip:
         self._rotors = Box(left + pad, top, box.left + box.width - left - 2 * pad, height)
 
     def draw_background(self, hover_share: float) -> None:
-        """Draw boxes, axes and bands; hover_share is the hover speed over the largest speed."""
+        """Draw boxes, axes and bands; `hover_share` is the hover speed over the largest speed."""
         box, canvas = self._box, self._canvas
         canvas.box(box.left, box.top, box.width, box.height, WHITE)
         edge = np.array([[box.left, box.top], [box.left + box.width, box.top]])
@@ -174,7 +174,7 @@ class Strip:
             canvas.text(str(k + 1), x, place.top + place.height + 1.0, small, GREY, 0.5)
 
     def _titles(self, flight: Flight, plot: Plot, *, named: bool = True) -> list[tuple[str, Color]]:
-        """What a plot's curves show and their last values; without names the values alone."""
+        """Names of a plot's curves with their last values, or the values alone."""
         found: list[tuple[str, Color]] = []
         roomy = self._canvas.width_of("0" * 45, self._size - 2) < self._boxes[0].width
         for column, name, color in plot.curves:

@@ -25,21 +25,21 @@ def record_flight(
     about: dict[str, Any] | None = None,
     **keywords: Any,
 ) -> Flight:
-    """Fly a policy for one episode and return the flight.
+    """Run a policy for one episode and return the flight.
 
     Args:
         policy: Any object with the `predict` method of Stable-Baselines3; it acts on a batch of one
             observation, as in `quad_gym.evaluation.roll_out`.
-        env_id: One of `quad_gym.IDS`.
+        env_id: Id from `quad_gym.IDS`.
         seed: Seed of the episode.
         about: Information to be stored with the flight, in addition to the id and the seed.
         keywords: Keywords of the environment.
 
     Returns:
-        The flight, from its start to the ending of the episode.
+        Flight, from its start to the ending of the episode.
 
     Raises:
-        ValueError: If the episode would have no end, or a keyword is invalid.
+        ValueError: If the environment has no time limit, or a keyword is invalid.
     """
     env = gymnasium.make_vec(env_id, num_envs=1, autoreset_mode="Disabled", **keywords)
     return flight_of(policy, env, seed=seed, about={"env_id": env_id, **(about or {})})
@@ -52,10 +52,10 @@ def flight_of(
     seed: int = 0,
     about: dict[str, Any] | None = None,
 ) -> Flight:
-    """Fly a policy for one episode of a vector environment with one flight, and return the flight.
+    """Run a policy for one episode of a vector environment with one flight, and return the flight.
 
     Raises:
-        ValueError: If the episode would have no end, or `env` is not such an environment.
+        ValueError: If `env` has no time limit, or is not a vector environment with one flight.
     """
     flights = getattr(env.unwrapped, "flights", None)
     if flights is None or env.num_envs != 1:
@@ -103,8 +103,8 @@ def save_video(
     """Write a flight as MP4 (H.264), animated GIF or WebP, depending on the file name's ending.
 
     Args:
-        flight: The flight.
-        path: Path of the file; missing folders are made.
+        flight: Flight to show.
+        path: Path of the file; missing folders are created.
         view: "fixed" or "chase".
         size: Width and height [pixels].
         fps: Pictures per second.
@@ -112,7 +112,7 @@ def save_video(
         progress: Wrapper of the times of the pictures, such as `tqdm.tqdm`.
 
     Returns:
-        The file.
+        Path of the file.
 
     Raises:
         ValueError: If an argument is invalid.
@@ -139,11 +139,11 @@ def record_video(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> Flight:
-    """Fly a policy for one episode and write a video of it: `record_flight`, then `save_video`.
+    """Run a policy for one episode and write a video of it: `record_flight`, then `save_video`.
 
     Args:
-        policy: As in `record_flight`.
-        env_id: One of `quad_gym.IDS`.
+        policy: Policy, as in `record_flight`.
+        env_id: Id from `quad_gym.IDS`.
         path: Path of the video (.mp4, .gif or .webp).
         seed: Seed of the episode.
         view: "fixed" or "chase".
@@ -160,7 +160,7 @@ def record_video(
         ValueError: If an argument is invalid.
         ImportError: If a library that writes the file is not installed.
     """
-    checked_video_path(path)  # before anything is flown
+    checked_video_path(path)  # before the flight
     flight = record_flight(policy, env_id, seed=seed, **keywords)
     save_video(flight, path, view=view, size=size, fps=fps, speed=speed, progress=progress)
     return flight
@@ -189,17 +189,16 @@ def checked_video_path(path: Path | str) -> Path:
 def write_frames(
     frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, lossless: bool = False
 ) -> None:
-    """Write pictures (height, width, 3) as a video, depending on the file name's ending.
+    """Write pictures (height, width, 3) as a video in the format of the file name's extension.
 
-    The file gets its name when it is complete: if writing is interrupted, there is none, and an
-    earlier file stays as it is.
+    The file is renamed when it is complete: an interrupted run leaves an earlier file unchanged.
 
     Args:
-        frames: The pictures, all of one size.
-        path: Path of the file; missing folders are made.
+        frames: Pictures of equal size.
+        path: Path of the file; missing folders are created.
         fps: Pictures per second.
-        lossless: WebP only: keep every pixel, which takes less space if most of the picture is at
-            rest.
+        lossless: Lossless compression (WebP only), which gives smaller files if most of the picture
+            does not change.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.stem}.part{path.suffix}")

@@ -67,10 +67,10 @@ def test_words_say_how_a_flight_ended_once_it_is_over(sides, written):
     assert f"crashed at {sides[0].end:.1f} s: collision" in written
     assert f"ended at {sides[1].end:.1f} s: time limit" in written
     assert {"trained on truth", "trained on more", f"{film.end:.1f} s"} <= set(written)
-    words = next(words for words in reversed(written) if words.startswith("filter's sigma "))
+    words = next(words for words in reversed(written) if words.startswith("filter sigma "))
     last = sides[1].flight["covariance"][-1]
     sigma = max(last[k, k] ** 0.5 for k in range(3))
-    assert words == f"filter's sigma {100.0 * sigma:.1f} cm"
+    assert words == f"filter sigma {100.0 * sigma:.1f} cm"
 
 
 def test_truth_and_estimate_have_their_colors(sides):
