@@ -126,7 +126,7 @@ def test_long_labels_break_after_commas_or_else_between_words():
     words = "estimate and standard deviation, reward for certainty"
     assert _wrapped(canvas, words, 19, 300.0) == [
         "estimate and standard deviation,",
-        "paid for being sure",
+        "reward for certainty",
     ]
     lines = _wrapped(canvas, words, 19, 150.0)
     assert " ".join(lines) == words
