@@ -197,6 +197,32 @@ def test_files_that_pages_name_exist():
             assert (ROOT / path).exists(), f"{page.name} names {path}"
 
 
+LINK = re.compile(r"(?<!\\)\]\(([^)\s]+)\)")
+REFERENCE = sorted((ROOT / "docs" / "reference").rglob("*.md"))
+
+
+def anchors(page):
+    """Anchors of a page's headings, as repositories' web pages and MyST make them."""
+    text = re.sub(
+        r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "CHANGELOG.md", *REFERENCE], ids=lambda page: page.stem
+)
+def test_links_lead_to_files_and_headings_of_the_repository(page):
+    for target in LINK.findall(BLOCK.sub("", page.read_text(encoding="utf-8"))):
+        if target.startswith(("http", "tutorials/")):
+            continue  # the site alone has tutorials
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
+
+
 def test_functions_that_the_equations_name_exist():
     text = " ".join((ROOT / "docs" / "filter-equations.md").read_text(encoding="utf-8").split())
     found = re.findall(r"((?:`\w+`(?:, | and )?)+) in `(quad_gym/[\w/]+\.py)`", text)
