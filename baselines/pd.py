@@ -86,8 +86,8 @@ class PDPolicy:
     """Proportional-derivative control of position and attitude (report section 4.2).
 
     `F = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F/|F|`, thrust `F . z`; with `b = unit(z*
-    x x*)` and `R_E = [b x z*, b, z*]^T` in body axes, e its antisymmetric part, `N = K e - Kd w + w
-    x J w`. How the thrust and the torque become an action depends on the environment's `action`:
+    x x*)`, `R_E = [b x z*, b, z*]^T` in body axes and `[e x] = R_E^T - R_E` (e is twice the vector
+    of an antisymmetric part), `N = K e - Kd w + w x J w`. How the thrust and the torque become an action depends on the environment's `action`:
 
     | `action` | what is commanded |
     |---|---|
@@ -291,7 +291,7 @@ class PDPolicy:
 
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:
-        """(n, 3) antisymmetric part of R_E, twice the rotation vector for small errors [-]."""
+        """e (n, 3) with `[e x] = R_E^T - R_E`, twice the rotation vector of small errors [-]."""
         b = np.cross(z_wanted, heading)
         b /= np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-9)
         a = np.cross(b, z_wanted)

@@ -1,4 +1,4 @@
-"""The Earth: its frames ECEF (G, WGS-84) and the local east-north-up one (I)."""
+"""Frames of the Earth: ECEF (G, WGS-84) and local east-north-up (I)."""
 
 import math
 
@@ -9,12 +9,12 @@ from quad_gym.params import checks as check
 from quad_gym.params.portable import norm
 
 WGS84_SEMI_MAJOR_AXIS = 6378137.0
-"""[m]"""
+"""Semi-major axis of the WGS-84 ellipsoid [m]."""
 WGS84_FLATTENING = 1.0 / 298.257223563
 
 
 def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
-    """Geodetic latitude, longitude and height of a point.
+    """Return the geodetic latitude, longitude and height of a point.
 
     The latitude is iterated to convergence: with N the radius of curvature in the prime vertical,
     tan(lat) = (z + e^2 N sin(lat)) / p.
@@ -33,12 +33,12 @@ def ecef_to_geodetic(r_G: ArrayLike) -> tuple[float, float, float]:
 
 
 def geodetic_to_ecef(latitude: float, longitude: float, height: float) -> NDArray[np.float64]:
-    """A point in ECEF from its geodetic coordinates: the inverse of `ecef_to_geodetic`.
+    """Return a point in ECEF from its geodetic coordinates: the inverse of `ecef_to_geodetic`.
 
     Args:
-        latitude: From the equator toward north [rad].
-        longitude: From Greenwich toward east [rad].
-        height: Above the ellipsoid [m].
+        latitude: Latitude, from the equator toward north [rad].
+        longitude: Longitude, from Greenwich toward east [rad].
+        height: Height above the ellipsoid [m].
 
     Returns:
         (3,) position in G [m].
@@ -84,7 +84,7 @@ def _geodetic(r_G: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def ecef_to_enu(r0_G: ArrayLike) -> NDArray[np.float64]:
-    """The rotation R_IG from ECEF to the east-north-up frame at a point.
+    """Return the rotation R_IG from ECEF to the east-north-up frame at a point.
 
     Its rows are the unit east, north and up vectors at the geodetic latitude and longitude of the
     point, in G; v_I = R_IG v_G.

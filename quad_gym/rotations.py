@@ -1,6 +1,6 @@
 """Attitude conversions on NumPy arrays.
 
-`R_BI` turns inertial components into body components, v_B = R_BI v_I. Euler angles are 3-1-2: yaw
+`R_BI` converts inertial components to body components, v_B = R_BI v_I. Euler angles are 3-1-2: yaw
 about z, then roll about x, then pitch about y. Quaternions are Hamilton's (w, x, y, z), body to
 inertial.
 """
@@ -28,19 +28,19 @@ def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.flo
 
 
 def _rotations() -> "type[Rotation]":
-    """SciPy's rotations. Importing them takes 0.2 s, which a flight without them does not pay."""
+    """Return SciPy's rotations. Importing them takes 0.2 s, only where they are needed."""
     from scipy.spatial.transform import Rotation
 
     return Rotation
 
 
 def _dcms(turns: "Rotation", shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """R_BI of SciPy's rotations, which turn vectors from B to I."""
+    """Return R_BI from SciPy's rotations, which rotate vectors from B to I."""
     return turns.as_matrix().transpose(0, 2, 1).reshape(*shape, 3, 3)  # type: ignore[no-any-return]
 
 
 def euler_to_dcm(e: ArrayLike) -> NDArray[np.float64]:
-    """The rotation matrix of 3-1-2 Euler angles.
+    """Convert 3-1-2 Euler angles to a rotation matrix.
 
     Args:
         e: (..., 3) roll phi, pitch theta, yaw psi [rad].
@@ -57,14 +57,14 @@ def euler_to_dcm(e: ArrayLike) -> NDArray[np.float64]:
 
 
 def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
-    """The 3-1-2 Euler angles of a rotation matrix.
+    """Convert a rotation matrix to 3-1-2 Euler angles.
 
     Args:
         R_BI: (..., 3, 3) rotation matrices.
 
     Returns:
         (..., 3) roll in [-pi/2, pi/2], pitch and yaw in [-pi, pi] [rad]; at a roll of +-pi/2, where
-        only one combination of pitch and yaw is determined, the pitch is 0.
+        only a combination of pitch and yaw is determined, the pitch is 0.
 
     Raises:
         ValueError: If `R_BI` has another shape or is not finite.
@@ -84,7 +84,7 @@ def dcm_to_euler(R_BI: ArrayLike) -> NDArray[np.float64]:
 
 
 def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
-    """The rotation matrix of a quaternion, which is normalized first.
+    """Convert a quaternion, which is normalized first, to a rotation matrix.
 
     Args:
         q: (..., 4) quaternions (w, x, y, z), not zero.
@@ -93,7 +93,7 @@ def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
         (..., 3, 3) R_BI.
 
     Raises:
-        ValueError: If `q` has another shape, is not finite, or has no direction.
+        ValueError: If `q` has another shape, is not finite, or is zero.
     """
     quaternions = _rows("q", q, (4,))
     norms = np.linalg.norm(quaternions, axis=-1, keepdims=True)
@@ -104,7 +104,7 @@ def quaternion_to_dcm(q: ArrayLike) -> NDArray[np.float64]:
 
 
 def dcm_to_quaternion(R_BI: ArrayLike) -> NDArray[np.float64]:
-    """The unit quaternion of a rotation matrix, its largest component positive.
+    """Convert a rotation matrix to a unit quaternion whose largest component is positive.
 
     Args:
         R_BI: (..., 3, 3) rotation matrices.

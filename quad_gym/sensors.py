@@ -1,4 +1,4 @@
-"""Sensors of one vehicle: each turns a true state into one measurement."""
+"""Sensors of one vehicle: each converts a true state to one measurement."""
 
 import math
 from typing import Any
@@ -39,11 +39,11 @@ class _Sensor:
 
 
 class GnssReceiver(_Sensor):
-    """GNSS: noisy position of an antenna and, with two, a noisy baseline of exact length.
+    """GNSS: noisy position of an antenna and, with two antennas, a noisy baseline of exact length.
 
     Args:
-        params: Geometry, noise, slow and constant errors; to delay measurements by `latency` is the
-            caller's.
+        params: Geometry, noise, time-correlated and constant errors. `latency` is ignored: the
+            caller has to delay measurements.
         rng: Seeds the sensor's random stream.
 
     Source: report sections 2.1 and 3.1.
@@ -60,7 +60,7 @@ class GnssReceiver(_Sensor):
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """One measurement.
+        """Take one measurement.
 
         Args:
             position: (3,) true position of the center of mass in I [m].
@@ -68,7 +68,7 @@ class GnssReceiver(_Sensor):
 
         Returns:
             (3,) primary antenna relative to the reference antenna and (3,) baseline, both in G [m];
-            NaN where there is no second antenna.
+            NaN without a second antenna.
 
         Raises:
             ValueError: If an argument has another shape or is not finite.
@@ -86,11 +86,11 @@ class GnssReceiver(_Sensor):
 
 
 class Camera(_Sensor):
-    """A pinhole camera that projects known features with pixel noise, blur and a limited range.
+    """A pinhole camera that projects known features, with pixel noise, blur and a limited range.
 
     Args:
-        params: Geometry, noise, limits and features; to delay images by `latency` is the caller's.
-            The ground that hides features is that of `WorldParams()`.
+        params: Geometry, noise, limits and features. `latency` is ignored: the caller has to delay
+            images. With `ground_hides`, the ground is at the height of `WorldParams()`.
         rng: Seeds the sensor's random stream.
 
     Source: report sections 2.2 and 3.2.
@@ -106,12 +106,12 @@ class Camera(_Sensor):
     def measure(
         self, position: ArrayLike, R_BI: ArrayLike, body_rates: ArrayLike = (0.0, 0.0, 0.0)
     ) -> NDArray[np.float64]:
-        """One image.
+        """Take one image.
 
         Args:
             position: (3,) true position of the center of mass in I [m].
             R_BI: (3, 3) true attitude.
-            body_rates: (3,) true angular rate in B, which blurs images where `exposure` is above 0
+            body_rates: (3,) true angular rate in B, which blurs images if `exposure` is above 0
                 [rad/s].
 
         Returns:
@@ -134,13 +134,13 @@ class Camera(_Sensor):
 
 
 class Imu(_Sensor):
-    """Accelerometer and gyro with white noise and Gauss-Markov biases, which drift between samples.
+    """Accelerometer and gyro with white noise and Gauss-Markov biases that drift between samples.
 
     Args:
         params: Lever arm, noise, biases, errors of scale and alignment, and vibration, which grows
             with the rotor speeds.
         rng: Seeds the sensor's random stream.
-        vehicle: The vehicle whose forces the accelerometer feels.
+        vehicle: The vehicle whose specific force the accelerometer measures.
 
     Source: report sections 2.3 and 3.3.
     """
@@ -159,12 +159,12 @@ class Imu(_Sensor):
 
     @property
     def accel_bias(self) -> NDArray[np.float64]:
-        """(3,) true accelerometer bias now [m/s^2]."""
+        """Present true accelerometer bias (3,) in B [m/s^2]."""
         return self._flight["b_a"][0].copy()
 
     @property
     def gyro_bias(self) -> NDArray[np.float64]:
-        """(3,) true gyro bias now [rad/s]."""
+        """Present true gyro bias (3,) in B [rad/s]."""
         return self._flight["b_g"][0].copy()
 
     def measure(
@@ -174,13 +174,13 @@ class Imu(_Sensor):
         *,
         since: State | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """One sample; the biases drift by one tick after it.
+        """Take one sample; the biases change by one tick after it.
 
         Args:
-            state: The true state now, see `quad_gym.vehicle.STATE_SHAPES`.
-            disturbance_I: (3,) external force in I [N]; where samples are averages, it is in the
-                change of the state already.
-            since: The true state one tick ago; needed where samples are averages, and only there.
+            state: The true state at present, see `quad_gym.vehicle.STATE_SHAPES`.
+            disturbance_I: (3,) external force in I [N]; where samples are averages, the change of
+                the state already includes it.
+            since: The true state one tick ago; required where samples are averages, and only there.
 
         Returns:
             (3,) angular rate in B [rad/s] and (3,) specific force in B [m/s^2].

@@ -21,11 +21,12 @@ STATE_SHAPES: dict[str, tuple[int, ...]] = {
     "body_rates": (3,),
     "rotor_speeds": (4,),
 }
-"""Keys and shapes of a state: [m] in I, [m/s] in I, attitude, [rad/s] in B, [rad/s]."""
+"""Keys and shapes of a state: position [m] and velocity [m/s] in I, attitude, body rates in B
+[rad/s], rotor speeds [rad/s]."""
 
 
 def checked_state(state: State, name: str = "state") -> dict[str, NDArray[np.float64]]:
-    """A copy of a state as float64 arrays; `name` is what messages call it.
+    """Return a copy of a state as float64 arrays; messages call it `name`.
 
     Raises:
         ValueError: If a key is missing or unknown, or a value has another shape or is not finite.
@@ -45,20 +46,20 @@ def state_derivative(
     params: VehicleParams,
     world: WorldParams | None = None,
 ) -> dict[str, NDArray[np.float64]]:
-    """The time derivative of a quadrotor's state.
+    """Return the time derivative of a quadrotor's state.
 
-    `dr/dt = v`, `m dv/dt = -m g e3 + z_I sum(F_i) + d - 0.5 Cd Ad rho |z_I . v| v`,
-    `dR_BI/dt = -[w x] R_BI`, `J dw/dt = N - w x J w`, `dW_i/dt = (cm ea_i - W_i) / taum`, with
-    `F_i = kF W_i^2` and `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`.
+    `dr/dt = v`, `m dv/dt = -m g e3 + z_I sum(F_i) + d - 0.5 Cd Ad rho |z_I . v| v`, `dR_BI/dt = -[w
+    x] R_BI`, `J dw/dt = N - w x J w`, `dW_i/dt = (cm ea_i - W_i) / taum`, with `F_i = kF W_i^2` and
+    `N = sum(l_i x F_i e3 - s_i kN W_i^2 e3)`.
 
     Args:
         state: position (3,) [m] and velocity (3,) [m/s] in I, R_BI (3, 3), body_rates (3,) [rad/s]
             in B, rotor_speeds (4,) [rad/s].
         voltages: (4,) motor voltages [V], between 0 and the vehicle's largest.
         disturbance_I: (3,) external force in I [N].
-        params: The vehicle.
-        world: Its steady wind, drag and ground effect act too: v is then relative to the air, and
-            the forces of `quad_gym.WorldParams` are added.
+        params: Parameters of the vehicle.
+        world: World with steady wind, drag and ground effect: v is then relative to the air, and
+            the forces of `quad_gym.WorldParams` are added. None: calm air.
 
     Returns:
         The derivative under the same keys, per second.

@@ -1,4 +1,4 @@
-"""State estimation for one vehicle: filters, their use on logs, and Wahba's problem."""
+"""State estimation for one vehicle: Kalman filters, replay of logs, and Wahba's problem."""
 
 from quad_gym.estimation.estimate import Innovations
 from quad_gym.estimation.filters import (

@@ -1,4 +1,4 @@
-"""The estimate of a filter in the memory of one flight, as its properties."""
+"""The estimate of a filter, as properties that read the memory of its flight."""
 
 from typing import Any, NamedTuple
 
@@ -14,21 +14,23 @@ from quad_gym.records import FilterStatus
 
 
 class Innovations(NamedTuple):
-    """Position, baseline, velocity, features, barometer and magnetometer of one update, in rows."""
+    """Innovations of one update: position, baseline, velocity, features, aiding sensors."""
 
     innovation: NDArray[np.float64]
-    """(n, 3) of position [m] and velocity [m/s] in I; of a direction across the predicted one,
-    horizontal and up, then NaN; of the barometer [m], then zeros; of the magnetometer in B [T]"""
+    """(n, 3) innovations: of position [m] and velocity [m/s] in I; of directions, horizontally and
+    vertically across the predicted direction, then NaN; of the barometer [m], then zeros; of the
+    magnetometer in B [T]"""
     sigma: NDArray[np.float64]
-    """(n, 3) standard deviations that the filter expected of them"""
+    """(n, 3) standard deviations of the innovations, as predicted by the filter"""
     nis: NDArray[np.float64]
-    """(n,) normalized squares, chi-square with 3, 2, 3, 2, 1 and 3 degrees of freedom"""
+    """(n,) normalized innovations squared; chi-square with 3, 2, 3, 2, 1 and 3 degrees of
+    freedom"""
     gate: NDArray[np.float64]
-    """(n,) what became of them, see `quad_gym.records.GateDecision`"""
+    """(n,) gate decisions, see `quad_gym.records.GateDecision`"""
 
 
 class Estimate:
-    """What a filter has estimated, and how sure it is."""
+    """State estimate and covariance."""
 
     sensors: SensorSuite
     _engine: Engine
@@ -40,33 +42,33 @@ class Estimate:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(3,) estimated position of the center of mass in I [m]."""
+        """Estimated position (3,) of the center of mass in I [m]."""
         return self._vector("r_hat")
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """(3,) estimated velocity in I [m/s]."""
+        """Estimated velocity (3,) in I [m/s]."""
         return self._vector("v_hat")
 
     @property
     def R_BI(self) -> NDArray[np.float64]:
-        """(3, 3) estimated attitude."""
+        """Estimated attitude (3, 3)."""
         mixed = self._mixed()
         return self._read("R_hat") if mixed is None else mixed.R_hat.copy()
 
     @property
     def accel_bias(self) -> NDArray[np.float64]:
-        """(3,) estimated accelerometer bias in B [m/s^2]."""
+        """Estimated accelerometer bias (3,) in B [m/s^2]."""
         return self._vector("b_a_hat")
 
     @property
     def gyro_bias(self) -> NDArray[np.float64]:
-        """(3,) estimated gyro bias in B [rad/s]."""
+        """Estimated gyro bias (3,) in B [rad/s]."""
         return self._vector("b_g_hat")
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """(15, 15) covariance of the errors, in the order r, v, e, b_a, b_g."""
+        """Covariance (15, 15) of the errors, in the order r, v, e, b_a, b_g."""
         mixed = self._mixed()
         if mixed is not None:
             return mixed.covariance[:15, :15].copy()
@@ -75,25 +77,27 @@ class Estimate:
 
     @property
     def heading_known(self) -> bool:
-        """Whether the heading is known well enough for one Gaussian.
+        """True if the heading is certain enough for a single Gaussian.
 
-        False after a start without any heading, until the motion has told it. Meanwhile estimate
-        and covariance are those of many filters together, one for each of many headings.
+        False after a start without any heading, until the motion has revealed it. Meanwhile,
+        estimate and covariance are the moments of a Gaussian sum: a bank of filters, one for each
+        of many headings.
         """
         self._require_start()
         return self._log_weights is None
 
     @property
     def gnss_drift(self) -> NDArray[np.float64]:
-        """(3,) estimated slow error of GNSS positions in I [m], zero for suites without one.
+        """Estimated time-correlated error (3,) of GNSS positions in I [m]; zero without drift.
 
-        It is zero at the start: positions count from where the receiver has the vehicle then.
+        It is zero at the start, because positions are relative to the position that the receiver
+        reports there.
         """
         return self._slow()[:3] * self.sensors.drifts
 
     @property
     def gnss_drift_covariance(self) -> NDArray[np.float64]:
-        """(3, 3) covariance of its error [m^2]."""
+        """Covariance (3, 3) of the estimated GNSS drift [m^2]."""
         mixed = self._mixed()
         if mixed is not None and self.sensors.drifts:
             return mixed.covariance[15:18, 15:18].copy()
@@ -102,10 +106,10 @@ class Estimate:
 
     @property
     def aid_errors(self) -> dict[str, NDArray[np.float64]]:
-        """Estimated slow errors of the suite's aiding sensors, by name.
+        """Estimated time-correlated errors of the suite's aiding sensors, by name.
 
-        "barometer": (1,) its bias [m]; "magnetometer": (4,) hard iron in B [T], then the true less
-        the believed declination [rad].
+        "barometer": (1,) bias [m]; "magnetometer": (4,) hard iron in B [T], and error of the
+        declination, true minus modeled [rad].
         """
         slow, found = self._slow(), {}
         for aid in self.sensors.aids:
@@ -118,50 +122,51 @@ class Estimate:
 
     @property
     def status(self) -> FilterStatus:
-        """What has gone wrong since the start; `FilterStatus(0)` when nothing has."""
+        """Numerical failures since the start; `FilterStatus(0)`: none."""
         return FilterStatus(int(self._of_lane("filter_status")))
 
     @property
     def diverged(self) -> bool:
         """True while innovations show that the estimate is wrong, as `filter_diverged` of flights.
 
-        Their NIS is twice its degrees of freedom or more, or they, or corrections of biases, have
-        not been white lately.
+        The NIS is twice its degrees of freedom or more, or recent innovations, or corrections of
+        biases, are not white.
         """
         return bool(self._of_lane("diverged") > 0.0)
 
     @property
     def nis(self) -> tuple[float, int]:
-        """Normalized innovation squared of the last update, and how many measurements it had.
+        """Normalized innovation squared of the last update, and its number of measurements.
 
-        Of the last by its time stamp, where measurements come late.
+        With delayed measurements, the last update is the one with the latest time stamp.
         """
         return float(self._read("nis")), int(self._read("nis_dimension"))
 
     @property
     def block_nis(self) -> NDArray[np.float64]:
-        """(n,) normalized innovation squared of the last position, baseline, velocity and features.
+        """Normalized innovations squared (n,) of the last measurements, block by block.
 
-        Then of the barometer and of the magnetometer, if there are such. In a filter that is right
-        they are chi-square with 3, 2, 3, 2, 1 and 3 degrees of freedom; NaN: not measured yet.
+        The blocks are position, baseline, velocity and features, followed by the barometer and the
+        magnetometer if the suite has them. For a consistent filter they are chi-square with 3, 2,
+        3, 2, 1 and 3 degrees of freedom; NaN: not measured yet.
         """
         return self._read("block_nis")[list(blocks_of(self.sensors))]
 
     @property
     def gate_decisions(self) -> NDArray[np.int64]:
-        """(n,) what became of each of these, see `quad_gym.records.GateDecision`."""
+        """Gate decisions (n,) in the order of `block_nis`, see `quad_gym.records.GateDecision`."""
         return self._read("gate")[list(blocks_of(self.sensors))].astype(np.int64)
 
     @property
     def last_update(self) -> Innovations:
-        """What the last call of `update` measured, also where it came late; NaN for the rest."""
+        """Innovations of the last call of `update`, also of a delayed one; NaN: not measured."""
         self._require_start()
-        if self._report is None:  # it came in time: what it told still stands in memory
+        if self._report is None:  # it came in time: its innovations are still in memory
             self._report = self._innovations(self._reported.blocks)
         return self._report
 
     def _innovations(self, measured: list[int]) -> Innovations:
-        """The innovations of some blocks, as they are in memory now."""
+        """Return the innovations of some blocks, as they are in memory now."""
         blocks = list(blocks_of(self.sensors))
         apart = np.array([block not in measured for block in blocks], bool)
         values = [
@@ -183,14 +188,14 @@ class Estimate:
         return slow
 
     def _mixed(self) -> Moments | None:
-        """Mean and covariance over all headings, as long as nobody knows it."""
+        """Return mean and covariance over all headings, as long as the heading is unknown."""
         self._require_start()
         if self._log_weights is not None and self._moments is None:
             self._moments = moments(self._engine, self._log_weights)
         return self._moments
 
     def _read(self, name: str) -> NDArray[Any]:
-        """A field of the one flight, or of that with the likeliest heading."""
+        """Return a field of the only flight, or of the flight with the likeliest heading."""
         self._require_start()
         return self._of_lane(name)
 

@@ -1,4 +1,4 @@
-"""An unscented and an extended Kalman filter for one vehicle."""
+"""Unscented and extended Kalman filters for one vehicle."""
 
 import math
 import warnings
@@ -21,13 +21,13 @@ from quad_gym.records import FilterForm, FilterStatus
 _STATE = ("r_hat", "v_hat", "R_hat", "b_a_hat", "b_g_hat")
 
 LONGEST_STEP = 1.0
-"""Of a prediction with one sample of the IMU [s], unless the suite's tick is longer."""
+"""Longest time of a prediction with one IMU sample [s], unless the suite's tick is longer."""
 
 _OF_GATES = int(FilterForm.GATE)
 
 
 class _KalmanFilter(Estimate):
-    """What the filters have in common: their interface, and all but the kind of their kernels."""
+    """Common base of the filters: everything but the kind of their kernels."""
 
     _kind: str
 
@@ -67,47 +67,51 @@ class _KalmanFilter(Estimate):
     ) -> None:
         """Start from a first fix.
 
-        With a baseline: attitude by Wahba's problem, the body z axis taken as vertical. A baseline
-        within 12 degrees of the vertical hardly tells the heading; then `heading` does, with the
-        deviation `initial_pose.heading_sigma` of the suite.
+        With a baseline, the attitude solves Wahba's problem, with the body z axis assumed vertical.
+        A baseline within 12 degrees of the vertical hardly observes the heading; `heading` then
+        provides it, with the standard deviation `initial_pose.heading_sigma` of the suite.
 
-        Without: the vehicle is taken as level, and its heading comes from the first of these that
-        is given: `heading`, `magnetometer`, or with `course` the direction of `gnss_velocity_G`. If
-        none is, the heading may be any, and the motion tells it: see `heading_known`.
+        Without a baseline, the vehicle is assumed level. Its heading comes from the first of these
+        that is given: `heading`, `magnetometer`, or, with `course`, the direction of
+        `gnss_velocity_G`. With none of them, the heading is unknown until the motion reveals it:
+        see `heading_known`.
 
-        With `accel`: roll and pitch are those of a vehicle at rest whose accelerometer measures
-        this, however tilted it stands. The heading comes from a baseline or from one of the above.
+        With `accel`, roll and pitch are computed from the specific force of a vehicle at rest,
+        however tilted it stands. The heading comes from a baseline or from one of the sources
+        above.
 
-        The covariance says how uncertain all of this is, and which errors depend on each other: a
-        tilt or hard iron turns the magnetic heading, a bias of the accelerometer tilts the start,
-        and the center of mass hangs below its antenna.
+        The initial covariance includes the correlations of these errors: a tilt error or hard iron
+        changes the magnetic heading, an accelerometer bias tilts the start, and the lever arm of
+        the antenna couples position and attitude.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m]; None: not measured.
-            heading: Of the body x axis, from east toward north [rad]; None: not known. The filter
-                of a steep baseline then takes it for anything, and as it linearizes, it may be
-                lost.
-            heading_sigma: Its deviation, or with `course` that of the body x axis from the course
-                [rad]; None: `initial_pose.heading_sigma`.
+            heading: Heading of the body x axis, from east toward north [rad]; None: unknown. With a
+                steep baseline and no heading, the initial heading is arbitrary, and the filter may
+                diverge.
+            heading_sigma: Standard deviation of `heading`, or, with `course`, of the angle between
+                the body x axis and the course [rad]; None: `initial_pose.heading_sigma`.
             magnetometer: (3,) magnetic field in B [T], for suites with a magnetometer.
-            magnetometer_sigma: Its white noise per axis [T]; None: as the suite says.
+            magnetometer_sigma: Standard deviation of its white noise, per axis [T]; None: the
+                suite's value.
             gnss_velocity_G: (3,) velocity in G [m/s]; None: at rest.
-            course: Whether the vehicle flies nose first.
-            gnss_sigma: Noise of the position, as of `update`; None: as the suite says.
-            velocity_sigma: Noise of the velocity per axis [m/s]; None: as the suite says.
-            tilt_sigma: Deviation of roll and pitch of a level start [rad]; None:
+            course: True: the vehicle flies nose first.
+            gnss_sigma: Noise of the position, as in `update`; None: the suite's value.
+            velocity_sigma: Standard deviation of the velocity, per axis [m/s]; None: the suite's
+                value.
+            tilt_sigma: Standard deviation of roll and pitch of a level start [rad]; None:
                 `FilterParams.initial_tilt_sigma`, or else LEVEL_SIGMA.
-            accel: (3,) specific force at rest in B, best the mean of many samples [m/s^2]; None:
-                the vehicle is taken as level.
-            accel_sigma: Its white noise per axis [m/s^2]; None: that of one sample. The bias counts
-                besides.
-            time: Time stamp of the start [s]; others count from the same zero.
+            accel: (3,) specific force at rest in B, preferably the mean of many samples [m/s^2];
+                None: the vehicle is assumed level.
+            accel_sigma: Standard deviation of the white noise of `accel`, per axis [m/s^2]; None:
+                the noise of one sample. The bias is accounted for separately.
+            time: Time stamp of the start [s]; all time stamps share its zero.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the position is farther
-                than FARTHEST_FIX from the reference antenna, the baseline is zero, or arguments do
-                not belong together; or the suite lacks a sensor.
+                than FARTHEST_FIX from the reference antenna, the baseline is zero, arguments
+                contradict each other, or the suite lacks a sensor.
         """
         fix = checked_fix(
             self.sensors,
@@ -147,17 +151,18 @@ class _KalmanFilter(Estimate):
         """Start from a given estimate.
 
         Args:
-            position: (3,) in I [m].
-            velocity: (3,) in I [m/s].
-            R_BI: (3, 3) attitude, a rotation.
-            accel_bias: (3,) in B [m/s^2].
-            gyro_bias: (3,) in B [rad/s].
-            covariance: (15, 15) in the order r, v, e, b_a, b_g; symmetric positive definite.
+            position: (3,) position in I [m].
+            velocity: (3,) velocity in I [m/s].
+            R_BI: (3, 3) attitude, a rotation matrix.
+            accel_bias: (3,) accelerometer bias in B [m/s^2].
+            gyro_bias: (3,) gyro bias in B [rad/s].
+            covariance: (15, 15) covariance in the order r, v, e, b_a, b_g; symmetric positive
+                definite.
             time: Time stamp of the start [s].
 
         Raises:
-            ValueError: If an argument has another shape, is not finite, R_BI is no rotation, or the
-                covariance is not symmetric positive definite.
+            ValueError: If an argument has another shape or is not finite, `R_BI` is not a rotation
+                matrix, or the covariance is not symmetric positive definite.
         """
         rotation = check.array("R_BI", R_BI, (3, 3))
         if abs(rotation @ rotation.T - np.eye(3)).max() > 1e-9 or np.linalg.det(rotation) < 0.0:
@@ -178,20 +183,20 @@ class _KalmanFilter(Estimate):
         )
         begin = check.number("time", time)
         self._begin(begin)
-        self._engine.start(np.zeros(3))  # what it remembers begins anew; the estimate is given
+        self._engine.start(np.zeros(3))  # all memory is cleared; the estimate is given
         for name, value in zip((*_STATE, "L"), (*values, L), strict=True):
             self._engine.fill(name, value)
         self._running = True
 
     def predict(self, gyro: ArrayLike, accel: ArrayLike, dt: float | None = None) -> None:
-        """Carry the estimate over one tick, or another time.
+        """Propagate the estimate over one tick, or another time.
 
         Args:
-            gyro: (3,) angular rate measured at the start of the time, or its mean over it (see
-                `ImuParams.samples`), in B [rad/s].
-            accel: (3,) specific force, likewise, in B [m/s^2].
-            dt: The time, at most LONGEST_STEP [s]; None: a tick of the suite's IMU. The white noise
-                of a sample over another time is that of the same density.
+            gyro: (3,) angular rate in B, measured at the start of the time or averaged over it (see
+                `ImuParams.samples`) [rad/s].
+            accel: (3,) specific force in B, measured or averaged in the same way [m/s^2].
+            dt: The time, at most LONGEST_STEP [s]; None: one tick of the suite's IMU. The noise
+                density is the same for all times.
 
         Raises:
             ValueError: If an argument has another shape or is not finite, or `dt` is not positive
@@ -220,29 +225,31 @@ class _KalmanFilter(Estimate):
         time: float | None = None,
         **others: Any,
     ) -> None:
-        """Condition the estimate on measurements of one instant; None: not measured.
+        """Update the estimate with measurements of one instant; None: not measured.
 
-        What comes late is included as if it had come in time, see `quad_gym.estimation.history`.
+        Delayed measurements are processed at their time stamps, see `quad_gym.estimation.history`.
 
         Args:
             gnss_position_G: (3,) primary antenna relative to the reference antenna, in G [m].
             gnss_baseline_G: (3,) primary to secondary antenna, in G [m].
-            pixels: (n_features, 2) feature projections [pixels]; a row with a NaN is a feature not
-                seen.
+            pixels: (n_features, 2) image coordinates of the features [pixels]; a row with a NaN is
+                a feature that was not detected.
             gnss_velocity_G: (3,) velocity of the primary antenna, in G [m/s]; for suites whose GNSS
-                measures it. Its lever arm is turned with the last `gyro` predicted with.
-            time: Their time stamp [s], from `oldest_time` to `time` of the filter; None: now.
-            others: What aiding sensors measure that the suite has: `barometer`, the height in I by
-                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T]. And noise in
-                place of the suite's, per axis: `gnss_sigma`, a number, three (east, north, up), or
-                a (3, 3) covariance in I, with which the position is processed by itself [m, m^2];
-                `velocity_sigma` [m/s], `baseline_sigma` [rad], `pixel_sigma` [pixels],
-                `barometer_sigma` [m], `magnetometer_sigma` [T].
+                measures it. The velocity of the lever arm is computed with the last `gyro` of
+                `predict`.
+            time: Time stamp of the measurements [s], from `oldest_time` to the filter's `time`;
+                None: the filter's `time`.
+            others: Measurements of aiding sensors in the suite: `barometer`, the height in I from
+                static pressure [m]; `magnetometer`, (3,) the magnetic field in B [T]. Also
+                standard deviations that replace the suite's, per axis: `gnss_sigma`, a number,
+                three numbers (east, north, up) or a (3, 3) covariance in I, with which the position
+                is processed separately [m, m^2]; `velocity_sigma` [m/s], `baseline_sigma` [rad],
+                `pixel_sigma` [pixels], `barometer_sigma` [m], `magnetometer_sigma` [T].
 
         Raises:
             ValueError: If an argument has another shape or is not finite, the suite lacks the
-                sensor whose measurement is given, or the time stamp is older than the window or
-                later than the last prediction; the estimate is unchanged then.
+                sensor of a measurement, or the time stamp is older than the window or later than
+                the last prediction; the estimate is unchanged then.
             RuntimeError: Before `initialize` or `set_state`.
         """
         self._require_start()
@@ -261,8 +268,8 @@ class _KalmanFilter(Estimate):
             self._report, self._reported = None, measurement
         elif stamp < self.oldest_time - SAME_TIME:
             raise ValueError(
-                f"time must be at least {self.oldest_time:.6f} s, as the filter remembers "
-                f"{self._history.window:g} s (window=) and what came since its start, got "
+                f"time must be at least {self.oldest_time:.6f} s, as the filter keeps "
+                f"{self._history.window:g} s of data (window=) since its start, got "
                 f"{stamp:.6f} s"
             )
         else:
@@ -277,13 +284,13 @@ class _KalmanFilter(Estimate):
 
     @property
     def oldest_time(self) -> float:
-        """The oldest time stamp of a measurement that `update` still takes [s]."""
+        """Oldest time stamp of a measurement that `update` accepts [s]."""
         return self._history.oldest
 
     # ---- memory -------------------------------------------------------------------------------
 
     def _begin(self, time: float, flights: int = 1) -> None:
-        """Forget everything, and make room for flights."""
+        """Clear all memory, and make room for flights."""
         self._log_weights, self._moments = None, None
         self._gyro, self._report, self._reported = None, None, Measurement()
         self._choose_form()
@@ -292,7 +299,7 @@ class _KalmanFilter(Estimate):
         self._history.begin(time)
 
     def _apply(self, given: Sample | Measurement) -> None:
-        """Give the filter a sample or a measurement."""
+        """Process a sample or a measurement."""
         self._moments, whole = None, given
         if isinstance(given, Sample):
             self._engine.predict(given)
@@ -308,7 +315,7 @@ class _KalmanFilter(Estimate):
             self._report = self._innovations(whole.blocks)
 
     def _condition(self, measurement: Measurement) -> None:
-        """Condition the estimate, or those for each heading, until one of them is left."""
+        """Update the estimate, or the bank of filters until a single one is left."""
         if self._log_weights is None:
             self._engine.update(measurement)
             return
@@ -329,7 +336,7 @@ class _KalmanFilter(Estimate):
         self._choose_form()
 
     def _choose_form(self) -> None:
-        """Gate only where one flight is estimated: what is unlikely of a heading weighs it."""
+        """Use the gate only with a single flight: unlikely innovations weigh headings."""
         form = int(self._engine.form)
         if self._log_weights is not None:
             form &= ~_OF_GATES
@@ -339,7 +346,7 @@ class _KalmanFilter(Estimate):
         return int(self._of_lane("filter_status"))
 
     def _warn_of_news(self, before: int) -> None:
-        """Warn of what has gone wrong since."""
+        """Warn of new failures."""
         bits = self._status_bits() & ~before
         if bits:
             news = FilterStatus(bits)
@@ -351,10 +358,10 @@ class _KalmanFilter(Estimate):
 class UnscentedKalmanFilter(_KalmanFilter):
     """The report's UKF for one vehicle: position, velocity, attitude and IMU biases.
 
-    One cycle is: `update` with what was measured at t_k, read the estimate, then `predict` to t_k+1
-    with the IMU sample of that tick. The measurement model is that of the report's section 3.4,
+    One cycle is: `update` with the measurements at t_k, read the estimate, then `predict` to t_k+1
+    with the IMU sample of that tick. The measurement model is the one in the report's section 3.4,
     with antenna position, baseline direction and feature directions; any of them may be missing at
-    any time. `FilterParams` tells where the filter may differ from the report's.
+    any time. `FilterParams` lists the options in which the filter may differ from the report's.
 
     Samples may come at any time, and measurements late, with their time stamps and their own noise:
     see `predict` and `update`. `quad_gym.estimation.replay` filters a log.
@@ -363,35 +370,35 @@ class UnscentedKalmanFilter(_KalmanFilter):
     the estimate as it was, sets `status`, and warns.
 
     Args:
-        sensors: The sensor suite whose geometry and noise the filter believes in.
-        window: How late measurements may come that carry their time stamp [s]; 0: none may, and
-            nothing is kept for them.
+        sensors: The sensor suite whose geometry and noise the filter assumes.
+        window: Longest delay of measurements with a time stamp [s]; 0: no delays, and no data are
+            kept for them.
 
     Raises:
-        ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
-            for something else, see `SensorSuite.require_filter`.
+        ValueError: If `sensors` is not a sensor suite, or its filter misinterprets the IMU samples,
+            see `SensorSuite.require_filter`.
     """
 
     _kind = "ukf"
 
 
 class ExtendedKalmanFilter(_KalmanFilter):
-    """An error-state EKF for one vehicle: the state, models, noise and use of the UKF.
+    """An error-state EKF for one vehicle, with the state, models, noise and interface of the UKF.
 
     Its covariance follows from analytic derivatives of the models at the estimate, which cost less
-    than sigma points and leave out the second order; see `quad_gym.kernels.filter.ekf`.
+    than sigma points and neglect the second order; see `quad_gym.kernels.filter.ekf`.
 
     Args:
-        sensors: The sensor suite whose geometry and noise the filter believes in.
-        window: How late measurements may come that carry their time stamp [s]; 0: none may, and
-            nothing is kept for them.
+        sensors: The sensor suite whose geometry and noise the filter assumes.
+        window: Longest delay of measurements with a time stamp [s]; 0: no delays, and no data are
+            kept for them.
 
     Raises:
-        ValueError: If `sensors` is not a sensor suite, or its filter takes the samples of the IMU
-            for something else, see `SensorSuite.require_filter`.
+        ValueError: If `sensors` is not a sensor suite, or its filter misinterprets the IMU samples,
+            see `SensorSuite.require_filter`.
 
-    Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about
-    an estimated attitude.
+    Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for error angles about an
+    estimated attitude.
     """
 
     _kind = "ekf"

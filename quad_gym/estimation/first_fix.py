@@ -29,7 +29,7 @@ from quad_gym.params.sensors import SensorSuite
 from quad_gym.records import Aid
 
 FARTHEST_FIX = 1e6
-"""From the reference antenna [m]; positions from the center of the Earth are farther."""
+"""Largest distance of a fix from the reference antenna [m]; the center of the Earth is farther."""
 
 LEAST_COURSE = 5.0
 """Speed over its deviation from which a course tells the heading."""

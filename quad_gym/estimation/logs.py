@@ -1,9 +1,9 @@
-"""Logs: what sensors measured in a flight, and the columns of tables that hold it.
+"""Logs: measurements of a flight, and the columns of tables that hold them.
 
-A table has a row per sample or measurement, or several in one row where they have the same time
-stamp. What a row does not hold is NaN, or empty in a file. Rows are in the order in which they
-arrived, unless a column `received` tells when they did: a row whose `time` is earlier than that of
-the IMU sample above it has come late.
+A table has a row per sample or measurement; measurements with the same time stamp may share a row.
+Missing values are NaN, or empty cells in a file. Rows are in the order of arrival, unless a column
+`received` has the times of arrival: a row with an earlier `time` than the IMU sample above it was
+delayed.
 """
 
 from dataclasses import dataclass, field
@@ -19,9 +19,13 @@ class LogColumn(NamedTuple):
     """Columns of a log, one for each number of a quantity."""
 
     names: tuple[str, ...]
+    """names of the columns"""
     unit: str
+    """unit of the numbers"""
     frame: str
+    """frame of the numbers; "-": none"""
     meaning: str
+    """description of the quantity"""
 
 
 def _xyz(name: str) -> tuple[str, ...]:
@@ -34,39 +38,40 @@ def _enu(name: str) -> tuple[str, ...]:
 
 # fmt: off
 LOG_COLUMNS = {
-    "time": LogColumn(("time",), "s", "-", "when it was measured; of a mean, the end of its time"),
-    "received": LogColumn(("received",), "s", "-", "when it arrived; else rows stand so"),
+    "time": LogColumn(("time",), "s", "-", "time stamp; of a mean, the end of its interval"),
+    "received": LogColumn(("received",), "s", "-", "time of arrival; default: the order of rows"),
     "gyro": LogColumn(_xyz("gyro"), "rad/s", "B", "angular rate"),
     "accel": LogColumn(_xyz("accel"), "m/s^2", "B", "specific force, about +9.8 upward at rest"),
     "gnss": LogColumn(_xyz("gnss"), "m", "ECEF", "primary antenna, from the center of the Earth"),
-    "gnss_lla": LogColumn(("gnss_lat", "gnss_lon", "gnss_alt"), "deg, m", "WGS-84", "the same"),
-    "gnss_enu": LogColumn(_enu("gnss"), "m", "I", "the same from the origin"),
-    "gnss_sigma": LogColumn(_enu("gnss_sigma"), "m", "I", "its deviations as reported"),
-    "gnss_velocity": LogColumn(_xyz("gnss_velocity"), "m/s", "ECEF", "of the antenna"),
-    "gnss_velocity_enu": LogColumn(_enu("gnss_velocity"), "m/s", "I", "the same"),
-    "gnss_velocity_sigma": LogColumn(("gnss_velocity_sigma",), "m/s", "-", "per axis"),
+    "gnss_lla": LogColumn(("gnss_lat", "gnss_lon", "gnss_alt"), "deg, m", "WGS-84", "as `gnss`"),
+    "gnss_enu": LogColumn(_enu("gnss"), "m", "I", "primary antenna, from the origin"),
+    "gnss_sigma": LogColumn(_enu("gnss_sigma"), "m", "I", "reported position sigma"),
+    "gnss_velocity": LogColumn(_xyz("gnss_velocity"), "m/s", "ECEF", "primary antenna"),
+    "gnss_velocity_enu": LogColumn(_enu("gnss_velocity"), "m/s", "I", "primary antenna"),
+    "gnss_velocity_sigma": LogColumn(("gnss_velocity_sigma",), "m/s", "-", "reported sigma"),
     "gnss_baseline": LogColumn(_xyz("gnss_baseline"), "m", "ECEF", "primary to secondary antenna"),
-    "gnss_baseline_enu": LogColumn(_enu("gnss_baseline"), "m", "I", "the same"),
+    "gnss_baseline_enu": LogColumn(_enu("gnss_baseline"), "m", "I", "between the antennas"),
     "barometer": LogColumn(("barometer",), "m", "I", "height by static pressure"),
     "magnetometer": LogColumn(_xyz("magnetometer"), "T", "B", "magnetic field"),
 }
 # fmt: on
-"""Columns of a table, by the names under which a dictionary may hold their numbers together.
+"""Columns of a table, by the keys under which a dictionary may hold their numbers together.
 
-Those of the camera, `pixel_0_u`, `pixel_0_v`, `pixel_1_u` and so on [pixels from the image's
-center], or together `pixels` (n, features, 2), are not among them."""
+The camera has further columns: `pixel_0_u`, `pixel_0_v`, `pixel_1_u` and so on [pixels from the
+image's center], or together `pixels` (n, features, 2).
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """What one sensor measured."""
+    """Measurements of one sensor."""
 
     time: Floats
     """(n,) time stamps [s]"""
     received: Floats
-    """(n,) when it arrived [s]"""
+    """(n,) times of arrival [s]"""
     values: dict[str, Floats]
-    """(n, ...) by name"""
+    """measurements (n, ...) by name"""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -74,26 +79,27 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """What sensors measured in a flight, each at its own times.
+    """Measurements of the sensors in a flight, each sensor at its own times.
 
-    Bodies are as in this package: x forward, y left, z up; I is east, north, up.
+    Frames are the package's: B with x forward, y left, z up; I with east, north, up.
     """
 
     imu: Stream
-    """gyro and accel, (n, 3) each"""
+    """IMU samples: gyro [rad/s] and accel [m/s^2], (n, 3) each, in B"""
     gnss: Stream | None = None
-    """position_G (n, 3) from the center of the Earth, or position_I from the origin; velocity_G or
-    velocity_I; baseline_G or baseline_I; position_sigma_I (n, 3); velocity_sigma (n,)"""
+    """GNSS measurements: position_G (n, 3) from the center of the Earth, or position_I from the
+    origin [m]; velocity_G or velocity_I [m/s]; baseline_G or baseline_I [m]; reported standard
+    deviations position_sigma_I (n, 3) [m] and velocity_sigma (n,) [m/s]"""
     camera: Stream | None = None
-    """pixels (n, features, 2)"""
+    """images: pixels (n, features, 2) from the image's center"""
     barometer: Stream | None = None
-    """barometer (n,)"""
+    """heights: barometer (n,) in I [m]"""
     magnetometer: Stream | None = None
-    """magnetometer (n, 3)"""
+    """magnetic fields: magnetometer (n, 3) in B [T]"""
     barometer_from_start: bool = False
-    """whether heights by pressure count from another level, so that only their changes tell"""
+    """True: heights from pressure refer to another level, so that only their changes are used"""
     about: dict[str, Any] = field(default_factory=dict)
-    """what else is worth knowing, such as where it comes from"""
+    """additional information, such as the source of the log"""
 
     def __post_init__(self) -> None:
         if len(self.imu) < 2:
@@ -111,15 +117,15 @@ class Log:
 
     @property
     def streams(self) -> dict[str, Stream]:
-        """Those of all sensors that measured something, by name."""
+        """Streams of all sensors with measurements, by name."""
         names = ("imu", "gnss", "camera", "barometer", "magnetometer")
         found = {name: getattr(self, name) for name in names}
         return {name: s for name, s in found.items() if s is not None and len(s)}
 
     def origin(self, near_G: Floats | None, within: float = 1e5) -> Floats | None:
-        """The origin of I in ECEF: `near_G` if the first fix is close to it, else that fix.
+        """Return the origin of I in ECEF: `near_G` if the first fix is close to it, else that fix.
 
-        None, and so `near_G`, where no position counts from the center of the Earth.
+        None, which also means `near_G`, if no position is relative to the center of the Earth.
         """
         if self.gnss is None or "position_G" not in self.gnss.values:
             return None

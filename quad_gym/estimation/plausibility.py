@@ -22,9 +22,9 @@ FORCE_CAUSES = (
     (500.0, "unit or scale of the accelerometer?"),
     (math.inf, "accelerometer in milli-g or cm/s^2?"),
 )
-"""Likely causes of another one, each up to a mean specific force [m/s^2]."""
+"""Likely causes of other values, each up to a mean specific force [m/s^2]."""
 MOST_RATE = 35.0
-"""Angular rate that gyros measure [rad/s]: 2000 deg/s."""
+"""Largest angular rate that gyros measure [rad/s]: 2000 deg/s."""
 MOST_MEAN_RATE = 10.0
 """Mean angular rate of a vehicle over a log [rad/s]: one and a half turns per second."""
 MOST_FIELD = 5.0
@@ -62,13 +62,13 @@ class MisfitError(ValueError):
 
 
 def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tuple[str, ...]:
-    """Sentences on a log whose units or axes are implausible, or which a suite does not describe.
+    """Return sentences on implausible units and axes of a log, and on a suite that does not fit.
 
     Args:
         log: The log that was replayed.
-        body: Axes that it was read with, see `read_log`.
-        suite: Assumed by the filter.
-        result: Of the replay.
+        body: Axes with which it was read, see `read_log`.
+        suite: The suite that the filter assumed.
+        result: The result of the replay.
     """
     gyro, accel = (log.imu.values[name] for name in ("gyro", "accel"))
     found = [*_force(accel, body), *_rates(gyro), *_aids(log, suite)]
@@ -86,7 +86,7 @@ def problems_of(log: Log, body: str, suite: SensorSuite, result: Replay) -> tupl
 
 
 def nothing_in_common(unused: tuple[str, ...]) -> str:
-    """Say that a suite has none of the sensors of a log."""
+    """Return a sentence on a suite that has none of the sensors of a log."""
     return f"this suite uses no measurement of this log, which has {', '.join(unused)}"
 
 

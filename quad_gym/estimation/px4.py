@@ -1,19 +1,19 @@
-"""Logs of PX4: what its file format ULog holds of the sensors, in the frames of this package.
+"""Logs of PX4: sensor data of its file format ULog, in the frames of this package.
 
 PX4's body is FRD (x forward, y right, z down) and its world NED (north, east, down); a body here is
 FLU (x forward, y left, z up) and the world ENU (east, north, up):
 
     (x, y, z)_FLU = (x, -y, -z)_FRD,    (e, n, u)_ENU = (e, n, -d) of (n, e, d)_NED
 
-| topic | what is taken |
+| topic | contents used |
 |---|---|
 | `sensor_combined` | gyro and accelerometer: means over the time before `timestamp` |
-| `vehicle_gps_position`, or `sensor_gps` | position, velocity, and the accuracy that it reports |
-| `vehicle_air_data` | height by static pressure; it counts from another level |
+| `vehicle_gps_position`, or `sensor_gps` | position, velocity, and their reported accuracy |
+| `vehicle_air_data` | height from static pressure, relative to another level |
 | `vehicle_magnetometer`, or `sensor_mag` | magnetic field [gauss] |
 
-A sample's `timestamp_sample` is its time stamp, and `timestamp` when it arrived. A GNSS receiver
-that reports no time of its own is taken to be late by PX4's parameter EKF2_GPS_DELAY, or 0.11 s.
+A sample's `timestamp_sample` is its time stamp, and `timestamp` its time of arrival. For a GNSS
+receiver without time stamps, the delay is PX4's parameter EKF2_GPS_DELAY, or 0.11 s.
 
 Source: the PX4 user guide, "ULog File Format" and the definitions of these messages.
 """
@@ -27,24 +27,24 @@ from quad_gym.estimation.logs import Floats, Log, Stream
 from quad_gym.frames import geodetic_to_ecef
 
 GNSS_DELAY = 0.11
-"""Of receivers, where a log does not say it [s]: PX4's default of EKF2_GPS_DELAY."""
+"""Delay of receivers if the log does not contain it [s]: PX4's default."""
 
 LEAST_FIX = 3
-"""`fix_type` from which a position is three-dimensional."""
+"""Smallest `fix_type` of a three-dimensional position."""
 
 _GAUSS = 1e-4  # [T]
 _TO_FLU = np.array([1.0, -1.0, -1.0])
 
 
 def read_ulog(path: Path | str) -> Log:
-    """A log of PX4, as its file has it.
+    """Read a log of PX4.
 
     Args:
-        path: Of a `.ulg` file.
+        path: Path of a `.ulg` file.
 
     Raises:
         ImportError: If pyulog is not installed.
-        ValueError: If the file is no ULog, is damaged, or has no samples of the IMU.
+        ValueError: If the file is not a ULog, is damaged, or has no IMU samples.
         OSError: If there is no such file.
     """
     try:
@@ -89,7 +89,7 @@ def _one_of(topics: dict[str, dict[str, Any]], *names: str) -> dict[str, Any] | 
 
 
 def _times(topic: dict[str, Any], delay: float = 0.0) -> tuple[Floats, Floats]:
-    """When samples were taken and arrived [s]; `delay`: where only the latter is known."""
+    """Return times of measurement and arrival [s]; `delay` if only the latter is known."""
     received = 1e-6 * np.asarray(topic["timestamp"], np.float64)
     taken = received - delay
     if "timestamp_sample" in topic:
@@ -99,12 +99,12 @@ def _times(topic: dict[str, Any], delay: float = 0.0) -> tuple[Floats, Floats]:
 
 
 def _triples(topic: dict[str, Any], name: str) -> Floats:
-    """(n, 3) of an array of three."""
+    """Return an array (n, 3) of a field of three numbers."""
     return np.column_stack([np.asarray(topic[f"{name}[{i}]"], np.float64) for i in range(3)])
 
 
 def _imu(topic: dict[str, Any]) -> Stream:
-    """Samples of the IMU; those that are not numbers, or come a second time, left out."""
+    """Return IMU samples, without those that are not finite or have a repeated time."""
     time, received = _times(topic)
     gyro = _triples(topic, "gyro_rad") * _TO_FLU
     accel = _triples(topic, "accelerometer_m_s2") * _TO_FLU
@@ -114,7 +114,7 @@ def _imu(topic: dict[str, Any]) -> Stream:
 
 
 def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
-    """Positions and velocities, where there is a fix; NaN: not reported."""
+    """Return positions and velocities with a fix; NaN: not reported."""
     if topic is None:
         return None
     time, received = _times(topic, delay)
@@ -143,12 +143,12 @@ def _gnss(topic: dict[str, Any] | None, delay: float) -> Stream | None:
 
 
 def _positive(values: Floats) -> Floats:
-    """Deviations that say something; NaN for the rest."""
+    """Return valid standard deviations; NaN for the rest."""
     return np.where(np.isfinite(values) & (values > 0.0), values, np.nan)
 
 
 def _barometer(topic: dict[str, Any] | None) -> Stream | None:
-    """Heights by pressure."""
+    """Return heights from pressure."""
     if topic is None:
         return None
     time, received = _times(topic)
@@ -156,7 +156,7 @@ def _barometer(topic: dict[str, Any] | None) -> Stream | None:
 
 
 def _magnetometer(topic: dict[str, Any] | None) -> Stream | None:
-    """Magnetic fields."""
+    """Return magnetic fields."""
     if topic is None:
         return None
     time, received = _times(topic)

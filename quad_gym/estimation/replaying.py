@@ -1,4 +1,4 @@
-"""Replay: a filter processes a log as it would have processed the flight."""
+"""Replay: a filter processes a log in the same way as in flight."""
 
 import inspect
 from collections.abc import Mapping
@@ -29,33 +29,33 @@ def replay(
 ) -> Replay:
     """Filter a log.
 
-    The filter starts from the first fix: with its baseline, or else with what `start` says of the
-    heading, or else with the magnetometer, or else with any heading.
+    The filter starts from the first fix. The initial heading comes from the first available of: its
+    baseline, `start`, the magnetometer; without any of these it is unknown.
 
-    Look at `problems` of the result before its estimates: it has a sentence for each sensor that
-    the suite does not describe, and for implausible units and axes.
+    Check `problems` of the result before you use its estimates: it has a sentence for each sensor
+    that the suite does not describe, and for implausible units and axes.
 
-    I has its origin at the suite's reference antenna if the first fix is within 100 km of it, and
-    else at the first fix.
+    The origin of I is the suite's reference antenna if the first fix is within 100 km of it, and
+    the first fix otherwise.
 
     Args:
-        log: A table or a file, see `quad_gym.estimation.read_log`, or what that returns.
-        sensors: The suite that the filter believes in, or its name. Its rates and latencies do not
-            count: the log has its own.
+        log: A table or a file, see `quad_gym.estimation.read_log`, or its result.
+        sensors: The suite that the filter assumes, or its name. Its rates and latencies are
+            ignored: the log has its own.
         estimator: "ukf" or "ekf".
         start: Keywords of `initialize`, such as `{"heading": 0.5}` or `{"course": True}`. Without
-            GNSS: `{"position": (0, 0, 0), "heading": 0.0}` of a level vehicle at rest, with the
+            GNSS: `{"position": (0, 0, 0), "heading": 0.0}` for a level vehicle at rest, with the
             errors of the suite's `initial_pose`, or all keywords of `set_state`; each with `time`,
-            or from the first sample on.
-        reported_noise: Whether what the receiver reports of its accuracy counts, where the log has
-            it, in place of the suite's numbers.
-        window: How late measurements may come [s].
+            by default the first sample's.
+        reported_noise: True: use the accuracy that the receiver reports, if the log has it, in
+            place of the suite's.
+        window: Longest delay of measurements [s].
         body: Axes of a table, see `read_log`.
 
     Raises:
-        ValueError: If the log or an argument is not as it should be, the log has no fix to start
-            from, images have other features than the suite, or the samples of the IMU have a gap of
-            more than LONGEST_STEP.
+        ValueError: If the log or an argument is invalid, the log has no fix to start from, images
+            have other features than the suite, or the IMU samples have a gap longer than
+            LONGEST_STEP.
     """
     check.choice("estimator", estimator, tuple(ESTIMATORS))
     check.flag("reported_noise", reported_noise)

@@ -19,75 +19,79 @@ class Measured:
     time: Floats
     """(m,) time stamps [s]"""
     received: Floats
-    """(m,) when they arrived [s]"""
+    """(m,) times of arrival [s]"""
     innovation: Floats
-    """(m, d); of positions and velocities in I, of directions across the predicted one"""
+    """(m, d) innovations; of positions and velocities in I, of directions across the predicted
+    one"""
     sigma: Floats
-    """(m, d) what the filter expected of them"""
+    """(m, d) standard deviations of the innovations, as predicted by the filter"""
     nis: Floats
-    """(m,) normalized squares, chi-square with d degrees of freedom in a filter that is right"""
+    """(m,) normalized innovations squared; chi-square with d degrees of freedom for a consistent
+    filter"""
     gate: Floats
-    """(m,) what became of them, see `quad_gym.records.GateDecision`"""
+    """(m,) gate decisions, see `quad_gym.records.GateDecision`"""
 
     @property
     def gated(self) -> Any:
-        """(m,) whether they were left out, beyond the gate or as the estimate was too uncertain."""
+        """Measurements (m,) that were left out: rejected, or with a too uncertain prediction."""
         return self.rejected | (self.gate == GateDecision.UNSURE)
 
     @property
     def rejected(self) -> Any:
-        """(m,) True where they were beyond the gate."""
+        """Measurements (m,) with innovations beyond the gate."""
         return self.gate == GateDecision.REJECTED
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """What a filter has made of a log, at each sample of the IMU since its start.
+    """Filter output for a log, at each IMU sample since the start of the filter.
 
-    Each row holds what was known when the next sample came: measurements count from when they had
-    arrived, not from their time stamps on.
+    Each row holds the estimate at the arrival of the next sample: measurements contribute from
+    their arrival on, not from their time stamps on.
     """
 
     estimator: str
-    """"ukf" or "ekf\""""
+    """kind of the filter: "ukf" or "ekf\""""
     sensors: SensorSuite
-    """what the filter believed in; `gnss.reference_antenna_G` is the origin of I"""
+    """sensor suite that the filter assumed; `gnss.reference_antenna_G` is the origin of I"""
     time: Floats
-    """(n,) of the samples [s]"""
+    """(n,) times of the samples [s]"""
     position: Floats
-    """(n, 3) in I [m]"""
+    """(n, 3) estimated position in I [m]"""
     velocity: Floats
-    """(n, 3) in I [m/s]"""
+    """(n, 3) estimated velocity in I [m/s]"""
     quaternion: Floats
-    """(n, 4) unit quaternions (w, x, y, z), body to inertial"""
+    """(n, 4) estimated attitude: unit quaternions (w, x, y, z), body to inertial"""
     accel_bias: Floats
-    """(n, 3) in B [m/s^2]"""
+    """(n, 3) estimated accelerometer bias in B [m/s^2]"""
     gyro_bias: Floats
-    """(n, 3) in B [rad/s]"""
+    """(n, 3) estimated gyro bias in B [rad/s]"""
     sigma: Floats
-    """(n, 15) standard deviations of the errors: position, velocity, error angles, biases"""
+    """(n, 15) standard deviations of position, velocity, error angles, accelerometer and gyro
+    bias"""
     heading_known: Any
-    """(n,) whether the motion, or something else, had told the heading"""
+    """(n,) True where the heading was known, from a measurement or from the motion"""
     diverged: Any
-    """(n,) True where the innovations showed that the estimate was wrong: the filter diverged"""
+    """(n,) True where the innovations showed that the filter had diverged"""
     status: FilterStatus
-    """failures of its arithmetic; 0 does not mean that the suite fits the log, see `problems`"""
+    """numerical failures; 0 does not imply that the suite fits the log, see `problems`"""
     measured: dict[str, Measured]
-    """by "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0", ..., "barometer" and
-    "magnetometer\""""
+    """innovations by measurement: "gnss_position", "gnss_baseline", "gnss_velocity", "feature_0",
+    ..., "barometer" and "magnetometer\""""
     too_late: int
-    """measurements older than the window when they arrived, and so left out"""
+    """number of measurements that were older than the window at their arrival, and were left out"""
     unused: tuple[str, ...]
-    """sensors of the log that the suite does not have"""
+    """sensors of the log that the suite does not use"""
     problems: tuple[str, ...] = ()
-    """sentences on implausible units and axes of the log, on a filter that diverged or failed, and
-    on sensors that the suite does not describe, with likely causes; empty: none was found"""
+    """sentences on implausible units and axes of the log, on divergence or failure of the filter,
+    and on sensors that the suite does not describe, with likely causes; empty: no problem was
+    found"""
 
     def __len__(self) -> int:
         return len(self.time)
 
     def columns(self) -> dict[str, Floats]:
-        """The estimates as a table: columns of one number each, by name."""
+        """Return the estimates as a table: columns of one number each, by name."""
         table = {"time": self.time}
         names = {
             "position": self.position,
@@ -106,7 +110,7 @@ class Replay:
         return table
 
     def summary(self) -> dict[str, Any]:
-        """Counts and mean NIS of each measurement, share of samples diverged, and `problems`."""
+        """Return counts and mean NIS per measurement, the diverged fraction, and `problems`."""
         kinds = {}
         for name, m in self.measured.items():
             used = np.isfinite(m.nis)
@@ -130,7 +134,7 @@ class Replay:
 
 
 def by_sensor(measured: Mapping[str, Measured]) -> dict[str, Measured]:
-    """The innovations of a replay by sensor, all features together as "features"."""
+    """Return the innovations of a replay by sensor, with all features together as "features"."""
     found = {name: m for name, m in measured.items() if not name.startswith("feature_")}
     features = [m for name, m in measured.items() if name.startswith("feature_")]
     if features:

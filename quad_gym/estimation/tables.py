@@ -1,4 +1,4 @@
-"""Logs read from tables: data frames, mappings of columns, files with commas."""
+"""Logs from tables: data frames, mappings of columns, comma-separated files."""
 
 import csv
 from collections.abc import Mapping
@@ -16,22 +16,23 @@ _FORMS = {
     "gnss_velocity": ("", "_enu"),
     "gnss_baseline": ("", "_enu"),
 }
-"""In which quantities may be given."""
+"""Forms in which quantities may be given."""
 
 
 def read_log(log: Any, *, body: str = "flu") -> Log:
-    """A log from a table or a file.
+    """Read a log from a table or a file.
 
     Args:
-        log: A pandas DataFrame, a mapping of columns, or a path: of a table with commas and a line
-            of names (.csv), or of a log of PX4 (.ulg, see `quad_gym.estimation.px4`). A mapping may
-            hold the numbers of a quantity together, such as `"gyro"` (n, 3). See LOG_COLUMNS.
-        body: Axes of IMU and magnetometer in a table: "flu" (x forward, y left, z up), or "frd"
-            (x forward, y right, z down).
+        log: A pandas DataFrame, a mapping of columns, or a path: of a comma-separated table with a
+            line of names (.csv), or of a log of PX4 (.ulg, see `quad_gym.estimation.px4`). A
+            mapping may hold the numbers of a quantity together, such as `"gyro"` (n, 3). See
+            LOG_COLUMNS.
+        body: Axes of IMU and magnetometer in a table: "flu" (x forward, y left, z up), or "frd" (x
+            forward, y right, z down).
 
     Raises:
-        ValueError: If columns are missing, unknown, of unequal length, hold no numbers or infinite
-            ones, or the samples of the IMU are not in the order of time.
+        ValueError: If columns are missing, unknown, or of unequal length, hold values that are
+            infinite or not numbers, or the IMU samples are not in the order of time.
         ImportError: If a log of PX4 is given and pyulog is not installed.
         OSError: If there is no such file.
     """
@@ -65,7 +66,7 @@ def _csv_columns(path: Path) -> dict[str, Floats]:
         except (UnicodeDecodeError, csv.Error):
             raise ValueError(f"{path.name} must be a table of text (.csv)") from None
     if len(set(names)) < len(names):
-        raise ValueError(f"{path.name} must have a name for each column once, got {names}")
+        raise ValueError(f"{path.name} must have different names of columns, got {names}")
     table = np.empty((len(cells), len(names)))
     for k, row in enumerate(cells):
         if len(row) != len(names):
@@ -106,7 +107,7 @@ def _columns(given: Mapping[Any, Any]) -> dict[str, Floats]:
             found[name] = check.array(f"column {name}", array, (None,), allow_nan=True)
     lengths = {len(column) for column in found.values()}
     if len(lengths) > 1:
-        raise ValueError(f"columns of a log must be of one length, got {sorted(lengths)}")
+        raise ValueError(f"columns of a log must have equal lengths, got {sorted(lengths)}")
     for name in ("time", *LOG_COLUMNS["gyro"].names, *LOG_COLUMNS["accel"].names):
         if name not in found:
             raise ValueError(f"a log must have a column {name}, got {', '.join(found) or 'none'}")
@@ -124,7 +125,7 @@ def _pixel_of(name: str) -> tuple[int, int] | None:
 def _log_of(columns: dict[str, Floats], body: str, about: dict[str, Any]) -> Log:
     """A log of checked columns."""
     time = columns["time"]
-    # in the order of rows: nothing arrives before what stands above it
+    # in the order of rows: no row arrives before the row above it
     received = columns.get("received")
     if received is None:
         filled = np.where(np.isnan(time), -np.inf, time)
@@ -138,7 +139,7 @@ def _log_of(columns: dict[str, Floats], body: str, about: dict[str, Any]) -> Log
             return None
         if not all(have):
             missing = names[have.index(False)]
-            raise ValueError(f"a log must have a column {missing} beside {names[have.index(True)]}")
+            raise ValueError(f"a log must have a column {missing} with {names[have.index(True)]}")
         block = np.column_stack([columns[name] for name in names])
         return block if len(names) > 1 else block[:, 0]
 

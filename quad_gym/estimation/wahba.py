@@ -8,9 +8,9 @@ from quad_gym.params import checks as check
 
 
 def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[np.float64]:
-    """The rotation that best turns vectors in I into the same vectors seen in B.
+    """Return the rotation that best maps vectors in I to the same vectors measured in B.
 
-    Minimises `sum_i a_i |v_B,i - R_BI v_I,i|^2`.
+    It minimizes `sum_i a_i |v_B,i - R_BI v_I,i|^2`.
 
     Args:
         weights: (n,) weights a_i, none negative and not all zero.
@@ -21,8 +21,8 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
         (3, 3) R_BI, a proper rotation.
 
     Raises:
-        ValueError: If the shapes do not fit, a value is not finite, or the vectors leave the
-            rotation open (all parallel, for example).
+        ValueError: If the shapes do not fit, a value is not finite, or the vectors do not determine
+            the rotation (all parallel, for example).
 
     Source: report section 4.1; F. L. Markley, J. Astronautical Sciences 36(3), 1988.
     """
@@ -35,6 +35,6 @@ def solve_wahba(weights: ArrayLike, v_I: ArrayLike, v_B: ArrayLike) -> NDArray[n
     uniqueness = single.wahba_of_vectors(a, vectors_I, vectors_B, R_BI)
     if not uniqueness > 1e-10:
         raise ValueError(
-            "v_I and v_B must determine a rotation: two directions at least must differ"
+            "v_I and v_B must determine a rotation: at least two directions must differ"
         )
     return R_BI

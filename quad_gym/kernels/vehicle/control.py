@@ -68,8 +68,8 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
     """Thrust and torque of the report's PD controller.
 
     `F_I = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F_I/|F_I|`, thrust `F_I . z_I`; with `b
-    = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and its antisymmetric part e,
-    `N = K e - Kd w + w x J w`.
+    = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and `[e x] = R_E^T - R_E`, so
+    that e is twice the vector of an antisymmetric part, `N = K e - Kd w + w x J w`.
 
     Args:
         r, v: Position [m] and velocity [m/s] in I.
