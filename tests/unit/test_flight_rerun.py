@@ -55,7 +55,7 @@ def test_poses_are_those_of_the_flight_on_its_time_line(read_back):
     flight = flown()
     entities = read_back(flight)
     for name, position, attitude in (
-        ("truth", "position", "attitude"),
+        ("truth", "position", "quaternion"),
         ("estimate", "estimated_position", "estimated_quaternion"),
     ):
         entity = entities[f"/world/{name}"]
