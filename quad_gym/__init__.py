@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from quad_gym import faults
 from quad_gym.envs import IDS, make_sb3_vec_env, register_all, register_task
+from quad_gym.envs.keywords import EnvKeywords
 from quad_gym.params.barometer import BarometerParams
 from quad_gym.params.camera import CameraParams
 from quad_gym.params.control import ActionParams, PDGains, pd_gains
@@ -27,20 +28,15 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import BatteryParams, WorldParams, world_params
 from quad_gym.records import Ending
 
-if TYPE_CHECKING:  # what _LAZY imports on first use
-    from quad_gym.batch.flight_batch import FlightBatch as FlightBatch
-    from quad_gym.envs.single import QuadEnv as QuadEnv
-    from quad_gym.envs.spaces import observation_layout as observation_layout
-    from quad_gym.envs.vector import QuadVectorEnv as QuadVectorEnv
-    from quad_gym.estimation import ExtendedKalmanFilter as ExtendedKalmanFilter
-    from quad_gym.estimation import UnscentedKalmanFilter as UnscentedKalmanFilter
-    from quad_gym.flights.record import Flight as Flight
-    from quad_gym.flights.record import FlightRecorder as FlightRecorder
-    from quad_gym.tasks import ObservationSpec as ObservationSpec
-    from quad_gym.tasks import Task as Task
-    from quad_gym.tasks import TaskError as TaskError
-    from quad_gym.tasks import rewards as rewards
-    from quad_gym.tasks.view import View as View
+if TYPE_CHECKING:  # _LAZY imports them on first use
+    from quad_gym.batch.flight_batch import FlightBatch
+    from quad_gym.envs.single import QuadEnv
+    from quad_gym.envs.spaces import observation_layout
+    from quad_gym.envs.vector import QuadVectorEnv
+    from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+    from quad_gym.flights.record import Flight, FlightRecorder
+    from quad_gym.tasks import ObservationSpec, Task, TaskError, rewards
+    from quad_gym.tasks.view import View
 
 __version__ = "0.1.0"
 
@@ -48,7 +44,7 @@ register_all()
 
 
 def __getattr__(name: str) -> Any:
-    """What needs the kernels is imported on first use, so that the package imports fast."""
+    """Import names that need the kernels on first use, so that the package imports fast."""
     if name in _LAZY:
         import importlib
 
@@ -56,17 +52,22 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'quad_gym' has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    """The public names, those that are imported on first use among them."""
+    return sorted([*__all__, "__doc__", "__file__", "__name__", "__path__"])
+
+
 _LAZY = {
+    "ExtendedKalmanFilter": "quad_gym.estimation",
     "Flight": "quad_gym.flights.record",
     "FlightBatch": "quad_gym.batch.flight_batch",
     "FlightRecorder": "quad_gym.flights.record",
+    "ObservationSpec": "quad_gym.tasks",
     "QuadEnv": "quad_gym.envs.single",
     "QuadVectorEnv": "quad_gym.envs.vector",
-    "ExtendedKalmanFilter": "quad_gym.estimation",
-    "UnscentedKalmanFilter": "quad_gym.estimation",
-    "ObservationSpec": "quad_gym.tasks",
     "Task": "quad_gym.tasks",
     "TaskError": "quad_gym.tasks",
+    "UnscentedKalmanFilter": "quad_gym.estimation",
     "View": "quad_gym.tasks.view",
     "observation_layout": "quad_gym.envs.spaces",
     "rewards": "quad_gym.tasks",
@@ -80,7 +81,12 @@ __all__ = [
     "CameraParams",
     "Cylinder",
     "Ending",
+    "EnvKeywords",
+    "ExtendedKalmanFilter",
     "FilterParams",
+    "Flight",
+    "FlightBatch",
+    "FlightRecorder",
     "GnssParams",
     "GroundParams",
     "ImuParams",
@@ -89,20 +95,29 @@ __all__ = [
     "MagnetometerParams",
     "NoisyObservationParams",
     "Normal",
+    "ObservationSpec",
     "PDGains",
+    "QuadEnv",
+    "QuadVectorEnv",
     "Randomization",
     "SensorSuite",
+    "Task",
+    "TaskError",
     "TaskParams",
     "Trajectory",
     "Uniform",
+    "UnscentedKalmanFilter",
     "VehicleParams",
+    "View",
     "Wall",
     "WorldParams",
     "__version__",
     "faults",
     "make_sb3_vec_env",
+    "observation_layout",
     "pd_gains",
     "register_task",
+    "rewards",
     "sensor_suite",
     "vehicle_params",
     "world_params",

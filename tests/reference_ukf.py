@@ -333,14 +333,13 @@ class PlainUKF:
 
     def _add_feature(self, X_I, pixel, measured, noises, models):
         camera = self.sensors.camera
-        size, focal = self.number(camera.pixel_size), self.number(camera.focal_length)
-        v = size * self._array([pixel[0], pixel[1], focal])
+        v = self._array([pixel[0], pixel[1], self.number(camera.focal_length)])
 
         def direction(r, R, d):
             to_feature = X_I - r - self.l_c @ R
             return unit((R @ to_feature[..., np.newaxis])[..., 0] @ self.R_CB.T)
 
-        variance = (self.number(camera.pixel_sigma) * size) ** 2 / (v @ v)
+        variance = self.number(camera.pixel_sigma) ** 2 / (v @ v)
         across = unit(v)
         if self.sensors.estimator.bearing_noise_at != "measured":
             across = direction(self.r, self.R, self.d)

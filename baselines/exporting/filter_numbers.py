@@ -28,7 +28,7 @@ _FIELDS = {
     ),
     "baseline": ("baseline_noise", "first_baseline_sigma", "baseline", "baseline_length"),
     "camera": (
-        *("camera", "R_CB", "pixel_size", "focal_length", "half_image", "pixel_sigma"),
+        *("camera", "R_CB", "focal_length", "half_image", "pixel_sigma"),
         *(
             "blur",
             "features",
@@ -66,7 +66,6 @@ _MEANINGS = {
     "slow_drive": "standard deviation of its driving noise over a tick",
     "aid_numbers": "further numbers of each sensor; of the magnetometer: the field in I [T]",
     "camera": "projection center of the camera in B",
-    "pixel_size": "size of a pixel",
     "pixel_sigma": "noise of a pixel per axis",
     "blur": "noise of a pixel per body rate",
     "initial_velocity_variance": "of the velocity at the start",

@@ -24,14 +24,9 @@ import docstring_parser
 import quad_gym
 from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.envs.configuration import (
-    KEYWORDS_WITHOUT_EFFECT,
-    ONE_TASK_KEYWORDS,
-    TASK_DEFAULTS,
-    TASK_KEYWORDS,
-    Flights,
-)
-from quad_gym.envs.rendered import rendering_of
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.effects import KEYWORDS_WITHOUT_EFFECT, ONE_TASK_KEYWORDS
+from quad_gym.envs.keywords import TASK_KEYWORDS
 from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights.record import COLUMNS, FEATURES
 from quad_gym.params.suites import ALL_SUITES
@@ -167,19 +162,9 @@ def _keywords_page() -> str:
         "threads": "Threads of a vector environment; None: as many as there are cores.",
         "render_flights": "Which flights of a vector environment are rendered.",
     }
-    parameters = inspect.signature(Flights._build).parameters.values()
-    defaults = {
-        p.name: p.default
-        for p in parameters
-        if p.kind is p.KEYWORD_ONLY and p.default is not p.empty
-    }
-    looks = inspect.signature(rendering_of).parameters
-    defaults |= {"max_episode_steps": None, "render_mode": None}
-    defaults |= {
-        name: looks[name].default
-        for name in looks
-        if name.startswith("render_") and name != "render_mode"
-    }
+    shown = inspect.signature(quad_gym.QuadEnv).parameters.values()
+    defaults = {p.name: p.default for p in shown if p.name not in ("task", "base", *TASK_KEYWORDS)}
+    defaults = {"task": None, **defaults, "threads": None, "render_flights": None}
     missing = sorted(set(defaults) - set(said))
     if missing:
         raise ValueError(f"the specification says nothing of {', '.join(missing)}")

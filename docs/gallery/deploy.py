@@ -92,4 +92,4 @@ figure.legend(loc="outside right upper")
 #
 # .. code-block:: sh
 #
-#    quad-gym export pretrained QuadGym/Lemniscate-v0 --to c
+#    quad-gym export policy pretrained QuadGym/Lemniscate-v0 --to c

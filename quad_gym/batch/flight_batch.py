@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch import quantities
 from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.cold_start import check_cold_start
+from quad_gym.batch.effects import require_effect, require_no_filter
 from quad_gym.batch.following import check_trajectories, followed
 from quad_gym.batch.innovations import innovations_of
 from quad_gym.batch.memory import FlightMemory, configuration_digest
@@ -76,7 +76,7 @@ class FlightBatch(FlightMemory):
         count: Number of flights.
         vehicle: Vehicle, or the name of a preset.
         sensors: Sensor suite, or the name of a preset.
-        gains: Gains of `Control.PD`, or the name of a preset.
+        gains: Gains of `Control.PD`, or the name of a preset; None: "lab".
         action_params: Scales of the actions, and bandwidths of the inner loops.
         task: Reference, start and termination.
         source: Source of the state that the controller observes.
@@ -118,7 +118,7 @@ class FlightBatch(FlightMemory):
         *,
         vehicle: VehicleParams | str = "lab",
         sensors: SensorSuite | str = "standard",
-        gains: PDGains | str = "lab",
+        gains: PDGains | str | None = None,
         action_params: ActionParams | None = None,
         task: TaskParams | None = None,
         source: Source = Source.ESTIMATE,
@@ -144,7 +144,7 @@ class FlightBatch(FlightMemory):
         self.count = check.whole("count", count, most=MOST_FLIGHTS)
         self.vehicle = vehicle_params(vehicle) if isinstance(vehicle, str) else vehicle
         self.sensors = sensor_suite(sensors) if isinstance(sensors, str) else sensors
-        self.gains = pd_gains(gains) if isinstance(gains, str) else gains
+        self.gains = pd_gains(gains or "lab") if isinstance(gains, str | None) else gains
         self.action_params = ActionParams() if action_params is None else action_params
         self.task = TaskParams() if task is None else task
         self.world = world_params(world) if isinstance(world, str) else world
@@ -179,8 +179,15 @@ class FlightBatch(FlightMemory):
             needed = include_std or innovations
             run_filter = needed or self.source in (Source.ESTIMATE, Source.MEASUREMENTS)
         self.run_filter = check.flag("run_filter", run_filter)
-        if self.task.truncate_when_diverged and not run_filter:
-            raise ValueError("truncate_when_diverged needs a filter, and none runs here")
+        given = {"gains": gains, "action_params": action_params}
+        require_effect(self.control, {name for name in given if given[name] is not None})
+        if not run_filter:
+            require_no_filter(
+                include_std=include_std,
+                innovations=innovations,
+                truncate_when_diverged=self.task.truncate_when_diverged,
+                filter_start=filter_start,
+            )
         watches = self.innovations or bool(self.faults) or self.task.truncate_when_diverged
         if run_filter:
             self.sensors.require_filter()
@@ -386,28 +393,6 @@ class FlightBatch(FlightMemory):
         self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
         threads = (self._own, self._believed, self._work)
         return Calls(self._blocks, self._room, shared, numbers, *threads, self._paths)
-
-    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """A quantity of the flights, as a new array (n, ...).
-
-        Args:
-            name: One of `quad_gym.batch.quantities.QUANTITIES`, such as "position",
-                "estimated_velocity" or "reference_position"; or a parameter that
-                `randomization` draws, such as "mass".
-            flights: Numbers of the flights; None: all of them.
-
-        Raises:
-            ValueError: If there is no such quantity, or no filter runs that would estimate it.
-        """
-        if name in self.randomization.names:
-            values = self.drawn()[name]
-            return values if flights is None else values[flights]
-        return quantities.read(self, name, flights)
-
-    @property
-    def R_IG(self) -> NDArray[np.float64]:
-        """(3, 3) from G, the frame of GNSS, to I."""
-        return np.array(self._model["R_IG"][0, ..., 0])
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the threads, which a copy starts again."""

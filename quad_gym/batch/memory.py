@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from quad_gym.batch import quantities
 from quad_gym.faults import Fault
 from quad_gym.faults.presets import named_faults
 from quad_gym.params import checks as check
@@ -80,6 +81,28 @@ class FlightMemory:
             self._blocks["drawn"] = undrawn[:, np.newaxis]
 
     # ---- reading ------------------------------------------------------------------------------
+
+    def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """A quantity of the flights, as a new array (n, ...).
+
+        Args:
+            name: One of `quad_gym.batch.quantities.QUANTITIES`, such as "position",
+                "estimated_velocity" or "reference_position"; or a parameter that
+                `randomization` draws, such as "mass".
+            flights: Numbers of the flights; None: all of them.
+
+        Raises:
+            ValueError: If there is no such quantity, or no filter runs that would estimate it.
+        """
+        if name in self.randomization.names:
+            values = self.drawn()[name]
+            return values if flights is None else values[flights]
+        return quantities.read(self, name, flights)  # type: ignore[arg-type]
+
+    @property
+    def R_IG(self) -> NDArray[np.float64]:
+        """(3, 3) from G, the frame of GNSS, to I."""
+        return np.array(self._model["R_IG"][0, ..., 0])
 
     def record(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
         """Return a field of the records by its name in the kernels, as a new array (n, ...).

@@ -12,10 +12,10 @@ Prints the table and writes it with the whole configuration to TABLE.json.
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -26,9 +26,6 @@ from quad_gym.analysis.consistency_flights import ASTRAY, Findings, endless, mea
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
-    Episodes,
-    FilterStart,
-    Seed,
     SuiteName,
     require_at_least,
     usage_errors,
@@ -45,22 +42,16 @@ SETTLED = 1.0
 class Args:
     """Options of the tables."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {
-        "--flights": "--episodes",
-        "--first-seed": "--seed",
-        "--start": "--filter-start",
-    }
-
     table: Positional[Literal["models", "filters"]] = "models"
     """which table"""
     sensors: SuiteName = "rtk"
-    flights: Episodes = 1000
+    episodes: int = 1000
     """flights in each case"""
-    first_seed: Seed = 0
+    seed: int = 0
     """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
-    start: Annotated[Literal["cold", "warm"], FilterStart] = "cold"
+    filter_start: Literal["cold", "warm"] = "cold"
     """the filter's start"""
     output: Path = Path("results/ablation")
     """folder for the numbers; made if missing"""
@@ -69,7 +60,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        require_at_least(self, flights=2, threads=1)
+        require_at_least(self, episodes=2, threads=1)
         least = SETTLED + 0.1
         if not (math.isfinite(self.duration) and self.duration >= least):
             raise ValueError(f"--duration must be at least {least:g} s, got {self.duration:g}")
@@ -210,7 +201,7 @@ def batch_of(case: Case, args: Args, flights: int, threads: int | None) -> Fligh
         sensors=case.sensors,
         gains="tuned",
         task=endless(TASK_DEFAULTS["random_trajectory"]),
-        filter_start=args.start,
+        filter_start=args.filter_start,
         innovations=True,
         threads=threads,
         true_vehicle=case.true_vehicle,
@@ -284,8 +275,8 @@ def main(args: Args) -> None:
     for number, case in enumerate(cases, 1):
         print(f"  {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
         findings = measure_consistency(
-            batch_of(case, args, args.flights, args.threads),
-            seeds=range(args.first_seed, args.first_seed + args.flights),
+            batch_of(case, args, args.episodes, args.threads),
+            seeds=range(args.seed, args.seed + args.episodes),
             duration=args.duration,
         )
         rows[case.name] = row_of(findings)
@@ -294,8 +285,8 @@ def main(args: Args) -> None:
         for row, seconds in zip(rows.values(), times, strict=True):
             row["seconds_per_tick"], row["relative_cost"] = seconds, seconds / times[0]
     print(
-        f"{args.flights:,} flights of {args.duration:g} s on random trajectories, suite "
-        f"{args.sensors}, {args.start} start.\n"
+        f"{args.episodes:,} flights of {args.duration:g} s on random trajectories, suite "
+        f"{args.sensors}, {args.filter_start} start.\n"
     )
     print(table_of(args, rows))
     print(f"\nErrors are root mean squares after {SETTLED:g} s; a flight {ASTRAY:g} m off its")
@@ -304,7 +295,7 @@ def main(args: Args) -> None:
         "rows": rows,
         "cases": cases,
         "configuration": args,
-        "seeds": [args.first_seed, args.first_seed + args.flights - 1],
+        "seeds": [args.seed, args.seed + args.episodes - 1],
         "versions": versions("numpy", "numba", "scipy"),
     }
     print(f"\nWrote {write_json(args.output / f'{args.table}.json', found)}.")

@@ -16,10 +16,9 @@ summary with the whole configuration (summary.json).
 import math
 import textwrap
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ from quad_gym.analysis.metrics import (
 from quad_gym.analysis.recording import Recording, record_flights
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.options import Episodes, Seed, require_at_least, usage_errors
+from quad_gym.commands.options import require_at_least, usage_errors
 from quad_gym.records import Source
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
@@ -48,11 +47,9 @@ NEES_TAIL = 0.001  # share of a consistent filter's NEES beyond the bound in the
 class Args:
     """Options of the experiment."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--seeds": "--episodes", "--first-seed": "--seed"}
-
-    seeds: Episodes = 1000
+    episodes: int = 1000
     """flights in each case"""
-    first_seed: Seed = 0
+    seed: int = 0
     """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
@@ -113,7 +110,7 @@ def configure(args: Args) -> Setup:
         OSError: If nothing can be written to the output folder.
         ImportError: If matplotlib or tqdm is missing.
     """
-    require_at_least(args, seeds=1, first_seed=0, threads=1)
+    require_at_least(args, episodes=1, seed=0, threads=1)
     if args.camera_rate is not None and not args.camera:
         raise ValueError("--camera-rate has no meaning with --no-camera")
     task = TaskParams(
@@ -155,7 +152,7 @@ def configure(args: Args) -> Setup:
         cases=cases,
         gains=gains,
         task=task,
-        seeds=range(args.first_seed, args.first_seed + args.seeds),
+        seeds=range(args.seed, args.seed + args.episodes),
         ticks=round(args.duration * suite.imu.rate),
         threads=args.threads,
         output=args.output,
@@ -376,7 +373,7 @@ def main(args: Args) -> None:
         setup = configure(args)
     print(
         f"Circle of radius {args.radius:g} m, period {args.period:g} s, height {args.height:g} m; "
-        f"{args.seeds:,} flights of {args.duration:g} s per case, from seed {args.first_seed}.\n"
+        f"{args.episodes:,} flights of {args.duration:g} s per case, from seed {args.seed}.\n"
     )
     began = time.perf_counter()
     results = {case: fly(case, setup) for case in setup.cases}

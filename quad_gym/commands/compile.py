@@ -16,11 +16,9 @@ The exit code is 1 if the code cannot be kept.
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
-
-from tyro.conf import arg
+from typing import Any, Literal
 
 from quad_gym.commands.options import require_at_least
 
@@ -31,20 +29,18 @@ Kind = Literal["plain", "truth", "single", "all"]
 class Args:
     """What to compile."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--processes": "--jobs"}
-
     stages: tuple[Kind, ...] = ("all",)
     """truth (an environment that observes the truth), plain (the default environment, with
     sensors and filter), single (the classes for one vehicle, such as UnscentedKalmanFilter), all
     (these, and every option of the environments)"""
-    processes: Annotated[int | None, arg(name="jobs")] = None
+    jobs: int | None = None
     """processes that compile; if not given, one per core"""
 
     def __post_init__(self) -> None:
         """Check that there is something to compile, and someone who does it."""
         if not self.stages:
             raise ValueError("--stages must name at least one, got none")
-        require_at_least(self, processes=1)
+        require_at_least(self, jobs=1)
 
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
@@ -88,7 +84,7 @@ def main(args: Args) -> int:
     missing = [name for name in names if not dispatcher_of(name).is_cached()]
     began = time.monotonic()
     if missing:
-        prepare(missing, args.processes)
+        prepare(missing, args.jobs)
     for name in names:
         print(f"{'compiled' if name in missing else 'in cache'}  {name}")
     lost = [name for name in missing if not _is_kept(dispatcher_of(name))]

@@ -30,12 +30,9 @@ Either run, when it was interrupted, goes on where it was.
 import math
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
-
-from tyro.conf import arg
+from typing import Any, Literal
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
 from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSquare
@@ -56,8 +53,6 @@ from quad_gym.analysis.reports import (
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import (
     TRACKING,
-    FilterStart,
-    Seed,
     SuiteName,
     TrackingId,
     known_id,
@@ -75,25 +70,17 @@ from quad_gym.records import Source
 class Args:
     """Options of the experiment."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {
-        "--flights": "--episodes",
-        "--first-seed": "--seed",
-        "--start": "--filter-start",
-        "--fly-on": "--observation",
-        "--task": "",
-    }
-
     env_id: TrackingId = "QuadGym/RandomTrajectory-v0"
 
-    flights: Annotated[int | None, arg(name="episodes")] = None
+    episodes: int | None = None
     """flights; if not given, 4000, or 400 in each cell of a matrix"""
-    first_seed: Seed = 0
+    seed: int = 0
     """of the first flight; the others follow it"""
     duration: float = 10.0
     """length of a flight [s]"""
-    fly_on: Annotated[Literal["estimate", "truth"], arg(name="observation")] = "estimate"
+    observation: Literal["estimate", "truth"] = "estimate"
     """what the controller sees"""
-    start: Annotated[Literal["cold", "warm", "matched"], FilterStart] = "cold"
+    filter_start: Literal["cold", "warm", "matched"] = "cold"
     """the filter's start: from its first fix; after some seconds of hovering; or with errors
     drawn from its own covariance, which tests the filter apart from its start"""
     every: float = 0.05
@@ -151,13 +138,13 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.flights is None:
-            object.__setattr__(self, "flights", 400 if self.tables else 4000)
+        if self.episodes is None:
+            object.__setattr__(self, "episodes", 400 if self.tables else 4000)
         if self.output is None:
             folder = "consistency_matrix" if self.matrix else "consistency"
             folder = "consistency_recovery" if self.recovery else folder
             object.__setattr__(self, "output", Path("results") / folder)
-        require_at_least(self, flights=2, threads=1)
+        require_at_least(self, episodes=2, threads=1)
         object.__setattr__(self, "env_id", known_id("ENV_ID", self.env_id, TRACKING))
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
@@ -166,7 +153,7 @@ class Args:
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{option_name(self, name)} must be above 0, got {value}")
+                raise ValueError(f"{option_name(name)} must be above 0, got {value}")
         if not 0.0 <= self.settle < self.duration:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
 
@@ -183,8 +170,8 @@ class Args:
     @property
     def count(self) -> int:
         """How many flights."""
-        assert self.flights is not None
-        return self.flights
+        assert self.episodes is not None
+        return self.episodes
 
     @property
     def folder(self) -> Path:
@@ -228,8 +215,8 @@ def batch_of(args: Args) -> FlightBatch:
         sensors=suite,
         gains="tuned",
         task=endless(TASK_DEFAULTS[args.task]),
-        source=Source.ESTIMATE if args.fly_on == "estimate" else Source.TRUTH,
-        filter_start="warm" if args.start == "warm" else "cold",
+        source=Source.ESTIMATE if args.observation == "estimate" else Source.TRUTH,
+        filter_start="warm" if args.filter_start == "warm" else "cold",
         innovations=True,
         threads=args.threads,
         true_vehicle=true_vehicle,
@@ -251,11 +238,11 @@ def fly(args: Args, batch: FlightBatch) -> Findings:
 
     return measure_consistency(
         batch,
-        seeds=range(args.first_seed, args.first_seed + args.count),
+        seeds=range(args.seed, args.seed + args.count),
         duration=args.duration,
         every=args.every,
         settle=args.settle,
-        matched=args.start == "matched",
+        matched=args.filter_start == "matched",
         progress=progress,
     )
 
@@ -265,7 +252,7 @@ def title_of(batch: FlightBatch, args: Args) -> str:
     sensors = batch.sensors
     choices = sensors.estimator
     parts = [
-        f"{choices.kind.upper()}, suite {args.sensors}, {args.start} start",
+        f"{choices.kind.upper()}, suite {args.sensors}, {args.filter_start} start",
         f"{sensors.imu.samples} samples",
         f"{choices.integration}",
         f"attitude reset {'on' if choices.attitude_reset else 'off'}",
@@ -318,7 +305,7 @@ def fly_tables(args: Args) -> None:
     name = "matrix" if args.matrix else "recovery"
     with usage_errors():
         require_writable("--output", args.folder)
-    flown: dict[str, Any] = {"flights": args.count, "first_seed": args.first_seed}
+    flown: dict[str, Any] = {"flights": args.count, "first_seed": args.seed}
     flown["threads"] = args.threads
     if args.matrix:
         chosen = matrix.cells_of(args.cells)
@@ -372,7 +359,7 @@ def main(args: Args) -> None:
         "vehicle": batch.vehicle,
         "world": batch.world,
         "faults": batch.faults,
-        "seeds": [args.first_seed, args.first_seed + args.count - 1],
+        "seeds": [args.seed, args.seed + args.count - 1],
         "versions": versions("numpy", "numba", "scipy"),
         "nees": whole.nees,
         "nis": whole.nis,

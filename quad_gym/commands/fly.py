@@ -16,10 +16,10 @@ program.
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -54,8 +54,6 @@ OTHER_ENDINGS = (".npz", ".csv", ".rrd")
 class Args:
     """Options of the flight."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--fault": "--faults", "--task": ""}
-
     env_id: EnvId = "QuadGym/Circle-v0"
     policy: str = "pd"
     """who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for the
@@ -78,10 +76,9 @@ class Args:
     """GNSS fixes per second [Hz]; if not given, the suite's"""
     camera_rate: float | None = None
     """images per second [Hz]; if not given, the suite's"""
-    fault: Annotated[
+    faults: Annotated[
         tuple[str, ...],
         arg(
-            name="faults",
             help="what goes wrong, one or several (also joined by +), in place of the task's own: "
             f"{', '.join(FAULTS)}; or none",
         ),
@@ -145,7 +142,7 @@ def check_options(args: Args) -> None:
         start, end = args.fault_time
         if not 0.0 <= start < end:
             raise ValueError(f"--fault-time must be a start and a later end, got {start:g} {end:g}")
-        if not args.fault:
+        if not args.faults:
             raise ValueError("--fault-time needs --faults")
     if args.output is not None:
         if args.output.suffix.lower() not in VIDEO_ENDINGS + OTHER_ENDINGS:
@@ -167,7 +164,7 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
         ValueError: If there is no such fault, or the sensors lack what it concerns.
     """
     sensors = sensor_suite(sensors_of(args.env_id, args.sensors))
-    faults = faults_of(args.fault, sensors if args.camera else sensors.replace(camera=None))
+    faults = faults_of(args.faults, sensors if args.camera else sensors.replace(camera=None))
     if args.fault_time is None:
         return faults
     start, end = args.fault_time
@@ -199,7 +196,7 @@ def make_env(args: Args) -> Any:
         keywords["camera"] = False
     if args.action is not None:
         keywords["action"] = args.action
-    if args.fault:
+    if args.faults:
         keywords["faults"] = faults_of_args(args)
     return gymnasium.make_vec(
         args.env_id,
@@ -335,7 +332,7 @@ def main(args: Args) -> None:
         "task": IDS[args.env_id],
         "policy": args.policy,
         "sensors": sensors,
-        "fault": args.fault,
+        "faults": args.faults,
     }
 
     def flights(seed: int, switches: Switches) -> Iterator[Flight]:

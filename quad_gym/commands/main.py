@@ -22,20 +22,22 @@ COMMANDS = {
     "consistency": "is the filter's covariance right? NEES and NIS over many flights",
     "ablation": "what each correction of the filter is worth, and what wrong models cost",
     "benchmark": "measure the speed of everything",
-    "export": "take a trained policy, or a filter's parameters, to an autopilot: C or ONNX",
+    "export policy": "take a trained policy to an autopilot: C or ONNX",
+    "export filter": "take the parameters of a filter to an autopilot: C or JSON",
     "compile": "compile the kernels ahead of their first use, into the cache",
     "completion": "print a script that completes commands and options with the Tab key",
     "version": "print the version",
 }
-"""Names of commands, with what each does."""
+"""Names of commands, of one word or two, and their descriptions."""
 
 PROGRAM = "quad-gym"
 
 
-def usage() -> str:
-    """The help of `quad-gym` itself."""
+def usage(group: str = "") -> str:
+    """The help of `quad-gym` itself, or of the commands that begin with a word."""
     width = max(map(len, COMMANDS))
-    lines = "\n".join(f"  {name:{width}}   {text}" for name, text in COMMANDS.items())
+    shown = {name: text for name, text in COMMANDS.items() if name.startswith(group)}
+    lines = "\n".join(f"  {name:{width}}   {text}" for name, text in shown.items())
     return (
         f"usage: {PROGRAM} COMMAND [options]\n\ncommands:\n{lines}\n\n"
         f"{PROGRAM} COMMAND --help explains a command.\n"
@@ -52,19 +54,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    groups = {name.split()[0] for name in COMMANDS if " " in name}
+    group = [words.pop(0)] if words[:1] and words[0] in groups else []
     if words[:1] in (["-h"], ["--help"]):
-        print(usage(), end="")
+        print(usage(*group), end="")
         return 0
-    if not words or words[0] not in COMMANDS:
-        got = f"got {words[0]!r}" if words else "none given"
-        meant = did_you_mean(words[0], COMMANDS) if words else ""
+    command = " ".join(group + words[:1])
+    if command not in COMMANDS:
+        got = f"got {command!r}" if command else "none given"
+        meant = did_you_mean(command, COMMANDS)
         print(
             f"{PROGRAM}: error: the command must be one of {', '.join(COMMANDS)}, {got}{meant} "
             "(--help explains them)",
             file=sys.stderr,
         )
         return USAGE_ERROR
-    return run(words[0], words[1:], program=f"{PROGRAM} {words[0]}")
+    return run(command, words[1:], program=f"{PROGRAM} {command}")
 
 
 def run(command: str, argv: Sequence[str] | None = None, *, program: str | None = None) -> int:
@@ -94,7 +99,7 @@ def run(command: str, argv: Sequence[str] | None = None, *, program: str | None 
 
 def module_of(command: str) -> Any:
     """The module of one of COMMANDS, with its `Args` and its `main`."""
-    name = "benchmark.main" if command == "benchmark" else command
+    name = "benchmark.main" if command == "benchmark" else command.replace(" ", "_")
     return importlib.import_module(f"quad_gym.commands.{name}")
 
 

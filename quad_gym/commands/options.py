@@ -38,9 +38,7 @@ def parse(
 ) -> _Args:
     """Options from the command line as an instance of a dataclass.
 
-    A ValueError of the dataclass's own checks ends the program as a wrong option does. Options that
-    had other names once, in `FORMER_NAMES` of the dataclass, are understood by them, too; one whose
-    name is now "" is given without a name.
+    A ValueError of the dataclass's own checks ends the program as a wrong option does.
 
     Args:
         kind: Dataclass whose fields are the options.
@@ -48,16 +46,7 @@ def parse(
         description: Text above the options in the help.
         program: Name of the program in its messages; None: that of the process.
     """
-    former: Mapping[str, str] = getattr(kind, "FORMER_NAMES", {})
-    given = list(sys.argv[1:] if argv is None else argv)
-    words, unnamed = [], []
-    while given:
-        option, equals, value = given.pop(0).partition("=")
-        if former.get(option) != "":
-            words.append(former.get(option, option) + equals + value)
-        elif equals or given:
-            unnamed.append(value if equals else given.pop(0))
-    words = unnamed + words  # first, as an option before them may take any number of words
+    words = list(sys.argv[1:] if argv is None else argv)
     program = program or Path(sys.argv[0]).name
     asked = bool({"-h", "--help"} & set(words))
     try:
@@ -82,17 +71,16 @@ def parse(
 def _require_sound(args: Any, words: Sequence[str], program: str) -> None:
     """End the program if an option has what no command takes: nothing, or a negative seed."""
     for option in dataclasses.fields(args):
-        name, value = option_name(args, option.name), getattr(args, option.name)
+        name, value = option_name(option.name), getattr(args, option.name)
         if name in words and value in ((), {}):
             raise refuse(f"{name} must name at least one, got none", program)
         if name == "--seed" and value < 0:
             raise refuse(f"{name} must be at least 0, got {value}", program)
 
 
-def option_name(args: Any, field: str) -> str:
-    """How the option is written that a field of a dataclass declares."""
-    name = f"--{field.replace('_', '-')}"
-    return getattr(args, "FORMER_NAMES", {}).get(name) or name
+def option_name(field: str) -> str:
+    """The option that a field of a dataclass declares, as it is written."""
+    return f"--{field.replace('_', '-')}"
 
 
 def require_at_least(args: Any, **least: int) -> None:
@@ -108,7 +96,7 @@ def require_at_least(args: Any, **least: int) -> None:
     for field, limit in least.items():
         value = getattr(args, field)
         if value is not None and value < limit:
-            raise ValueError(f"{option_name(args, field)} must be at least {limit}, got {value}")
+            raise ValueError(f"{option_name(field)} must be at least {limit}, got {value}")
 
 
 @contextmanager
@@ -159,6 +147,29 @@ def refuse_overwriting(file: Path, overwrite: bool) -> None:
     """
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists: give --overwrite to replace it, or another --output")
+
+
+def writable_file(output: Path | None, name: str, suffix: str, overwrite: bool) -> Path:
+    """The file that an export writes, in a folder that can be written to.
+
+    Args:
+        output: The file that is given by `--output`; None: one in results/export.
+        name: Its name then.
+        suffix: The end of its name.
+        overwrite: Whether it may be replaced.
+
+    Raises:
+        ValueError: If it ends otherwise, or is there already.
+        OSError: If nothing can be written to the folder.
+    """
+    from quad_gym.analysis.reports import require_writable
+
+    file = output or Path("results/export") / (name + suffix)
+    if file.suffix != suffix:
+        raise ValueError(f"--output must end in {suffix}, got {file}")
+    refuse_overwriting(file, overwrite)
+    require_writable("--output", file.parent)
+    return file
 
 
 def sensors_of(env_id: str, given: str | None) -> str:
@@ -299,15 +310,6 @@ EnvId = tyro.conf.Positional[
 
 TrackingId = Annotated[EnvId, tyro.conf.arg(help=one_of(TRACKING))]
 """The same, of tasks in which a reference is followed."""
-
-Episodes = Annotated[int, tyro.conf.arg(name="episodes")]
-"""How many are flown."""
-
-Seed = Annotated[int, tyro.conf.arg(name="seed")]
-"""Of the first episode."""
-
-FilterStart = tyro.conf.arg(name="filter-start")
-"""How the filter starts, as the keyword of environments."""
 
 _OR_FILE = f"{', '.join(ALL_SUITES)}, or a file of SensorSuite.save (.toml)"
 

@@ -170,4 +170,4 @@ def main(args: Args) -> None:
     policy = f"--policy {done.best_policy}{flying_options(plan.environment)}"
     print(f"Fly it: quad-gym evaluate {plan.env_id} {policy}")
     if plan.recipe.algorithm != "recurrent_ppo":
-        print(f"Export it: quad-gym export {done.best_policy} --to c")
+        print(f"Export it: quad-gym export policy {done.best_policy} --to c")

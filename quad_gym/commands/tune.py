@@ -13,11 +13,10 @@ and writes gains.json and search.csv.
 
 import math
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -58,8 +57,6 @@ POPULATION = 8
 class Args:
     """Options of the search."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--start": "--gains", "--tasks": "--env-ids"}
-
     env_ids: Annotated[
         tuple[str, ...],
         arg(help=f"{one_of(TRACKING)}; if not given, all of them", help_behavior_hint=""),
@@ -69,7 +66,7 @@ class Args:
     sensors: SuiteName = "standard"
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as action=wrench control_rate=200"""
-    start: Annotated[Literal["lab", "tuned"], arg(name="gains")] = "lab"
+    gains: Literal["lab", "tuned"] = "lab"
     """gains to start from"""
     candidates: int = 400
     """gains to fly, those at the start among them"""
@@ -206,12 +203,12 @@ def configure(args: Args) -> Search:
     refuse_overwriting(args.output / "gains.json", args.overwrite)
     envs = make_envs(args, args.episodes)
     for env in envs.values():
-        PDPolicy(env, gains=args.start)  # refuses actions and layouts that do not admit it
+        PDPolicy(env, gains=args.gains)  # refuses actions and layouts that do not admit it
     require_writable("--output", args.output)
     torques = args.env.get("action") in ("motor", "wrench")
     first = first_seed("training", args.seed, args.episodes)
     first_seed("test", args.seed, args.fresh_episodes)  # refuses too large seeds before the search
-    return Search(envs, Knobs(pd_gains(args.start), torques), first)
+    return Search(envs, Knobs(pd_gains(args.gains), torques), first)
 
 
 def search(args: Args, found: Search) -> PDGains:
@@ -276,7 +273,7 @@ def main(args: Args) -> None:
     with usage_errors():
         found = configure(args)
     tuned = search(args, found)
-    start = f"gains at the start ({args.start})"
+    start = f"gains at the start ({args.gains})"
     text, numbers = judge(args, {start: found.knobs.start, "tuned gains": tuned})
     print(
         f"\nPD on the {args.observation}, sensors {args.sensors}; "

@@ -1,10 +1,11 @@
 """The environments: one flight, many flights, and many flights for Stable-Baselines3."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from gymnasium.envs.registration import register, registry
 
 from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.envs.keywords import EnvKeywords, VectorKeywords, checked, shows
 from quad_gym.params import checks as check
 from quad_gym.params.task import TASKS
 
@@ -28,11 +29,12 @@ def register_all() -> None:
             register(env_id, **_ENTRY_POINTS, kwargs={"base": task})  # type: ignore[arg-type]
 
 
+@shows(EnvKeywords)
 def register_task(
     env_id: str,
     task: "Task | type[Task] | str",
     base: str = "QuadGym/Circle-v0",
-    **keywords: Any,
+    **keywords: Unpack[EnvKeywords],
 ) -> None:
     """Register an environment with your own task, for all three interfaces.
 
@@ -43,8 +45,10 @@ def register_task(
         keywords: Keywords of `QuadEnv`, as defaults.
 
     Raises:
+        TypeError: If a keyword is unknown; the exception is also a ValueError.
         ValueError: If the id is one of `IDS`, or `base` is not one of them.
     """
+    checked(keywords)
     check.choice("base", base, tuple(IDS))
     if env_id in IDS:
         raise ValueError(f"env_id must be a new one, got {env_id!r}")
@@ -77,8 +81,9 @@ def _meant(env_id: Any) -> str:
     return f"; did you mean {id_of_task.get(close, close)}?" if close else ""
 
 
+@shows(VectorKeywords)
 def make_sb3_vec_env(
-    env_id: str, n_envs: int = 1, seed: int | None = None, **keywords: Any
+    env_id: str, n_envs: int = 1, seed: int | None = None, **keywords: Unpack[VectorKeywords]
 ) -> "QuadSB3VecEnv":
     """Make a Stable-Baselines3 vector environment of N flights.
 
@@ -86,7 +91,7 @@ def make_sb3_vec_env(
         env_id: One of `IDS`, with or without the prefix "quad_gym:", or an id of `register_task`.
         n_envs: Number of flights.
         seed: Seed of the first reset: flight i has seed + i.
-        keywords: Keywords of `QuadEnv`, and `threads`.
+        keywords: Keywords of `QuadEnv`, `threads` and `render_flights`.
 
     Returns:
         The environment, ready for any Stable-Baselines3 algorithm.
@@ -95,7 +100,7 @@ def make_sb3_vec_env(
         ValueError: If the id or a keyword is unknown, or a value is invalid.
         ImportError: If Stable-Baselines3 is not installed.
     """
-    given = keywords_of(env_id) | keywords
+    given: dict[str, Any] = keywords_of(env_id) | dict(keywords)
     check.seed("seed", seed)
     try:
         from quad_gym.envs.sb3 import QuadSB3VecEnv

@@ -1,8 +1,6 @@
 """From the keywords of an environment to its flights: the same for all three interfaces."""
 
-import inspect
 from collections.abc import Mapping
-from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +12,15 @@ from quad_gym.batch.flight_batch import MOST_FLIGHTS, FlightBatch
 from quad_gym.batch.standing import check_pad
 from quad_gym.batch.starts import checked_start
 from quad_gym.envs.benchmarks import BENCHMARKS
+from quad_gym.envs.effects import require_effect, require_own_task, runs_no_sensor
+from quad_gym.envs.keywords import DEFAULTS, TASK_KEYWORDS
 from quad_gym.envs.spaces import (
     ACTIONS,
     LAYOUTS,
     OBSERVATIONS,
     ObservationField,
     layout_bounds,
-    observation_layout,
+    layout_of_suite,
     observation_space,
     policy_size,
 )
@@ -59,32 +59,6 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
     "trajectory": TaskParams(kind="trajectory", start="hover"),
 }
 """What each task is unless keywords say otherwise."""
-
-TASK_KEYWORDS = tuple(field.name for field in fields(TaskParams) if field.name != "kind")
-"""Fields of `TaskParams` that an environment takes as keywords."""
-
-ONE_TASK_KEYWORDS = {
-    "max_speed": "random_trajectory",
-    "max_acceleration": "random_trajectory",
-    "gate_count": "waypoints",
-    "gate_radius": "waypoints",
-    "trajectory": "trajectory",
-}
-"""Those that mean something to a single task."""
-
-KEYWORDS_WITHOUT_EFFECT = {
-    "hover": ("period",),
-    "waypoints": ("period", "preview"),
-    "trajectory": ("radius", "period", "height"),
-}
-"""Those that mean something to most tasks, by the tasks to which they mean nothing."""
-
-INTERFACE_KEYWORDS = ("render_mode", "render_view", "render_size", "render_flights")
-"""Keywords that the interfaces take themselves."""
-
-
-CONTROL_RATE = 50.0
-"""Actions per second unless a keyword says otherwise [Hz]."""
 
 MAX_STEPS = 10**9
 """Longest time limit in steps; a duration of 0 has none."""
@@ -147,21 +121,9 @@ class Flights:
         name, own_task = kind_and_task(task, base)
         self.name = name
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
-        check.keywords(
-            keywords, (*_BUILT_WITH, *TASK_KEYWORDS, *INTERFACE_KEYWORDS), "environments"
-        )
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
-        for keyword in given:
-            if ONE_TASK_KEYWORDS.get(keyword, defaults.kind) != defaults.kind:
-                raise ValueError(
-                    f"{keyword} belongs to the task {ONE_TASK_KEYWORDS[keyword]}, and must not be "
-                    f"given for {name}"
-                )
-            if keyword in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ()):
-                raise ValueError(
-                    f"{keyword} means nothing to the task {name}, and must not be given"
-                )
+        require_own_task(given, name, defaults.kind)
         self.task: TaskParams = defaults.replace(**given)
         if "pad" in given and not self.task.may_start_on_ground:
             raise ValueError(
@@ -170,18 +132,20 @@ class Flights:
         if "trajectory" in given and "duration" not in given:  # all of it, or a round
             longest = max(path.duration for path in self.task.trajectories)
             self.task = self.task.replace(duration=longest)
-        keywords = {**own, **keywords}
+        asked = frozenset(keywords)
+        keywords = {**DEFAULTS, **own, **keywords}
         if own_task is not None:
             keywords["task"] = own_task
-        if "faults" in own and keywords["faults"] is own["faults"] and _runs_no_sensor(keywords):
-            del keywords["faults"]  # the task's own, which nobody would notice
+        if "faults" in own and keywords["faults"] is own["faults"] and runs_no_sensor(keywords):
+            keywords["faults"] = None  # the task's own, which nobody would notice
         steps = keywords.pop("max_episode_steps", None)
         if steps is not None:
             steps = check.whole("max_episode_steps", steps, most=MAX_STEPS)
         if steps is not None and "duration" not in given:  # in place of the task's own limit
-            rate = check.positive("control_rate", keywords.get("control_rate", CONTROL_RATE))
+            rate = check.positive("control_rate", keywords["control_rate"])
             self.task = self.task.replace(duration=steps / rate)
-        self._build(count, autoreset, camera_is_wanted="camera" in keywords, **keywords)
+        require_effect(asked, keywords)
+        self._build(count, autoreset, camera_is_wanted="camera" in asked, **keywords)
         if steps is not None:
             self.batch.limit(min(steps, self.batch.max_steps or steps))
 
@@ -191,27 +155,27 @@ class Flights:
         autoreset: Autoreset,
         *,
         camera_is_wanted: bool,
-        observation: str = "estimate",
-        action: str = "ctbr",
-        layout: str = "relative",
-        include_std: bool = False,
-        privileged: bool = False,
-        sensors: SensorSuite | str = "standard",
-        vehicle: VehicleParams | str = "lab",
-        action_params: ActionParams | None = None,
-        camera: bool = True,
-        estimator: str | None = None,
-        filter_start: str = "cold",
-        control_rate: float = CONTROL_RATE,
-        action_delay: float = 0.0,
-        substeps: int = 1,
-        innovations: bool = False,
+        observation: str,
+        action: str,
+        layout: str,
+        include_std: bool,
+        privileged: bool,
+        sensors: SensorSuite | str,
+        vehicle: VehicleParams | str,
+        action_params: ActionParams | None,
+        camera: bool,
+        estimator: str | None,
+        filter_start: str,
+        control_rate: float,
+        action_delay: float,
+        substeps: int,
+        innovations: bool,
+        true_vehicle: VehicleParams | None,
+        true_sensors: SensorSuite | None,
+        world: WorldParams | str,
+        randomization: Randomization | Mapping[str, Given] | None,
+        faults: FaultsGiven,
         threads: int | None = None,
-        true_vehicle: VehicleParams | None = None,
-        true_sensors: SensorSuite | None = None,
-        world: WorldParams | str = "calm",
-        randomization: Randomization | Mapping[str, Given] | None = None,
-        faults: FaultsGiven = None,
         task: "Task | type[Task] | str | None" = None,
     ) -> None:
         check.choice("observation", observation, tuple(OBSERVATIONS))
@@ -233,7 +197,7 @@ class Flights:
         if true_sensors is not None:
             check.instance("true_sensors", true_sensors, SensorSuite)
         befall = faults_of(faults, suite if true_sensors is None else true_sensors)
-        idle = _runs_no_sensor(
+        idle = runs_no_sensor(
             {
                 "observation": observation,
                 "include_std": include_std,
@@ -252,15 +216,12 @@ class Flights:
         check.instance("world", place, WorldParams)
         if place.ground is None and task is None and "start_position_I" not in drawn.names:
             check_pad(self.task)  # a task of one's own may say where vehicles start
-        features = 0 if suite.camera is None else len(suite.camera.features_I)
-        self.table: tuple[ObservationField, ...] = observation_layout(
+        self.table: tuple[ObservationField, ...] = layout_of_suite(
             observation,
             layout,
+            suite,
             include_std=include_std,
             privileged=privileged,
-            feature_count=features,
-            gnss_velocity=suite.gnss is not None and suite.gnss.velocity_sigma is not None,
-            aids=tuple(suite.aids),
             drawn=drawn.names if drawn.names or place != WorldParams() else None,
         )
         bounds = layout_bounds(self.table)
@@ -322,23 +283,6 @@ class Flights:
             "policy": observations[..., : self._split].copy(),
             "privileged": observations[..., self._split :].copy(),
         }
-
-
-_BUILT_WITH = (
-    *(
-        name
-        for name, parameter in inspect.signature(Flights._build).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY and name != "camera_is_wanted"
-    ),
-    "max_episode_steps",
-)
-"""Keywords of all tasks."""
-
-
-def _runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
-    """Whether an environment of these keywords simulates no sensor."""
-    asked = any(keywords.get(name) is True for name in ("include_std", "innovations"))
-    return keywords.get("observation") in ("truth", "noisy") and not asked
 
 
 COLUMN = {name: column for column, name in enumerate(RESULTS)}

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from quad_gym.envs.configuration import Flights
+from quad_gym.envs.keywords import RENDERING_KEYWORDS
 
 if TYPE_CHECKING:
     from quad_gym.rendering.live import Rendering
@@ -17,12 +18,10 @@ RENDERING_METADATA: dict[str, Any] = {
 }
 """Gymnasium's metadata; an environment's own has its control rate as the frame rate."""
 
-_OPTIONS = ("render_view", "render_size", "render_flights")
-
 
 def rendering_options(keywords: dict[str, Any]) -> dict[str, Any]:
     """Remove the rendering keywords from the keywords of an environment, and return them."""
-    return {name: keywords.pop(name) for name in _OPTIONS if name in keywords}
+    return {name: keywords.pop(name) for name in RENDERING_KEYWORDS if name in keywords}
 
 
 def rendering_of(

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,7 @@ from quad_gym.envs.configuration import (
     start_options,
 )
 from quad_gym.envs.flight_info import flight_info, info_of_flight
+from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
@@ -49,6 +50,7 @@ class QuadSB3VecEnv(VecEnv):
         ValueError: If a keyword belongs to another task, or its value is invalid.
     """
 
+    @shows(EnvKeywords)
     def __init__(
         self,
         num_envs: int,
@@ -57,16 +59,20 @@ class QuadSB3VecEnv(VecEnv):
         base: str | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
-        **keywords: Any,
+        render_flights: Sequence[int] | None = None,
+        **keywords: Unpack[EnvKeywords],
     ) -> None:
         if render_mode not in (None, "human", "rgb_array"):
             raise ValueError(f"render_mode must be human or rgb_array, got {render_mode!r}")
-        look = rendering_options(keywords)
+        given = checked(keywords, "threads", "render_mode", "render_flights")
+        look = rendering_options(given)
         self.flights = Flights(
-            task, num_envs, Autoreset.SAME_STEP, base=base, threads=threads, **keywords
+            task, num_envs, Autoreset.SAME_STEP, base=base, threads=threads, **given
         )
         self.render_mode = render_mode
-        self.rendering = rendering_of(self.flights, render_mode, **look)
+        self.rendering = rendering_of(
+            self.flights, render_mode, render_flights=render_flights, **look
+        )
         self.spec: Any = None
         self._began = time.monotonic()
         self._seeded = False

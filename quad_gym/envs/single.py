@@ -2,7 +2,7 @@
 
 import copy
 import inspect
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,7 @@ from quad_gym.envs.configuration import (
     drawn_info,
 )
 from quad_gym.envs.flight_info import flight_info, info_of_flight
+from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
 from quad_gym.envs.spaces import action_space
 from quad_gym.params import checks as check
@@ -207,22 +208,19 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
     metadata: dict[str, Any] = RENDERING_METADATA
 
+    @shows(EnvKeywords)
     def __init__(
         self,
         task: "Task | type[Task] | str | None" = None,
         *,
         base: str | None = None,
         render_mode: str | None = None,
-        **keywords: Any,
+        **keywords: Unpack[EnvKeywords],
     ) -> None:
-        if "threads" in keywords:
-            raise check.UnknownKeywordError(
-                "threads is not a keyword of a single environment, which has one (unexpected keyword "
-                "argument 'threads'); gymnasium.make_vec takes it"
-            )
-        look = rendering_options(keywords)
-        keywords.setdefault("max_episode_steps", limit_asked_of_make())
-        self.flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **keywords)
+        given = checked(keywords, "render_mode")
+        look = rendering_options(given)
+        given.setdefault("max_episode_steps", limit_asked_of_make())
+        self.flights = Flights(task, 1, Autoreset.DISABLED, base=base, threads=1, **given)
         self.render_mode = render_mode
         self.rendering = rendering_of(self.flights, render_mode, **look)
         self.metadata = self.metadata | {"render_fps": round(self.flights.control_rate)}
@@ -384,19 +382,3 @@ def limit_asked_of_make() -> int | None:
 
 _MAKERS = ("limit_asked_of_make", "__init__")
 """Names of the functions between `gymnasium.make` and the inspection of its frame."""
-
-
-def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
-    """Return one seed per flight: seed + i for a number, the list itself for a list.
-
-    Raises:
-        ValueError: If a seed is not an integer of at least 0, or a list has another length.
-    """
-    if seed is None:
-        return [None] * count
-    if not isinstance(seed, (list, tuple, np.ndarray)):
-        first = check.seed("seed", seed) or 0
-        return [first + i for i in range(count)]
-    if len(seed) != count:
-        raise ValueError(f"seed must be a number or {count} numbers, got {len(seed)} of them")
-    return [check.seed("seed", s) for s in seed]

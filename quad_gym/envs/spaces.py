@@ -5,14 +5,14 @@ order.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.params.sensors import AID_PARAMS
+from quad_gym.params.sensors import AID_PARAMS, SensorSuite
 from quad_gym.records import AID_FREEDOMS, COLUMNS, MAX_OBSERVATION, Aid, Control, Layout, Source
 
 OBSERVATIONS = {source.name.lower(): source for source in Source}
@@ -145,26 +145,28 @@ def _table(parts: tuple[Part, ...], first: int) -> list[ObservationField]:
 
 def observation_layout(
     observation: str = "estimate",
-    layout: str = "relative",
+    layout: str | None = None,
     *,
     include_std: bool = False,
     privileged: bool = False,
-    feature_count: int = 2,
-    gnss_velocity: bool = False,
-    aids: Sequence[Aid] = (),
+    feature_count: int | None = None,
+    gnss_velocity: bool | None = None,
+    aids: Sequence[Aid] | None = None,
     drawn: Sequence[str] | None = None,
 ) -> tuple[ObservationField, ...]:
     """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
 
     Args:
         observation: The environment's `observation`; "measurements" has a layout of its own.
-        layout: The environment's `layout`.
+        layout: The environment's `layout`; None: "relative".
         include_std: Whether the filter's 15 standard deviations follow.
         privileged: Whether the truth ends the table; its slices go on counting, though the
             environment returns that part under a key of its own.
-        feature_count: Features of the camera, for "measurements".
-        gnss_velocity: Whether GNSS measures velocity, for "measurements".
-        aids: Barometer and magnetometer, as far as there are such, for "measurements".
+        feature_count: Features of the camera, for "measurements" and for drawn features in the
+            truth; None: two.
+        gnss_velocity: Whether GNSS measures velocity, for "measurements"; None: it does not.
+        aids: Barometer and magnetometer, as far as the suite has them, for "measurements"; None:
+            neither.
         drawn: What is drawn for every episode, see `quad_gym.Randomization`: the truth ends with
             the wind and the draws. None: in a calm world without draws it does not.
 
@@ -172,13 +174,27 @@ def observation_layout(
         The table.
 
     Raises:
-        ValueError: If `observation`, `layout` or a name in `drawn` is unknown.
+        ValueError: If `observation`, `layout` or a name in `drawn` is unknown, or an argument has
+            no effect.
     """
     check.choice("observation", observation, tuple(OBSERVATIONS))
-    check.choice("layout", layout, tuple(LAYOUTS))
+    check.choice("layout", "relative" if layout is None else layout, tuple(LAYOUTS))
     parts = _ABSOLUTE if layout == "absolute" else _RELATIVE
     if observation == "measurements":
-        parts = _sensor_fields(feature_count, gnss_velocity, aids)
+        parts = _sensor_fields(_or(feature_count, 2), bool(gnss_velocity), aids or ())
+    drawn_features = privileged and drawn is not None
+    for name, value, counts in (
+        ("layout", layout, observation != "measurements"),
+        ("feature_count", feature_count, observation == "measurements" or drawn_features),
+        ("gnss_velocity", gnss_velocity, observation == "measurements"),
+        ("aids", aids, observation == "measurements"),
+        ("drawn", drawn, privileged),
+    ):
+        if value is not None and not counts:
+            raise ValueError(
+                f"{name} must not be given with observation={observation!r} and "
+                f"privileged={privileged}, where it has no effect, got {value!r}"
+            )
     parts = (*parts, _LAST_ACTION)
     if include_std:
         units = ("m", "m/s", "rad", "m/s^2", "rad/s")
@@ -188,8 +204,37 @@ def observation_layout(
             for name, unit, frame in zip(STATE_NAMES, units, frames, strict=True)
         )
     if privileged:
-        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, feature_count))
+        features = _or(feature_count, 2)
+        parts += _PRIVILEGED + (() if drawn is None else _world_fields(drawn, features))
     return tuple(_table(parts, 0))
+
+
+def _or(value: int | None, otherwise: int) -> int:
+    return otherwise if value is None else value
+
+
+def layout_of_suite(
+    observation: str,
+    layout: str,
+    suite: SensorSuite,
+    *,
+    include_std: bool,
+    privileged: bool,
+    drawn: Sequence[str] | None,
+) -> tuple[ObservationField, ...]:
+    """The `observation_layout` of an environment with a sensor suite."""
+    given: dict[str, Any] = {}
+    if observation == "measurements":
+        gnss = suite.gnss
+        given["gnss_velocity"] = gnss is not None and gnss.velocity_sigma is not None
+        given["aids"] = tuple(suite.aids)
+    else:
+        given["layout"] = layout
+    if privileged and drawn is not None:
+        given["drawn"] = drawn
+    if "aids" in given or "drawn" in given:
+        given["feature_count"] = 0 if suite.camera is None else len(suite.camera.features_I)
+    return observation_layout(observation, include_std=include_std, privileged=privileged, **given)
 
 
 def layout_bounds(

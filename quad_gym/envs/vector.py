@@ -1,6 +1,7 @@
 """`QuadVectorEnv`: many flights as a Gymnasium vector environment."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -17,9 +18,11 @@ from quad_gym.envs.configuration import (
     named_options,
 )
 from quad_gym.envs.flight_info import final_parts, flight_info, replace_faults
+from quad_gym.envs.keywords import EnvKeywords, checked, shows
 from quad_gym.envs.rendered import RENDERING_METADATA, rendering_of, rendering_options
-from quad_gym.envs.single import seeds_of, with_limit
+from quad_gym.envs.single import with_limit
 from quad_gym.envs.spaces import action_space
+from quad_gym.params import checks as check
 from quad_gym.records import Autoreset, Ending
 
 if TYPE_CHECKING:
@@ -30,6 +33,7 @@ _MODES = {
     AutoresetMode.SAME_STEP: Autoreset.SAME_STEP,
     AutoresetMode.DISABLED: Autoreset.DISABLED,
 }
+_OTHERS = ("num_envs", "autoreset_mode", "threads", "render_mode", "render_flights")
 _ENDINGS = np.array(list(Ending), object)
 _TERMINATED, _TRUNCATED = COLUMN["terminated"], COLUMN["truncated"]
 
@@ -55,6 +59,7 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         ValueError: If a keyword belongs to another task, or its value is invalid.
     """
 
+    @shows(EnvKeywords)
     def __init__(
         self,
         num_envs: int = 1,
@@ -64,15 +69,19 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         render_mode: str | None = None,
-        **keywords: Any,
+        render_flights: Sequence[int] | None = None,
+        **keywords: Unpack[EnvKeywords],
     ) -> None:
-        look = rendering_options(keywords)
+        given = checked(keywords, *_OTHERS)
+        look = rendering_options(given)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         mode = _MODES[self.autoreset_mode]
-        self.flights = Flights(task, num_envs, mode, base=base, threads=threads, **keywords)
+        self.flights = Flights(task, num_envs, mode, base=base, threads=threads, **given)
         self.num_envs = self.flights.batch.count
         self.render_mode = render_mode
-        self.rendering = rendering_of(self.flights, render_mode, **look)
+        self.rendering = rendering_of(
+            self.flights, render_mode, render_flights=render_flights, **look
+        )
         self.metadata = RENDERING_METADATA | {
             "render_fps": round(self.flights.control_rate),
             "autoreset_mode": self.autoreset_mode,
@@ -316,3 +325,19 @@ def _masked(infos: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
             masked[name] = _masked(values, mask)
         masked[f"_{name}"] = mask.copy()
     return masked
+
+
+def seeds_of(seed: int | list[int | None] | None, count: int) -> list[int | None]:
+    """One seed per flight: seed + i for a number, the list itself for a list.
+
+    Raises:
+        ValueError: If a seed is no whole number of at least 0, or a list has another length.
+    """
+    if seed is None:
+        return [None] * count
+    if not isinstance(seed, (list, tuple, np.ndarray)):
+        first = check.seed("seed", seed) or 0
+        return [first + i for i in range(count)]
+    if len(seed) != count:
+        raise ValueError(f"seed must be a number or {count} numbers, got {len(seed)} of them")
+    return [check.seed("seed", s) for s in seed]

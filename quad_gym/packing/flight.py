@@ -122,8 +122,7 @@ def params_record(
     if sensors.camera is not None:
         camera = sensors.camera
         p["camera"], p["R_CB"] = camera.position_B, portable.euler_dcm(camera.attitude)
-        p["pixel_size"], p["focal_length"] = camera.pixel_size, camera.focal_length
-        p["half_image"] = np.array(camera.image_size) / 2
+        p["focal_length"], p["half_image"] = camera.focal_length, np.array(camera.image_size) / 2
         p["pixel_sigma"] = camera.pixel_sigma
         p["max_range"], p["blur"] = camera.max_range, camera.blur
         p["features"][: len(camera.features_I)] = camera.features_I

@@ -22,8 +22,6 @@ class CameraParams(Checked):
     attitude: Vector = (math.radians(120.0), 0.0, math.radians(90.0))
     """(3,) Euler angles of R_CB (roll, pitch and yaw in the 3-1-2 sequence), with the camera's z
     axis along the optical axis [rad]; laboratory"""
-    pixel_size: float = 2e-6
-    """[m]; laboratory"""
     focal_length: float = 1657.72
     """focal length [pixels]; laboratory"""
     image_size: Vector = (3840.0, 2160.0)
@@ -56,7 +54,7 @@ class CameraParams(Checked):
         if not (isinstance(self.max_range, float) and self.max_range == math.inf):
             self._check(check.positive, "max_range")
         self._check(check.phase, "phase")
-        self._check(check.positive, "rate", "pixel_size", "focal_length", "pixel_sigma")
+        self._check(check.positive, "rate", "focal_length", "pixel_sigma")
         self._check(check.place, "position_B")
         self._check(check.vector, "attitude", length=3)
         self._check(check.vector, "image_size", length=2)

@@ -2,9 +2,10 @@
 
 import dataclasses
 import difflib
+import inspect
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -247,8 +248,31 @@ Vector = tuple[float, ...]
 Matrix = tuple[tuple[float, ...], ...]
 
 
+class _Signature:
+    """The signature of a dataclass that has a `__new__`, which Python would show in its place."""
+
+    def __get__(self, instance: Any, owner: type) -> inspect.Signature:
+        """The parameters of its `__init__`, less `self`."""
+        init = owner.__init__  # type: ignore[misc]
+        _, *parameters = inspect.signature(init).parameters.values()
+        return inspect.Signature(parameters)
+
+
 class Checked:
     """A frozen dataclass whose fields are replaced by their checked form on creation."""
+
+    __signature__ = _Signature()
+
+    def __new__(cls, *_: Any, **given: Any) -> Self:
+        """Refuse keywords that are no fields, and name the field that may be meant.
+
+        Raises:
+            UnknownKeywordError: If there is one.
+        """
+        if given:
+            fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+            keywords(given, [field.name for field in fields if field.init], cls.__name__)
+        return super().__new__(cls)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)

@@ -85,7 +85,6 @@ PARAMS_FIELDS = (
     Field("velocity_sigma", (), "m/s", "velocity noise per axis; 0: not measured"),
     Field("camera", (3,), "m", "projection center in B"),
     Field("R_CB", (3, 3), "-", "body to camera"),
-    Field("pixel_size", (), "m", "pixel"),
     Field("focal_length", (), "pixels", "focal length"),
     Field("half_image", (2,), "pixels", "half the image's width and height"),
     Field("pixel_sigma", (), "pixels", "noise per axis"),

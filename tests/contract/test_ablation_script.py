@@ -8,7 +8,7 @@ from tests import console_commands
 
 
 def run(output, *options):
-    common = ("--flights", "48", "--duration", "1.1", "--output", str(output))
+    common = ("--episodes", "48", "--duration", "1.1", "--output", str(output))
     done = console_commands.run("ablation", *options, *common)
     assert done.returncode == 0, done.stderr
     return done.stdout, json.loads((output / f"{options[0]}.json").read_text())

@@ -30,7 +30,7 @@ def no_figures(monkeypatch):
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("circle")
-    return folder, run(folder, "--seeds 20")
+    return folder, run(folder, "--episodes 20")
 
 
 class TestSummary:
@@ -63,7 +63,7 @@ class TestSummary:
         assert configuration["vehicle"]["mass"] == 0.78
         assert configuration["sensors"]["estimate"]["camera"]["pixel_sigma"] == 20.0
         assert configuration["sensors"]["estimate_without_camera"]["camera"] is None
-        assert configuration["arguments"]["seeds"] == 20
+        assert configuration["arguments"]["episodes"] == 20
         assert flown[1]["versions"]["numpy"] == np.__version__
         assert flown[1]["seeds"] == {"first": 0, "count": 20}
 
@@ -97,7 +97,7 @@ def test_figures_are_those_of_the_report(flown):
 
 
 def test_prints_a_table_and_says_what_it_means(tmp_path, capsys, no_figures):
-    run(tmp_path, "--seeds 3 --duration 1")
+    run(tmp_path, "--episodes 3 --duration 1")
     printed = capsys.readouterr()
     for part in ("tracking error [mm]", "crash", "truth", "estimate, no camera", "±", "NEES"):
         assert part in printed.out
@@ -110,7 +110,7 @@ def test_prints_a_table_and_says_what_it_means(tmp_path, capsys, no_figures):
 
 
 def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
-    one = run(tmp_path / "one", "--first-seed 3 --seeds 1 --threads 1")
+    one = run(tmp_path / "one", "--seed 3 --episodes 1 --threads 1")
     with (flown[0] / "flights.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for case in CASES:
@@ -123,7 +123,7 @@ def test_results_do_not_depend_on_batch_or_threads(tmp_path, flown, no_figures):
 def test_without_camera(tmp_path, capsys, monkeypatch):
     drawn = []
     monkeypatch.setattr(script.plots, "save_figure", lambda figure, path: drawn.append(path) or [])
-    summary = run(tmp_path, "--seeds 2 --duration 1 --no-camera")
+    summary = run(tmp_path, "--episodes 2 --duration 1 --no-camera")
     assert set(summary["cases"]) == {"truth", "estimate_without_camera"}
     names = {path.name for path in drawn}
     assert "path_estimate_without_camera" in names
@@ -132,7 +132,7 @@ def test_without_camera(tmp_path, capsys, monkeypatch):
 
 
 def test_options_reach_the_flights(tmp_path, no_figures):
-    line = "--seeds 2 --duration 1 --radius 2 --gains tuned --velocity-gain 4 --gnss-rate 10"
+    line = "--episodes 2 --duration 1 --radius 2 --gains tuned --velocity-gain 4 --gnss-rate 10"
     configuration = run(tmp_path, f"{line} --bearing-noise-at predicted")["configuration"]
     assert configuration["task"]["radius"] == 2.0
     assert configuration["gains"]["position"] == pd_gains("tuned").position
@@ -143,7 +143,7 @@ def test_options_reach_the_flights(tmp_path, no_figures):
 
 
 def test_crashes_are_counted(tmp_path, capsys):
-    weak = "--seeds 3 --duration 4 --position-gain 0 --velocity-gain 0 --attitude-gain 0 0 0"
+    weak = "--episodes 3 --duration 4 --position-gain 0 --velocity-gain 0 --attitude-gain 0 0 0"
     summary = run(tmp_path, f"--no-camera {weak}")
     for case in summary["cases"].values():
         assert (case["finished"], case["crashed"]) == (0, 3)
@@ -155,7 +155,7 @@ def test_crashes_are_counted(tmp_path, capsys):
 
 
 def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
-    args = script.Args(seeds=1, duration=0.5, output=tmp_path)
+    args = script.Args(episodes=1, duration=0.5, output=tmp_path)
     trace = script.fly("estimate", script.configure(args)).trace
     distance = np.linalg.norm(trace.position - trace.reference, axis=1)
     np.testing.assert_allclose(trace.error, distance, atol=1e-12)
@@ -166,8 +166,8 @@ def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("--seeds 0", "--episodes must be at least 1"),
-        ("--first-seed -1", "--seed must be at least 0"),
+        ("--episodes 0", "--episodes must be at least 1"),
+        ("--seed -1", "--seed must be at least 0"),
         ("--threads 0", "--threads must be at least 1"),
         ("--gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),
         ("--camera-rate 400", "camera_rate must divide the IMU rate"),

@@ -130,7 +130,7 @@ def test_help_of_a_command_has_examples(capsys):
         ["flap"],
         ["compile", "--stages", "most"],
         ["compile", "--stages"],
-        ["compile", "--processes", "0"],
+        ["compile", "--jobs", "0"],
         ["version", "stray"],
     ],
     ids=" ".join,

@@ -22,7 +22,7 @@ def run(output, *options):
         "--form",
         "corrected",
         "--no-camera",
-        "--flights",
+        "--episodes",
         "64",
         "--duration",
         "1",
@@ -41,7 +41,7 @@ def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
         assert (tmp_path / name).stat().st_size > 5000
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert found["seeds"] == [0, 63]
-    assert found["configuration"]["flights"] == 64
+    assert found["configuration"]["episodes"] == 64
     assert found["sensors"]["estimator"]["kind"] == "ekf"
     assert found["sensors"]["imu"]["samples"] == "average"
     assert set(found["nees"]) < set(found["overall"])
@@ -61,7 +61,7 @@ def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path, monk
 
 
 def test_wrong_options_are_refused_in_a_line(tmp_path):
-    for options in (("--flights", "1"), ("--settle", "5"), ("--sensors", "none")):
+    for options in (("--episodes", "1"), ("--settle", "5"), ("--sensors", "none")):
         done = run(tmp_path, *options)
         assert done.returncode == 2
         assert "Traceback" not in done.stderr
@@ -76,7 +76,7 @@ def test_the_former_name_of_the_corrected_form_is_accepted():
 
 
 def test_small_innovations_of_a_constant_error_that_counts_as_noise_are_expected(tmp_path):
-    line = ["--flights", "100", "--duration", "2", "--output", str(tmp_path)]
+    line = ["--episodes", "100", "--duration", "2", "--output", str(tmp_path)]
     assert console_commands.run("consistency", "--sensors", "rtk", *line).returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     verdicts = found["verdicts"]

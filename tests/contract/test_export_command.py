@@ -22,7 +22,7 @@ def refused(line, capsys):
 
 
 def test_a_policy_becomes_a_c_file_named_after_its_task(tmp_path, capsys):
-    assert main(["export", "pretrained", "QuadGym/Hover-v0", "--to", "c"]) == 0
+    assert main(["export", "policy", "pretrained", "QuadGym/Hover-v0", "--to", "c"]) == 0
     file = tmp_path / "results" / "export" / "hover.c"
     assert "int hover(const float observation[28], float action[4])" in file.read_text()
     told = capsys.readouterr().out
@@ -31,7 +31,7 @@ def test_a_policy_becomes_a_c_file_named_after_its_task(tmp_path, capsys):
 
 
 def test_a_file_is_replaced_only_when_told(tmp_path, capsys):
-    line = "export pretrained QuadGym/Hover-v0 --output it.c"
+    line = "export policy pretrained QuadGym/Hover-v0 --output it.c"
     assert main(line.split()) == 0
     before = (tmp_path / "it.c").read_text()
     (tmp_path / "it.c").write_text("mine")
@@ -44,13 +44,13 @@ def test_a_file_is_replaced_only_when_told(tmp_path, capsys):
 def test_a_policy_becomes_an_onnx_model(tmp_path, capsys):
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
-    assert main(["export", "pretrained", "QuadGym/Waypoints-v0", "--to", "onnx"]) == 0
+    assert main(["export", "policy", "pretrained", "QuadGym/Waypoints-v0", "--to", "onnx"]) == 0
     assert (tmp_path / "results" / "export" / "waypoints.onnx").stat().st_size > 10_000
     assert "differ from the policy's by at most" in capsys.readouterr().out
 
 
 def test_names_of_files_become_names_of_functions(tmp_path):
-    main(["export", "pretrained", "QuadGym/Hover-v0", "--output", "2nd-try.c"])
+    main(["export", "policy", "pretrained", "QuadGym/Hover-v0", "--output", "2nd-try.c"])
     assert "int policy_2nd_try(" in (tmp_path / "2nd-try.c").read_text()
 
 
@@ -67,21 +67,38 @@ def test_a_filter_becomes_json_or_a_header(tmp_path, kind, suffix):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("export", "POLICY"),
-        ("export pretrained", "needs an ENV_ID"),
-        ("export pd QuadGym/Hover-v0", "must be a trained network"),
-        ("export pretrained QuadGym/Hover-v1", "must be one of"),
-        ("export pretrained QuadGym/Hover-v0 --to json", "--to must be c or onnx for a policy"),
-        ("export pretrained QuadGym/Hover-v0 --to ros", "must be one of"),
-        ("export pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
-        ("export pretrained QuadGym/Hover-v0 --sensors rtk", "give --env sensors=rtk"),
-        ("export pretrained QuadGym/Hover-v0 --env action=motor", "trained with action ctbr"),
-        ("export filter --to c", "--to must be header or json for a filter"),
-        ("export filter QuadGym/Hover-v0 --to json", "takes no ENV_ID"),
+        ("export policy", "POLICY"),
+        ("export policy pretrained", "needs an ENV_ID"),
+        ("export policy pd QuadGym/Hover-v0", "must be a trained network"),
+        ("export policy pretrained QuadGym/Hover-v1", "must be one of"),
+        ("export policy pretrained QuadGym/Hover-v0 --to json", "must be one of c, onnx"),
+        ("export policy pretrained QuadGym/Hover-v0 --to ros", "must be one of"),
+        ("export policy pretrained QuadGym/Hover-v0 --output it.onnx", "must end in .c"),
+        ("export policy pretrained QuadGym/Hover-v0 --sensors rtk", "unrecognized options"),
+        (
+            "export policy pretrained QuadGym/Hover-v0 --env action=motor",
+            "trained with action ctbr",
+        ),
+        ("export filter --to c", "must be one of header, json"),
+        ("export filter QuadGym/Hover-v0 --to json", "unrecognized options: QuadGym/Hover-v0"),
         ("export filter --sensors gps --to json", "sensors must be one of"),
-        ("export nothing.npz", "there is no policy"),
-        ("export pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
+        ("export policy nothing.npz", "there is no policy"),
+        ("export policy pretrained QuadGym/Hover-v0 --output /dev/null/it.c", "cannot write"),
     ],
 )
 def test_nonsense_is_refused(line, message, capsys):
     assert message in refused(line, capsys)
+
+
+@pytest.mark.parametrize("words", [["export"], ["export", "pretrained"], ["export", "filters"]])
+def test_an_export_of_nothing_that_can_be_exported_is_refused(words, capsys):
+    assert main(words) == 2
+    assert "the command must be one of" in capsys.readouterr().err
+
+
+def test_the_help_of_exports_lists_them(capsys):
+    assert main(["export", "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert "export policy" in printed
+    assert "export filter" in printed
+    assert "evaluate" not in printed

@@ -58,7 +58,7 @@ def test_actions_and_faults_are_those_of_the_task_unless_they_are_given():
     flights = script.make_env(script.Args(env_id="outage_dash")).unwrapped.flights
     assert flights.action == "velocity"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]
-    given = script.Args(env_id="outage_dash", action="ctbr", fault=("rotor_loss",))
+    given = script.Args(env_id="outage_dash", action="ctbr", faults=("rotor_loss",))
     flights = script.make_env(given).unwrapped.flights
     assert flights.action == "ctbr"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["RotorLoss"]
@@ -83,7 +83,7 @@ def test_a_flight_becomes_a_recording_for_rerun(tmp_path):
 
 
 def test_faults_come_and_go_at_the_given_time(tmp_path):
-    options = ("hover", "--duration", 3, "--fault", "gnss_outage", "--fault-time", 1, 2)
+    options = ("hover", "--duration", 3, "--faults", "gnss_outage", "--fault-time", 1, 2)
     done = fly(*options, "--no-camera", "--output", "flight.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     flight = Flight.load(tmp_path / "flight.npz")
@@ -103,16 +103,16 @@ def test_faults_come_and_go_at_the_given_time(tmp_path):
     [
         (("--output", "a.avi"), "--output must end in"),
         (("--speed", 0), "--speed"),
-        (("--fault", "gnss_outage", "--fault-time", 3, 2), "--fault-time"),
+        (("--faults", "gnss_outage", "--fault-time", 3, 2), "--fault-time"),
         (("--fault-time", 2, 3), "--fault-time"),
-        (("--fault", "gremlins"), "gremlins"),
-        (("--fault", "camera_occlusion", "--no-camera"), "CameraOcclusion"),
+        (("--faults", "gremlins"), "gremlins"),
+        (("--faults", "camera_occlusion", "--no-camera"), "CameraOcclusion"),
         (("--size", 10, 10, "--output", "a.gif"), "render_size"),
         (("--replay", "nowhere.npz"), "nowhere.npz"),
         (("--policy", "me"), "policy must be"),
         (("--policy", "pretraind"), "did you mean pretrained?"),
         (("--sensors", "standart"), "did you mean standard?"),
-        (("--fault", "gnss_outtage"), "did you mean gnss_outage?"),
+        (("--faults", "gnss_outtage"), "did you mean gnss_outage?"),
         (("circel",), "did you mean circle?"),
         (("--env", "worl=calm"), "did you mean world?"),
         (("--env", "world=clam"), "did you mean calm?"),
@@ -147,7 +147,7 @@ def test_keys_change_the_flight_while_one_watches():
         def pressed_keys(self):
             return self.presses.pop(self.shown, [])
 
-    fault = {"fault": ("imu_bias_step",), "fault_time": (90.0, 99.0)}
+    fault = {"faults": ("imu_bias_step",), "fault_time": (90.0, 99.0)}
     args = script.Args(
         env_id="QuadGym/Hover-v0", duration=2.0, camera=False, size=(320, 240), **fault
     )

@@ -1,6 +1,5 @@
-"""The same option has the same name and kind in every command; former names are understood."""
+"""The same option has the same name and kind in every command."""
 
-import importlib
 import re
 from collections import defaultdict
 
@@ -10,28 +9,15 @@ from quad_gym.commands import compare, consistency, evaluate, fly, study, train
 from quad_gym.commands.main import COMMANDS, main, module_of
 from quad_gym.commands.options import parse
 
-FORMER = {
-    "--task",
-    "--tasks",
-    "--flights",
-    "--first-seed",
-    "--fly-on",
-    "--fault",
-    "--processes",
-    "--envs",
-    "--start",
-}
-
 
 def args_of(command):
-    name = "benchmark.main" if command == "benchmark" else command
-    return importlib.import_module(f"quad_gym.commands.{name}").Args
+    return module_of(command).Args
 
 
 def options_of(command, capsys):
     """Kinds of the options of a command, such as INT or {} for choices, by their names."""
     with pytest.raises(SystemExit):
-        main([command, "--help"])
+        main([*command.split(), "--help"])
     found = {}
     for line in capsys.readouterr().out.splitlines():
         option = re.match(r"(?:│|  ?)(?: )?(--[a-z-]+)(?:, --no-[a-z-]+| (\S+))?", line)
@@ -39,11 +25,6 @@ def options_of(command, capsys):
             kind = re.sub(r"\{None\}\||[\[\]]", "", option[2] or "FLAG")
             found[option[1]] = "{}" if kind.startswith("{") else kind
     return found
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_commands_show_no_former_names(command, capsys):
-    assert not FORMER & set(options_of(command, capsys))
 
 
 def test_options_of_one_name_are_of_one_kind(capsys):
@@ -58,24 +39,6 @@ def test_options_of_one_name_are_of_one_kind(capsys):
         assert all(value == values[0] for value in values), (option, found)
     assert len(kinds["--seed"]) >= 7
     assert len(kinds["--episodes"]) >= 6
-
-
-def test_former_names_are_understood():
-    args = parse(args_of("consistency"), ["--flights", "8", "--first-seed", "3", "--start", "warm"])
-    assert (args.flights, args.first_seed, args.start) == (8, 3, "warm")
-    assert args == parse(
-        args_of("consistency"), ["--episodes", "8", "--seed=3", "--filter-start", "warm"]
-    )
-    assert parse(args_of("circle"), ["--seeds=5"]).seeds == 5
-    assert parse(args_of("fly"), ["--fault", "rotor_loss"]).fault == ("rotor_loss",)
-    flight = ["--fault", "rotor_loss", "gnss_outage", "--task", "hover"]
-    flight = parse(args_of("fly"), flight)
-    assert flight.env_id == parse(args_of("fly"), ["hover"]).env_id == "QuadGym/Hover-v0"
-    assert flight.fault == ("rotor_loss", "gnss_outage")
-    assert parse(args_of("consistency"), ["--task=circle"]).env_id == "QuadGym/Circle-v0"
-    assert parse(args_of("tune"), ["--tasks", "circle"]).env_ids == ("circle",)
-    assert parse(args_of("tune"), ["--start", "tuned"]).start == "tuned"
-    assert parse(args_of("compare"), ["--seeds", "2"]).seeds == 2  # of trainings
 
 
 def test_ids_may_be_short_without_the_command_line(tmp_path):
@@ -111,6 +74,6 @@ def test_help_shows_examples_as_they_are_written(command, capsys):
         if line.strip().startswith(("quad-gym ", "source "))
     ]
     with pytest.raises(SystemExit):
-        main([command, "--help"])
+        main([*command.split(), "--help"])
     shown = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert [line for line in examples if line not in shown] == []

@@ -160,7 +160,7 @@ def test_it_does_not_change_the_observation_and_has_no_memory():
 @pytest.mark.parametrize(
     ("keywords", "complaint"),
     [
-        ({"observation": "measurements"}, "sensors"),
+        ({"observation": "measurements"}, "measurements"),
         ({"action": "velocity"}, "absolute"),
         ({"action": "velocity", "observation": "truth"}, "absolute"),
     ],

@@ -166,7 +166,7 @@ def test_a_reset_turns_the_covariance_as_the_error_angles_turn(turn):
         T[6:9, 6:9] = np.stack(
             [(renewed(step) - renewed(-step)) / (2 * h) for step in h * np.eye(3)], axis=1
         )
-        expected = plain.covariance if turn == "none" else T @ plain.covariance @ T.T
+        expected = T @ plain.covariance @ T.T if turn else plain.covariance
         sd = np.sqrt(np.diag(expected))
         np.testing.assert_allclose(
             other.covariance / np.outer(sd, sd), expected / np.outer(sd, sd), rtol=0.0, atol=1e-8

@@ -273,7 +273,7 @@ def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
         text = (KERNELS.parent / "measurements" / f"{block}.py").read_text(encoding="utf-8")
         source += text.partition("# ---- update")[2]  # before it is what sensors do
     read = set(re.findall(r"(?<![\w.])(?:p|params|model)\.(\w+)", source)) & set(PARAMS.names)
-    camera = {"camera", "R_CB", "pixel_size", "focal_length", "features", "pixel_sigma", "blur"}
+    camera = {"camera", "R_CB", "focal_length", "features", "pixel_sigma", "blur"}
     camera |= {"noise_at_prediction", "noise_pinhole", "recursive_update_threshold"}
     gates = {"gate_position", "gate_direction", "gate_uncertainty"}  # open ones are left out
     present = quad_gym.sensor_suite(suite)

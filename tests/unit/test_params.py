@@ -115,7 +115,6 @@ BAD_VALUES = {
     ("CameraParams", "rate"): NOT_POSITIVE,
     ("CameraParams", "position_B"): NO_VECTORS,
     ("CameraParams", "attitude"): NO_VECTORS,
-    ("CameraParams", "pixel_size"): NOT_POSITIVE,
     ("CameraParams", "focal_length"): NOT_POSITIVE,
     ("CameraParams", "image_size"): [(1.0, 2.0, 3.0), 1.0, (0.0, 1.0), (100.0, -1.0), None],
     ("CameraParams", "pixel_sigma"): NOT_POSITIVE,

@@ -165,13 +165,9 @@ def test_a_first_fix_is_a_measurement_of_a_filter_that_it_did_not_start():
     assert (warm.record("nis_dimension") == 9.0).all()
 
 
-def test_without_a_filter_there_is_nothing_to_warm():
-    keywords = {"source": quad_gym.records.Source.TRUTH, "sensors": "rtk"}
-    flown = [FlightBatch(4, filter_start=start, **keywords) for start in ("cold", "warm")]
-    for batch in flown:
-        batch.reset(seeds=range(4))
-        batch.step()
-    assert flown[0].snapshot().tobytes() == flown[1].snapshot().tobytes()
+def test_a_warm_start_without_a_filter_is_refused():
+    with pytest.raises(ValueError, match="filter_start needs a filter, and none runs here"):
+        FlightBatch(4, filter_start="warm", source=quad_gym.records.Source.TRUTH)
 
 
 def test_nonsense_is_refused():

@@ -22,12 +22,10 @@ import platform
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
-
-from tyro.conf import arg
+from typing import Any, Literal
 
 from quad_gym.analysis.reports import require_writable, text_table, versions, write_json
 from quad_gym.batch.flight_batch import FlightBatch
@@ -66,15 +64,13 @@ ALONE = ("compile", "learning")
 class Args:
     """Options of the benchmark."""
 
-    FORMER_NAMES: ClassVar[Mapping[str, str]] = {"--envs": "--n-envs"}
-
     only: Section = "all"
     """section to run; all: every one but compile and learning, minutes"""
     against: Path | None = None
     """folder of another checkout to compare the environments with, instead of the sections"""
     batch: int = 256
     """flights in the batches of filter, tick and options, in eights"""
-    envs: Annotated[int, arg(name="n-envs")] = 1024
+    n_envs: int = 1024
     """environments in the interfaces' batches"""
     threads: int | None = None
     """most threads to use; if not given, one per core"""
@@ -93,7 +89,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        require_at_least(self, batch=1, envs=1, repeats=1, seeds=1, steps=1, threads=1)
+        require_at_least(self, batch=1, n_envs=1, repeats=1, seeds=1, steps=1, threads=1)
         if self.batch % WIDTH:
             raise ValueError(f"--batch must be a multiple of {WIDTH}, got {self.batch}")
         if self.against is not None and not (self.against / "quad_gym" / "__init__.py").is_file():
@@ -199,7 +195,7 @@ SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str
     "tick": (lambda args: time_tick(args.batch, args.effort), tick_table),
     "options": (lambda args: time_options(args.batch, args.effort), options_table),
     "interfaces": (
-        lambda args: time_interfaces(args.envs, args.most_threads, args.effort),
+        lambda args: time_interfaces(args.n_envs, args.most_threads, args.effort),
         interfaces_table,
     ),
     "tasks": (lambda args: time_own_task(args.effort, args.most_threads), own_task_table),
@@ -224,7 +220,7 @@ def chosen_sections(args: Args) -> list[str]:
 def compare(args: Args) -> list[Row]:
     """The environments of another checkout by turns with these."""
     assert args.against is not None
-    return time_against(args.against, args.envs, args.most_threads, args.effort)
+    return time_against(args.against, args.n_envs, args.most_threads, args.effort)
 
 
 def main(args: Args) -> None:

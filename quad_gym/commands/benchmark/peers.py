@@ -98,8 +98,8 @@ def filterpy_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[]
         for k in range(features):
             camera = sensors.camera
             assert camera is not None
-            ray = camera.pixel_size * np.array([*now.pixels[k], camera.focal_length])
-            variance = (camera.pixel_sigma * camera.pixel_size) ** 2 / (ray @ ray)
+            ray = np.array([*now.pixels[k], camera.focal_length])
+            variance = camera.pixel_sigma**2 / (ray @ ray)
             z.append(unit(ray))
             across = plain.R_CB @ unit(R @ (plain.features[k] - r) - plain.l_c)
             noise.append(plain._direction_noise(across, variance))

@@ -66,6 +66,8 @@ from quad_gym.records import DELAY_SLOTS, DRAW_FEATURE, FEATURE_BLOCKS, FilterFo
 SENSOR = Sensor.CAMERA
 _CAMERA, _EKF, _GATE = int(SENSOR), int(FilterForm.EKF), int(FilterForm.GATE)
 
+_PIXEL = 2e-6  # [m]; it cancels, and no parameter has it: the report writes rays in meters
+
 # ---- simulation ------------------------------------------------------------------------------
 
 
@@ -121,16 +123,15 @@ def _center(flight, p, work, settings, k):
             store3(work.X_B[i], X_B)
             work.inverse_distance[i] = 1.0 / norm(to_feature)
             put_three(work.h, k, has, scale(work.inverse_distance[i], to_feature))
-            pixel = p.pixel_size
             ray_C = (
-                pixel * flight.pixels[i, 0],
-                pixel * flight.pixels[i, 1],
-                pixel * p.focal_length,
+                _PIXEL * flight.pixels[i, 0],
+                _PIXEL * flight.pixels[i, 1],
+                _PIXEL * p.focal_length,
             )
             length = norm(ray_C)
             u_B = apply_transposed(R_CB, scale(1.0 / length, ray_C))
             put_three(work.z, k, has, u_B)
-            sigma = pixel_sigma * pixel / length
+            sigma = pixel_sigma * _PIXEL / length
             predicted = scale(work.inverse_distance[i], to_feature)
             u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
             noise = direction_noise(u_B, sigma * sigma, p.direction_floor)

@@ -1,0 +1,74 @@
+"""Keywords of environments that have no effect with the others, and are refused."""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from quad_gym.envs.keywords import FILTER_KEYWORDS
+
+ONE_TASK_KEYWORDS = {
+    "max_speed": "random_trajectory",
+    "max_acceleration": "random_trajectory",
+    "gate_count": "waypoints",
+    "gate_radius": "waypoints",
+    "trajectory": "trajectory",
+}
+"""Those that mean something to a single task."""
+
+KEYWORDS_WITHOUT_EFFECT = {
+    "hover": ("period",),
+    "waypoints": ("period", "preview"),
+    "trajectory": ("radius", "period", "height"),
+}
+"""Those that mean something to most tasks, by the tasks to which they mean nothing."""
+
+
+def require_own_task(given: Collection[str], name: str, kind: str) -> None:
+    """Refuse keywords of other tasks.
+
+    Args:
+        given: Names of fields of `TaskParams` that were given.
+        name: Name of the task.
+        kind: Kind of its reference.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    for keyword in given:
+        if ONE_TASK_KEYWORDS.get(keyword, kind) != kind:
+            raise ValueError(
+                f"{keyword} belongs to the task {ONE_TASK_KEYWORDS[keyword]}, and must not be "
+                f"given for {name}"
+            )
+        if keyword in KEYWORDS_WITHOUT_EFFECT.get(kind, ()):
+            raise ValueError(f"{keyword} means nothing to the task {name}, and must not be given")
+
+
+def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
+    """Refuse keywords that were asked for and have no effect with the others.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    observation, action = keywords["observation"], keywords["action"]
+    if "layout" in asked and observation == "measurements":
+        raise ValueError(
+            f'layout must not be given with observation="measurements", which has a layout of its '
+            f"own, got {keywords['layout']!r}"
+        )
+    for name in FILTER_KEYWORDS:
+        if name in asked and keywords[name] is not None and runs_no_sensor(keywords):
+            raise ValueError(
+                f'{name} must not be given with observation="{observation}", where no filter runs '
+                f"unless include_std or innovations ask for it, got {keywords[name]!r}"
+            )
+    if keywords["action_params"] is not None and action in ("motor", "wrench"):
+        raise ValueError(
+            f'action_params must not be given with action="{action}", whose scales follow from '
+            "the vehicle"
+        )
+
+
+def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
+    """Whether an environment of these keywords simulates no sensor."""
+    asked = any(keywords.get(name) is True for name in ("include_std", "innovations"))
+    return keywords.get("observation") in ("truth", "noisy") and not asked

@@ -1,0 +1,172 @@
+"""Keywords of the environments: types and defaults, and the signatures that show them.
+
+`EnvKeywords` is the only list of them. Type checkers and editors read it from `**keywords` of the
+interfaces, `inspect.signature` and `help` from the signatures that `shows` makes of it. `QuadEnv`
+explains each keyword.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
+
+from quad_gym.faults.presets import FaultsGiven
+from quad_gym.params import checks as check
+from quad_gym.params.control import ActionParams
+from quad_gym.params.randomization import Given, Randomization
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.trajectories import Trajectory
+from quad_gym.params.vehicle import VehicleParams
+from quad_gym.params.world import WorldParams
+
+if TYPE_CHECKING:
+    from quad_gym.tasks import Task
+
+
+class TaskKeywords(TypedDict, total=False):
+    """Fields of `quad_gym.TaskParams`; None: as the id's task has it."""
+
+    radius: float | None
+    period: float | None
+    height: float | None
+    start: Literal["ground", "hover", "mixed", "moving"] | None
+    pad: bool | None
+    reward_per: Literal["step", "second"] | None
+    randomize_reference: bool | None
+    duration: float | None
+    out_of_bounds: float | None
+    min_height: float | None
+    truncate_when_diverged: bool | None
+    max_tilt: float | None
+    max_speed: float | None
+    max_acceleration: float | None
+    gate_count: int | None
+    gate_radius: float | None
+    preview: Sequence[float] | None
+    trajectory: Trajectory | str | Path | Sequence[Trajectory | str | Path] | None
+
+
+class EnvKeywords(TaskKeywords, total=False):
+    """Keywords of every environment, which `quad_gym.QuadEnv` explains."""
+
+    observation: Literal["estimate", "truth", "noisy", "measurements"]
+    action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"]
+    layout: Literal["relative", "absolute"]
+    include_std: bool
+    privileged: bool
+    sensors: SensorSuite | str
+    innovations: bool
+    vehicle: VehicleParams | str
+    action_params: ActionParams | None
+    camera: bool
+    estimator: Literal["ukf", "ekf"] | None
+    filter_start: Literal["cold", "warm"]
+    control_rate: float
+    action_delay: float
+    substeps: int
+    max_episode_steps: int | None
+    true_vehicle: VehicleParams | None
+    true_sensors: SensorSuite | None
+    world: WorldParams | str
+    randomization: Randomization | Mapping[str, Given] | None
+    faults: FaultsGiven
+    render_view: Literal["fixed", "chase"] | None
+    render_size: tuple[int, int] | None
+
+
+class VectorKeywords(EnvKeywords, total=False):
+    """Keywords of `make_sb3_vec_env`: those of every environment, and of many flights."""
+
+    task: "Task | type[Task] | str | None"
+    threads: int | None
+    render_mode: Literal["human", "rgb_array"] | None
+    render_flights: Sequence[int] | None
+
+
+DEFAULTS: EnvKeywords = {
+    "observation": "estimate",
+    "action": "ctbr",
+    "layout": "relative",
+    "include_std": False,
+    "privileged": False,
+    "sensors": "standard",
+    "innovations": False,
+    "vehicle": "lab",
+    "action_params": None,
+    "camera": True,
+    "estimator": None,
+    "filter_start": "cold",
+    "control_rate": 50.0,
+    "action_delay": 0.0,
+    "substeps": 1,
+    "true_vehicle": None,
+    "true_sensors": None,
+    "world": "calm",
+    "randomization": None,
+    "faults": None,
+}
+"""Values of keywords that are not given, unless the id's task has others; of all others, None."""
+
+TASK_KEYWORDS = tuple(inspect.get_annotations(TaskKeywords))
+"""Names of the keywords that are fields of `TaskParams`."""
+
+RENDERING_KEYWORDS = ("render_view", "render_size")
+"""Names of the keywords that concern pictures."""
+
+FILTER_KEYWORDS = ("estimator", "filter_start")
+"""Names of the keywords that have an effect only where a filter runs."""
+
+
+def types_of(keywords: type) -> dict[str, Any]:
+    """The types of the keywords of a TypedDict by their names, the most general ones first."""
+    types = dict(inspect.get_annotations(keywords))
+    return {name: types[name] for name in sorted(types, key=lambda name: name in TASK_KEYWORDS)}
+
+
+def checked(given: Mapping[str, Any], *others: str) -> dict[str, Any]:
+    """A copy of keywords of an environment.
+
+    Args:
+        given: The keywords.
+        others: Names that the interface has besides, which may be meant by an unknown one.
+
+    Raises:
+        UnknownKeywordError: If one is unknown.
+    """
+    known = (*types_of(EnvKeywords), "task", "base", *others)
+    for name in ("threads", "render_flights"):
+        if name in given and name not in known:
+            raise check.UnknownKeywordError(
+                f"{name} is not a keyword of a single environment, which has one (unexpected "
+                f"keyword argument '{name}'); gymnasium.make_vec takes it"
+            )
+    check.keywords(given, known, "environments")
+    return dict(given)
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def shows(keywords: type) -> Callable[[F], F]:
+    """A decorator that shows the keywords of a TypedDict in a signature, in place of `**keywords`.
+
+    Args:
+        keywords: `EnvKeywords`, or what extends it.
+    """
+
+    def decorate(function: F) -> F:
+        signature = inspect.signature(function)
+        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        more = [
+            inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=dict(DEFAULTS).get(name),
+                annotation=kind,
+            )
+            for name, kind in types_of(keywords).items()
+        ]
+        function.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
+        return function
+
+    return decorate

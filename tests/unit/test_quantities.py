@@ -1,0 +1,149 @@
+"""Quantities by their public names: the same words, and the same numbers, in all interfaces."""
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quad_gym
+from quad_gym import FlightBatch, TaskParams, sensor_suite
+from quad_gym.batch.quantities import QUANTITIES
+from quad_gym.flights.record import COLUMNS
+from quad_gym.params.randomization import DRAWABLES
+from quad_gym.records import FLIGHT_FIELDS, Source
+from quad_gym.tasks.fields import VIEW_FIELDS
+
+ONLY_IN_FLIGHTS = {"covariance", "nees", "gnss_decision", "feature_decision"}
+AIDED = sensor_suite("rtk").replace(
+    barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
+)
+
+
+class Nothing(quad_gym.Task):
+    """Only there so that there is a view."""
+
+
+def flown(task="Circle", steps=30, count=5, **keywords):
+    env = gymnasium.make_vec(f"QuadGym/{task}-v0", num_envs=count, task=Nothing(), **keywords)
+    env.reset(seed=1)
+    for _ in range(steps):
+        env.step(np.full((count, 4), 0.02))
+    return env.unwrapped.flights.batch
+
+
+def test_flights_and_views_have_the_words_of_the_table():
+    assert {column.name for column in COLUMNS} - set(QUANTITIES) == ONLY_IN_FLIGHTS
+    views = {field.name for field in VIEW_FIELDS}
+    for name in QUANTITIES:
+        group, _, rest = name.partition("_")
+        for prefix, shown in (("estimated", "estimate"), ("observed", "observed")):
+            if group == prefix and rest not in ("gnss_drift", "quaternion"):
+                assert f"{shown}.{rest}" in views, name
+    assert {"truth.position", "truth.quaternion", "truth.accel_bias", "reference_velocity"} <= views
+
+
+def test_no_quantity_has_the_name_of_a_drawn_parameter():
+    assert not set(QUANTITIES) & {drawable.name for drawable in DRAWABLES}
+
+
+def test_every_quantity_has_the_shape_of_the_table():
+    room = {"features": 4, "gates": 5, "obstacles": 1}
+    wall = quad_gym.Wall(center_I=(9.0, 0.0, 1.0))
+    batch = flown("Waypoints", sensors=AIDED, world=quad_gym.WorldParams(obstacles=(wall,)))
+    room["features"] = len(AIDED.camera.features_I)
+    for name, quantity in QUANTITIES.items():
+        shape = tuple(room.get(n, n) for n in quantity.shape)
+        values = batch.read(name)
+        assert values.shape == (5, *shape), name
+        assert values.dtype == {float: np.float64, int: np.int64, bool: np.bool_}[quantity.kind]
+        some = batch.read(name, np.array([3, 1]))
+        np.testing.assert_array_equal(some, values[[3, 1]], err_msg=name)
+        values[:] = 0  # a copy
+        np.testing.assert_array_equal(batch.read(name, np.array([3, 1])), some, err_msg=name)
+
+
+def test_fields_of_the_records_are_read_as_they_are():
+    batch, fields = flown(sensors="rtk"), {field.name for field in FLIGHT_FIELDS}
+    for name, quantity in QUANTITIES.items():
+        if isinstance(quantity.of, str) and quantity.of in fields:
+            np.testing.assert_array_equal(batch.read(name), batch.record(quantity.of), name)
+    drift = flown(sensors="consumer")
+    np.testing.assert_array_equal(
+        drift.read("estimated_gnss_drift"), drift.record("slow_hat")[:, :3]
+    )
+
+
+def test_attitudes_agree_with_scipy():
+    batch = flown(sensors="rtk", observation="noisy", include_std=True)
+    for prefix in ("", "estimated_", "observed_"):
+        q, R_BI = batch.read(f"{prefix}quaternion"), batch.read(f"{prefix}R_BI")
+        expected = Rotation.from_quat(q, scalar_first=True).as_matrix().transpose(0, 2, 1)
+        np.testing.assert_allclose(R_BI, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        *("Hover", "Circle", "Lemniscate", "RandomTrajectory", "Waypoints", "Trajectory"),
+        *("LookAround", "OutageDash"),
+    ],
+)
+def test_the_reference_is_the_one_that_tasks_are_shown(task):
+    batch = flown(task, steps=40)
+    view = batch.view
+    for name in ("position", "velocity", "acceleration", "heading"):
+        np.testing.assert_allclose(
+            batch.read(f"reference_{name}"), getattr(view, f"reference_{name}"), atol=1e-11
+        )
+    np.testing.assert_array_equal(batch.read("position"), view.position)
+    np.testing.assert_array_equal(batch.read("time"), view.time)
+
+
+def test_measurements_are_those_of_a_view_and_nan_where_there_was_none():
+    suite = AIDED.with_rates(gnss=10.0, camera=20.0)
+    env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=3, task=Nothing(), sensors=suite)
+    env.reset(seed=2)
+    batch, fixes = env.unwrapped.flights.batch, 0
+    for _ in range(20):
+        env.step(np.zeros((3, 4)))
+        measured = batch.view.measured
+        for name in ("gyro", "accel", "gnss_position", "gnss_baseline", "gnss_velocity", "pixels"):
+            np.testing.assert_allclose(
+                batch.read(name), getattr(measured, name), atol=1e-9, err_msg=name
+            )
+        fixes += np.isfinite(batch.read("gnss_position")[0, 0])
+    assert 0 < fixes < 20
+
+
+def test_an_unknown_quantity_is_refused_with_the_one_that_may_be_meant():
+    batch = FlightBatch(1)
+    with pytest.raises(ValueError, match=r"must be a quantity.* did you mean position"):
+        batch.read("positon")
+    for wrong in ("r", "v_hat", None, 3):
+        with pytest.raises(ValueError, match="name must be a quantity of flights"):
+            batch.read(wrong)
+    with pytest.raises(ValueError, match=r"field of a flight's record.* did you mean b_a_hat"):
+        batch.record("b_a_hut")
+
+
+def test_estimates_without_a_filter_are_refused():
+    batch = FlightBatch(2, source=Source.TRUTH, task=TaskParams(start="hover"))
+    batch.reset(seeds=[0, 1])
+    for name, quantity in QUANTITIES.items():
+        if quantity.filtered:
+            with pytest.raises(ValueError, match=f"{name} needs a filter"):
+                batch.read(name)
+        else:
+            batch.read(name)
+    assert not batch.read("filter_diverged").any()
+
+
+def test_flights_that_were_never_reset_have_no_attitude():
+    assert np.isnan(FlightBatch(2).read("R_BI")).all()
+
+
+def test_a_drawn_parameter_is_read_by_its_name():
+    batch = FlightBatch(4, randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
+    batch.reset(seeds=range(4))
+    np.testing.assert_array_equal(batch.read("mass"), batch.drawn()["mass"])
+    np.testing.assert_array_equal(batch.read("mass", np.array([2])), batch.drawn()["mass"][2:3])
