@@ -87,8 +87,8 @@ class PDPolicy:
 
     `F = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F/|F|`, thrust `F . z`; with `b = unit(z*
     x x*)`, `R_E = [b x z*, b, z*]^T` in body axes and `[e x] = R_E^T - R_E` (e is twice the vector
-    of an antisymmetric part), `N = K e - Kd w + w x J w`. How the thrust and the torque become
-    an action depends on the environment's `action`:
+    of an antisymmetric part), `N = K e - Kd w + w x J w`. How the thrust and the torque become an
+    action depends on the environment's `action`:
 
     | `action` | what is commanded |
     |---|---|
@@ -292,7 +292,7 @@ class PDPolicy:
 
     @staticmethod
     def _attitude_error(z_wanted: Array, heading: Array) -> Array:
-        """Return e (n, 3) with `[e x] = R_E^T - R_E`: twice a small rotation vector [-]."""
+        """Return e (n, 3), `[e x] = R_E^T - R_E`: twice the rotation vector of small errors [-]."""
         b = np.cross(z_wanted, heading)
         b /= np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-9)
         a = np.cross(b, z_wanted)

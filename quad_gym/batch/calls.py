@@ -18,10 +18,10 @@ class Calls:
 
     Args:
         blocks: The flights.
-        room: Which fields they have.
+        room: The fields that they have.
         shared: Arrays that all threads see.
-        numbers: Words that are no addresses.
-        own, believed, work: Arrays of each thread.
+        numbers: Words that are not addresses.
+        own, believed, work: Arrays of each thread: true parameters, assumed parameters, workspace.
         kept: Arrays whose addresses others hold.
     """
 
@@ -51,26 +51,26 @@ class Calls:
 
     @property
     def words(self) -> NDArray[np.int64]:
-        """(len(Call),) of the first thread."""
+        """Words (len(Call),) of the first thread."""
         return self._rows[0]
 
     def observe_into(self, observations: NDArray[np.float32]) -> None:
-        """Let the next step write its observations here."""
+        """Set the array into which the next step writes its observations."""
         self._memory[1][Call.OBSERVATIONS] = observations
         self._words[:, Call.OBSERVATIONS] = address_of(observations)
 
     def show_into(self, shown: NDArray[np.float64]) -> None:
-        """Let the next step or reset write what is shown here."""
+        """Set the array into which the next step or reset writes the fields that tasks read."""
         self._memory[1][Call.SHOWN] = shown
         self._words[:, Call.SHOWN] = address_of(shown)
         self._words[:, Call.SHOWN_PITCH] = shown.strides[0]
 
     def __call__(self, board: NDArray[np.int64], number: int, command: int, serving: bool) -> bool:
-        """Fly blocks that a board has, as the thread of this number; see `fly`."""
+        """Fly blocks of a board, as the thread of this number; see `fly`."""
         return bool(fly(self._rows[number], board, number, command, serving))
 
 
 def address_of(array: NDArray[Any]) -> int:
-    """Where the memory of an array begins."""
+    """Return the address of an array's memory."""
     address: int = array.__array_interface__["data"][0]
     return address

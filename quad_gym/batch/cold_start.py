@@ -1,9 +1,9 @@
-"""Cold starts: how vague the first estimate of a filter may be.
+"""Cold starts: limits of the uncertainty of a filter's first estimate.
 
-A filter starts level, with a linearized model. The error of such a model is half the square of the
-attitude error. It goes into velocity and position before the first fix, where the covariance lacks
-it; updates in steps, as of images, do not undo that. Up to the bounds below, the mean NEES of 15
-states stays under 17, see `tests/statistical/test_vague_starts.py`.
+A filter starts level, with a linearized model, whose error is half the square of the attitude
+error. This error enters velocity and position before the first fix, where the covariance lacks it;
+updates in steps, as of images, do not remove it. Up to the bounds below, the mean NEES of 15 states
+stays under 17, see `tests/statistical/test_vague_starts.py`.
 """
 
 import math
@@ -34,10 +34,10 @@ STEEP = 0.2
 
 
 def check_cold_start(sensors: SensorSuite, draws: DrawingTable) -> None:
-    """Refuse tilts that a filter does not start from, and warn of a suite that starts too vaguely.
+    """Refuse tilts from which a filter cannot start, and warn of suites with too uncertain starts.
 
     Args:
-        sensors: As the filter assumes them.
+        sensors: The sensors that the filter assumes.
         draws: The draws of an episode.
 
     Raises:

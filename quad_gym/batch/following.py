@@ -1,4 +1,4 @@
-"""Flights that follow users' trajectories: whether they can, and which one each follows."""
+"""Flights that follow user-defined trajectories: feasibility, and the one of each flight."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from quad_gym.batch.flight_batch import FlightBatch
 
 MOST_THRUST = 2.0
-"""Largest thrust that an action commands, over the weight; motor voltages have no such limit."""
+"""Largest thrust-to-weight ratio that an action commands; motor voltages have no such limit."""
 
 
 def check_trajectories(
@@ -24,13 +24,13 @@ def check_trajectories(
     """Refuse trajectories that the vehicle cannot fly, or that no action commands.
 
     Args:
-        task: Has the trajectories, and the tilt at which episodes end.
-        vehicle: As the controller believes it to be.
+        task: Task with the trajectories, and the tilt at which episodes end.
+        vehicle: The vehicle that the controller assumes.
         actions: Scales of the actions.
-        control: What an action means.
+        control: Meaning of an action.
 
     Raises:
-        ValueError: If there is one.
+        ValueError: If a trajectory is refused.
     """
     limits: dict[str, Any] = {"max_tilt": task.max_tilt}
     if control in (Control.WRENCH, Control.CTBR, Control.ATTITUDE):

@@ -83,13 +83,13 @@ class FlightMemory:
     # ---- reading ------------------------------------------------------------------------------
 
     def read(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:
-        """A quantity of the flights, as a new array (n, ...).
+        """Return a quantity of the flights, as a new array (n, ...).
 
         Args:
             name: One of `quad_gym.batch.quantities.QUANTITIES`, such as "position",
-                "estimated_velocity" or "reference_position"; or a parameter that
-                `randomization` draws, such as "mass".
-            flights: Numbers of the flights; None: all of them.
+                "estimated_velocity" or "reference_position"; or a parameter that `randomization`
+                draws, such as "mass".
+            flights: Indices of the flights; None: all of them.
 
         Raises:
             ValueError: If there is no such quantity, or no filter runs that would estimate it.
@@ -101,7 +101,7 @@ class FlightMemory:
 
     @property
     def R_IG(self) -> NDArray[np.float64]:
-        """(3, 3) from G, the frame of GNSS, to I."""
+        """Rotation (3, 3) from G, the frame of GNSS, to I."""
         return np.array(self._model["R_IG"][0, ..., 0])
 
     def record(self, name: str, flights: NDArray[np.intp] | None = None) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Whether vehicles can stand on the ground of a world, or on the launch pad, and begin there."""
+"""Checks that vehicles can stand on the ground of a world or on the launch pad, and begin there."""
 
 import numpy as np
 
@@ -16,10 +16,10 @@ def check_standing(
     """Refuse ground on which the vehicle cannot stand, or where no episode of a task can begin.
 
     Args:
-        task: Says where the reference begins, and how far away an episode is over.
-        vehicle: As it is.
-        world: With its ground, if there is one.
-        draws: What is drawn around the task's own start.
+        task: Task with the reference, and the distance at which an episode ends.
+        vehicle: The true vehicle.
+        world: The world, with its ground if it has one.
+        draws: Draws around the start of the task.
 
     Raises:
         ValueError: If a foot is not below all rotor hubs, on which the vehicle would stand, which
@@ -55,7 +55,7 @@ def check_pad(task: TaskParams) -> None:
     """Refuse a task whose launch pad, at height 0, is out of bounds wherever its reference begins.
 
     Raises:
-        ValueError: If the episodes that start there would end with their first step.
+        ValueError: If episodes that start there would end with their first step.
     """
     if not task.may_start_on_ground:
         return
@@ -69,7 +69,7 @@ def check_pad(task: TaskParams) -> None:
 
 
 def _reference_heights(task: TaskParams) -> list[tuple[float, float]]:
-    """Between which heights each reference of a task begins [m]."""
+    """Return the lowest and highest start of each reference of a task [m]."""
     if task.kind == "waypoints":
         return [(LOWEST_GATE * task.height, (LOWEST_GATE + GATE_SPREAD) * task.height)]
     if task.kind == "random_trajectory":

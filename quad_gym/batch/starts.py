@@ -1,4 +1,4 @@
-"""What a reset is given: random streams, which flights, and where they start."""
+"""Arguments of a reset: random streams, flights, and their initial states."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,10 @@ from quad_gym.params.task import TaskParams
 from quad_gym.params.world import WorldParams
 
 MAX_SPEED = 1e4
-"""Fastest start [m/s]: some times faster than any bullet, and the drag still integrable."""
+"""Largest initial speed [m/s]: several times faster than any bullet, with drag still integrable."""
 
 MAX_YAW = 1e4
-"""Some thousand turns [rad]: a heading beyond is a mistake."""
+"""Largest initial yaw [rad], some thousand turns: larger ones are mistakes."""
 
 
 def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
@@ -23,7 +23,7 @@ def stream_key(rng: np.random.Generator) -> NDArray[np.uint64]:
 
 
 def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
-    """Keys for flights seeded one by one, as Gymnasium seeds; None takes fresh entropy."""
+    """Return keys for flights seeded one by one, as in Gymnasium; None uses fresh entropy."""
     checked = [check.seed("seeds", seed) for seed in seeds]
     return np.array([stream_key(np.random.Generator(np.random.PCG64(seed))) for seed in checked])
 
@@ -31,7 +31,7 @@ def stream_keys(seeds: Sequence[int | None]) -> NDArray[np.uint64]:
 def checked_keys(
     count: int, seeds: Sequence[int | None] | None, keys: ArrayLike | None
 ) -> NDArray[np.uint64] | None:
-    """(count, 2) keys, those of the seeds if there are any; None if there are neither."""
+    """Return keys (count, 2): of the seeds if given, else `keys`; None without either."""
     if seeds is not None:
         if isinstance(seeds, str) or not hasattr(seeds, "__len__"):
             raise ValueError(f"seeds must hold {count} seeds, got {seeds!r}")
@@ -57,15 +57,15 @@ def checked_start(
     world: WorldParams | None = None,
     chosen: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64] | None:
-    """(count, 7) start values, NaN where they are to be drawn; None if all are.
+    """Return initial values (count, 7), NaN where they are to be drawn; None if all are.
 
     Args:
-        count: Of flights.
+        count: Number of flights.
         position: (3,) or (count, 3) in I [m], or None.
-        velocity: Likewise [m/s].
+        velocity: (3,) or (count, 3) in I [m/s], or None.
         yaw: Scalar or (count,) [rad], or None.
-        task: Says how far away a start may be.
-        world: Says what stands in the way; None: nothing.
+        task: Task, for the largest distance of a start.
+        world: World with obstacles and geofence; None: without any.
         chosen: (count,) flights that begin, whose positions have to be free; None: all.
 
     Raises:
@@ -119,12 +119,12 @@ def checked_start(
 
 
 def _largest(rows: NDArray[np.float64]) -> float:
-    """The largest length of a row; NaN, which is larger than nothing, if none is given."""
+    """Return the largest length of a row; NaN, which compares as false, if none is given."""
     return float(np.linalg.norm(rows, axis=1).max())
 
 
 def checked_mask(count: int, mask: ArrayLike | None) -> NDArray[np.bool_]:
-    """(count,) which flights; all without a mask."""
+    """Return the mask (count,) of flights; all of them without a mask."""
     if mask is None:
         return np.ones(count, bool)
     chosen = np.asarray(mask)

@@ -1,6 +1,6 @@
 """Distances from obstacles and lines of sight, in NumPy: for starts, views of tasks and records.
 
-The same as `quad_gym.kernels.obstacles.shapes`, for places that the kernels do not fly to.
+The kernels in `quad_gym.kernels.obstacles.shapes` compute the same for places of flights.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def _length(vectors: Floats) -> Floats:
 
 
 def _depths(obstacle: Obstacle, p: Floats) -> tuple[Floats, Floats]:
-    """How far points are beyond each face, (n, 2 or 3), and outward directions, (n, 2 or 3, 3)."""
+    """Return distances beyond each face, (n, 2 or 3), and outward directions, (n, 2 or 3, 3)."""
     signs, half = np.where(p < 0.0, -1.0, 1.0), np.array(obstacle.half_size)
     if obstacle.shape == Shape.WALL:
         return np.abs(p) - half, signs[:, :, np.newaxis] * np.eye(3)
@@ -53,16 +53,16 @@ def _depths(obstacle: Obstacle, p: Floats) -> tuple[Floats, Floats]:
 def nearest_obstacle(
     obstacles: Sequence[Obstacle], centers: Floats, points: Floats
 ) -> tuple[Floats, Floats]:
-    """How far points are from the nearest surface of an obstacle.
+    """Return the distance of points from the nearest surface of an obstacle.
 
     Args:
-        obstacles: At least one.
-        centers: (n, obstacles, 3) where they are in I [m].
+        obstacles: At least one obstacle.
+        centers: (n, obstacles, 3) their centers in I [m].
         points: (n, 3) in I [m].
 
     Returns:
-        (n,) distances, negative inside [m]; (n, 3) vectors to the surface's nearest point, in I
-        [m].
+        (n,) distances, negative inside [m]; (n, 3) vectors to the nearest point of the surface, in
+        I [m].
     """
     best, found = np.full(len(points), np.inf), np.zeros((len(points), 3))
     for k, obstacle in enumerate(obstacles):
@@ -88,11 +88,11 @@ def nearest_obstacle(
 def hidden_points(
     obstacles: Sequence[Obstacle], centers: Floats, eyes: Floats, points: Floats
 ) -> NDArray[np.bool_]:
-    """(n, m) whether an obstacle stands between an eye and a point.
+    """Return the mask (n, m) of points behind an obstacle, as seen from an eye.
 
     Args:
-        obstacles: Any number.
-        centers: (n, obstacles, 3) where they are in I [m].
+        obstacles: Any number of obstacles.
+        centers: (n, obstacles, 3) their centers in I [m].
         eyes: (n, 3) in I [m].
         points: (m, 3) or (n, m, 3) in I [m].
     """
@@ -114,7 +114,7 @@ def hidden_points(
 
 
 def _slab(start: Floats, along: Floats, half: float) -> tuple[Floats, Floats]:
-    """The shares of lines at which they enter and leave [-half, half]."""
+    """Return the fractions of lines at which they enter and leave [-half, half]."""
     across, within = np.abs(along) > 1e-12, np.abs(start) < half
     per = np.where(across, along, 1.0)
     a, b = (-half - start) / per, (half - start) / per
@@ -123,7 +123,7 @@ def _slab(start: Floats, along: Floats, half: float) -> tuple[Floats, Floats]:
 
 
 def _disc(start: Floats, along: Floats, radius: float) -> tuple[Floats, Floats]:
-    """Likewise the infinite cylinder around the vertical."""
+    """Return the fractions of lines at which they enter and leave a vertical infinite cylinder."""
     x, y, u, v = start[..., 0], start[..., 1], along[..., 0], along[..., 1]
     a, b, c = u * u + v * v, x * u + y * v, x * x + y * y - radius * radius
     across, root = a > 1e-24, b * b - a * c
@@ -135,15 +135,15 @@ def _disc(start: Floats, along: Floats, radius: float) -> tuple[Floats, Floats]:
 
 
 def require_room(name: str, points: Floats, world: WorldParams) -> None:
-    """Refuse places within a vehicle's radius of an obstacle, wherever that may be shifted to.
+    """Refuse places within a vehicle's radius of an obstacle, with any shift that may be drawn.
 
     Args:
-        name: What they are called in the message.
+        name: Name of the places in the message.
         points: (n, 3) in I [m].
-        world: With its obstacles and its geofence.
+        world: The world, with its obstacles and its geofence.
 
     Raises:
-        ValueError: If one is, or is beyond the geofence.
+        ValueError: If a place is refused, or is beyond the geofence.
     """
     reach: list[Floats] = []
     for k, obstacle in enumerate(world.obstacles):

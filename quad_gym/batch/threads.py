@@ -1,6 +1,6 @@
-"""Threads, which share the blocks of a batch. No other module knows of threads.
+"""Threads, which share the blocks of a batch. No other module deals with threads.
 
-Kernels release the GIL, so plain threads run them side by side. A crew of threads belongs to the
+Kernels release the GIL, so plain threads run them in parallel. A crew of threads belongs to the
 process that made it: after a fork the child makes its own, and a batch that is pickled or copied
 takes none along.
 """
@@ -19,17 +19,17 @@ from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.params import checks as check
 
 MIN_BLOCKS_PER_THREAD = 4
-"""Fewer blocks than this are not worth a hand-over to another thread."""
+"""Smallest number of blocks that is worth a hand-over to another thread."""
 
 CHUNKS_OF_RANGE = 16
-"""Times that a thread comes for blocks of its range: each time costs some tens of nanoseconds."""
+"""Number of chunks into which a thread's range is cut: each costs some tens of nanoseconds."""
 
 MAX_THREADS = 1024
-"""More than this is a mistake: each thread has memory of its own."""
+"""Largest number of threads: each has its own memory, so more are a mistake."""
 
 
 def resolve_threads(threads: int | None) -> int:
-    """`threads` checked, or the available cores where it is None.
+    """Return `threads` checked, or the number of available cores for None.
 
     Raises:
         ValueError: If `threads` is not a whole number from 1 to MAX_THREADS.
@@ -40,22 +40,23 @@ def resolve_threads(threads: int | None) -> int:
 
 
 Fly = Callable[[NDArray[np.int64], int, int, bool], bool]
-"""Flies blocks that a board has: board, number of the thread, command, whether it serves."""
+"""Function that flies blocks of a board: board, number of the thread, command, True if it
+serves."""
 
 POSTED_BEFORE = -1
-"""In place of a command: nothing new, wait for what was posted before."""
+"""Value instead of a command: wait for the command that was posted before."""
 
 
 class Crew:
     """The threads that fly the blocks of one batch: the calling one, and helpers.
 
-    A helper lives in compiled code while steps follow each other fast, and sleeps otherwise; see
+    A helper stays in compiled code while steps follow each other fast, and sleeps otherwise; see
     `kernels/board.py`. It ends with the crew. A single thread needs no crew, but has its board.
 
     Args:
         fly: Flies blocks, see `Fly`.
-        blocks: How many blocks there are.
-        threads: The most threads to fly them.
+        blocks: Number of blocks.
+        threads: Largest number of threads to fly them.
     """
 
     def __init__(self, fly: Fly, blocks: int, threads: int) -> None:
@@ -91,7 +92,7 @@ class Crew:
             self._flying = False
 
     def gather(self) -> None:
-        """Wait for what an interrupted step may have left, and wake the helpers that sleep."""
+        """Wait for the rest of an interrupted step, if any, and wake the helpers that sleep."""
         if not self._alarms:
             return
         words = self._board
@@ -132,7 +133,7 @@ def _help(
     alarm: threading.Semaphore,
     errors: list[BaseException],
 ) -> None:
-    """What a helper thread does: sleep until it is woken, then serve the board."""
+    """Run a helper thread: sleep until it is woken, then serve the board."""
     while True:
         alarm.acquire()
         if words[board.STOP]:
@@ -146,7 +147,7 @@ def _help(
 
 
 def _dismiss(words: NDArray[np.int64], alarms: list[tuple[int, threading.Semaphore]]) -> None:
-    """End the helpers of a crew that nobody needs any more."""
+    """End the helpers of a crew that is no longer needed."""
     words[board.STOP] = 1
     for _, alarm in alarms:
         alarm.release()

@@ -1,9 +1,9 @@
 """Warm starts: the covariance that a filter has reached before a flight begins.
 
-Before any real take-off the filter has been running for a while. Its covariance then depends on
-the sensors and hardly on the flight, so that it is computed once for a configuration: flights hover
-where the task begins, each with its own noise, and every episode begins with the mean of their
-covariances, turned to a common heading.
+Before any real take-off the filter has been running for a while. Its covariance then depends on the
+sensors and hardly on the flight, so it is computed once per configuration: flights hover where the
+task begins, each with its own noise, and every episode begins with the mean of their covariances,
+rotated to a common heading.
 """
 
 import functools
@@ -28,15 +28,15 @@ FILTER_STARTS = ("cold", "warm")
 """Values of the keyword `filter_start`."""
 
 WARM_UP = 10.0
-"""How long a filter has been running at a warm start [s]: some correlation times of its velocity
-and attitude, as between switching a vehicle on and its take-off."""
+"""Time for which a filter has been running at a warm start [s]: several correlation times of its
+velocity and attitude, as between switching a vehicle on and its take-off."""
 
 FLIGHTS = 8
 """Flights whose covariances are averaged."""
 
 LOST = 0.35
-"""Error of the attitude beyond which a filter is lost, whatever it claims [rad]: a linear model of
-it is wrong by its square over two. Overconfidence alone is no reason to refuse a warm start."""
+"""Attitude error above which a filter has diverged, whatever its covariance [rad]: the linear model
+is wrong by half its square. Overconfidence alone is no reason to refuse a warm start."""
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def pack_warm_start(
     Args:
         settings: One SETTINGS record.
         make: Makes a batch of flights, called as `FlightBatch`.
-        true_sensors: The sensors as they are.
+        true_sensors: The true sensors.
         configuration: Arguments of `converged_covariance`.
     """
     P, sensors = converged_covariance(make, **configuration), configuration["sensors"]
@@ -71,22 +71,22 @@ def converged_covariance(
     task: TaskParams,
     substeps: int,
 ) -> Floats:
-    """The covariance that filters reach from a cold start in `WARM_UP` of hovering.
+    """Return the covariance that filters reach from a cold start in `WARM_UP` of hovering.
 
     Args:
         make: Makes a batch of flights, called as `FlightBatch`.
-        vehicle: As the controller believes it to be.
-        sensors: As the filter believes them to be.
-        task: Where its starts are; on the ground the flights hover at height 0.
-        substeps: Runge-Kutta steps in a tick.
+        vehicle: The vehicle that the controller assumes.
+        sensors: The sensors that the filter assumes.
+        task: Task with the starts; on the ground the flights hover at height 0.
+        substeps: Runge-Kutta steps per tick.
 
     Returns:
         (15, 15) mean covariance, in the order r, v, e, b_a, b_g, of a vehicle that looks east;
-        larger with the slow errors of sensors last, if the filter estimates such.
+        larger if the filter estimates time-correlated sensor errors, which come last.
 
     Raises:
-        ValueError: If a filter fails on the way, or is lost at its end, as one that has nothing to
-            tell it its heading.
+        ValueError: If a filter fails on the way, or has diverged at the end, for example because no
+            sensor observes the heading.
     """
     with warnings.catch_warnings():  # that the start is vague, as errors are drawn from P itself
         warnings.simplefilter("ignore", UserWarning)
@@ -119,8 +119,8 @@ def converged_covariance(
     if angle > LOST:
         raise ValueError(
             f"filter_start must be 'cold' for these sensors: after {WARM_UP:g} s of hovering the "
-            f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything tell the "
-            "filter its heading, such as a level baseline or the mark of `initial_pose`?"
+            f"attitude is wrong by {math.degrees(angle):.0f} degrees. Does anything observe the "
+            "heading, such as a level baseline or the heading of `initial_pose`?"
         )
     states = 15 + len(slow_states(sensors).errors)
     mean = np.zeros((states, states))
@@ -144,10 +144,10 @@ def _factors(batch: Any) -> Floats:
 
 
 def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:
-    """(24, 24) turn of what is in I from a vehicle that looks east to this one.
+    """Return the rotation (24, 24) of quantities in I from a vehicle that looks east to this one.
 
-    Three slow numbers of an aiding sensor are in B, as hard iron is. How they go with the error of
-    the heading depends on where the field is, so that they are kept as seen from I.
+    Three time-correlated errors of an aiding sensor are in B, such as hard iron. Their correlation
+    with the heading error depends on the direction of the field, so they are kept as seen from I.
     """
     w, x, y, z = map(float, q)
     forward = (w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z))
@@ -163,27 +163,28 @@ def _turned_east(q: Floats, sensors: SensorSuite) -> Floats:
 
 
 def drift_sigma(gnss: GnssParams) -> Floats:
-    """(3,) deviation of the slow error of GNSS positions `WARM_UP` after it was zero [m]."""
+    """Return the standard deviation (3,) of the GNSS drift `WARM_UP` after it was zero [m]."""
     decay = math.exp(-2.0 * WARM_UP / gnss.drift_tau)
     return np.array(gnss.drift_sigma_I) * math.sqrt(1.0 - decay)
 
 
 def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
-    """W with W W^T = P, some of whose columns belong to the true biases and the true slow error.
+    """Return W with W W^T = P, some of whose columns belong to the true biases and drifts.
 
     A filter that started from the distribution of the biases, of covariance S, has an estimate that
     is independent of its error, so that cov(error, bias) = P_b, the columns of P for the biases.
-    Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals. Likewise the slow
-    errors of sensors.
+    Errors W u have it with u = (n, S^-1/2 bias), where n are standard normals. Time-correlated
+    errors of sensors are treated in the same way.
 
     Args:
-        P: (n, n) covariance, n at least 15, whose share of biases and slow errors is not larger
-            than S.
-        sensors: As the filter believes them to be; say what S is.
+        P: (n, n) covariance, n at least 15, whose blocks of biases and time-correlated errors are
+            not larger than S.
+        sensors: The sensors that the filter assumes, which define S.
 
     Returns:
-        (n, WARM_DRAWS + 2 (n - 15)), with the columns of the biases after the first fifteen; behind
-        them, by threes, those of the slow errors alone and those of the true ones.
+        (n, WARM_DRAWS + 2 (n - 15)), with the columns of the biases after the first fifteen,
+        followed, in threes, by the columns of the time-correlated errors alone and of their true
+        values.
     """
     imu = sensors.imu
     sigma = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
@@ -193,7 +194,7 @@ def root_with_truth(P: Floats, sensors: SensorSuite) -> Floats:
     sigma = np.concatenate([sigma, slow])
     W = np.zeros((len(P), WARM_DRAWS + 2 * len(slow)))
     with_truth = P[:, 9:] / sigma
-    # what the truth does not explain; where it explains everything, rounding leaves some of it
+    # the part that the truth does not explain; where it explains all, rounding leaves a rest
     rest = portable.lower_root(P - portable.product(with_truth, with_truth.T), np.diag(P))
     W[:, :15], W[:, 15:21] = rest[:, :15], with_truth[:, :6]
     for k in range(0, len(slow), 3):

@@ -58,7 +58,7 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
     ),
     "trajectory": TaskParams(kind="trajectory", start="hover"),
 }
-"""What each task is unless keywords say otherwise."""
+"""Defaults of each task, which keywords override."""
 
 MAX_STEPS = 10**9
 """Longest time limit in steps; a duration of 0 has none."""
@@ -67,14 +67,14 @@ MAX_STEPS = 10**9
 def kind_and_task(
     task: "Task | type[Task] | str | None", base: str | None
 ) -> "tuple[str, Task | type[Task] | str | None]":
-    """The kind of task that is flown, and the user's own that is laid over it, if any.
+    """Return the kind of task that is flown, and the user-defined task laid over it, if any.
 
     Args:
-        task: The name of a kind, a task of the user's own as `resolve_task` takes it, or None.
-        base: The kind that this is laid over; None: the one that `task` names, or the circle.
+        task: Name of a kind, a user-defined task as `resolve_task` accepts it, or None.
+        base: Kind under that task; None: the one that `task` names, or the circle.
 
     Raises:
-        ValueError: If there is no such kind, or both name one.
+        ValueError: If there is no such kind, or both arguments name one.
     """
     kinds = (*TASK_DEFAULTS, *BENCHMARKS)
     kind = "circle" if base is None else check.choice("base", base, kinds)
@@ -312,7 +312,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _in_order(actions: Any, shape: tuple[int, ...]) -> bool:
-    """Whether actions need neither a check nor clipping; NaN and infinity are not within bounds."""
+    """Return True if actions need no check and no clipping; NaN and infinity always do."""
     if not (type(actions) is np.ndarray and actions.dtype.kind == "f" and actions.shape == shape):
         return False
     if actions.ndim == 1:  # a few numbers are sooner looked at than handed to NumPy
@@ -346,7 +346,7 @@ def start_options(options: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def drawn_info(drawn: dict[str, NDArray[np.float64]], flight: int) -> dict[str, Any]:
-    """What `info` says of one flight's draws: "drawn", by name; nothing where nothing is drawn."""
+    """Return the entry "drawn" of `info` for one flight: draws by name; empty without draws."""
     values = {name: flights[flight] for name, flights in drawn.items()}
     numbers = {name: float(v) if v.ndim == 0 else v for name, v in values.items()}
     return {"drawn": numbers} if numbers else {}

@@ -12,14 +12,14 @@ ONE_TASK_KEYWORDS = {
     "gate_radius": "waypoints",
     "trajectory": "trajectory",
 }
-"""Those that mean something to a single task."""
+"""Keywords that have an effect with a single task, and that task."""
 
 KEYWORDS_WITHOUT_EFFECT = {
     "hover": ("period",),
     "waypoints": ("period", "preview"),
     "trajectory": ("radius", "period", "height"),
 }
-"""Those that mean something to most tasks, by the tasks to which they mean nothing."""
+"""Keywords that have an effect with most tasks, by the tasks with which they have none."""
 
 
 def require_own_task(given: Collection[str], name: str, kind: str) -> None:
@@ -69,6 +69,6 @@ def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
 
 
 def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
-    """Whether an environment of these keywords simulates no sensor."""
+    """Return True if an environment with these keywords simulates no sensor."""
     asked = any(keywords.get(name) is True for name in ("include_std", "innovations"))
     return keywords.get("observation") in ("truth", "noisy") and not asked

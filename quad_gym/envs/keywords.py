@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class TaskKeywords(TypedDict, total=False):
-    """Fields of `quad_gym.TaskParams`; None: as the id's task has it."""
+    """Fields of `quad_gym.TaskParams`; None: the value of the id's task."""
 
     radius: float | None
     period: float | None
@@ -75,7 +75,7 @@ class EnvKeywords(TaskKeywords, total=False):
 
 
 class VectorKeywords(EnvKeywords, total=False):
-    """Keywords of `make_sb3_vec_env`: those of every environment, and of many flights."""
+    """Keywords of `make_sb3_vec_env`: of every environment, and of vector environments."""
 
     task: "Task | type[Task] | str | None"
     threads: int | None
@@ -105,7 +105,7 @@ DEFAULTS: EnvKeywords = {
     "randomization": None,
     "faults": None,
 }
-"""Values of keywords that are not given, unless the id's task has others; of all others, None."""
+"""Defaults of keywords that the id's task does not set; None for all others."""
 
 TASK_KEYWORDS = tuple(inspect.get_annotations(TaskKeywords))
 """Names of the keywords that are fields of `TaskParams`."""
@@ -118,20 +118,20 @@ FILTER_KEYWORDS = ("estimator", "filter_start")
 
 
 def types_of(keywords: type) -> dict[str, Any]:
-    """The types of the keywords of a TypedDict by their names, the most general ones first."""
+    """Return the types of the keywords of a TypedDict by name, the most general ones first."""
     types = dict(inspect.get_annotations(keywords))
     return {name: types[name] for name in sorted(types, key=lambda name: name in TASK_KEYWORDS)}
 
 
 def checked(given: Mapping[str, Any], *others: str) -> dict[str, Any]:
-    """A copy of keywords of an environment.
+    """Return a copy of keywords of an environment.
 
     Args:
         given: The keywords.
-        others: Names that the interface has besides, which may be meant by an unknown one.
+        others: Further names of the interface that an unknown keyword may be meant for.
 
     Raises:
-        UnknownKeywordError: If one is unknown.
+        UnknownKeywordError: If a keyword is unknown.
     """
     known = (*types_of(EnvKeywords), "task", "base", *others)
     for name in ("threads", "render_flights"):
@@ -148,10 +148,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def shows(keywords: type) -> Callable[[F], F]:
-    """A decorator that shows the keywords of a TypedDict in a signature, in place of `**keywords`.
+    """Return a decorator that shows the keywords of a TypedDict in a signature, not `**keywords`.
 
     Args:
-        keywords: `EnvKeywords`, or what extends it.
+        keywords: `EnvKeywords`, or a class that extends it.
     """
 
     def decorate(function: F) -> F:

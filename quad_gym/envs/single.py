@@ -112,9 +112,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     (`LookAround`: -5 m, `OutageDash`: 0 m), when the last gate is passed, or, in worlds that have
     them, when the vehicle touches an obstacle or leaves the geofence. Truncated: at the time limit,
     when the filter has failed numerically (`info["filter_status"]`), or, with
-    `truncate_when_diverged=True`, when its consistency monitor flags divergence. A step
-    can do both, as with Gymnasium's `TimeLimit`. `info["ending"]`, a `quad_gym.Ending` that equals
-    its name as text, is the reason, and the termination where there are both.
+    `truncate_when_diverged=True`, when its consistency monitor flags divergence. A step can do
+    both, as with Gymnasium's `TimeLimit`. `info["ending"]` is the reason, the termination if both:
+    a `quad_gym.Ending`, which equals its name as text.
 
     ## Start
     "ground": at rest at height 0 below the start of the reference, rotors stopped, level, with the

@@ -154,21 +154,22 @@ def observation_layout(
     aids: Sequence[Aid] | None = None,
     drawn: Sequence[str] | None = None,
 ) -> tuple[ObservationField, ...]:
-    """What an observation holds: name, slice, unit, frame and bounds of every part, in order.
+    """Return the table of an observation: name, slice, unit, frame and bounds of each part.
 
     Args:
-        observation: The environment's `observation`; "measurements" has a layout of its own.
+        observation: The environment's `observation`; "measurements" has its own layout.
         layout: The environment's `layout`; None: "relative".
-        include_std: Whether the filter's 15 standard deviations follow.
-        privileged: Whether the truth ends the table; its slices go on counting, though the
-            environment returns that part under a key of its own.
-        feature_count: Features of the camera, for "measurements" and for drawn features in the
-            truth; None: two.
-        gnss_velocity: Whether GNSS measures velocity, for "measurements"; None: it does not.
+        include_std: True: append the filter's 15 standard deviations.
+        privileged: True: append the truth. Its slices continue the numbering, although the
+            environment returns this part under a separate key.
+        feature_count: Number of the camera's features, for "measurements" and for drawn features in
+            the truth; None: two.
+        gnss_velocity: True: GNSS measures velocity, for "measurements"; None: it does not.
         aids: Barometer and magnetometer, as far as the suite has them, for "measurements"; None:
             neither.
-        drawn: What is drawn for every episode, see `quad_gym.Randomization`: the truth ends with
-            the wind and the draws. None: in a calm world without draws it does not.
+        drawn: Names of the parameters drawn in every episode, see `quad_gym.Randomization`: the
+            truth ends with the wind and the draws. None: it does not, as in a calm world without
+            draws.
 
     Returns:
         The table.
@@ -222,7 +223,7 @@ def layout_of_suite(
     privileged: bool,
     drawn: Sequence[str] | None,
 ) -> tuple[ObservationField, ...]:
-    """The `observation_layout` of an environment with a sensor suite."""
+    """Return the `observation_layout` of an environment with a sensor suite."""
     given: dict[str, Any] = {}
     if observation == "measurements":
         gnss = suite.gnss

@@ -66,7 +66,7 @@ def _csv_columns(path: Path) -> dict[str, Floats]:
         except (UnicodeDecodeError, csv.Error):
             raise ValueError(f"{path.name} must be a table of text (.csv)") from None
     if len(set(names)) < len(names):
-        raise ValueError(f"{path.name} must have different names of columns, got {names}")
+        raise ValueError(f"{path.name} must have distinct column names, got {names}")
     table = np.empty((len(cells), len(names)))
     for k, row in enumerate(cells):
         if len(row) != len(names):

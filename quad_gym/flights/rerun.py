@@ -1,18 +1,18 @@
-"""A `Flight` as a Rerun recording: 3D, the camera's image and plots on one time line.
+"""A `Flight` as a Rerun recording: 3D, the camera's image and plots on one timeline.
 
-| entity | what |
+| entity | contents |
 |---|---|
 | `world/reference`, `world/gates`, `world/features` | the path, the course, the features |
-| `world/walls`, `world/cylinders`, `world/geofence` | what stands in the way |
-| `world/truth`, `world/estimate` | the vehicle where it is and where the filter believes it to be |
+| `world/walls`, `world/cylinders`, `world/geofence` | the obstacles and the geofence |
+| `world/truth`, `world/estimate` | the vehicle at its true and at its estimated pose |
 | `world/truth/camera/image` | the image plane: features as measured, and as the estimate predicts |
-| `world/ellipsoid` | where the filter expects the position with 3 sigma, at its true size |
+| `world/ellipsoid` | the filter's 3-sigma ellipsoid of the position, at its true size |
 | `world/gnss`, `world/rays` | fixes as they arrive, features while the camera sees them |
-| `world/trail` | where truth and estimate were |
+| `world/trail` | past positions of truth and estimate |
 | `plots` | errors, position errors with the filter's 3 sigma, NEES with its band, rotors, actions |
 
-Times are seconds since the start of the episode, lengths meters, in east, north, up; Rerun keeps
-what it draws in single precision, and what it plots in double.
+Times are seconds since the start of the episode, lengths meters, in east, north, up. Rerun stores
+3D objects in single precision, and plots in double precision.
 """
 
 import json
@@ -41,7 +41,7 @@ FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
 
 
 def rerun_recording(flight: Flight) -> Any:
-    """The recording of a flight.
+    """Return the recording of a flight.
 
     Args:
         flight: The flight.
@@ -169,7 +169,7 @@ class _Log:
         return "\n".join(["| | |", "|---|---|", *rows])
 
     def reference(self) -> None:
-        """Where the vehicle should be, and where in the next second."""
+        """Log the reference at present, and over the next second."""
         rr, flight, scene = self._rr, self._flight, self._scene
         at = rr.Points3D.columns(positions=flight["reference_position"])
         self._static("world/reference/now", rr.Points3D.from_fields(radii=0.05, colors=[REFERENCE]))
@@ -184,7 +184,7 @@ class _Log:
     # ---- what flies ---------------------------------------------------------------------------
 
     def vehicles(self) -> None:
-        """The vehicle where it is, with body axes."""
+        """Log the vehicle at its true pose, with body axes."""
         self._body("world/truth", "position", "quaternion", TRUTH)
         axes = 0.42 * np.eye(3)
         arrows = self._rr.Arrows3D(vectors=axes, colors=[NEUTRAL], labels=list("xyz"))
@@ -192,7 +192,7 @@ class _Log:
         self._trail("truth", "position", TRUTH)
 
     def estimate(self) -> None:
-        """The vehicle where the filter believes it to be, and how sure it is."""
+        """Log the vehicle at its estimated pose, with the covariance of its position."""
         rr, flight = self._rr, self._flight
         self._body("world/estimate", "estimated_position", "estimated_quaternion", ESTIMATE)
         self._trail("estimate", "estimated_position", ESTIMATE)
@@ -223,7 +223,7 @@ class _Log:
         self._static(f"{entity}/body", rr.LineStrips3D([*arms, *rings], radii=0.01, colors=[color]))
 
     def _trail(self, name: str, position: str, color: tuple[int, ...]) -> None:
-        """A piece per row, of which the view shows those of the last seconds."""
+        """Log a piece per row; the view shows the pieces of the last seconds."""
         rr, places = self._rr, self._flight[position]
         good = np.isfinite(places).all(axis=1)
         pieces = np.stack([np.concatenate([places[:1], places[:-1]]), places], axis=1)
@@ -235,7 +235,7 @@ class _Log:
     # ---- sensors ------------------------------------------------------------------------------
 
     def fixes(self) -> None:
-        """GNSS fixes when they arrive; gray where the filter's gate has rejected them."""
+        """Log GNSS fixes when they arrive; gray if the filter's gate has rejected them."""
         rr, fixes = self._rr, self._flight["gnss_position"]
         measured = np.isfinite(fixes).all(axis=1)
         if measured.any():
@@ -246,7 +246,7 @@ class _Log:
             self._send("world/gnss", points, measured)
 
     def camera(self) -> None:
-        """The image plane with what was measured and what the estimate predicts, and the rays."""
+        """Log the image plane with measured and predicted features, and the rays."""
         rr, flight, scene = self._rr, self._flight, self._scene
         turn = _xyzw(dcm_to_quaternion(scene.R_CB))
         camera = "world/truth/camera"
@@ -323,7 +323,7 @@ class _Log:
 
 
 def _blueprint(flight: Flight) -> Any:
-    """How the viewer lays it out: 3D on the left, the camera and the plots on the right."""
+    """Return the layout of the viewer: 3D on the left, camera and plots on the right."""
     import rerun.blueprint as rrb
 
     def last(seconds: float) -> Any:

@@ -1,4 +1,4 @@
-"""Checks of what users pass in: each raises a ValueError that names the argument."""
+"""Checks of user input: each raises a ValueError that names the argument."""
 
 import dataclasses
 import difflib
@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MOST_TICKS = 10**5
-"""Between two events of a clock; 500 s at 200 Hz."""
+"""Largest number of ticks between two events of a clock; 500 s at 200 Hz."""
 
 LARGEST = 1e15
-"""No quantity of a vehicle is larger, in SI units; its square is still far from overflow."""
+"""Largest magnitude of any quantity in SI units; its square is far from overflow."""
 
 SMALLEST = 1e-15
-"""No quantity that has to be positive is smaller; its square is still far from underflow."""
+"""Smallest value of a quantity that has to be positive; its square is far from underflow."""
 
 
 FARTHEST_ON_VEHICLE = 100.0
@@ -25,11 +25,11 @@ FARTHEST_ON_VEHICLE = 100.0
 
 
 class UnknownKeywordError(TypeError, ValueError):
-    """A keyword that nothing has; as Python's own a TypeError, and a ValueError as all checks."""
+    """An unknown keyword: a TypeError, as in Python, and a ValueError, as in all checks."""
 
 
 class NotResetError(RuntimeError, ValueError):
-    """Something is to fly that has never been reset."""
+    """A flight was to be stepped that has never been reset."""
 
 
 def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
@@ -42,10 +42,10 @@ def keywords(given: Iterable[str], known: Sequence[str], of: str) -> None:
 
 
 def closest(name: Any, known: Iterable[str]) -> str | None:
-    """The one of `known` that a misspelt name may stand for, whatever its case; None: none.
+    """Return the one of `known` that a misspelt name may stand for, ignoring case; None: none.
 
-    A word that `name` resembles as a whole comes before one of which it resembles a part, as
-    `rate` does of `control_rate`.
+    Words that `name` resembles as a whole come before words of which it resembles a part, as `rate`
+    does of `control_rate`.
     """
     if not isinstance(name, str):
         return None
@@ -70,13 +70,13 @@ def _likeness(a: str, b: str) -> float:
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
-    """The end of a message that refuses a name: the one that may be meant, if there is one."""
+    """Return the end of a message that refuses a name: the one that may be meant, if any."""
     close = closest(name, known)
     return f"; did you mean {close}?" if close else ""
 
 
 def _no_number(value: Any) -> bool:
-    """Whether a value that Python would turn into a float is none: text, truth, an array."""
+    """Return True for a value that Python converts to a float, but is none: text, bool, array."""
     return isinstance(value, (str, bytes, bytearray, bool, np.bool_)) or np.ndim(value) > 0
 
 
@@ -193,7 +193,7 @@ def array(
 
 
 def _holds_no_numbers(value: Any) -> bool:
-    """Whether text, truth values or nothing at all would be taken for numbers by NumPy."""
+    """Return True if NumPy would convert text, booleans or nothing at all to numbers."""
     if isinstance(value, np.ndarray):
         return value.dtype.kind not in "iuf"
     if isinstance(value, (list, tuple)):
@@ -207,7 +207,7 @@ def vector(name: str, value: Any, length: int) -> tuple[float, ...]:
 
 
 def _sized(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Numbers none of which is larger than LARGEST."""
+    """Return numbers that are all at most LARGEST in magnitude."""
     if values.size and np.abs(values).max() > LARGEST:
         raise ValueError(f"{name} must be at most {LARGEST:g} either way, got {values}")
     return values
@@ -230,7 +230,7 @@ def matrix(name: str, value: Any, rows: int | None, columns: int) -> tuple[tuple
 
 
 def ticks(name: str, rate: float, tick_rate: float) -> int:
-    """How many ticks lie between two events at `rate` [Hz]; they must be a whole number."""
+    """Return the number of ticks between two events at `rate` [Hz], which must be whole."""
     ratio = tick_rate / positive(name, rate)
     if ratio > MOST_TICKS:
         raise ValueError(

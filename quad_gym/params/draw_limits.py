@@ -1,4 +1,4 @@
-"""Which draws are possible: within the bounds of the parameters, able to hover, and stable."""
+"""Limits of draws: within the bounds of the parameters, able to hover, and stable."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ FAST = 100.0
 
 _OF_PARTS = {"battery_charge": "charge", "battery_resistance": "resistance"}
 _OF_PARTS |= {"camera_position_B": "position_B"}
-"""Names in their dataclasses of what has another name among draws."""
+"""Names of fields whose draws have other names."""
 
 
 def check_bounds(
@@ -42,7 +42,7 @@ def check_bounds(
         world: The world without draws.
 
     Raises:
-        ValueError: If the least or the largest draws of a parameter are beyond its bounds.
+        ValueError: If the smallest or the largest draws of a parameter are beyond its bounds.
     """
     parts = (vehicle, world, world.battery, sensors.imu, sensors.gnss, sensors.camera)
     present = [part for part in parts if part is not None]
@@ -99,7 +99,7 @@ def _check_center(place: NDArray[np.float64], vehicle: VehicleParams) -> None:
 
 
 def _check_antennas(table: "DrawingTable") -> None:
-    """Refuse antennas whose draws may come together."""
+    """Refuse antennas whose draws may coincide."""
     one, other = COLUMNS["primary_antenna_B"], COLUMNS["secondary_antenna_B"]
     gap = np.maximum(table.low[one] - table.high[other], table.low[other] - table.high[one])
     check_baseline(
@@ -108,7 +108,7 @@ def _check_antennas(table: "DrawingTable") -> None:
 
 
 def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldParams) -> None:
-    """Refuse draws whose worst case cannot carry its weight, or has no power to.
+    """Refuse draws whose worst case lacks the thrust or the power to hover.
 
     Args:
         table: The draws.
@@ -116,7 +116,7 @@ def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldPa
         world: The world without draws.
 
     Raises:
-        ValueError: If there are such.
+        ValueError: If there are such draws.
     """
     least, most = table.least, table.most
     mass = most("mass")
@@ -137,7 +137,7 @@ def check_hovering(table: "DrawingTable", vehicle: VehicleParams, world: WorldPa
     speed = math.sqrt(mass * vehicle.gravity / lift)
     torque = 4.0 * least("rotor_efficiency") * most("torque_coefficient") * speed**2
     power = torque * speed / world.battery.motor_efficiency
-    # U (U0 - U) / R is what it delivers at U: the most at half of U0, unless hovering takes more U
+    # it delivers U (U0 - U) / R at U: the most at half of U0, unless hovering takes more U
     voltage = max(speed / least("motor_speed_per_volt"), 0.5 * full)
     largest = voltage * (full - voltage) / power
     if most("battery_resistance") > largest:

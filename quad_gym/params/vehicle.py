@@ -174,13 +174,13 @@ def check_gyration(name: str, moments: ArrayLike, mass: float, rotors: ArrayLike
     """Refuse moments of inertia that are too small for the mass and the size of the vehicle.
 
     Args:
-        name: What they belong to.
+        name: Name of the argument in messages.
         moments: (3,) about three orthogonal axes [kg m^2].
-        mass: Of the vehicle [kg].
+        mass: Mass of the vehicle [kg].
         rotors: (4, 3) rotor hubs relative to the center of mass [m].
 
     Raises:
-        ValueError: If one is smaller than that of LEAST_GYRATION.
+        ValueError: If one is smaller than the radius of gyration LEAST_GYRATION allows.
     """
     reach = float(np.linalg.norm(rotors, axis=1).max())
     smallest = max(LEAST_MOMENT, mass * (LEAST_GYRATION * reach) ** 2)

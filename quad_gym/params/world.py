@@ -28,9 +28,9 @@ class BatteryParams(Checked):
     motors get at most U with `U = U0 - resistance P / U`. The battery delivers at most
     `U0^2 / (4 resistance)`, at U = U0 / 2. The rotors take `P = V I` at the voltage
     `V = W / motor_speed_per_volt` of steady speeds, and the motors get at most the V at which V I
-    is what the battery delivers at most: rotors that want more slow down to where they take that.
-    At s = 0 the battery cuts off. A resistance with which it cannot deliver what hovering takes is
-    refused.
+    is the largest power of the battery: rotors that would take more slow down to that power. At
+    s = 0 the battery cuts off. A resistance with which the power for hovering cannot be delivered
+    is refused.
     """
 
     energy: float = 88e3

@@ -1,4 +1,4 @@
-"""The parameters that can be drawn anew for every episode, in the order of a flight's field `drawn`."""
+"""The parameters that can be drawn in every episode, in the order of a flight's field `drawn`."""
 
 import math
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 from quad_gym.records.sizes import MAX_ACTION_DELAY, MAX_FEATURES
 
 FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3
-"""How a parameter is drawn."""
+"""Kinds of distributions in the kernels."""
 
 
 class Drawable(NamedTuple):
@@ -28,43 +28,43 @@ class Drawable(NamedTuple):
 DRAWABLES = (
     # the vehicle
     Drawable("mass", 1, "kg", "mass"),
-    Drawable("inertia", 3, "kg m^2", "its diagonal; the rest follows"),
-    Drawable("center_of_mass_B", 3, "m", "true center of mass, from where it is believed to be"),
-    Drawable("thrust_coefficient", 1, "N/(rad/s)^2", "kF"),
-    Drawable("torque_coefficient", 1, "N m/(rad/s)^2", "kN"),
-    Drawable("rotor_efficiency", 4, "-", "of each rotor: of its thrust and torque", above=0.0),
-    Drawable("motor_time_constant", 1, "s", "lag of the rotor speed"),
+    Drawable("inertia", 3, "kg m^2", "diagonal of the inertia; the rest follows"),
+    Drawable("center_of_mass_B", 3, "m", "true center of mass relative to the assumed one"),
+    Drawable("thrust_coefficient", 1, "N/(rad/s)^2", "thrust coefficient kF"),
+    Drawable("torque_coefficient", 1, "N m/(rad/s)^2", "torque coefficient kN"),
+    Drawable("rotor_efficiency", 4, "-", "factor on thrust and torque of each rotor", above=0.0),
+    Drawable("motor_time_constant", 1, "s", "time constant of the rotor speeds"),
     Drawable("motor_speed_per_volt", 1, "rad/s/V", "steady rotor speed per volt"),
     Drawable("max_voltage", 1, "V", "largest voltage of the motors"),
-    Drawable("drag_coefficient", 1, "-", "of the drag disc"),
+    Drawable("drag_coefficient", 1, "-", "drag coefficient of the drag disc"),
     # the world
-    Drawable("wind_east", 1, "m/s", "steady wind"),
-    Drawable("wind_north", 1, "m/s", "steady wind"),
-    Drawable("wind_up", 1, "m/s", "steady wind"),
+    Drawable("wind_east", 1, "m/s", "steady wind toward east"),
+    Drawable("wind_north", 1, "m/s", "steady wind toward north"),
+    Drawable("wind_up", 1, "m/s", "steady wind upward"),
     Drawable("wind_speed", 1, "m/s", "horizontal speed of the steady wind", least=0.0),
-    Drawable("wind_direction", 1, "rad", "where the steady wind blows to, from east toward north"),
+    Drawable("wind_direction", 1, "rad", "direction toward which the steady wind blows, from east toward north"),
     Drawable("gust_wind_speed", 1, "m/s", "W20, the strength of gusts"),
-    Drawable("linear_drag_B", 3, "N s/m", "linear drag"),
-    Drawable("rotor_drag_B", 3, "N s/m per rad/s", "linear drag per rotor speed"),
-    Drawable("battery_charge", 1, "-", "charge at the start"),
+    Drawable("linear_drag_B", 3, "N s/m", "linear drag along each body axis"),
+    Drawable("rotor_drag_B", 3, "N s/m per rad/s", "linear drag along each body axis, per rotor speed"),
+    Drawable("battery_charge", 1, "-", "charge of the battery at the start"),
     Drawable("battery_resistance", 1, "ohm", "resistance of the battery"),
-    # sensors as they are
-    Drawable("accel_noise_density", 1, "m/s^2/sqrt(Hz)", "white noise"),
-    Drawable("gyro_noise_density", 1, "rad/s/sqrt(Hz)", "white noise"),
-    Drawable("accel_bias_sigma", 1, "m/s^2", "of the stationary bias"),
-    Drawable("gyro_bias_sigma", 1, "rad/s", "of the stationary bias"),
-    Drawable("accel_bias_tau", 1, "s", "correlation time"),
-    Drawable("gyro_bias_tau", 1, "s", "correlation time"),
+    # the true sensors
+    Drawable("accel_noise_density", 1, "m/s^2/sqrt(Hz)", "white noise of the accelerometer"),
+    Drawable("gyro_noise_density", 1, "rad/s/sqrt(Hz)", "white noise of the gyro"),
+    Drawable("accel_bias_sigma", 1, "m/s^2", "stationary standard deviation of the accelerometer bias"),
+    Drawable("gyro_bias_sigma", 1, "rad/s", "stationary standard deviation of the gyro bias"),
+    Drawable("accel_bias_tau", 1, "s", "correlation time of the accelerometer bias"),
+    Drawable("gyro_bias_tau", 1, "s", "correlation time of the gyro bias"),
     Drawable("position_sigma_I", 3, "m", "noise of the GNSS position"),
     Drawable("baseline_sigma", 1, "rad", "noise of the GNSS baseline's direction"),
-    Drawable("pixel_sigma", 1, "pixels", "noise of the camera"),
-    # how they are mounted
-    Drawable("lever_arm_B", 3, "m", "accelerometer"),
-    Drawable("primary_antenna_B", 3, "m", "primary GNSS antenna"),
-    Drawable("secondary_antenna_B", 3, "m", "secondary GNSS antenna"),
-    Drawable("camera_position_B", 3, "m", "projection center"),
+    Drawable("pixel_sigma", 1, "pixels", "noise of the features' image coordinates"),
+    # their mounting
+    Drawable("lever_arm_B", 3, "m", "position of the accelerometer"),
+    Drawable("primary_antenna_B", 3, "m", "position of the primary GNSS antenna"),
+    Drawable("secondary_antenna_B", 3, "m", "position of the secondary GNSS antenna"),
+    Drawable("camera_position_B", 3, "m", "position of the camera's projection center"),
     Drawable("camera_rotation", 3, "rad", "error e of the camera's attitude, R(e) R_CB"),
-    Drawable("focal_length", 1, "pixels", "of the camera"),
+    Drawable("focal_length", 1, "pixels", "focal length of the camera"),
     # the start, on top of the task's own; what a caller gives to a reset stays as it was given
     Drawable("start_position_I", 3, "m", "added to the start's position", -1e6, most=1e6),
     Drawable("start_velocity_I", 3, "m/s", "added to the start's velocity", -1e4, most=1e4),
@@ -72,12 +72,12 @@ DRAWABLES = (
     Drawable("start_roll", 1, "rad", "added to the start's roll"),
     Drawable("start_pitch", 1, "rad", "added to the start's pitch"),
     Drawable("start_yaw", 1, "rad", "added to the start's yaw"),
-    # what actions meet
-    Drawable("action_delay", 1, "steps", "of actions, in control steps", 0.0, most=MAX_ACTION_DELAY),
-    # where the camera's features are, which the filter knows
-    Drawable("features_yaw", 1, "rad", "turn of all features about the vertical through the origin", -1e4, most=1e4),
-    Drawable("features_shift_I", 3, "m", "shift of all features, after the turn", -1e4, most=1e4),
-    Drawable("feature_offsets_I", 3 * MAX_FEATURES, "m", "offset of each feature by itself, before the turn", -1e4, most=1e4),
+    # the execution of actions
+    Drawable("action_delay", 1, "steps", "delay of actions, in control steps", 0.0, most=MAX_ACTION_DELAY),
+    # the positions of the camera's features, which are known to the filter
+    Drawable("features_yaw", 1, "rad", "rotation of all features about the vertical through the origin", -1e4, most=1e4),
+    Drawable("features_shift_I", 3, "m", "shift of all features, after the rotation", -1e4, most=1e4),
+    Drawable("feature_offsets_I", 3 * MAX_FEATURES, "m", "offset of each feature, before the rotation", -1e4, most=1e4),
 )
 # fmt: on
 """Every parameter that can be drawn; the columns of a flight's field `drawn`, in this order."""

@@ -180,7 +180,7 @@ def test_stamps_of_the_future_and_from_before_the_window_are_refused():
     before = estimate(kf)
     oldest = kf.oldest_time
     assert 0.5 - 0.2 - 1e-9 <= oldest <= 0.5
-    for time, words in ((0.501, "predict up to it"), (oldest - 0.01, "remembers 0.2 s")):
+    for time, words in ((0.501, "predict up to it"), (oldest - 0.01, "keeps 0.2 s")):
         with pytest.raises(ValueError, match=rf"time must .*{words}"):
             kf.update(np.zeros(3), time=time)
     for bad in (math.nan, "now", [0.3]):

@@ -290,7 +290,7 @@ def small(**changes):
         ({"gyro": None}, "must have a column gyro_x"),
         ({"time": np.array([0.0, 0.02, 0.01, 0.03])}, r"must increase, got 0\.010000 s after"),
         ({"time": np.array([0.0, 0.01, 0.01, 0.03])}, "must increase"),
-        ({"time": np.zeros(3)}, "of one length"),
+        ({"time": np.zeros(3)}, "equal lengths"),
         ({"time": np.array(["a", "b", "c", "d"])}, "column time must hold numbers"),
         ({"gyro": np.zeros((4, 2))}, "gyro must have shape"),
         ({"accel": np.full((4, 3), np.inf)}, "accel must be finite"),
@@ -298,7 +298,7 @@ def small(**changes):
         ({"gyros": np.zeros(4)}, "gyros is not a keyword of logs"),
         ({"gnss": np.zeros((4, 3))}, "must have one of gnss, gnss_enu"),
         ({"gnss_enu": None}, "must have a GNSS position to start from"),
-        ({"gnss_enu": None, "gnss_east": np.zeros(4)}, "must have a column gnss_north beside"),
+        ({"gnss_enu": None, "gnss_east": np.zeros(4)}, "must have a column gnss_north with"),
         ({"pixel_0_u": np.zeros(4), "pixel_0_v": np.zeros(4)}, "12 features of the suite, got 1"),
         ({"time": np.array([0.0, 0.01, 1.5, 1.51])}, "at most 1 s apart, got none from 0.010 s"),
         ({"time": np.array([0.0, np.nan, 0.02, 0.03])}, "must increase|must be finite"),
@@ -348,7 +348,7 @@ def test_files_that_are_none_are_refused(tmp_path):
     for text, message in (
         ("time,gyro_x\n0.0\n", "2 cells in each row, got 1 in row 1"),
         ("time,gyro_x\n0.0,x\n", "must hold numbers"),
-        ("time,time\n0.0,1.0\n", "a name for each column once"),
+        ("time,time\n0.0,1.0\n", "must have distinct column names"),
         ("", "must have a column time"),
     ):
         file.write_text(text)
