@@ -137,8 +137,8 @@ def _matrix(folder: Path, _: Sequence[str]) -> dict[str, str]:
 def _recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
     """All trials as CSV, and those with more than 1 % undetected failures."""
     cells = _read(folder / "0/recovery.json")["cells"]
-    faulty = {label: cell for label, cell in cells.items() if "silent" in cell["values"]}
-    calm = {label: cell for label, cell in cells.items() if "silent" not in cell["values"]}
+    faulty = {label: cell for label, cell in cells.items() if "undetected" in cell["values"]}
+    calm = {label: cell for label, cell in cells.items() if "undetected" not in cell["values"]}
     for name, chosen in (("faults", faulty), ("calm", calm)):
         columns = list(next(iter(chosen.values()))["values"])
         with (folder / f"0/{name}.csv").open("w", encoding="utf-8", newline="") as stream:
@@ -151,13 +151,13 @@ def _recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows = [
         [
             label,
-            *(f"{cell['values'][n]:.1f}" for n in ("right", "told", "silent")),
+            *(f"{cell['values'][n]:.1f}" for n in ("consistent", "flagged", "undetected")),
             cell["expected"],
         ]
         for label, cell in faulty.items()
         if cell["miss"]
     ]
-    alarms = max(cell["values"]["alarms"] for cell in calm.values())
+    alarms = max(cell["values"]["alarms_per_hour"] for cell in calm.values())
     return {
         "recovery": table(
             ("suite, fault", "consistent [%]", "flagged [%]", "undetected [%]", "reason"), rows

@@ -1,10 +1,10 @@
 """Recovery of filters after faults, and detection of divergence.
 
-* A flight is **consistent** (`right`) while the NEES of position, velocity and attitude is below
+* A flight is **consistent** while the NEES of position, velocity and attitude is below
   the 99.73 % chi-square quantile with nine degrees of freedom, which corresponds to 3 sigma of a
   single number. A consistent filter exceeds it in 0.27 % of the flights at any instant.
-* A flight is **flagged** (`told`) while `info["filter_diverged"]` is true.
-* A flight has a **large error** (`far_off`) while any of these nine errors exceeds six standard
+* A flight is **flagged** while `info["filter_diverged"]` is true.
+* A flight has a **large error** while any of these nine errors exceeds six standard
   deviations. A missed alarm is a flight with large errors for `MISSED_AFTER` without interruption
   that is not flagged in that time; a false alarm is a new flag without a fault.
 """
@@ -19,13 +19,13 @@ from quad_gym.analysis.consistency import flight_errors
 from quad_gym.analysis.metrics import chi_square_quantile, nees
 from quad_gym.batch.flight_batch import FlightBatch
 
-RIGHT = 0.9973
+CONSISTENT = 0.9973
 """Probability of the chi-square quantile below which a flight is consistent, as for 3 sigma."""
-FAR_OFF = 6.0
+LARGE = 6.0
 """Number of standard deviations beyond which an error counts as large."""
 MISSED_AFTER = 2.0
 """Duration of large errors without a flag after which an alarm counts as missed [s]."""
-WANTED = 0.99
+REQUIRED = 0.99
 """Required share of flights that are consistent or flagged."""
 MOTION = slice(0, 9)
 """Coordinates of position, velocity and attitude in the error state."""
@@ -39,11 +39,11 @@ class Recovery:
 
     time: NDArray[np.float64]
     """Time since the start, (t,) [s]"""
-    right: Flags
+    consistent: Flags
     """True while a flight is consistent, (t, flights)"""
-    told: Flags
+    flagged: Flags
     """True while a flight is flagged as diverged, (t, flights)"""
-    far_off: Flags
+    large_error: Flags
     """True while a flight has a large error, (t, flights)"""
 
     def share(self, flags: Flags, time: float) -> float:
@@ -55,43 +55,43 @@ class Recovery:
         return int(np.abs(self.time - time).argmin())
 
     @property
-    def silent(self) -> Flags:
+    def undetected(self) -> Flags:
         """Undetected failures, (t, flights): True while neither consistent nor flagged."""
-        return ~(self.right | self.told)
+        return ~(self.consistent | self.flagged)
 
     def time_to(self, flags: Flags, since: float) -> float:
-        """Time after `since` until `flags` hold permanently for the share `WANTED` of the flights.
+        """Time after `since` until `flags` hold permanently for the `REQUIRED` share of flights.
 
         Even of a consistent filter, some of a hundred flights occasionally exceed the quantile by
-        chance. Shares above 1 - 2 (1 - `WANTED`) therefore do not interrupt a recovery.
+        chance. Shares above 1 - 2 (1 - `REQUIRED`) therefore do not interrupt a recovery.
 
         Returns:
             Time [s]; infinite if the share is never reached.
         """
         after = self.time > since + 1e-9
         share = flags[after].mean(axis=1)
-        lacking = np.flatnonzero(share < 1.0 - 2.0 * (1.0 - WANTED))
+        lacking = np.flatnonzero(share < 1.0 - 2.0 * (1.0 - REQUIRED))
         share[: lacking[-1] + 1 if lacking.size else 0] = 0.0
-        enough = np.flatnonzero(share >= WANTED)
+        enough = np.flatnonzero(share >= REQUIRED)
         return float(self.time[after][enough[0]] - since) if enough.size else np.inf
 
     def missed_alarms(self) -> Flags:
         """True for flights with large errors for `MISSED_AFTER` and no flag, (flights,)."""
-        return longest(self.far_off & ~self.told) * self._every >= MISSED_AFTER - 1e-9
+        return longest(self.large_error & ~self.flagged) * self._every >= MISSED_AFTER - 1e-9
 
-    def long_far_off(self) -> Flags:
+    def long_large_error(self) -> Flags:
         """True for flights with large errors for `MISSED_AFTER`, flagged or not, (flights,)."""
-        return longest(self.far_off) * self._every >= MISSED_AFTER - 1e-9
+        return longest(self.large_error) * self._every >= MISSED_AFTER - 1e-9
 
     def alarms(self) -> int:
         """Number of times that a flag was newly raised, in all flights together."""
-        before = np.vstack([np.zeros_like(self.told[:1]), self.told[:-1]])
-        return int((self.told & ~before).sum())
+        before = np.vstack([np.zeros_like(self.flagged[:1]), self.flagged[:-1]])
+        return int((self.flagged & ~before).sum())
 
     @property
     def hours(self) -> float:
         """Total flight time of all flights [h]."""
-        return float(self.right.size * self._every / 3600.0)
+        return float(self.consistent.size * self._every / 3600.0)
 
     @property
     def _every(self) -> float:
@@ -126,17 +126,17 @@ def follow_recovery(
     looks = round(duration * batch.sensors.imu.rate) // stride
     if looks < 2:
         raise ValueError(f"duration must be at least twice every, got {duration} and {every}")
-    bound = chi_square_quantile(MOTION.stop - MOTION.start, RIGHT)
+    bound = chi_square_quantile(MOTION.stop - MOTION.start, CONSISTENT)
     shape = (looks, batch.count)
-    right, told, far_off = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
+    consistent, flagged, large_error = np.zeros((3, *shape), bool)
     batch.reset(seeds=seeds)
     for k in range(looks):
         for _ in range(stride):
             batch.step()
         errors, covariances = flight_errors(batch)[:, MOTION], batch.covariance()[:, MOTION, MOTION]
         sigma = np.sqrt(np.einsum("nii->ni", covariances))
-        right[k] = nees(errors, covariances) < bound
-        told[k] = batch.record("diverged") > 0.0
-        far_off[k] = (np.abs(errors) > FAR_OFF * sigma).any(axis=1)
+        consistent[k] = nees(errors, covariances) < bound
+        flagged[k] = batch.record("diverged") > 0.0
+        large_error[k] = (np.abs(errors) > LARGE * sigma).any(axis=1)
     time = np.array([batch.sensors.imu.dt * stride * k for k in range(1, looks + 1)])
-    return Recovery(time, right, told, far_off)
+    return Recovery(time, consistent, flagged, large_error)

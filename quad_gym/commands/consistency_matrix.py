@@ -49,7 +49,7 @@ class Cell:
     suite: str
     task: str
     start: str
-    condition: str = "as it is"
+    condition: str = "nominal"
     wrong: str = ""
     """what is not as the filter believes; empty: nothing"""
     sensors: SensorSuite | None = None

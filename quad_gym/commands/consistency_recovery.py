@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.analysis.consistency_flights import endless
-from quad_gym.analysis.recovery import WANTED, follow_recovery
+from quad_gym.analysis.recovery import REQUIRED, follow_recovery
 from quad_gym.analysis.reports import versions
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.resumable import run_cells
@@ -40,15 +40,19 @@ AT_ONCE = (AccelBiasStep, GyroBiasStep, PositionJump)
 """What happens at an instant; it is over when it has happened."""
 
 COLUMNS = {
-    "end": "right at its end [%]",
-    "right": "right 10 s later [%]",
-    "told": "not right, told [%]",
-    "silent": "not right, silent [%]",
-    "time": "99 % right or told after [s]",
-    "far_off": "ever far off for 2 s [%]",
-    "missed": "of all, never told then [%]",
+    "consistent_at_end": "consistent at its end [%]",
+    "consistent": "consistent 10 s later [%]",
+    "flagged": "inconsistent, flagged [%]",
+    "undetected": "undetected failures [%]",
+    "settling_time": "99 % consistent or flagged after [s]",
+    "large_error": "large error for 2 s [%]",
+    "missed": "never flagged in that time [%]",
 }
-CALM_COLUMNS = {"alarms": "alarms per hour", "share": "time told [%]", "hours": "flown [h]"}
+CALM_COLUMNS = {
+    "alarms_per_hour": "alarms per hour",
+    "flagged": "time flagged [%]",
+    "hours": "flown [h]",
+}
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ class Trial:
 
     @property
     def expected(self) -> str:
-        """Why filters may stay wrong in silence."""
+        """Reason for undetected failures of a filter."""
         gated = self.flown.estimator.false_alarm_probability > 0.0
         return "" if gated else "no gate, so it cannot correct itself"
 
@@ -139,22 +143,25 @@ def measure(
     found = follow_recovery(batch, seeds=seeds, duration=end)
     if calm:
         hours = found.hours
-        values = {"alarms": found.alarms() / hours, "share": 100.0 * found.told.mean()}
+        values = {
+            "alarms_per_hour": found.alarms() / hours,
+            "flagged": 100.0 * found.flagged.mean(),
+        }
         values["hours"] = hours
     else:
-        told = found.told & ~found.right
+        flagged = found.flagged & ~found.consistent
         values = {
-            "end": 100.0 * found.share(found.right, trial.over),
-            "right": 100.0 * found.share(found.right, end),
-            "told": 100.0 * found.share(told, end),
-            "silent": 100.0 * found.share(found.silent, end),
-            "time": found.time_to(~found.silent, trial.over),
-            "far_off": 100.0 * float(found.long_far_off().mean()),
+            "consistent_at_end": 100.0 * found.share(found.consistent, trial.over),
+            "consistent": 100.0 * found.share(found.consistent, end),
+            "flagged": 100.0 * found.share(flagged, end),
+            "undetected": 100.0 * found.share(found.undetected, end),
+            "settling_time": found.time_to(~found.undetected, trial.over),
+            "large_error": 100.0 * float(found.long_large_error().mean()),
             "missed": 100.0 * float(found.missed_alarms().mean()),
         }
     return {
         "values": values,
-        "miss": not calm and values["silent"] > 100.0 * (1.0 - WANTED) + 1e-9,
+        "miss": not calm and values["undetected"] > 100.0 * (1.0 - REQUIRED) + 1e-9,
         "expected": "" if calm else trial.expected,
         "filters_failed": int((batch.record("filter_status") != 0).sum()),
         "sensors": batch.sensors,
@@ -179,13 +186,13 @@ def table_of(cells: Mapping[str, Mapping[str, Any]], flights: int) -> str:
             texts = {k: _text(cell["values"][k]) for k in heads}
             mark = "*" if cell["expected"] else "**"
             if cell["miss"]:
-                texts["silent"] = f"{mark}{texts['silent']}{mark}"
+                texts["undetected"] = f"{mark}{texts['undetected']}{mark}"
             remark = cell["expected"] if cell["miss"] else ""
             if cell["filters_failed"]:
                 remark += f" **{cell['filters_failed']} filters failed**"
             lines.append(f"| {label} | " + " | ".join(texts.values()) + f" | {remark.strip()} |")
         parts.append("\n".join(lines))
-    end = "**Bold**: more than one in a hundred is wrong in silence. *Italics*: the same, expected."
+    end = "**Bold**: more than 1 % undetected failures. *Italics*: the same, expected."
     return "\n\n".join([*parts, end]) + "\n"
 
 

@@ -23,7 +23,7 @@ def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
     cells = matrix.cells_of("all")
     names = [cell.name for cell in cells]
     assert len(set(names)) == len(names)
-    tasks = {(c.suite, c.task, c.start) for c in cells if c.condition == "as it is"}
+    tasks = {(c.suite, c.task, c.start) for c in cells if c.condition == "nominal"}
     assert len(tasks) == len(SUITES) * 6 * 2
     conditions = {c.condition for c in cells if c.suite == "rtk"}
     assert {"gnss_outage", "camera_occlusion", "two periods late", "lever arm"} <= conditions
@@ -40,10 +40,10 @@ def test_latencies_are_none_half_and_all_of_two_periods():
 
 
 def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
-    cells = chosen("rtk, hover, warm, as it is", "lab, circle, cold, as it is")
+    cells = chosen("rtk, hover, warm, nominal", "lab, circle, cold, nominal")
     done = matrix.run_matrix(cells, tmp_path, **SMALL)
     sound, report = (
-        done[f"{name}, as it is"] for name in ("rtk, hover, warm", "lab, circle, cold")
+        done[f"{name}, nominal"] for name in ("rtk, hover, warm", "lab, circle, cold")
     )
     assert 13.0 < sound["values"]["state"] < 17.0  # 3 deviations of the mean of 64 at one instant
     assert report["values"]["state"] > 17.0

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.analysis.recovery import RIGHT, Recovery, follow_recovery, longest
+from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery, longest
 from quad_gym.commands import consistency
 from quad_gym.commands import consistency_recovery as recovery
 from quad_gym.commands.options import parse
@@ -16,9 +16,9 @@ from quad_gym.params.suites import SUITES
 from tests.field_flights import fly, nees
 
 
-def seen(right, told, far_off, every=0.5):
-    time = every * np.arange(1, len(right) + 1)
-    return Recovery(time, *(np.array(flags, bool) for flags in (right, told, far_off)))
+def flights_of(consistent, flagged, large_error, every=0.5):
+    time = every * np.arange(1, len(consistent) + 1)
+    return Recovery(time, *(np.array(flags, bool) for flags in (consistent, flagged, large_error)))
 
 
 def test_runs_are_the_longest_ones():
@@ -27,45 +27,51 @@ def test_runs_are_the_longest_ones():
     assert longest(flags[:, :0]).shape == (0,)
 
 
-def test_alarms_are_missed_where_a_flight_is_far_off_for_two_seconds_and_never_told():
-    far_off = [[1, 1, 1]] * 4 + [[0, 0, 1]]  # 2 s, 2 s, and 2.5 s of which one instant is told
-    told = [[0, 0, 0]] * 3 + [[0, 1, 0]] + [[0, 0, 0]]
-    found = seen(np.zeros((5, 3)), told, far_off)
-    assert found.long_far_off().tolist() == [True, True, True]
+def test_alarms_are_missed_after_two_seconds_of_large_errors_without_a_flag():
+    large_error = [[1, 1, 1]] * 4 + [
+        [0, 0, 1]
+    ]  # 2 s, 2 s, and 2.5 s of which one instant is flagged
+    flagged = [[0, 0, 0]] * 3 + [[0, 1, 0]] + [[0, 0, 0]]
+    found = flights_of(np.zeros((5, 3)), flagged, large_error)
+    assert found.long_large_error().tolist() == [True, True, True]
     assert found.missed_alarms().tolist() == [True, False, True]
     assert found.alarms() == 1
     assert found.hours == pytest.approx(5 * 3 * 0.5 / 3600.0)
 
 
-def test_the_time_to_recover_is_until_nearly_all_are_right():
-    right = np.ones((8, 100), bool)
-    right[:3], right[4, 0], right[5, :2] = False, False, False  # one in a hundred is allowed
-    found = seen(right, np.zeros_like(right), ~right)
-    assert found.time_to(found.right, 1.0) == pytest.approx(1.0)
-    assert found.time_to(found.right, 2.5) == pytest.approx(1.0)
-    assert found.time_to(found.told, 1.0) == math.inf
-    assert found.share(found.silent, 3.0) == pytest.approx(0.02)
+def test_the_time_to_recover_is_until_nearly_all_are_consistent():
+    consistent = np.ones((8, 100), bool)
+    consistent[:3], consistent[4, 0], consistent[5, :2] = (
+        False,
+        False,
+        False,
+    )  # one in a hundred is allowed
+    found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
+    assert found.time_to(found.consistent, 1.0) == pytest.approx(1.0)
+    assert found.time_to(found.consistent, 2.5) == pytest.approx(1.0)
+    assert found.time_to(found.flagged, 1.0) == math.inf
+    assert found.share(found.undetected, 3.0) == pytest.approx(0.02)
 
 
 def test_flights_that_go_wrong_later_had_not_recovered():
     """As after a step of a bias: the errors need seconds to grow."""
-    right = np.ones((8, 100), bool)
-    right[3:6, :20] = False
-    found = seen(right, np.zeros_like(right), ~right)
-    assert found.time_to(found.right, 0.0) == pytest.approx(3.5)
-    right[-1, :20] = False
-    assert seen(right, ~right, ~right).time_to(right, 0.0) == math.inf
+    consistent = np.ones((8, 100), bool)
+    consistent[3:6, :20] = False
+    found = flights_of(consistent, np.zeros_like(consistent), ~consistent)
+    assert found.time_to(found.consistent, 0.0) == pytest.approx(3.5)
+    consistent[-1, :20] = False
+    assert flights_of(consistent, ~consistent, ~consistent).time_to(consistent, 0.0) == math.inf
 
 
-def test_flights_are_right_and_far_off_as_a_plain_computation_says():
+def test_consistent_flights_and_flags_equal_a_plain_computation():
     batch = fly(
         quad_gym.sensor_suite("rtk"), 64, filter_start="warm", faults=GyroBiasStep(start=0.3)
     )
     found = follow_recovery(batch, seeds=range(64), duration=1.5, every=0.5)
     square = nees(batch, slice(0, 9))
-    np.testing.assert_array_equal(found.right[-1], square < stats.chi2.ppf(RIGHT, 9))
-    assert 0.0 < found.share(found.right, 1.5) < 1.0
-    np.testing.assert_array_equal(found.told[-1], batch.record("diverged") > 0.0)
+    np.testing.assert_array_equal(found.consistent[-1], square < stats.chi2.ppf(CONSISTENT, 9))
+    assert 0.0 < found.share(found.consistent, 1.5) < 1.0
+    np.testing.assert_array_equal(found.flagged[-1], batch.record("diverged") > 0.0)
     assert found.time.tolist() == pytest.approx([0.5, 1.0, 1.5])
     with pytest.raises(ValueError, match="at least twice every"):
         follow_recovery(batch, seeds=range(64), duration=0.1, every=0.1)
@@ -90,10 +96,10 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     chosen = [t for t in chosen if t.faults]  # hovering takes a minute
     cells = recovery.run_recovery(chosen, tmp_path, flights=32, first_seed=0)
     values = cells["rtk, camera_occlusion"]["values"]
-    assert values["right"] >= 90.0
+    assert values["consistent"] >= 90.0
     assert set(values) == set(recovery.COLUMNS)
     assert "| rtk, camera_occlusion | " in (tmp_path / "recovery.md").read_text()
-    calm = {"values": {"alarms": 0.25, "share": 0.01, "hours": 6.0}, "miss": False}
+    calm = {"values": {"alarms_per_hour": 0.25, "flagged": 0.01, "hours": 6.0}, "miss": False}
     calm |= {"expected": "", "filters_failed": 0}
     lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "miss": True, "expected": ""}
     lost |= {"filters_failed": 1}
