@@ -58,7 +58,7 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
     ),
     "trajectory": TaskParams(kind="trajectory", start="hover"),
 }
-"""What each task is unless keywords say otherwise."""
+"""Reference, start and termination of each task, unless keywords change them."""
 
 MAX_STEPS = 10**9
 """Longest time limit in steps; a duration of 0 has none."""

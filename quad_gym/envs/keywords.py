@@ -75,7 +75,7 @@ class EnvKeywords(TaskKeywords, total=False):
 
 
 class VectorKeywords(EnvKeywords, total=False):
-    """Keywords of `make_sb3_vec_env`: those of every environment, and of many flights."""
+    """Keywords of `make_sb3_vec_env`: `EnvKeywords`, and keywords of many flights."""
 
     task: "Task | type[Task] | str | None"
     threads: int | None
@@ -151,7 +151,7 @@ def shows(keywords: type) -> Callable[[F], F]:
     """A decorator that shows the keywords of a TypedDict in a signature, in place of `**keywords`.
 
     Args:
-        keywords: `EnvKeywords`, or what extends it.
+        keywords: `EnvKeywords`, or a TypedDict that extends it.
     """
 
     def decorate(function: F) -> F:
