@@ -50,6 +50,7 @@ from quad_gym.commands.options import (
     require_at_least,
     usage_errors,
     with_full_id,
+    without_idle_filter,
 )
 from quad_gym.commands.train import require_model
 from quad_gym.faults.presets import felt_without_sensors
@@ -128,9 +129,7 @@ def configure(args: Args) -> Setting:
     for seed in range(args.seed, args.seed + seeds):  # the first seed is complete first
         for suite in args.sensors:
             for source in args.train_on:
-                environment = with_felt_faults(
-                    {**args.env, "observation": source, "sensors": suite}
-                )
+                environment = with_effect({**args.env, "observation": source, "sensors": suite})
                 plan = Plan(
                     env_id=args.env_id,
                     environment=environment,
@@ -164,8 +163,9 @@ def configure(args: Args) -> Setting:
     return setting
 
 
-def with_felt_faults(keywords: dict[str, Any]) -> dict[str, Any]:
-    """Keywords of an environment without the faults of sensors where it has none running."""
+def with_effect(given: dict[str, Any]) -> dict[str, Any]:
+    """Keywords of an environment without a filter's and faults of sensors where none runs."""
+    keywords = without_idle_filter(given)
     if keywords["observation"] == "estimate" or "faults" not in keywords:
         return keywords
     suite = sensor_suite(keywords["sensors"])
@@ -292,7 +292,7 @@ def fly_all(setting: Setting) -> Comparison:
             if not file.exists():
                 keywords = {**setting.environment, "observation": observation, "sensors": suite}
                 env = gymnasium.make_vec(
-                    setting.env_id, num_envs=setting.episodes, **with_felt_faults(keywords)
+                    setting.env_id, num_envs=setting.episodes, **with_effect(keywords)
                 )
                 file.parent.mkdir(parents=True, exist_ok=True)
                 fly(load_policy(name, env), env, setting.first_episode).save(file)

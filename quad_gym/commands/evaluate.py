@@ -41,6 +41,7 @@ from quad_gym.commands.options import (
     sensors_of,
     usage_errors,
     with_full_id,
+    without_idle_filter,
 )
 from quad_gym.evaluation import Episodes, Policy, roll_out
 from quad_gym.faults.presets import felt_without_sensors
@@ -145,10 +146,9 @@ def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
     return gymnasium.make_vec(
         args.env_id,
         num_envs=count,
-        observation=observation,
         sensors=sensors_of(args.env_id, args.sensors),
         threads=args.threads,
-        **keywords,
+        **without_idle_filter({**keywords, "observation": observation}),
     )
 
 

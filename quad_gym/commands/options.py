@@ -23,6 +23,8 @@ from quad_gym.commands.refusals import refuse, told_in_one_line
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.envs.effects import runs_no_sensor
+from quad_gym.envs.keywords import FILTER_KEYWORDS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
@@ -176,6 +178,16 @@ def sensors_of(env_id: str, given: str | None) -> str:
     """The name of the sensor suite: what was given, or else the task's own."""
     own = BENCHMARKS.get(IDS[env_id])
     return given or ("standard" if own is None else own.keywords["sensors"])
+
+
+def without_idle_filter(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """Keywords of an environment, without those of a filter where none runs.
+
+    A comparison flies several observations with the same keywords, and environments refuse
+    keywords that have no effect.
+    """
+    idle = FILTER_KEYWORDS if runs_no_sensor(keywords) else ()
+    return {name: value for name, value in keywords.items() if name not in idle}
 
 
 def free_folder(folder: Path, result: str) -> Path:

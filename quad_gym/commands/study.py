@@ -43,6 +43,7 @@ from quad_gym.commands.options import (
     require_at_least,
     usage_errors,
     with_full_id,
+    without_idle_filter,
 )
 from quad_gym.commands.study_flights import Flown, fly
 from quad_gym.commands.study_report import table_text, write_report
@@ -200,7 +201,7 @@ def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
     chosen = study.recipes[arm.algorithm]
     return Plan(
         env_id=study.env_id,
-        environment={**study.environment, **arm.environment, **arm.training},
+        environment=without_idle_filter({**study.environment, **arm.environment, **arm.training}),
         learning=arm.learning,
         recipe=chosen.replace(parameters={**chosen.parameters, **arm.parameters}),
         seed=seed,
@@ -212,7 +213,9 @@ def plan_of(study: Study, arm: Arm, seed: int) -> Plan:
 
 def test_flights(study: Study, arm: Arm, count: int) -> Any:
     """The environment of the test: on the estimate, unless the arm says otherwise."""
-    keywords = {"observation": "estimate", **study.environment, **arm.environment}
+    keywords = without_idle_filter(
+        {"observation": "estimate", **study.environment, **arm.environment}
+    )
     return gymnasium.make_vec(study.env_id, num_envs=count, threads=study.threads, **keywords)
 
 

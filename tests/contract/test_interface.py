@@ -12,6 +12,7 @@ import pytest
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.commands import compare, evaluate
 from quad_gym.envs.configuration import Flights
 from quad_gym.envs.keywords import (
     DEFAULTS,
@@ -188,6 +189,20 @@ def test_inputs_without_effect_are_refused(keywords, name):
 )
 def test_they_are_accepted_where_they_have_one(keywords):
     quad_gym.QuadEnv("hover", **keywords)
+
+
+def test_a_comparison_gives_the_filters_keywords_where_a_filter_runs(tmp_path):
+    args = evaluate.Args(env={"filter_start": "warm", "estimator": "ekf"}, output=tmp_path)
+    for observation in ("truth", "noisy", "estimate"):
+        evaluate.make_flights(args, observation, 1, "pd").close()
+    given = {**args.env, "sensors": "rtk"}
+    assert compare.with_effect({**given, "observation": "truth"}) == {
+        **{"observation": "truth", "sensors": "rtk"}
+    }
+    assert compare.with_effect({**given, "observation": "estimate"}) == {
+        **{"observation": "estimate"},
+        **given,
+    }
 
 
 @pytest.mark.parametrize(

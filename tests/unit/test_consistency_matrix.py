@@ -42,9 +42,7 @@ def test_latencies_are_none_half_and_all_of_two_periods():
 def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
     cells = chosen("rtk, hover, warm, nominal", "lab, circle, cold, nominal")
     done = matrix.run_matrix(cells, tmp_path, **SMALL)
-    sound, report = (
-        done[f"{name}, nominal"] for name in ("rtk, hover, warm", "lab, circle, cold")
-    )
+    sound, report = (done[f"{name}, nominal"] for name in ("rtk, hover, warm", "lab, circle, cold"))
     assert 13.0 < sound["values"]["state"] < 17.0  # 3 deviations of the mean of 64 at one instant
     assert report["values"]["state"] > 17.0
     assert report["misses"]
