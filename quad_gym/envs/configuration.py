@@ -58,11 +58,7 @@ TASK_DEFAULTS: dict[str, TaskParams] = {
     ),
     "trajectory": TaskParams(kind="trajectory", start="hover"),
 }
-<<<<<<< HEAD
 """Defaults of each task, which keywords override."""
-=======
-"""Reference, start and termination of each task, unless keywords change them."""
->>>>>>> names
 
 MAX_STEPS = 10**9
 """Longest time limit in steps; a duration of 0 has none."""

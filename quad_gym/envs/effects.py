@@ -69,10 +69,6 @@ def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
 
 
 def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
-<<<<<<< HEAD
     """Return True if an environment with these keywords simulates no sensor."""
-=======
-    """True if an environment with these keywords simulates no sensor."""
->>>>>>> names
     asked = any(keywords.get(name) is True for name in ("include_std", "innovations"))
     return keywords.get("observation") in ("truth", "noisy") and not asked

@@ -75,11 +75,7 @@ class EnvKeywords(TaskKeywords, total=False):
 
 
 class VectorKeywords(EnvKeywords, total=False):
-<<<<<<< HEAD
     """Keywords of `make_sb3_vec_env`: of every environment, and of vector environments."""
-=======
-    """Keywords of `make_sb3_vec_env`: `EnvKeywords`, and keywords of many flights."""
->>>>>>> names
 
     task: "Task | type[Task] | str | None"
     threads: int | None
@@ -155,11 +151,7 @@ def shows(keywords: type) -> Callable[[F], F]:
     """Return a decorator that shows the keywords of a TypedDict in a signature, not `**keywords`.
 
     Args:
-<<<<<<< HEAD
         keywords: `EnvKeywords`, or a class that extends it.
-=======
-        keywords: `EnvKeywords`, or a TypedDict that extends it.
->>>>>>> names
     """
 
     def decorate(function: F) -> F:
