@@ -90,7 +90,6 @@ def cases():
             **{
                 "observation": "truth",
                 "sensors": suite,
-                "filter_start": "warm",
                 "randomize_reference": True,
             },
             **{"faults": ["rotor_loss"], "world": "fresh_breeze", "action_delay": 0.5},
