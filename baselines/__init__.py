@@ -1,4 +1,4 @@
-"""Controllers to compare against."""
+"""Baseline controllers, training, and export of policies."""
 
 from baselines.pd import PDPolicy
 

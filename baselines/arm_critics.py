@@ -1,9 +1,9 @@
-"""Variants of tasks that end the observation in training with the truth, for the critic alone.
+"""Variants of tasks whose observation in training ends with the truth, for the critic only.
 
-With `critic_only` among the parameters of the compiled PPO, the value function sees these numbers,
-and the policy does not: it flies the task without them. The value function then learns from what
-decides about the rewards to come, such as how far off the estimate is, and the policy learns from
-what a controller can know.
+With `critic_only` among the parameters of the compiled PPO, the value function receives these
+values and the policy does not (asymmetric actor-critic): the policy flies the task without them.
+The value function can then use information that determines future rewards, such as the estimation
+error, while the policy uses only information available to a controller.
 """
 
 from collections.abc import Mapping
@@ -42,25 +42,25 @@ _SCALED_TRUE: Mapping[str, ObservationSpec] = {
 
 
 class WithStdCertaintyRewardForCritic(WithStdCertaintyReward):
-    """`WithStdCertaintyReward` that observes the true state relative to the reference, too.
+    """`WithStdCertaintyReward` that also observes the true state relative to the reference.
 
-    What the estimate shows of position and velocity error, vertical, heading and body rates, as it
-    truly is.
+    The additional parts are the true values of position error, velocity error, vertical, heading
+    and body rates.
     """
 
     privileged = True
     observes: Mapping[str, ObservationSpec] = {**WithStdCertaintyReward.observes, **_TRUE}
 
     def observe(self, view: "View") -> Parts:
-        """As `WithStdCertaintyReward`, and five parts (n, 3) of the truth."""
+        """Return the base's observation, and five parts (n, 3) of the truth."""
         return {**super().observe(view), **_true_state(view, view.reference_position)}
 
 
 class ConstantCrashCostWithUncertaintyForCritic(ConstantCrashCostWithUncertainty):
-    """`ConstantCrashCostWithUncertainty` that observes the truth relative to the next gap, too.
+    """`ConstantCrashCostWithUncertainty` that also observes the truth relative to the next gap.
 
-    The gap is the one that is truly next. The numbers are scaled as those of the estimate are, and
-    `gnss_fails` is 1 while GNSS fails.
+    The next gap is determined by the true position. The values have the same scales as the
+    estimate, and `gnss_fails` is 1 while GNSS fails.
     """
 
     privileged = True
@@ -70,7 +70,7 @@ class ConstantCrashCostWithUncertaintyForCritic(ConstantCrashCostWithUncertainty
     }
 
     def observe(self, view: "View") -> Parts:
-        """As its base, five parts (n, 3) of the truth, and `gnss_fails` (n,)."""
+        """Return the base's observation, five parts (n, 3) of the truth, and `gnss_fails` (n,)."""
         gaps = gaps_of(view)
         gap = gaps.centers[np.arange(view.count), gaps_behind(gaps, view.position)]
         fails = view.truth.faults["gnss_outage"].astype(np.float64)
@@ -79,7 +79,7 @@ class ConstantCrashCostWithUncertaintyForCritic(ConstantCrashCostWithUncertainty
 
 
 def _true_state(view: "View", target: NDArray[np.float64]) -> Parts:
-    """The parts of _TRUE, (n, 3) each, for a vehicle that is to be at targets (n, 3) in I."""
+    """Parts of `_TRUE`, (n, 3) each, relative to target positions (n, 3) in I."""
 
     def in_body(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.ascontiguousarray((view.R_BI @ vectors[:, :, np.newaxis])[:, :, 0])

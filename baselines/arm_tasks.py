@@ -1,4 +1,4 @@
-"""Variants of tasks for the arms of a study: for training, and some for evaluation."""
+"""Variants of tasks for the arms of studies, mostly for training."""
 
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
@@ -21,34 +21,34 @@ if TYPE_CHECKING:
     from quad_gym.tasks.view import View
 
 TYPICAL = 0.03
-"""Standard deviation of the position of a filter that sees markers [m]."""
+"""Typical standard deviation of the position while markers are in view [m]."""
 
 EVERY = 10
-"""Steps between what is remembered: 0.2 s at 50 Hz."""
+"""Steps between the instants of a history: 0.2 s at 50 Hz."""
 
 REMEMBERED = 4
-"""How many instants are remembered."""
+"""Number of instants in a history."""
 
 _SEEN = 18
-"""What is remembered of each: errors of position and velocity, vertical, heading, body rates and
-the direction of the features."""
+"""Number of values per instant: errors of position and velocity, vertical, heading, body rates and
+direction of the features."""
 
 RECALLED_EVERY = 5
-"""Steps between what is recalled in a race: 0.1 s."""
+"""Steps between the instants of a history in a race: 0.1 s."""
 
 _RECALLED = 12
-"""What is recalled of each: errors of position and velocity, vertical, body rates."""
+"""Number of values per instant in a race: errors of position and velocity, vertical, body rates."""
 
 _SCALES = {"position_error": 6.0, "velocity_error": 4.0, "body_rates": 2.0, "next_gap": 12.0}
-"""What parts of the observation of `OutageDash` are divided by, in their units."""
+"""Divisors of parts of the observation of `OutageDash`, in their units."""
 
 _MIDDLE_WIDTH, _HALF_RANGE = 4.5, 1.5
-"""Of the gaps of `OutageDash` [m]."""
+"""Center and half range of the widths of gaps of `OutageDash` [m]."""
 
 _WIDTHS = ("gap_width", "next_width")
 
 _ACTUAL = "actual_"
-"""Before the names of parts that show the truth, scaled alike."""
+"""Prefix of the names of parts that contain the truth, with the same scales."""
 
 RACE_STD = {
     "position_sigma": ("m", "I", 0.008),
@@ -57,11 +57,11 @@ RACE_STD = {
     "accel_bias_sigma": ("m/s^2", "B", 0.13),
     "gyro_bias_sigma": ("rad/s", "B", 0.011),
 }
-"""Standard deviations in the observation of a race: unit, frame, and the median in 200 episodes of
-the policy that ships."""
+"""Standard deviations in the observation of a race: unit, frame, and median in 200 episodes of the
+included policy."""
 
 CONSTANT_CRASH_COST = 100.0
-"""Of a crash in `ConstantCrashCost`."""
+"""Cost of a crash in `ConstantCrashCost`."""
 
 _CRASH = Crash()
 
@@ -69,13 +69,13 @@ Parts = dict[str, NDArray[np.float64]]
 
 
 class WithStd(LookAround):
-    """`LookAround` whose observation also says how sure the filter is of its position.
+    """`LookAround` whose observation also contains the standard deviation of the position.
 
-    As log10(sigma / TYPICAL) of the largest standard deviation, so that a network sees a doubling
-    alike whether it is of millimeters or of meters.
+    It is observed as log10(sigma / `TYPICAL`), where sigma is the largest standard deviation along
+    an axis, so that a doubling of millimeters and a doubling of meters are the same difference.
 
     Args:
-        factor: The standard deviation is multiplied by this before it is observed.
+        factor: Factor on the standard deviation that is observed.
     """
 
     def __init__(self, factor: float = 1.0) -> None:
@@ -88,10 +88,10 @@ class WithStd(LookAround):
     }
 
     def observe(self, view: "View") -> Parts:
-        """`features_direction` (n, 3), and `log_sigma` (n,)."""
+        """Return `features_direction` (n, 3) and `log_sigma` (n,)."""
         try:
             sigma = self._factor * view.estimate.position_sigma.max(axis=1)
-        except ValueError:  # no filter runs: who sees the truth has no doubt
+        except ValueError:  # no filter runs with observation="truth"
             sigma = np.zeros(view.count)
         return {**super().observe(view), "log_sigma": np.log10(np.maximum(sigma, 1e-9) / TYPICAL)}
 
@@ -103,9 +103,9 @@ REPORTED_STD_X1_4, REPORTED_STD_X1_2, REPORTED_STD_X2, REPORTED_STD_X4 = map(
 
 
 class WithStdHistory(WithStd):
-    """`WithStd` whose observation also has what was observed 0.2, 0.4, 0.6 and 0.8 s ago.
+    """`WithStd` whose observation also contains the observations 0.2, 0.4, 0.6 and 0.8 s ago.
 
-    At the start of an episode, the past is zero.
+    At the start of an episode, the history is zero.
     """
 
     state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _SEEN))}
@@ -115,7 +115,7 @@ class WithStdHistory(WithStd):
     }
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Every so often, remember the present, and forget the oldest."""
+        """Append the present observation to the history at intervals, and drop the oldest one."""
         due = (view.step % EVERY == 0)[:, np.newaxis, np.newaxis]
         seen = view.observed
         direction = LookAround.observe(self, view)["features_direction"]
@@ -125,40 +125,41 @@ class WithStdHistory(WithStd):
         view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
 
     def observe(self, view: "View") -> Parts:
-        """As `WithStd`, and `past` (n, 72)."""
+        """Return the observation of `WithStd`, and `past` (n, 72)."""
         return {**super().observe(view), "past": view.state.past.reshape(view.count, -1)}
 
 
 class CertaintyReward(LookAround):
-    """`LookAround` that also pays for a sure filter, which the controller does not see.
+    """`LookAround` that also rewards a small standard deviation, which is not observed.
 
-    0.3 (1 - min(sigma / 0.5 m, 1)) a step, sigma the largest standard deviation of the position:
-    what a doubt of 0.25 m costs is as much as the heading can bring. A payment, not a fine: where
-    the rewards of a lost vehicle add up to less than zero, a policy learns to crash at once.
+    The reward is 0.3 (1 - min(sigma / 0.5 m, 1)) per step, where sigma is the largest standard
+    deviation of the position along an axis; 0.25 m costs as much as the heading can earn. It is a
+    bonus rather than a penalty: if the rewards of a lost vehicle were negative, a policy would
+    learn to crash at once.
     """
 
     def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) see the class."""
+        """Return the reward described in the class, (n,)."""
         sigma = view.estimate.position_sigma.max(axis=1)
         return super().reward(view) + 0.3 * (1.0 - np.minimum(sigma / 0.5, 1.0))
 
 
 class WithStdCertaintyReward(CertaintyReward, WithStd):
-    """`WithStd` that also pays for a sure filter, as `CertaintyReward` does."""
+    """`WithStd` with the additional reward of `CertaintyReward`."""
 
 
 class RaceWithHistory(StaleRace):
-    """`StaleRace` whose observation also has what was observed 0.1, 0.2, 0.3 and 0.4 s ago.
+    """`StaleRace` whose observation also contains the observations 0.1, 0.2, 0.3 and 0.4 s ago.
 
-    What a late measurement does to the estimate depends on how the vehicle has been moving. At the
-    start of an episode, the past is zero.
+    The effect of a delayed measurement on the estimate depends on the past motion of the vehicle.
+    At the start of an episode, the history is zero.
     """
 
     state: Mapping[str, ArrayLike] = {"past": np.zeros((REMEMBERED, _RECALLED))}
     observes: Mapping[str, ObservationSpec] = {"past": ObservationSpec("mixed", "B")}
 
     def update(self, view: "View", rng: "FlightRandom") -> None:
-        """Every so often, remember the present, and forget the oldest."""
+        """Append the present observation to the history at intervals, and drop the oldest one."""
         due = (view.step % RECALLED_EVERY == 0)[:, np.newaxis, np.newaxis]
         seen = view.observed
         now = [seen.position_error, seen.velocity_error, seen.up, seen.body_rates]
@@ -167,12 +168,12 @@ class RaceWithHistory(StaleRace):
         view.state.past = np.where(due, np.concatenate([latest, past[:, :-1]], axis=1), past)
 
     def observe(self, view: "View") -> Parts:
-        """`past` (n, 48)."""
+        """Return `past` (n, 48)."""
         return {"past": view.state.past.reshape(view.count, -1)}
 
 
 class ObservedRace(StaleRace):
-    """`StaleRace` observed as `ResidualRace` is: what is seen, without a model of residuals."""
+    """`StaleRace` with the observation of `ResidualRace`, but without residuals."""
 
     replaces_observation = True
     keeps: Collection[str] = ("last_action",)
@@ -187,11 +188,14 @@ class ObservedRace(StaleRace):
     }
 
     def residual(self, view: "View") -> NDArray[np.float64]:
-        """(n, 12) what is added to the seen state; see `baselines.residuals`."""
+        """Return the residual that is added to the observed state, (n, 12).
+
+        See `baselines.residuals`.
+        """
         return np.zeros((view.count, residuals.SIZE))
 
     def observe(self, view: "View") -> Parts:
-        """The gates relative to a state that is off by the residual."""
+        """Return the gates relative to the observed state plus the residual."""
         residual, seen = self.residual(view), view.observed
         R_BI = Rotation.from_rotvec(residual[:, 6:9].copy()).as_matrix() @ seen.R_BI
 
@@ -211,9 +215,10 @@ class ObservedRace(StaleRace):
 
 
 class ResidualRace(ObservedRace):
-    """`ObservedRace` with residuals that a model of recorded estimation errors draws.
+    """`ObservedRace` with residuals drawn from a model of recorded estimation errors.
 
-    To be trained in on the truth (`observation="truth"`); the episode begins without an error.
+    It is for training on the truth (`observation="truth"`). Residuals are zero at the start of an
+    episode.
     """
 
     state: Mapping[str, ArrayLike] = {"residual": np.zeros(residuals.SIZE)}
@@ -228,42 +233,42 @@ class ResidualRace(ObservedRace):
         view.state.residual = self._model.advance(view.state.residual, view.velocity, noise)
 
     def residual(self, view: "View") -> NDArray[np.float64]:
-        """(n, 12) the drawn one."""
+        """Return the residual drawn for this step, (n, 12)."""
         return view.state.residual
 
 
 def _scaled(name: str, value: Any) -> Any:
-    """What `Scaled` shows for a value of a part of `OutageDash`."""
+    """Scale a value of a part of `OutageDash` for `Scaled`."""
     if name in _WIDTHS:
         return (value - _MIDDLE_WIDTH) / _HALF_RANGE
     return value / _SCALES.get(name.removeprefix(_ACTUAL), 1.0)
 
 
 def _shown_as(name: str) -> str:
-    """The name that `Scaled` gives to a part of `OutageDash`."""
+    """Name in `Scaled` of a part of `OutageDash`."""
     return f"{name}_scaled" if name.removeprefix(_ACTUAL) in (*_SCALES, *_WIDTHS) else name
 
 
 def scaled_parts(parts: Parts) -> Parts:
-    """Parts of an observation of `OutageDash`, by the names and in the units of `Scaled`."""
+    """Convert parts of an observation of `OutageDash` to the names and units of `Scaled`."""
     return {_shown_as(name): _scaled(name, part) for name, part in parts.items()}
 
 
 def _in_numbers(name: str, part: ObservationSpec) -> ObservationSpec:
-    """A part of `OutageDash` as `Scaled` declares it: without a unit, its bounds scaled."""
+    """Specification in `Scaled` of a part of `OutageDash`: dimensionless, with scaled bounds."""
     if _shown_as(name) == name:
         return part
     return ObservationSpec("-", part.frame, _scaled(name, part.low), _scaled(name, part.high))
 
 
 class Scaled(OutageDash):
-    """`OutageDash` whose observation is in numbers of the order of one.
+    """`OutageDash` whose observation is normalized to values of the order of one.
 
-    Gaps are 12 m apart, and body rates a few tenths of rad/s: in units of SI, a network learns
-    from the former alone for long. The position error is divided by 6 m, the velocity error by
-    4 m/s, the body rates by 2 rad/s, the way from gap to gap by 12 m; widths w become
-    (w - 4.5 m) / 1.5 m. Such parts have names of their own, as `position_error_scaled`, so that
-    policies that fly `OutageDash` are refused here, and those of here are refused there.
+    Gaps are 12 m apart, but body rates are a few tenths of rad/s: in SI units, a network long
+    learns only from the former. The position error is divided by 6 m, the velocity error by 4 m/s,
+    the body rates by 2 rad/s, and the vector between gaps by 12 m; widths w become
+    (w - 4.5 m) / 1.5 m. Normalized parts have other names, such as `position_error_scaled`, so that
+    policies for `OutageDash` are rejected in this task, and vice versa.
     """
 
     observes: Mapping[str, ObservationSpec] = {
@@ -271,16 +276,16 @@ class Scaled(OutageDash):
     }
 
     def observe(self, view: "View") -> Parts:
-        """As `OutageDash`, scaled."""
+        """Return the observation of `OutageDash`, scaled."""
         return scaled_parts(super().observe(view))
 
 
 class WithUncertainty(Scaled):
-    """`Scaled` whose observation also says how unsure the filter is for the next two gaps.
+    """`Scaled` whose observation also contains the uncertainty relative to the next two gaps.
 
-    As log4(2 sigma / room), sigma the largest standard deviation of the position, and room what is
-    left beside a vehicle in the middle of the gap: half its width, less 0.5 m. Above 0, two
-    standard deviations do not fit through.
+    It is log4(2 sigma / clearance), where sigma is the largest standard deviation of the position
+    along an axis, and the clearance is half the width of the gap minus 0.5 m. Above 0, two standard
+    deviations exceed the clearance.
     """
 
     observes: Mapping[str, ObservationSpec] = {
@@ -289,7 +294,7 @@ class WithUncertainty(Scaled):
     }
 
     def observe(self, view: "View") -> Parts:
-        """As `Scaled`, and `uncertainty` (n, 2)."""
+        """Return the observation of `Scaled`, and `uncertainty` (n, 2)."""
         parts = super().observe(view)
         scaled = np.stack([parts[f"{name}_scaled"] for name in _WIDTHS], axis=1)
         return {
@@ -299,17 +304,17 @@ class WithUncertainty(Scaled):
 
 
 class ConstantCrashCost(Scaled):
-    """`Scaled` for training: crashes cost the same everywhere, and episodes begin along the course.
+    """`Scaled` for training, with a constant crash cost, and starts along the course.
 
-    A crash costs `CONSTANT_CRASH_COST`, and forfeits nothing. That makes hurrying pay late in the
-    course, but sums of up to 660 that are lost all at once make learning unsteady. So do flights
-    that come to the same gap, and lose GNSS, at the same time: a batch shows one part of the course
-    alone, and what was learned of the others is lost. Episodes begin before the first wall, or
-    halfway between two walls, with equal chances.
+    A crash costs `CONSTANT_CRASH_COST` and forfeits no reward. Hurrying therefore becomes
+    worthwhile late in the course, but losing rewards of up to 660 at once makes learning unstable.
+    So do flights that reach a gap and lose GNSS simultaneously: a batch then covers only one part
+    of the course, and the policy forgets the other parts. Episodes begin before the first wall or
+    halfway between two walls, with equal probability.
     """
 
     def reset(self, view: "View", rng: "FlightRandom") -> Mapping[str, ArrayLike]:
-        """Draw where episodes begin."""
+        """Draw start positions; returns "position" (n, 3) in I [m]."""
         x = gaps_of(view).centers[:, :-1, 0]
         before = np.floor(x.shape[1] * rng.random()).astype(np.int64)
         halfway = x[np.arange(view.count), before] + 0.5 * (x[:, 0] - x[:, 1])
@@ -318,20 +323,20 @@ class ConstantCrashCost(Scaled):
         return {"position": start}
 
     def reward(self, view: "View") -> NDArray[np.float64]:
-        """(n,) see the class."""
+        """Return the reward described in the class, (n,)."""
         less = self._crash_cost + view.state.earned - CONSTANT_CRASH_COST
         return super().reward(view) + _CRASH(view) * less
 
 
 class ConstantCrashCostWithUncertainty(ConstantCrashCost, WithUncertainty):
-    """`WithUncertainty` for training, as `ConstantCrashCost` is."""
+    """`WithUncertainty` for training, with the changes of `ConstantCrashCost`."""
 
 
 def normalized_uncertainty(view: "View", widths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, k) log4(2 sigma / room) for gaps of widths (n, k) [m]; see `WithUncertainty`."""
+    """log4(2 sigma / clearance) for gaps of widths (n, k) [m], (n, k); see `WithUncertainty`."""
     try:
         sigma = view.estimate.position_sigma.max(axis=1)
-    except ValueError:  # no filter runs: who sees the truth has no doubt
+    except ValueError:  # no filter runs with observation="truth"
         sigma = np.zeros(view.count)
     ratio = SIGMAS * sigma[:, np.newaxis] / (0.5 * widths - MARGIN)
     return np.asarray(0.5 * np.log2(np.maximum(ratio, 2.0**-8)))
@@ -340,11 +345,11 @@ def normalized_uncertainty(view: "View", widths: NDArray[np.float64]) -> NDArray
 class MaskedStd(StaleRace):
     """`StaleRace` with the 15 standard deviations in its observation, some of them masked.
 
-    A masked one is shown as its constant median of `RACE_STD`, so that a policy that was
-    trained with `include_std=True` can be flown without that part.
+    Masked standard deviations are replaced by their constant medians of `RACE_STD`, so that a
+    policy trained with `include_std=True` can be tested without this information.
 
     Args:
-        masked: Names of `RACE_STD`.
+        masked: Names from `RACE_STD` of the standard deviations to mask.
     """
 
     observes: Mapping[str, ObservationSpec] = {
@@ -358,7 +363,7 @@ class MaskedStd(StaleRace):
         self._masked = masked
 
     def observe(self, view: "View") -> Parts:
-        """Each (n, 3)."""
+        """Return the standard deviations by name, (n, 3) each."""
         shown = {name: getattr(view.estimate, name) for name in RACE_STD}
         medians = {name: RACE_STD[name][2] for name in self._masked}
         return {**shown, **{k: np.full((view.count, 3), value) for k, value in medians.items()}}

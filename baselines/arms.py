@@ -1,7 +1,7 @@
-"""Arms of a study: what a controller is trained on, as data.
+"""Arms of studies, as data: each defines how a controller is trained and tested.
 
-A study trains each arm with several seeds, and flies every policy on the estimate in the same
-episodes. To add arms of your own, write a file like this one, with a tuple `ARMS`, and name it to
+A study trains each arm with several seeds, and tests every policy on the estimate in the same
+episodes. To define your own arms, write a file like this one with a tuple `ARMS`, and pass it to
 `quad-gym study --arms-file`.
 """
 
@@ -18,28 +18,28 @@ from quad_gym.params.checks import Checked
 
 @dataclass(frozen=True, kw_only=True)
 class Arm(Checked):
-    """A way to get a controller."""
+    """Arm of a study: the training and the test of one kind of controller."""
 
     name: str
-    """short, for folders"""
+    """Short name, for folders"""
     label: str
-    """for people"""
+    """Label for tables and figures"""
     policy: str | None = None
-    """by name (`baselines.policies.load_policy`), one that is not trained; None: trained"""
+    """Name of a policy that needs no training (`baselines.policies.load_policy`); None: trained"""
     flies: str | None = None
-    """name of a trained arm whose policies it flies elsewhere: a control"""
+    """Name of a trained arm whose policies this arm tests in another environment, as a control"""
     environment: Mapping[str, Any] = field(default_factory=dict)
-    """keywords of the environment in which it flies the test, such as what is observed"""
+    """Keywords of the environment in the test, such as the observation"""
     training: Mapping[str, Any] = field(default_factory=dict)
-    """keywords that hold in place of these while it is trained and its best policy is chosen"""
+    """Keywords that override `environment` in training and in the selection of the best policy"""
     learning: Mapping[str, Any] = field(default_factory=dict)
-    """keywords that hold in place of these while it is trained, but not where its best policy is
-    chosen, such as a reward of its own"""
+    """Keywords that override both in training, but not in the selection of the best policy, such as
+    another reward"""
     algorithm: str = "ppo"
-    """one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine, and the
-    others with Stable-Baselines3"""
+    """Algorithm, one of `baselines.recipes.ALGORITHMS`; PPO is trained with the compiled engine,
+    the others with Stable-Baselines3"""
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    """of the algorithm, in place of the recipe's"""
+    """Parameters of the algorithm that override the recipe's"""
 
     def __post_init__(self) -> None:
         self._check(check.choice, "algorithm", choices=ALGORITHMS)
@@ -49,29 +49,29 @@ class Arm(Checked):
         for name in ("environment", "training", "learning", "parameters"):
             check.instance(f"Arm.{name}", getattr(self, name), Mapping)
             self._set(name, MappingProxyType(dict(getattr(self, name))))
-        given = self.policy if self.flies is None else f"that of {self.flies}"
+        given = self.policy if self.flies is None else f"taken from {self.flies}"
         learns = self.training or self.learning or self.parameters or self.algorithm != "ppo"
         if given is not None and learns:
-            raise ValueError(f"Arm {self.name} must not be trained, as its policy is {given}")
+            raise ValueError(f"Arm {self.name} must not be trained, because its policy is {given}")
         if self.policy is not None and self.flies is not None:
             raise ValueError(
-                f"Arm {self.name} must have a policy, or fly that of another, not both"
+                f"Arm {self.name} must have either a policy or the name of another arm, not both"
             )
 
     @property
     def trained(self) -> bool:
-        """Whether it is trained."""
+        """True if the arm is trained."""
         return self.policy is None and self.flies is None
 
     @property
     def engine(self) -> str:
-        """What trains it, one of `baselines.plans.ENGINES`."""
+        """Training engine of the arm, one of `baselines.plans.ENGINES`."""
         return "compiled" if self.algorithm == "ppo" else "sb3"
 
 
 _FAR_SIGHTED = {"gamma": 0.995}
-"""Without a reward for being sure, what a look is worth comes seconds later: with the recipe's 0.99
-a third of the flights crashed in pilots."""
+"""Longer horizon: without a reward for certainty, looking at the markers is rewarded only seconds
+later. With the recipe's 0.99, a third of the flights crashed in preliminary trainings."""
 _WITH_STD = {"task": "baselines.arm_tasks:WithStd"}
 
 ARMS = (
@@ -116,8 +116,8 @@ ARMS = (
         learning={"task": "baselines.arm_critics:WithStdCertaintyRewardForCritic"},
         parameters={"critic_only": 15},
     ),
-    # rewarded for certainty as `certainty` and `std_certainty` are, so that these differ in what
-    # the policy knows
+    # rewarded for certainty like `certainty` and `std_certainty`, so that they differ only in the
+    # information available to the policy
     Arm(
         name="recurrent",
         label="estimate, LSTM, reward for certainty",
@@ -125,7 +125,7 @@ ARMS = (
         algorithm="recurrent_ppo",
     ),
 )
-"""Those of `QuadGym/LookAround-v0`."""
+"""Arms of `QuadGym/LookAround-v0`."""
 
 _TRUTH = {"observation": "truth"}
 _STD = {"include_std": True}
@@ -133,7 +133,7 @@ _STALE = sensor_suite("stale")
 _STAMPED = {
     "sensors": _STALE.replace(estimator=_STALE.estimator.replace(delay_compensation="retrodict"))
 }
-"""The same sensors, and a filter that knows how old their measurements are."""
+"""Sensors of the race, with a filter that uses the time stamps of their measurements."""
 _WITH_HISTORY = {"task": "baselines.arm_tasks:RaceWithHistory", **_STD}
 
 STALE_RACE = (
@@ -167,7 +167,7 @@ STALE_RACE = (
         environment={**_STD, **_STAMPED},
     ),
 )
-"""Those of `QuadGym/StaleRace-v0`."""
+"""Arms of `QuadGym/StaleRace-v0`."""
 
 _SCALED = {"task": "baselines.arm_tasks:Scaled"}
 _WITH_UNCERTAINTY = {"task": "baselines.arm_tasks:WithUncertainty"}
@@ -210,7 +210,7 @@ OUTAGE_DASH = (
         environment={**_SCALED, **_TRUTH},
     ),
 )
-"""Those of `QuadGym/OutageDash-v0`."""
+"""Arms of `QuadGym/OutageDash-v0`."""
 
 ARMS_OF = {"look_around": ARMS, "stale_race": STALE_RACE, "outage_dash": OUTAGE_DASH}
-"""By task."""
+"""Arms by task."""

@@ -1,9 +1,10 @@
-"""Arms of a study of which standard deviations matter to a policy.
+"""Arms of a study of the standard deviations that matter to a policy.
 
     quad-gym study stale_race --arms-file baselines/arms_masked.py
 
-All fly StaleRace with the pretrained policy, which was trained with all fifteen in its observation.
-Nothing is trained. A masked standard deviation is shown as its constant median.
+All arms fly StaleRace with the pretrained policy, which was trained with all fifteen standard
+deviations in its observation. No arm is trained. Masked standard deviations are replaced by their
+constant medians.
 """
 
 from baselines.arms import Arm
@@ -32,4 +33,4 @@ ARMS = (
     *(_flown(f"ONLY_{name}", f"only {label}") for name, label in _BLOCKS.items()),
     _flown("NONE_SHOWN", "none"),
 )
-"""Those of `QuadGym/StaleRace-v0`."""
+"""Arms of `QuadGym/StaleRace-v0`."""

@@ -1,9 +1,9 @@
-"""Arms of a study of policies that fly with a miscalibrated covariance.
+"""Arms of a study of policies with a miscalibrated covariance.
 
     quad-gym study --arms-file baselines/arms_miscalibrated.py
 
-All fly LookAround with the pretrained policy, which was trained with a consistent filter. Nothing
-is trained.
+All arms fly LookAround with the pretrained policy, which was trained with a consistent filter. No
+arm is trained.
 """
 
 from typing import Any
@@ -19,10 +19,10 @@ _NOISES = (
     *("accel_noise_density", "gyro_noise_density", "accel_vibration", "gyro_vibration"),
     *("accel_bias_sigma", "gyro_bias_sigma", "accel_scale_sigma", "accel_misalignment_sigma"),
 )
-"""Parameters of the IMU that the filter may assume wrongly: all its errors."""
+"""Parameters of all IMU errors, which the filter may assume wrongly."""
 
 _FACTORS = {"1_4": "1/4", "1_2": "1/2", "2": "2", "4": "4"}
-"""Factors of standard deviations as in names, and for people."""
+"""Factors of standard deviations, as in names and in labels."""
 
 
 def _flown(name: str, label: str, task: str = _WITH_STD, **environment: Any) -> Arm:
@@ -35,7 +35,7 @@ def _flown(name: str, label: str, task: str = _WITH_STD, **environment: Any) -> 
 
 
 def _assuming(name: str, label: str, factor: float) -> Arm:
-    """A filter that assumes the IMU's noise and drift to be so many times as large as they are."""
+    """Make an arm whose filter assumes IMU noise and drift multiplied by a factor."""
     imu = _SUITE.imu
     assumed = imu.replace(**{each: factor * getattr(imu, each) for each in _NOISES})
     return _flown(name, label, sensors=_SUITE.replace(imu=assumed), true_sensors=_SUITE)
@@ -68,4 +68,4 @@ ARMS = (
         ),
     ),
 )
-"""Those of `QuadGym/LookAround-v0`."""
+"""Arms of `QuadGym/LookAround-v0`."""

@@ -1,4 +1,4 @@
-"""Checkpoints of Stable-Baselines3's models, from which a run resumes exactly."""
+"""Checkpoints of models of Stable-Baselines3, from which a run resumes exactly."""
 
 import io
 import pickle
@@ -22,13 +22,13 @@ LAST = "last.zip"
 
 
 class Keeper(RunKeeper, BaseCallback):
-    """Keeps a training with Stable-Baselines3, which calls it."""
+    """`RunKeeper` for Stable-Baselines3, as a callback."""
 
     def _on_training_start(self) -> None:
         self.begin(self.num_timesteps)
 
     def _on_rollout_start(self) -> None:
-        """Here nothing is half done: the last rollout is learned, the next not begun."""
+        """Evaluate and save between two rollouts, after the update by the last one."""
         self.watch(self.model, self.model.num_timesteps)
 
     def _on_step(self) -> bool:
@@ -53,7 +53,7 @@ def _model_bytes(model: BaseAlgorithm) -> bytes:
 
 
 def save_model(folder: Path, model: BaseAlgorithm, keeper: Keeper) -> None:
-    """Write `last.zip`: the model, and the state of everything that random numbers come from."""
+    """Write `last.zip`: the model, and the states of the flights and random number generators."""
     env = model.get_env()
     assert env is not None
     state = {
@@ -80,13 +80,13 @@ def save_model(folder: Path, model: BaseAlgorithm, keeper: Keeper) -> None:
 
 
 def load_model(folder: Path, model: BaseAlgorithm, env: VecEnv, keeper: Keeper) -> BaseAlgorithm:
-    """The model of `last.zip`, with flights and random numbers as they were then.
+    """Load the model of `last.zip`, and restore flights and random number generators.
 
     Args:
-        folder: Where the run is kept.
-        model: An untrained model of the same plan.
-        env: Its flights.
-        keeper: Gets back what it knew.
+        folder: Folder of the run.
+        model: Untrained model of the same plan.
+        env: Environment of the model.
+        keeper: Keeper whose state is restored.
 
     Raises:
         ValueError: If the file is damaged.
@@ -122,8 +122,8 @@ def run(
     tensorboard: bool,
     quiet: bool,
 ) -> Keeper:
-    """Train with Stable-Baselines3, or go on from the folder's checkpoint; see `training.train`."""
-    torch.set_num_threads(1)  # networks this small gain nothing from more
+    """Train with Stable-Baselines3, or resume from the last checkpoint; see `training.train`."""
+    torch.set_num_threads(1)  # networks of this size do not benefit from more
     env = plan.make_flights()
     model = make_model(plan, env, folder / "tensorboard" if tensorboard else None)
     keeper = Keeper(plan, folder, judge, quiet=quiet)

@@ -1,4 +1,4 @@
-"""What is kept of a run, with either engine: evaluations and the best policy, on Ctrl-C, too."""
+"""Evaluations and checkpoints of a run, for both engines; on Ctrl-C, too."""
 
 import csv
 import io
@@ -19,7 +19,7 @@ from quad_gym.evaluation import Policy, roll_out
 
 EVALUATIONS = "evaluations.csv"
 STATE = "training_state.pickle"
-"""Within the file of the last policy, where those who load the policy pass over it."""
+"""Name of the state within the file of the last policy; loading the policy ignores it."""
 _COLUMNS = (
     "steps",
     "training_seconds",
@@ -33,33 +33,34 @@ _COLUMNS = (
 
 
 SUFFIXES = {"sb3": ".zip", "compiled": ".npz"}
-"""Of files of policies, by engine."""
+"""Extensions of policy files, by engine."""
 
 
 class RunError(ValueError):
-    """A folder does not hold the run that it should."""
+    """Error raised when a folder does not contain the expected run."""
 
 
 def last_file(plan: Plan, folder: Path) -> Path:
-    """Where the policy of the last evaluation is kept, and what resuming needs."""
+    """File of the policy of the last evaluation, with the state for resuming."""
     return folder / f"last{SUFFIXES[plan.engine]}"
 
 
 def best_file(plan: Plan, folder: Path) -> Path:
-    """Where the policy of the best evaluation is kept."""
+    """File of the policy of the best evaluation."""
     return folder / f"best{SUFFIXES[plan.engine]}"
 
 
 def has_checkpoint(folder: Path) -> bool:
-    """Whether a run can be resumed from the folder."""
+    """True if a run can be resumed from the folder."""
     kept = any((folder / f"last{suffix}").exists() for suffix in SUFFIXES.values())
     return kept and (folder / "training.json").exists()
 
 
 def score(summary: dict[str, float], duration: float) -> float:
-    """What makes an evaluation the best: few crashes and small errors, or many gates and soon.
+    """Score by which the best evaluation is selected.
 
-    Of a task with a reward of its own: the largest return.
+    Small errors and few crashes; on a course, many gates in a short time and few crashes; for a
+    task that defines its own reward, the return.
     """
     if summary["own_reward"] > 0.0:
         return summary["return"]
@@ -69,16 +70,16 @@ def score(summary: dict[str, float], duration: float) -> float:
 
 
 class RunKeeper(ABC):
-    """Evaluates the policy now and then, and keeps what a run leaves behind.
+    """Evaluations of the policy during a run, and files of the run.
 
-    All is done between a rollout and the next, where nothing is half done. A checkpoint is written
-    under another name and then moved to its place, so a kill at any moment leaves the one before.
+    Evaluations and checkpoints are made between two rollouts. A checkpoint is written under another
+    name and then renamed, so that the previous one survives an interruption at any time.
 
     Args:
-        plan: What is trained.
-        folder: Where the run is kept.
-        judge: Flights to evaluate on.
-        quiet: Whether to leave out the progress bar.
+        plan: Plan of the training.
+        folder: Folder of the run.
+        judge: Environment for evaluations.
+        quiet: True to hide the progress bar.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class RunKeeper(ABC):
         self._handlers: dict[int, Any] = {}
         self._bar: Any = None
 
-    # ---- what depends on the engine -------------------------------------------------------------
+    # ---- specific to the engine -----------------------------------------------------------------
 
     @abstractmethod
     def _training_return(self, model: Any) -> float:
@@ -110,15 +111,15 @@ class RunKeeper(ABC):
 
     @abstractmethod
     def _save(self, model: Any, *, best: bool) -> None:
-        """Write the best policy where this is it, and then the last checkpoint.
+        """Write the best policy, if this is the best, and then the last checkpoint.
 
-        In this order: a run that dies in between makes the same best policy again.
+        The order matters: a run that is killed in between finds the same best policy again.
         """
 
     # ---- between rollouts -----------------------------------------------------------------------
 
     def begin(self, steps: int) -> None:
-        """Start clock and bar of a training that has done `steps` steps; all is compiled now."""
+        """Start the clock and the progress bar at a number of steps, after compilation."""
         if not self._quiet:
             from tqdm.auto import tqdm
 
@@ -127,7 +128,7 @@ class RunKeeper(ABC):
         self.steps, self._since = steps, time.perf_counter()
 
     def watch(self, model: Policy, steps: int) -> None:
-        """Evaluate and keep a policy where it is due; to be called before every rollout."""
+        """Evaluate and store the policy if this is due; to be called before every rollout."""
         if self._bar is not None:
             self._bar.update(steps - self._bar.n)
         due = steps // self._interval > self.steps // self._interval
@@ -137,14 +138,14 @@ class RunKeeper(ABC):
 
     @property
     def stopping(self) -> bool:
-        """Whether the run has been asked to end."""
+        """True if the run has been requested to stop."""
         return self._stop
 
     # ---- the beginning and the end --------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        """Take over Ctrl-C and the request to terminate."""
-        if threading.current_thread() is threading.main_thread():  # else they are not ours to take
+        """Install handlers for SIGINT and SIGTERM."""
+        if threading.current_thread() is threading.main_thread():  # Python allows no other thread
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
         return self
@@ -155,20 +156,20 @@ class RunKeeper(ABC):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give the signals back."""
+        """Restore the previous signal handlers."""
         while self._handlers:
             signal.signal(*self._handlers.popitem())
         if self._bar is not None:
             self._bar.close()
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        """The first signal ends the run with the rollout's present step; a second one, at once."""
+        """Stop the run after the present step; after a second signal, immediately."""
         if self._stop:
             raise KeyboardInterrupt
         self._stop = True
 
     def finish(self, model: Policy, steps: int) -> None:
-        """Keep the policy that the last step has made, if the run came to its end."""
+        """Store the policy after the last step, if the run is complete."""
         if self._bar is not None:
             self._bar.update(steps - self._bar.n)
         self.finished = steps >= self._plan.recipe.steps
@@ -176,7 +177,7 @@ class RunKeeper(ABC):
             self.steps = steps
             self._keep(model)
 
-    # ---- keeping --------------------------------------------------------------------------------
+    # ---- checkpoints ----------------------------------------------------------------------------
 
     def _keep(self, model: Policy) -> None:
         """Evaluate, and write a checkpoint."""
@@ -207,11 +208,11 @@ class RunKeeper(ABC):
         self._since = time.perf_counter()
 
     def state(self) -> dict[str, Any]:
-        """What the next process has to know to go on."""
+        """State from which the next process resumes."""
         return {name: getattr(self, name) for name in ("rows", "best", "last", "seconds")}
 
     def restore(self, state: dict[str, Any], steps: int) -> None:
-        """Know again what `state` gave when `steps` steps were done."""
+        """Restore a `state` that was taken after `steps` steps."""
         for name, value in state.items():
             setattr(self, name, value)
         self.steps = steps
@@ -225,7 +226,7 @@ class RunKeeper(ABC):
 
 
 def replace_file(file: Path, content: bytes) -> None:
-    """Write a file so that at any moment there is the old or the new one, whole."""
+    """Write a file atomically: at any time it is either the old or the new one."""
     part = file.with_name(file.name + ".part")
     with part.open("wb") as stream:
         stream.write(content)

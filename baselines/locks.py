@@ -1,8 +1,8 @@
-"""A lock on the folder of a run, so that no two processes ever train in it.
+"""Lock on the folder of a run, so that only one process at a time trains in it.
 
-The system releases the lock when its process ends, however it ends. On a file system that several
-machines share, the lock holds between them, too, if the file system supports locks (NFS does, and
-Lustre if it is mounted with `flock`).
+The operating system releases the lock when the process ends for any reason. The lock also works
+between machines on a shared file system that supports locks (NFS, and Lustre if it is mounted with
+`flock`).
 """
 
 import os
@@ -22,42 +22,42 @@ except ImportError:  # Windows, where runs are not locked
     fcntl = None
 
 LOCK = "training.lock"
-"""In the folder; it names the process that has or had it."""
+"""Name of the lock file in the folder; it contains the process that has or had the lock."""
 
 PATIENCE = 0.5
-"""How long to try [s]: who only asks whether a folder is locked holds the lock for a moment."""
+"""Time to wait for a lock [s]; checking for a lock takes it briefly."""
 
 
 class BusyError(RunError):
-    """Another process trains in the folder."""
+    """Error raised when another process trains in the folder."""
 
 
 @contextmanager
 def locked(folder: Path, patience: float = PATIENCE) -> Iterator[None]:
-    """Be the only one who trains in a folder.
+    """Lock the folder of a run.
 
     Args:
-        folder: Of the run; it is there.
-        patience: How long to try [s].
+        folder: Existing folder of the run.
+        patience: Time to wait for the lock [s].
 
     Raises:
-        ValueError: If another process has the lock (BusyError).
-        OSError: If the file system has no locks, or nothing can be written to the folder.
+        ValueError: If another process has the lock (`BusyError`).
+        OSError: If the file system has no locks, or the folder is not writable.
     """
     file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         if not _take(file, patience):
             raise BusyError(f"folder {folder} is in use by {holder(folder)}")
-        with suppress(OSError):  # a full disk: the lock holds without words
+        with suppress(OSError):  # on a full disk the lock file stays empty
             os.ftruncate(file, 0)
             os.pwrite(file, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
         yield
     finally:
-        os.close(file)  # which gives the lock back
+        os.close(file)  # releases the lock
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a process trains in a folder now."""
+    """True if a process trains in the folder now."""
     try:
         file = os.open(folder / LOCK, os.O_RDWR)
     except OSError:  # never begun
@@ -69,7 +69,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def holder(folder: Path) -> str:
-    """The process that has the lock of a folder, or had it last."""
+    """Process that has the lock of a folder, or had it last."""
     try:
         return (folder / LOCK).read_text(encoding="utf-8").strip() or "another process"
     except OSError:

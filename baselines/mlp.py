@@ -1,7 +1,7 @@
-"""`MlpPolicy`: a trained network as plain arrays, flown with NumPy alone.
+"""`MlpPolicy`: a trained network as plain arrays, evaluated in NumPy.
 
-A shipped policy needs neither torch nor unpickling: it is a file of weights that also holds the
-record of its training.
+Included policies need neither torch nor unpickling: they are files of weights with the record of
+the training.
 """
 
 import json
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = "quad_gym policy 1"
-"""What a file of ours says it is."""
+"""Identifier of the file format."""
 
 _ACTIVATIONS: dict[str, Any] = {
     "relu": lambda x: np.maximum(x, 0.0),
@@ -26,16 +26,16 @@ _ACTIVATIONS: dict[str, Any] = {
 
 
 class MlpPolicy:
-    """Layers of a network: x <- activation(W x + b) each, the last one clipped to [-1, 1].
+    """Network with layers x <- activation(W x + b), whose output is clipped to [-1, 1].
 
     Args:
-        weights: (outputs, inputs) of each layer.
-        biases: (outputs,) of each layer.
-        activations: "relu", "tanh", "elu" or "none", for each layer.
-        record: How it was trained, and for what: the plan and its results.
+        weights: Weights of each layer, (outputs, inputs).
+        biases: Biases of each layer, (outputs,).
+        activations: Activation of each layer: "relu", "tanh", "elu" or "none".
+        record: Training record: the plan and its results.
 
     Raises:
-        ValueError: If the layers do not fit each other.
+        ValueError: If the shapes of the layers are inconsistent.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class MlpPolicy:
 
     @property
     def inputs(self) -> int:
-        """Numbers in an observation."""
+        """Length of an observation."""
         return int(self.weights[0].shape[1])
 
     def predict(
@@ -68,7 +68,7 @@ class MlpPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Actions for observations (..., n); always deterministic.
+        """Return actions for observations (..., n), and None; always deterministic.
 
         Raises:
             ValueError: If the observations have another length.
@@ -92,7 +92,7 @@ class MlpPolicy:
         """Read a policy.
 
         Raises:
-            ValueError: If there is no such file, or it holds no policy of ours.
+            ValueError: If the file does not exist, or is not a policy in this format.
         """
         file = Path(file)
         if not file.exists():
@@ -104,21 +104,21 @@ class MlpPolicy:
                 weights = [stored[f"W{i}"] for i in range(count)]
                 biases = [stored[f"b{i}"] for i in range(count)]
         except (zipfile.BadZipFile, OSError, EOFError, KeyError, ValueError, TypeError):
-            raise ValueError(f"{file} is no policy: it is damaged or something else") from None
+            raise ValueError(f"{file} is not a policy, or is damaged") from None
         if about.get("format") != FORMAT:
             raise ValueError(f"{file} must be a {FORMAT!r}, got {about.get('format')!r}")
         return cls(weights, biases, about["activations"], about["record"])
 
 
 def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
-    """The deterministic actor of a Stable-Baselines3 model.
+    """Convert the deterministic actor of a Stable-Baselines3 model.
 
     Args:
         model: PPO, SAC, TD3 or TQC with an "MlpPolicy".
-        record: How it was trained.
+        record: Training record.
 
     Raises:
-        ValueError: If the model's actor is no plain network.
+        ValueError: If the model's actor is not a multilayer perceptron.
     """
     from torch import nn
 
@@ -141,5 +141,5 @@ def mlp_of(model: Any, record: Mapping[str, Any]) -> MlpPolicy:
         elif type(module) in names:
             activations[-1] = names[type(module)]
         else:
-            raise ValueError(f"model must be made of plain layers, got {type(module).__name__}")
+            raise ValueError(f"model must consist of plain layers, got {type(module).__name__}")
     return MlpPolicy(weights, biases, activations, record)

@@ -1,4 +1,4 @@
-"""The untrained models of Stable-Baselines3 that belong to a plan."""
+"""Untrained models of Stable-Baselines3 for a plan."""
 
 import inspect
 import math
@@ -20,11 +20,11 @@ from quad_gym.params import checks as check
 
 _OURS = {"self", "policy", "env", "learning_rate", "policy_kwargs", "action_noise"}
 _OURS |= {"seed", "device", "tensorboard_log", "_init_setup_model"}
-"""What `make_model` itself gives to an algorithm, or no recipe may."""
+"""Arguments of algorithms that `make_model` sets, or that recipes must not set."""
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """The class of an algorithm, by its name in `recipes.ALGORITHMS`."""
+    """Class of an algorithm, by its name in `recipes.ALGORITHMS`."""
     if name in ("recurrent_ppo", "tqc"):
         import sb3_contrib
 
@@ -33,16 +33,16 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 
 def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> BaseAlgorithm:
-    """An untrained model as the plan's recipe has it.
+    """Make the untrained model of a plan's recipe.
 
     Raises:
-        ValueError: If the algorithm does not know one of the recipe's parameters, or cannot have
-            its value.
+        ValueError: If a parameter of the recipe is unknown to the algorithm, or its value is
+            invalid.
     """
     chosen = plan.recipe
     if chosen.parameters.get("critic_only"):
         raise ValueError(
-            "critic_only must be 0 with Stable-Baselines3, whose critics see what the actor sees, "
+            "critic_only must be 0 with Stable-Baselines3, where actor and critic share inputs, "
             f'got {chosen.parameters["critic_only"]}: it needs engine="compiled"'
         )
     parameters = _checked_parameters(chosen)
@@ -72,15 +72,15 @@ def make_model(plan: Plan, env: VecEnv, tensorboard: Path | None = None) -> Base
         )
     except (TypeError, AssertionError) as error:
         raise ValueError(f"recipe does not fit {chosen.algorithm}: {error}") from None
-    # the algorithm has seeded the flights with its own seed, and so with those of a test
+    # the algorithm has seeded the flights with its own seed, which are seeds of tests
     env.seed(first_seed("training", plan.seed, chosen.n_envs))
     return model
 
 
 def _checked_parameters(chosen: Recipe) -> dict[str, Any]:
-    """The parameters of a recipe, each a number where the algorithm's default is one.
+    """Check the parameters of a recipe against the types of the algorithm's defaults.
 
-    Stable-Baselines3 checks few of them, and fails while training.
+    Stable-Baselines3 checks few of them and would fail during training.
     """
     kind = algorithm_class(chosen.algorithm)
     known = {k: v for k, v in inspect.signature(kind).parameters.items() if k not in _OURS}
@@ -105,7 +105,7 @@ def _checked_parameters(chosen: Recipe) -> dict[str, Any]:
 
 
 def _exploration(chosen: Recipe, env: VecEnv) -> dict[str, Any]:
-    """The noise on actions while learning, for TD3, whose policy has none of its own."""
+    """Exploration noise for TD3, whose policy is deterministic."""
     if chosen.algorithm != "td3":
         return {}
     mean = np.zeros(env.action_space.shape or ())

@@ -1,4 +1,4 @@
-"""The report's PD controller, as a policy that computes its action from the observation alone."""
+"""PD controller of the report, as a policy that computes actions only from observations."""
 
 import warnings
 from collections.abc import Mapping
@@ -15,32 +15,33 @@ from quad_gym.params.control import PDGains, pd_gains
 Array = NDArray[np.float64]
 
 LEAST_LIFT, MOST_TILT = 0.3, 1.2
-"""The wanted force keeps this share of the weight upward, and at most this ratio of its horizontal
-to its vertical part (50 degrees): no step of the reference turns the vehicle over."""
+"""Limits of the desired force: minimum upward part as a share of the weight, and maximum ratio of
+horizontal to vertical part (50 degrees), so that steps of the reference do not flip the vehicle."""
 
 
 PACES = ("steady", "waiting")
-"""How PD control flies through gaps."""
+"""Modes of PD control at gaps."""
 
 REACH_OF_GAPS = 1.5
-"""Position errors are shortened to this where there are gaps, so that it flies 4.7 m/s [m]."""
+"""Limit of position errors on courses with gaps, which gives a speed of 4.7 m/s [m]."""
 
 WAITS_BEFORE = 6.0
-"""How far before a gap it waits: halfway from the one before, on OutageDash [m]."""
+"""Distance before a gap at which mode "waiting" waits, on OutageDash halfway between gaps [m]."""
 
 SIGMAS, MARGIN = 2.0, 0.5
-"""It waits where so many standard deviations of the position reach from the middle of the next gap
-to within this of its edge, which is the vehicle's radius and a little more [m]."""
+"""Criterion of mode "waiting": it waits while this number of standard deviations of the position
+exceeds half the width of the next gap minus this margin, slightly more than the vehicle's radius
+[m]."""
 
 FACES = ("reference", "features", "features_when_uncertain")
-"""Where PD control points body x."""
+"""Directions in which PD control can point body x."""
 
 UNSURE = 0.1
-"""Largest standard deviation of the position beyond which it looks for features [m]."""
+"""Standard deviation of the position above which "features_when_uncertain" faces features [m]."""
 
 
 class _Seen(NamedTuple):
-    """What the controller needs of an observation, all (n, 3) in the body frame."""
+    """Parts of an observation that the controller uses, (n, 3) each in the body frame."""
 
     position_error: Array
     velocity_error: Array
@@ -49,7 +50,7 @@ class _Seen(NamedTuple):
     body_rates: Array
     reference_acceleration: Array
     velocity: Array | None
-    """None where the observation does not hold it"""
+    """Velocity; None if the observation does not contain it"""
 
 
 _RELATIVE_FIELDS = _Seen._fields[:-1]
@@ -60,10 +61,10 @@ _ABSOLUTE_FIELDS = (
 
 
 def _require_plain_observations(env: Any) -> None:
-    """Refuse an environment that shows other observations than the one within it makes.
+    """Reject environments whose wrappers change the observation.
 
     Raises:
-        ValueError: If a wrapper is one of observations, or changes their space.
+        ValueError: If a wrapper changes observations or their space.
     """
     layer = env
     while True:
@@ -76,7 +77,7 @@ def _require_plain_observations(env: Any) -> None:
         normalizes = getattr(layer, "norm_obs", False)  # VecNormalize of Stable-Baselines3
         if changes or normalizes or layer.observation_space != inner.observation_space:
             raise ValueError(
-                "env must show observations as they are, in meters and radians: "
+                "env must return its original observations, in meters and radians: "
                 f"{type(layer).__name__} changes them"
             )
         layer = inner
@@ -87,39 +88,40 @@ class PDPolicy:
 
     `F = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F/|F|`, thrust `F . z`; with `b = unit(z*
     x x*)`, `R_E = [b x z*, b, z*]^T` in body axes and `[e x] = R_E^T - R_E` (e is twice the vector
-    of an antisymmetric part), `N = K e - Kd w + w x J w`. How the thrust and the torque become an
-    action depends on the environment's `action`:
+    of an antisymmetric part), `N = K e - Kd w + w x J w`. The environment's `action` determines the
+    command:
 
-    | `action` | what is commanded |
+    | `action` | command |
     |---|---|
-    | "motor" | the voltages of the allocation, with the largest alpha that saturates no rotor |
+    | "motor" | voltages of the allocation, with the largest alpha that saturates no rotor |
     | "wrench" | thrust and torque N |
-    | "ctbr" | thrust and the body rates (K/Kd) e at which N would be zero but for w x J w |
+    | "ctbr" | thrust and the body rates (K/Kd) e, at which N is zero except for w x J w |
     | "attitude" | thrust, roll and pitch of z*, yaw rate (K/Kd) e |
-    | "velocity" | the velocity whose error the inner loop turns into F: needs `layout="absolute"` |
+    | "velocity" | velocity whose error the inner loop converts to F; requires `layout="absolute"` |
 
-    Where there are gaps, as on OutageDash, "velocity" needs no such layout.
+    On courses with gaps, such as OutageDash, "velocity" also works with the relative layout.
 
-    F is kept from pointing down or far sideways (`LEAST_LIFT`, `MOST_TILT`), as it would between
-    gates; on the report's circle it never does.
+    F is prevented from pointing down or far sideways (`LEAST_LIFT`, `MOST_TILT`), as it otherwise
+    would between gates; on the report's circle these limits are never reached.
 
     Args:
         env: A `QuadGym` environment: single, vector or Stable-Baselines3. Its observation must be
             "estimate", "truth" or "noisy".
-        gains: "lab" (the report's), "tuned", or `PDGains`.
-        max_position_error: Position errors are shortened to this length [m], which sets the speed;
-            None: 1 m on `Waypoints`, which are far apart, REACH_OF_GAPS where the environment
-            observes gaps, as OutageDash does, and unlimited elsewhere.
-        faces: Where body x points: in the direction of the "reference"; toward the "features" of
-            an environment that observes their direction, as LookAround does; or toward them
-            "features_when_uncertain", while the filter's largest standard deviation of the position
-            is above UNSURE, which the environment must show (`include_std=True`).
-        pace: "steady", or "waiting": WAITS_BEFORE a gap that is too narrow for how sure the filter
-            is, which the environment must show (`include_std=True`).
+        gains: "lab" (the report's gains), "tuned", or `PDGains`.
+        max_position_error: Limit of the norm of position errors [m], which determines the speed.
+            None: 1 m on `Waypoints`, whose gates are far apart, `REACH_OF_GAPS` if the environment
+            observes gaps, as OutageDash does, and unlimited otherwise.
+        faces: Direction of body x. "reference": desired heading; "features": toward the features,
+            if the environment observes their direction, as LookAround does;
+            "features_when_uncertain": toward the features while the filter's largest standard
+            deviation of the position is above `UNSURE` (requires `include_std=True`), else the
+            desired heading.
+        pace: "steady", or "waiting": wait `WAITS_BEFORE` a gap that is too narrow for the filter's
+            uncertainty (requires `include_std=True`).
 
     Raises:
-        ValueError: If the environment's observation or action does not admit the controller, or a
-            wrapper changes the observations, such as `NormalizeObservation`.
+        ValueError: If the controller does not support the environment's observation or action, or
+            a wrapper changes the observations, such as `NormalizeObservation`.
     """
 
     def __init__(
@@ -135,7 +137,7 @@ class PDPolicy:
             raise ValueError(f"env must be a QuadGym environment, got {type(env).__name__}")
         _require_plain_observations(env)
         if flights.observation == "measurements":
-            raise ValueError('env must observe a state: observation="measurements" holds none')
+            raise ValueError('env must observe a state: observation="measurements" contains none')
         needed = _ABSOLUTE_FIELDS if flights.layout == "absolute" else _RELATIVE_FIELDS
         self._faces = check.choice("faces", faces, FACES)
         wanted = {
@@ -158,18 +160,18 @@ class PDPolicy:
                         f'env must observe {name} for pace="waiting", as OutageDash does with '
                         "include_std=True"
                     )
-        # a task's own observation of a reference at rest has no use for its acceleration
+        # observations of tasks with a reference at rest may lack its acceleration
         self._gaps = "gap_width" in shown
         spared = {"reference_acceleration"} if self._gaps else set()
         missing = sorted(set(needed) - shown - spared)
         if missing:
             raise ValueError(
-                f"env must observe {missing[0]}: its task replaces the observation that ships"
+                f"env must observe {missing[0]}: its task replaces the built-in observation"
             )
         if flights.action == "velocity" and flights.layout != "absolute" and not self._gaps:
             raise ValueError(
-                'env must have layout="absolute" for action="velocity", as the relative layout '
-                "holds no velocity"
+                'env must have layout="absolute" for action="velocity", because the relative '
+                "layout contains no velocity"
             )
         self.gains = pd_gains(gains) if isinstance(gains, str) else gains
         if flights.action in ("motor", "wrench"):
@@ -190,38 +192,39 @@ class PDPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """The action for an observation, with the signature of Stable-Baselines3.
+        """Return the action for an observation, with the signature of Stable-Baselines3.
 
         Args:
-            observation: (n_observation,) or (n, n_observation), or the Dict with "policy".
+            observation: Observation, (n_observation,) or (n, n_observation), or a dictionary with
+                the key "policy".
             state: Not used; the controller has no memory.
             episode_start: Not used.
-            deterministic: Not used; the controller is.
+            deterministic: Not used; the controller is always deterministic.
 
         Returns:
-            (4,) or (n, 4) action in [-1, 1], and None.
+            Action (4,) or (n, 4) in [-1, 1], and None.
 
         Raises:
-            ValueError: If observations have another length than those of the environment.
+            ValueError: If the length of the observations is not the one of the environment.
         """
         flat = observation["policy"] if isinstance(observation, dict) else observation
         rows = np.atleast_2d(np.asarray(flat, np.float64))
         if rows.ndim != 2 or rows.shape[1] not in self._widths:
             raise ValueError(
-                f"observation must be (..., {self._widths[0]}) as that of the environment which "
-                f"the policy was made for, got shape {np.shape(flat)}"
+                f"observation must be (..., {self._widths[0]}), as in the environment for which "
+                f"the policy was made, got shape {np.shape(flat)}"
             )
         action = self._act(self._read(rows))
         clipped = np.clip(action, -1.0, 1.0).astype(np.float32)
         return (clipped if np.ndim(flat) == 2 else clipped[0]), None
 
     def _warn_if_too_slow(self, control_rate: float, inertia: Any) -> None:
-        """The sampled rate loop w+ = (1 - Kd/(J f)) w is unstable beyond Kd/(J f) = 2."""
+        """Warn if the sampled rate loop w+ = (1 - Kd/(J f)) w is unstable, Kd/(J f) > 2."""
         gain = float(np.max(np.array(self.gains.body_rates) / np.diag(inertia))) / control_rate
         if gain > 1.0:
             warnings.warn(
-                f"PD control of torques needs {gain * control_rate:.0f} Hz with these gains, this "
-                f"environment is controlled at {control_rate:g} Hz: expect it to shake or crash",
+                f"PD control of torques needs {gain * control_rate:.0f} Hz with these gains, but "
+                f"the control rate is {control_rate:g} Hz: expect oscillations or a crash",
                 UserWarning,
                 stacklevel=3,
             )
@@ -231,7 +234,7 @@ class PDPolicy:
     def _read(self, rows: Array) -> _Seen:
         part = {name: rows[:, where] for name, where in self._slices.items()}
         seen = self._read_state(part)
-        if self._gaps:  # through them, not just to their middle
+        if self._gaps:  # aim beyond the center, to fly through
             ahead = (seen.position_error * seen.heading).sum(axis=1, keepdims=True)
             beyond = np.maximum(REACH_OF_GAPS - ahead, 0.0) * seen.heading
             seen = seen._replace(position_error=seen.position_error + beyond)
@@ -273,7 +276,7 @@ class PDPolicy:
         )
 
     def _force(self, seen: _Seen) -> Array:
-        """(n, 3) wanted force F in B [N]."""
+        """Desired force F, (n, 3) in B [N]."""
         g, vehicle = self.gains, self._vehicle
         distance = np.linalg.norm(seen.position_error, axis=1, keepdims=True)
         error = seen.position_error * np.minimum(1.0, self._reach / np.maximum(distance, 1e-9))
@@ -330,13 +333,13 @@ class PDPolicy:
 
     @staticmethod
     def _level_axes(up: Array) -> tuple[Array, Array]:
-        """Ahead and left, level, in B."""
+        """Horizontal unit vectors ahead and to the left, in B."""
         ahead = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
         ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
         return ahead, np.cross(up, ahead)
 
     def _tilt(self, z_wanted: Array, up: Array) -> Array:
-        """(n, 2) roll and pitch of the wanted thrust axis, scaled."""
+        """Roll and pitch of the desired thrust axis, scaled, (n, 2)."""
         ahead, left = self._level_axes(up)
         x, y = (z_wanted * ahead).sum(axis=1), (z_wanted * left).sum(axis=1)
         z = (z_wanted * up).sum(axis=1)
@@ -344,7 +347,7 @@ class PDPolicy:
         return np.stack([roll, pitch], axis=1) / self._scales.tilt_scale
 
     def _velocity(self, F: Array, seen: _Seen) -> Array:
-        """(n, 3) level velocity whose error times m k_v is F less the weight, scaled."""
+        """Velocity in level axes whose error times m k_v is F minus the weight, scaled, (n, 3)."""
         vehicle = self._vehicle
         if seen.velocity is None:
             raise ValueError('action="velocity" needs layout="absolute"')
@@ -356,7 +359,7 @@ class PDPolicy:
         return np.stack(level, axis=1) / self._scales.velocity_scale
 
     def _voltages(self, thrust: Array, torque: Array) -> Array:
-        """(n, 4) motor voltages by the laboratory's allocation."""
+        """Motor voltages by the allocation of the report, (n, 4)."""
         vehicle = self._vehicle
         limit = vehicle.max_rotor_force
         allocation = np.linalg.inv(vehicle.effectiveness)

@@ -1,4 +1,4 @@
-"""What is to be trained: a plan, and the flights that belong to it."""
+"""Plans of trainings, and the environments that they define."""
 
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -18,31 +18,31 @@ if TYPE_CHECKING:
     from baselines.scaled_reward import ScaledReward
 
 ENGINES = ("sb3", "compiled")
-"""What trains: Stable-Baselines3, or `baselines.compiled_ppo`."""
+"""Training engines: Stable-Baselines3, or `baselines.compiled_ppo`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Checked):
-    """What is to be trained, and how it is watched."""
+    """Plan of a training and its evaluations."""
 
     env_id: str = "QuadGym/Circle-v0"
-    """one of `quad_gym.IDS`"""
+    """Id of the environment, from `quad_gym.IDS`"""
     environment: Any = field(default_factory=dict)
-    """keywords of the environment, in training as in evaluation, before those of the recipe"""
+    """Keywords of the environment in training and evaluation; they override the recipe's"""
     learning: Any = field(default_factory=dict)
-    """keywords of the environment in training alone, before all others"""
+    """Keywords of the environment in training only; they override all others"""
     recipe: Recipe = field(default_factory=lambda: recipe("QuadGym/Circle-v0"))
     seed: int = 0
-    """of the networks; the flights of training and validation have blocks of seeds that follow from
-    it, see `baselines.seeds`"""
+    """Seed of the networks; it also determines the blocks of seeds of the flights in training and
+    validation, see `baselines.seeds`"""
     threads: int | None = None
-    """for the flights; None: as many as there are cores; no result depends on them"""
+    """Number of threads of the flights; None: one per core. It does not affect results"""
     engine: str = "sb3"
-    """one of ENGINES"""
+    """Training engine, one of `ENGINES`"""
     evaluations: int = 20
-    """how often the policy is evaluated, and kept, over the run"""
+    """Number of evaluations, each with a checkpoint, during the training"""
     episodes: int = 100
-    """flown in each evaluation"""
+    """Number of episodes in each evaluation"""
 
     def __post_init__(self) -> None:
         self._check(check.choice, "env_id", choices=tuple(quad_gym.IDS))
@@ -56,11 +56,11 @@ class Plan(Checked):
             self._set(name, MappingProxyType(dict(getattr(self, name))))
 
     def __reduce__(self) -> Any:
-        """Plans go to other processes."""
+        """Support pickling, to send plans to other processes."""
         return unfreeze(self)
 
     def make_flights(self) -> "ScaledReward":
-        """The flights to train on with Stable-Baselines3."""
+        """Make the environment to train in with Stable-Baselines3."""
         from baselines.scaled_reward import ScaledReward
 
         env = quad_gym.make_sb3_vec_env(
@@ -73,7 +73,7 @@ class Plan(Checked):
         return ScaledReward(env, self.recipe.reward_scale)
 
     def make_vector_flights(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-        """The same flights for the compiled engine; not yet seeded."""
+        """Make the environment to train in with the compiled engine; it is not seeded."""
         return gymnasium.make_vec(
             self.env_id,
             num_envs=self.recipe.n_envs,
@@ -83,7 +83,7 @@ class Plan(Checked):
         )
 
     def make_judge(self) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-        """The flights to evaluate on: the task as the id and the keywords have it."""
+        """Make the environment for evaluations, defined by the id and the keywords."""
         return gymnasium.make_vec(
             self.env_id, num_envs=self.episodes, threads=self.threads, **self.environment
         )
@@ -91,20 +91,20 @@ class Plan(Checked):
 
 @dataclass(frozen=True)
 class Linear:
-    """A number that goes linearly from its first to its last value while training."""
+    """Schedule that changes linearly from a first to a last value during training."""
 
     first: float
     last: float
 
     def __call__(self, remaining: float) -> float:
-        """The value when a share `remaining` of the training is still ahead."""
+        """Return the value when a share `remaining` of the training remains."""
         return self.last + (self.first - self.last) * remaining
 
 
 def description(plan: Plan) -> dict[str, Any]:
-    """A plan as JSON has it."""
+    """Convert a plan to JSON types."""
     found: dict[str, Any] = as_json(plan)
-    del found["threads"]  # changes no result
+    del found["threads"]  # does not affect results
     if not plan.learning:
         del found["learning"]
     given = (plan.environment.get("sensors"), plan.learning.get("sensors"))

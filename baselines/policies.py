@@ -1,4 +1,4 @@
-"""Policies by name or file, checked against the environment that they are to fly in."""
+"""Policies by name or file, checked against the environment in which they will fly."""
 
 import json
 import pickle
@@ -17,7 +17,7 @@ from quad_gym.evaluation import Policy
 from quad_gym.params import checks as check
 
 PRETRAINED = Path(__file__).resolve().parent / "pretrained"
-"""Folder of the policies that ship."""
+"""Folder of the included policies."""
 
 NAMES = (
     "pd",
@@ -29,7 +29,7 @@ NAMES = (
     "pd:waiting",
     "pretrained",
 )
-"""Policies that have names, see `load_policy`."""
+"""Names of policies, see `load_policy`."""
 
 _ALGORITHM_OF_MODULE = {
     "stable_baselines3.common.policies": "ppo",
@@ -41,9 +41,10 @@ _ALGORITHM_OF_MODULE = {
 
 
 def interface_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> dict[str, Any]:
-    """What observations and actions of an environment mean to a policy.
+    """Describe the observations and actions of an environment for a policy.
 
-    Its source is left out: what has learned on the truth may fly on the estimate.
+    The source of the observation is left out: a policy trained on the truth may fly on the
+    estimate.
     """
     flights = env.unwrapped.flights  # type: ignore[attr-defined]
     return {
@@ -54,21 +55,20 @@ def interface_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> dict[str, An
 
 
 def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Policy:
-    """A policy, ready to fly in an environment.
+    """Load a policy for an environment.
 
     Args:
-        name: "pd" (tuned gains), "pd:lab" (the report's), "pd:features" and
+        name: "pd" (tuned gains), "pd:lab" (gains of the report), "pd:features" and
             "pd:features_when_uncertain" (tuned gains, facing the features), "pd:slow" and
-            "pd:waiting" (through gaps, at half the speed, or waiting when uncertain),
-            "pd:FILE.json" (gains of `scripts/tune.py`), "pretrained" (the pretrained policy of the
-            environment's task), or a file: `.npz` as `MlpPolicy` saves it, or `.zip` as
-            Stable-Baselines3 does. A `.zip` can run code while it is loaded: open only those that
-            you trust.
+            "pd:waiting" (for courses with gaps: half the speed, or waiting when uncertain),
+            "pd:FILE.json" (gains found by `quad-gym tune`), "pretrained" (the included policy for
+            the task of the environment), or a file: `.npz` written by `MlpPolicy`, or `.zip`
+            written by Stable-Baselines3. Loading a `.zip` can run code: open only trusted files.
         env: A `QuadVectorEnv`.
 
     Raises:
-        ValueError: If there is no such policy, or it does not fit the environment.
-        ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
+        ValueError: If the policy does not exist, or does not fit the environment.
+        ImportError: If the file is a `.zip` and Stable-Baselines3 is not installed.
 
     Warns:
         UserWarning: If a `.npz` was trained on another task.
@@ -91,7 +91,7 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
         trained_on = policy.record.get("plan", {}).get("env_id", task_of(env))
         if trained_on != task_of(env):
             warnings.warn(
-                f"{file} was trained on {trained_on}, and flies {task_of(env)}", stacklevel=2
+                f"{file} was trained on {trained_on}, but flies {task_of(env)}", stacklevel=2
             )
         return policy  # type: ignore[no-any-return]
     if file.suffix != ".zip":
@@ -103,14 +103,14 @@ def load_policy(name: str, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Po
 
 
 def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
-    """Keywords that make an environment show a policy what it needs, beyond what the id says.
+    """Keywords that an environment needs for a policy, in addition to the defaults of its id.
 
     Args:
-        name: As `load_policy` takes it.
-        env_id: One of `quad_gym.IDS`.
+        name: Name or file, as in `load_policy`.
+        env_id: Id from `quad_gym.IDS`.
 
     Raises:
-        ValueError: If no policy ships for the task and "pretrained" is asked for.
+        ValueError: If the name is "pretrained" and no policy is included for the task.
     """
     if name in ("pd:features_when_uncertain", "pd:waiting"):
         return {"include_std": True}
@@ -121,33 +121,33 @@ def keywords_of_policy(name: str, env_id: str) -> dict[str, Any]:
 
 
 def _gains_of(file: Path) -> PDGains:
-    """PD gains as `scripts/tune.py` writes them."""
+    """Read PD gains written by `quad-gym tune`."""
     if not file.exists():
         name = f"pd:{file}"
         raise ValueError(f"there are no gains {file}{check.did_you_mean(name, NAMES)}")
     try:
         return PDGains(**json.loads(file.read_text(encoding="utf-8"))["gains"])
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{file} holds no PD gains: {error!r}") from None
+        raise ValueError(f"{file} does not contain PD gains: {error!r}") from None
 
 
 def pretrained_file(env_id: str) -> Path:
-    """The file of the policy that ships for a task.
+    """File of the included policy for a task.
 
     Raises:
-        ValueError: If none ships for it.
+        ValueError: If no policy is included for it.
     """
     file = PRETRAINED / f"{IDS[env_id]}.npz"
     if not file.exists():
         known = sorted(f.stem for f in PRETRAINED.glob("*.npz"))
         raise ValueError(
-            f"no policy ships for {env_id}; there are some for {', '.join(known) or 'no task'}"
+            f"no policy is included for {env_id}, only for {', '.join(known) or 'no task'}"
         )
     return file
 
 
 def task_of(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> str:
-    """The id of an environment."""
+    """Id of an environment."""
     name = env.unwrapped.flights.name  # type: ignore[attr-defined]
     return next(env_id for env_id, task in IDS.items() if task == name)
 
@@ -159,9 +159,9 @@ def _stable_baselines_policy(file: Path, env: gymnasium.vector.VectorEnv[Any, An
         with zipfile.ZipFile(file) as archive:
             module = json.loads(archive.read("data"))["policy_class"]["__module__"]
     except (zipfile.BadZipFile, KeyError, json.JSONDecodeError):
-        raise ValueError(f"{file} is no policy of Stable-Baselines3, or it is damaged") from None
+        raise ValueError(f"{file} is not a policy of Stable-Baselines3, or is damaged") from None
     if module not in _ALGORITHM_OF_MODULE:
-        raise ValueError(f"{file} holds a policy of an unknown algorithm ({module})")
+        raise ValueError(f"{file} contains a policy of an unknown algorithm ({module})")
     record = file.parent / "training.json"
     if record.exists():
         _require_agreement(file, json.loads(record.read_text(encoding="utf-8")), env)
@@ -187,15 +187,15 @@ def _require_size(file: Path, size: int, env: gymnasium.vector.VectorEnv[Any, An
     here = gymnasium.spaces.flatdim(env.single_observation_space)
     if size != here:
         raise ValueError(
-            f"{file} expects observations of {size} numbers, and the environment gives {here}: "
-            "make it with the keywords that the policy was trained with"
+            f"{file} expects observations of {size} numbers, but the environment returns {here}: "
+            "make it with the keywords with which the policy was trained"
         )
 
 
 def _require_agreement(
     file: Path, record: Mapping[str, Any], env: gymnasium.vector.VectorEnv[Any, Any, Any]
 ) -> None:
-    """Refuse a policy whose actions or observations mean something else here."""
+    """Reject a policy that was trained with other actions or observations."""
     trained, here = record.get("interface", {}), interface_of(env)
     for name in trained:
         if trained[name] == here[name]:
@@ -205,19 +205,19 @@ def _require_agreement(
             had = "".join(f" {key}={value}" for key, value in keywords.items())
             raise ValueError(
                 f"{file} was trained with observations of "
-                f"{_difference(trained[name], here[name])}: make it with the keywords that the "
-                f"policy was trained with{had and ','}{had}"
+                f"{_difference(trained[name], here[name])}: make it with the keywords with which "
+                f"the policy was trained{had and ','}{had}"
             )
         raise ValueError(
-            f"{file} was trained with {name} {trained[name]}, and the environment has {here[name]}"
+            f"{file} was trained with {name} {trained[name]}, but the environment has {here[name]}"
         )
 
 
 def _difference(trained: Sequence[str], here: Sequence[str]) -> str:
-    """Sizes of two lists of names, and which names only one of them has."""
+    """Describe the difference of two lists of names: sizes, missing and additional names."""
     lacking = [name for name in trained if name not in here]
     more = [name for name in here if name not in trained]
     words = [f"lacks {', '.join(lacking)}"] if lacking else []
     words += [f"adds {', '.join(more)}"] if more else []
     found = f"it {' and '.join(words)}" if words else "in another order"
-    return f"{len(trained)} fields, and the environment gives {len(here)} ({found})"
+    return f"{len(trained)} fields, but the environment returns {len(here)} ({found})"

@@ -1,8 +1,8 @@
-"""Recipes: how each algorithm is trained on each task, all hyper-parameters in one place.
+"""Recipes: all hyperparameters of each algorithm on each task.
 
-A recipe is data. `scripts/train.py` and `scripts/compare.py` read it, and their options override
-it. Policies are always evaluated on the task of the environment's id; `flights` says how the
-flights in training differ from it, such as a start that is easier to learn from.
+A recipe is data. `quad-gym train` and `quad-gym compare` read it, and their options override it.
+Policies are always evaluated on the task of the environment's id; `flights` defines differences of
+the flights in training, such as a start that is easier to learn from.
 """
 
 from collections.abc import Mapping
@@ -16,41 +16,42 @@ from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked
 
 ALGORITHMS = ("ppo", "recurrent_ppo", "sac", "td3", "tqc")
-"""Those of Stable-Baselines3 and its contributions that fit continuous actions in many flights."""
+"""Algorithms of Stable-Baselines3 and SB3-Contrib that support continuous actions and vector
+environments."""
 
 ACTIVATIONS = ("relu", "tanh", "elu")
-"""Between the layers of a policy."""
+"""Activations between the layers of a policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe(Checked):
-    """How a policy is trained."""
+    """Hyperparameters of a training."""
 
     algorithm: str = "ppo"
-    """one of ALGORITHMS"""
+    """Algorithm, one of `ALGORITHMS`"""
     steps: int = 1_800_000
-    """environment steps, over all flights"""
+    """Environment steps, summed over all flights"""
     n_envs: int = 256
-    """flights at a time"""
+    """Number of parallel flights"""
     learning_rate: tuple[float, float] = (1e-3, 1e-4)
-    """at the beginning and at the end; linear in between"""
+    """Learning rate at the beginning and at the end, with linear decay between"""
     layers: tuple[int, ...] = (64, 64)
-    """units of each hidden layer of the policy"""
+    """Number of units in each hidden layer of the policy"""
     critic_layers: tuple[int, ...] = (64, 64)
-    """likewise of the value function, or of each critic"""
+    """Number of units in each hidden layer of the value function, or of each critic"""
     activation: str = "relu"
-    """one of ACTIVATIONS"""
+    """Activation of hidden layers, one of `ACTIVATIONS`"""
     reward_scale: float = 0.2
-    """the algorithm sees the reward times this; with it a perfect circle returns 160"""
+    """Factor on the rewards that the algorithm receives; a perfect circle then returns 160"""
     action_noise: float = 0.1
-    """standard deviation of the noise on actions while learning; of TD3 alone, as the policies of
-    the other algorithms have noise of their own"""
+    """Standard deviation of the exploration noise on actions of TD3; the policies of the other
+    algorithms are stochastic themselves"""
     flights: Mapping[str, Any] = field(default_factory=lambda: {"start": "mixed"})
-    """keywords of the environment that hold in training alone, unless they are given"""
+    """Keywords of the environment for training only, unless they are given explicitly"""
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    """further arguments of the algorithm's class"""
+    """Further arguments of the algorithm's class"""
     policy: Mapping[str, Any] = field(default_factory=dict)
-    """further arguments of its policy's class"""
+    """Further arguments of the policy's class"""
 
     def __post_init__(self) -> None:
         self._check(check.choice, "algorithm", choices=ALGORITHMS)
@@ -71,12 +72,12 @@ class Recipe(Checked):
             self._set(name, MappingProxyType(dict(getattr(self, name))))
 
     def __reduce__(self) -> Any:
-        """Recipes go to other processes; read-only mappings alone cannot be pickled."""
+        """Support pickling, which read-only mappings do not."""
         return unfreeze(self)
 
 
 def unfreeze(recipe: Any) -> tuple[Any, ...]:
-    """What pickle needs to make a dataclass with read-only mappings again."""
+    """Reduce a dataclass with read-only mappings, for pickle."""
     values = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
     plain = {k: dict(v) if isinstance(v, Mapping) else v for k, v in values.items()}
     kind: Any = type(recipe)
@@ -97,7 +98,7 @@ _PPO = Recipe(
     policy={"log_std_init": -1.0},
     flights={"start": "mixed", "randomize_reference": True},
 )
-"""From a search over learning rates, reward scales, activations and batch shapes on the circle."""
+"""Result of a search over learning rates, reward scales, activations and batch sizes on Circle."""
 
 _RECURRENT_PPO = _PPO.replace(
     algorithm="recurrent_ppo",
@@ -115,13 +116,13 @@ _OFF_POLICY = {
 }
 _SAC = Recipe(
     algorithm="sac",
-    # flights cost next to nothing beside gradient steps: many, each sample used 16 times
+    # flights cost next to nothing compared with gradient steps: many, each sample used 16 times
     n_envs=256,
     learning_rate=(1e-3, 1e-5),
     critic_layers=(128, 128),
     flights={"start": "mixed", "randomize_reference": True},
-    # a step's reward is about 0.3: an entropy worth 1 at the start would hide it for long, and
-    # noise as wide as the usual target's would blur what the last centimeters are worth
+    # the reward of a step is about 0.3: an initial entropy coefficient of 1 would dominate it for
+    # long, and the usual target entropy would mask the reward for the last centimeters
     parameters={**_OFF_POLICY, "ent_coef": "auto_0.02", "target_entropy": -8.0},
 )
 
@@ -132,24 +133,25 @@ _DEFAULTS = {
     "td3": _SAC.replace(algorithm="td3", parameters={**_OFF_POLICY, "policy_delay": 2}),
     "tqc": _SAC.replace(algorithm="tqc"),
 }
-"""One for each algorithm, made for the circle."""
+"""Default recipe of each algorithm, found on Circle."""
 
 _SPECIAL: dict[tuple[str, str], Recipe] = {
-    # gates lie seconds apart, so that a shorter sight flies past the next one and out of bounds
+    # gates are seconds apart: with a shorter horizon, policies fly past them and out of bounds
     ("QuadGym/Waypoints-v0", "ppo"): _PPO.replace(
         steps=3_000_000, parameters={**_PPO.parameters, "gamma": 0.99}
     ),
     ("QuadGym/StaleRace-v0", "ppo"): _PPO.replace(
         steps=4_000_000, reward_scale=1.0, parameters={**_PPO.parameters, "gamma": 0.99}
     ),
-    # closer bounds than the task's: who has lost himself need not be watched for long
+    # closer bounds than the task's: a flight that has lost its position teaches little
     ("QuadGym/LookAround-v0", "ppo"): _PPO.replace(
         steps=8_000_000,
         parameters={**_PPO.parameters, "gamma": 0.99},
         flights={"out_of_bounds": 3.0},
     ),
-    # As PPO there; rollouts long enough to learn what to remember for a second, and large batches,
-    # as the time of a gradient step is that of the sequence. Slow: fewer steps than PPO has.
+    # As PPO on this task, with rollouts that are long enough to learn a memory of a second, and
+    # large batches, because the time of a gradient step depends on the length of the sequence. It
+    # is slow, and therefore has fewer steps than PPO.
     ("QuadGym/LookAround-v0", "recurrent_ppo"): _RECURRENT_PPO.replace(
         steps=2_000_000,
         parameters={
@@ -162,8 +164,8 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
     ),
     # During an outage, halving the speed prevents few crashes, and waiting for its end prevents
     # most: a policy has to discover pauses of seconds. Exploration noise drawn ten times a second
-    # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting still
-    # count 0.996^28 = 89 %.
+    # averages out, so training holds each action for 0.25 s. Rewards after 7 s of waiting are
+    # discounted by 0.996^28 = 0.89.
     ("QuadGym/OutageDash-v0", "ppo"): _PPO.replace(
         steps=1_200_000,
         reward_scale=0.02,
@@ -177,15 +179,15 @@ _SPECIAL: dict[tuple[str, str], Recipe] = {
         flights={"control_rate": 4.0},
     ),
 }
-"""Where a task needs another one, by id and algorithm."""
+"""Recipes for tasks that need other hyperparameters, by id and algorithm."""
 
 
 def recipe(env_id: str, algorithm: str = "ppo") -> Recipe:
-    """The shipped recipe for a task and an algorithm.
+    """Included recipe for a task and an algorithm.
 
     Args:
-        env_id: One of `quad_gym.IDS`.
-        algorithm: One of ALGORITHMS.
+        env_id: Id from `quad_gym.IDS`.
+        algorithm: One of `ALGORITHMS`.
 
     Raises:
         ValueError: If either is unknown.

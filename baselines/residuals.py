@@ -1,14 +1,15 @@
-"""A model of what an estimate is off by, fitted to flights, to train on the truth with.
+"""Residual model of estimation errors, fitted to flights, for training on the truth.
 
-The way of E. Kaufmann and others, "Champion-level drone racing using deep reinforcement learning",
-Nature 620, 2023: fly, record how the estimate differs from the truth, fit a model of it, and train
-on the truth plus what the model draws. Theirs are Gaussian processes; this one is a linear
-autoregression that knows the velocity, which late measurements make errors depend on:
+The method is the one of E. Kaufmann et al., "Champion-level drone racing using deep reinforcement
+learning", Nature 620, 2023: fly, record the difference between estimate and truth, fit a model of
+it, and train on the truth plus errors drawn from the model. They use Gaussian processes; this model
+is a linear autoregression with the velocity as input, because delayed measurements cause errors
+that depend on it:
 
-    e' = A e + B (v, 1) + L w,  w normal, of unit covariance,
+    e' = A e + B (v, 1) + L w,  w normal with unit covariance,
 
-with the error e (12): of position and velocity in I, of the attitude as a rotation vector in B, and
-of the body rates in B, one control step after the other.
+with the error e (12): position and velocity in I, attitude as a rotation vector in B, and body
+rates in B, from one control step to the next.
 """
 
 import json
@@ -26,57 +27,64 @@ from quad_gym.evaluation import Policy, roll_out
 Floats = NDArray[np.float64]
 
 SIZE = 12
-"""Numbers of an error."""
+"""Number of components of an error."""
 
 FITTED = Path(__file__).resolve().parent / "residuals"
-"""Folder of the models that ship, by task."""
+"""Folder of the included models, by task."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualModel:
-    """A linear autoregression of errors."""
+    """Linear autoregression of errors."""
 
     A: Floats
-    """(12, 12)"""
+    """Transition matrix, (12, 12)"""
     B: Floats
-    """(12, 4) of the true velocity in I, and of 1"""
+    """Input matrix for the true velocity in I and a constant 1, (12, 4)"""
     L: Floats
-    """(12, 12) factor of the covariance of what the rest leaves over"""
+    """Lower Cholesky factor of the covariance of the residuals of the fit, (12, 12)"""
 
     def advance(self, error: Floats, velocity: Floats, noise: Floats) -> Floats:
-        """(n, 12) errors a step later, from errors (n, 12), velocities (n, 3), noise (n, 12)."""
+        """Compute the errors one step later, (n, 12).
+
+        Args:
+            error: Errors, (n, 12).
+            velocity: True velocities, (n, 3) in I [m/s].
+            noise: Independent standard normal numbers, (n, 12).
+        """
         return error @ self.A.T + _inputs(velocity) @ self.B.T + noise @ self.L.T
 
     def save(self, file: Path) -> None:
-        """Write it as JSON."""
+        """Write the model as JSON."""
         numbers = {name: getattr(self, name).tolist() for name in ("A", "B", "L")}
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(numbers) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, file: Path) -> "ResidualModel":
-        """Read what `save` wrote."""
+        """Read a model written by `save`."""
         numbers = json.loads(file.read_text(encoding="utf-8"))
         return cls(**{name: np.array(values) for name, values in numbers.items()})
 
 
 def fit(errors: Floats, velocities: Floats) -> ResidualModel:
-    """The model that fits best by least squares.
+    """Fit a model by least squares.
 
     Args:
-        errors: (t, n, 12) of n flights at successive control steps; NaN where they are over.
-        velocities: (t, n, 3) true ones in I [m/s].
+        errors: Errors of n flights at successive control steps, (t, n, 12); NaN after the end of a
+            flight.
+        velocities: True velocities, (t, n, 3) in I [m/s].
 
     Raises:
-        ValueError: If there are too few, or if what they say would grow without end.
+        ValueError: If there are too few errors, or the fitted model is unstable.
     """
     before, after, moving = errors[:-1], errors[1:], velocities[:-1]
     whole = np.isfinite(after).all(axis=2) & np.isfinite(before).all(axis=2)
     x = np.concatenate([before[whole], _inputs(moving[whole])], axis=1)
     if len(x) < 10 * x.shape[1]:
-        raise ValueError(f"errors must hold at least {10 * x.shape[1]} steps, got {len(x)}")
+        raise ValueError(f"errors must have at least {10 * x.shape[1]} steps, got {len(x)}")
     y = after[whole]
-    # errors differ in size by orders of magnitude: each column on its own scale
+    # errors differ by orders of magnitude: scale each column
     scale = np.maximum(np.sqrt((x * x).mean(axis=0)), 1e-12)
     found, *_ = np.linalg.lstsq(x / scale, y, rcond=None)
     found = (found / scale[:, np.newaxis]).T
@@ -84,9 +92,7 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
     A, covariance = found[:, :SIZE], np.cov(rest.T)
     largest = float(np.abs(np.linalg.eigvals(A)).max())
     if largest >= 1.0:
-        raise ValueError(
-            f"errors must be those of a stationary model, got eigenvalue {largest:.4f}"
-        )
+        raise ValueError(f"errors must be stationary, got a model with eigenvalue {largest:.4f}")
     L: Floats = np.linalg.cholesky(covariance + 1e-18 * np.eye(SIZE)).astype(np.float64)
     return ResidualModel(A, found[:, SIZE:], L)
 
@@ -94,7 +100,7 @@ def fit(errors: Floats, velocities: Floats) -> ResidualModel:
 def record(
     policy: Policy, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int = 0
 ) -> tuple[Floats, Floats]:
-    """Fly an episode in every flight; return errors (t, n, 12) and true velocities (t, n, 3)."""
+    """Run an episode in each flight; return errors (t, n, 12) and true velocities (t, n, 3)."""
     errors, velocities = [], []
 
     def watch(step: int, batch: Any, flying: NDArray[np.bool_]) -> None:
@@ -108,7 +114,7 @@ def record(
 
 
 def error_of(view: Any) -> Floats:
-    """(n, 12) what is seen, less what is so."""
+    """Error of the observed state: observed minus true, (n, 12)."""
     seen, truth = view.observed, view.truth
     turn = Rotation.from_matrix(seen.R_BI @ truth.R_BI.transpose(0, 2, 1)).as_rotvec()
     return np.concatenate(
@@ -130,9 +136,10 @@ def fit_task(env_id: str, policy: str = "pd", episodes: int = 500) -> ResidualMo
     """Fit the model to episodes of a task, flown on the estimate.
 
     Args:
-        env_id: One of `quad_gym.IDS`.
-        policy: By name or file, see `baselines.policies.load_policy`.
-        episodes: How many; they have the seeds of trainings (`baselines.seeds`), not of tests.
+        env_id: Id from `quad_gym.IDS`.
+        policy: Name or file, see `baselines.policies.load_policy`.
+        episodes: Number of episodes; their seeds are for training, not for tests
+            (`baselines.seeds`).
     """
     from baselines.policies import load_policy
     from baselines.seeds import first_seed

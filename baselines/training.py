@@ -1,16 +1,14 @@
-"""Training: from a plan to a folder with everything about the run.
+"""Training of policies according to a plan, with all results in one folder.
 
-The folder holds
+The folder contains
 
-- `last.zip` and `best.zip`: the policy at the last evaluation and at the best one, as
-  Stable-Baselines3 loads them; `last.zip` also holds what resuming needs: the flights, the random
-  number generators, the counters (and `replay_*.pickle` beside it, for algorithms with a replay
-  buffer);
-- or, from the compiled engine, `last.npz` and `best.npz` of the same kind, as `MlpPolicy` loads
-  them;
-- `training.json`: the plan, versions, seeds, wall time; `evaluations.csv`: errors while training;
-- `training.lock`: which process trains in it, or did last;
-- TensorBoard's files.
+- `last.zip` and `best.zip`: the policies of the last and of the best evaluation, in the format of
+  Stable-Baselines3; `last.zip` also contains the state for resuming: flights, random number
+  generators and counters (and `replay_*.pickle` in addition, for algorithms with a replay buffer);
+- or, from the compiled engine, `last.npz` and `best.npz`, in the format of `MlpPolicy`;
+- `training.json`: plan, versions, seeds, wall time; `evaluations.csv`: errors during training;
+- `training.lock`: the process that trains in the folder, or did last;
+- files for TensorBoard.
 
 A resumed run continues exactly from its last evaluation.
 """
@@ -32,44 +30,44 @@ from quad_gym.batch.threads import resolve_threads
 
 @dataclass(frozen=True)
 class Training:
-    """What came of a run."""
+    """Results of a training."""
 
     folder: Path
     steps: int
-    """environment steps done"""
+    """Number of environment steps completed"""
     seconds: float
-    """wall time of training, evaluations left out"""
+    """Wall time of the training without evaluations [s]"""
     finished: bool
-    """whether all steps were done"""
+    """True if all steps were completed"""
     best: dict[str, float]
-    """of the best evaluation"""
+    """Results of the best evaluation, by name"""
     best_policy: Path
-    """the policy at the best evaluation"""
+    """File of the policy with the best evaluation"""
 
 
 def train(
     plan: Plan, folder: Path, *, resume: bool = False, tensorboard: bool = True, quiet: bool = False
 ) -> Training:
-    """Train a policy, or go on with a training that was stopped.
+    """Train a policy, or resume a training that was stopped.
 
-    Ctrl-C, or a request to terminate, ends the run at the next step; it can be resumed then. While
-    it runs, its folder is locked (`baselines.locks`).
+    Ctrl-C or SIGTERM stops the run at the next step, from which it can be resumed. The folder is
+    locked during the run (`baselines.locks`).
 
     Args:
-        plan: What to train.
-        folder: Where the run is kept; made if missing.
-        resume: Go on from the folder's last checkpoint; without one, begin.
-        tensorboard: Whether to write TensorBoard's files.
-        quiet: Whether to leave out the progress bar.
+        plan: Plan of the training.
+        folder: Folder of the run, created if it is missing.
+        resume: True to continue from the folder's last checkpoint, if it has one.
+        tensorboard: True to write files for TensorBoard.
+        quiet: True to hide the progress bar.
 
     Returns:
-        What came of it.
+        Results of the training.
 
     Raises:
-        ValueError: If the plan is invalid, the folder holds a run and `resume` is not set, or
-            holds the run of another plan, or another process trains in it.
-        OSError: If nothing can be written to the folder.
-        ImportError: If TensorBoard's files are wanted and it is not installed.
+        ValueError: If the plan is invalid, the folder contains a run and `resume` is not set, it
+            contains the run of another plan, or another process trains in it.
+        OSError: If the folder is not writable.
+        ImportError: If `tensorboard` is set and TensorBoard is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
@@ -77,29 +75,30 @@ def train(
 
 
 def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
-    """The record of the run that the folder holds, which goes on; None: one begins.
+    """Record of the run in a folder that is resumed; None: a new run begins.
 
     Args:
-        folder: Where the run is, or will be.
-        plan: What to train.
-        resume: Whether to go on from the folder's last checkpoint.
+        folder: Folder of the run.
+        plan: Plan of the training.
+        resume: True to continue from the folder's last checkpoint.
 
     Raises:
-        RunError: If it holds a run and `resume` is not set, or holds the run of another plan.
+        RunError: If the folder contains a run and `resume` is not set, or contains the run of
+            another plan.
     """
     if not has_checkpoint(folder):
         return None
     if not resume:
         raise RunError(
-            f"folder {folder} holds a run already: resume it (--resume), or choose "
-            "another (--output)"
+            f"folder {folder} already contains a run: resume it (--resume), or choose "
+            "another folder (--output)"
         )
     before: dict[str, Any] = json.loads((folder / "training.json").read_text(encoding="utf-8"))
     described = description(plan)
     if before["plan"] != described:
         differing = [k for k in described if before["plan"].get(k) != described[k]]
         raise RunError(
-            f"folder {folder} holds the run of another plan (different: {', '.join(differing)})"
+            f"folder {folder} contains a run of another plan (different: {', '.join(differing)})"
         )
     return before
 
@@ -149,15 +148,15 @@ def _train(plan: Plan, folder: Path, *, resume: bool, tensorboard: bool, quiet: 
 
 
 def _write_record(folder: Path, record: Any) -> None:
-    """Write `training.json`; at any moment there is the old or the new one, whole."""
+    """Write `training.json` atomically."""
     write_json(folder / "training.json.part", record).replace(folder / "training.json")
 
 
 def export(training: Training, file: Path) -> None:
-    """Write the best policy of a training, with its record, to a file that needs NumPy alone.
+    """Write the best policy of a training, with its record, to a file that requires only NumPy.
 
     Raises:
-        ValueError: If the policy is no plain network.
+        ValueError: If the policy is not a multilayer perceptron.
     """
     record = json.loads((training.folder / "training.json").read_text(encoding="utf-8"))
     if training.best_policy.suffix == ".npz":

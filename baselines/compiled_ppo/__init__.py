@@ -1,4 +1,4 @@
-"""PPO without torch: rollouts, losses, gradients and Adam, compiled and on several cores."""
+"""PPO without torch: rollouts, losses, gradients and Adam as compiled, multithreaded code."""
 
 from baselines.compiled_ppo.ppo import CompiledPPO
 

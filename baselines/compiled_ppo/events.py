@@ -1,4 +1,4 @@
-"""TensorBoard's files without torch."""
+"""Files for TensorBoard, written without torch."""
 
 import time
 from collections.abc import Mapping
@@ -7,10 +7,10 @@ from typing import Any
 
 
 class Events:
-    """Scalars over steps, written as TensorBoard reads them.
+    """Writer of scalars over steps for TensorBoard.
 
     Args:
-        folder: Where the files go.
+        folder: Folder for the files.
 
     Raises:
         ImportError: If TensorBoard is not installed.
@@ -24,7 +24,7 @@ class Events:
         self._writer: Any = EventFileWriter(str(folder))
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Write scalars, by their tags, at a step."""
+        """Write scalars at a step, by tag."""
         values = [
             self._summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()
         ]
@@ -33,5 +33,5 @@ class Events:
         self._writer.flush()
 
     def close(self) -> None:
-        """Finish the file."""
+        """Close the file."""
         self._writer.close()

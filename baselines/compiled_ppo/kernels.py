@@ -1,11 +1,12 @@
-"""Compiled parts of PPO: networks forward and backward, the loss, and Adam.
+"""Compiled parts of PPO: forward and backward passes of networks, the loss, and Adam.
 
-A network is a table with a row for each layer, and a part of one vector of float32 parameters:
-weights (outputs, inputs) of each layer, then its biases. `flipped` holds the weights transposed,
-so that every product of matrices is one that BLAS does fast. Samples are taken TILE at a time: what
-a tile needs stays in the first caches, and BLAS does not divide products this small among threads.
+A network is a table with one row per layer, and a part of one vector of float32 parameters: weights
+(outputs, inputs) of each layer, followed by its biases. `flipped` contains the transposed weights,
+so that BLAS computes all matrix products fast. Samples are processed in tiles of `TILE`: the data
+of a tile fit into the first-level caches, and BLAS does not distribute such small products over
+threads.
 
-All kernels are in this file, as the cache of compiled code follows imports of `quad_gym` alone.
+All kernels are in this file, because the cache of compiled code follows only imports of `quad_gym`.
 """
 
 import math
@@ -17,19 +18,19 @@ from quad_gym.kernels.compiling import entry, kernel, routine
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 
 TILE = 64
-"""Samples that go through the networks together."""
+"""Number of samples in a tile."""
 
 INPUTS, OUTPUTS, WEIGHTS, BIASES, STORED = range(5)
-"""Columns of a table of layers: sizes, where the layer's numbers begin in the vector of parameters,
-and the sum of the outputs of the layers below."""
+"""Columns of a table of layers: sizes, offsets of weights and biases in the vector of parameters,
+and sum of the outputs of the layers below."""
 
 ACTIVATIONS = RELU, TANH, ELU = range(3)
 
 BETAS, EPSILON = (0.9, 0.999), 1e-5
-"""Of Adam: torch's, and Stable-Baselines3's for PPO."""
+"""Parameters of Adam: the betas of torch, and the epsilon of Stable-Baselines3 for PPO."""
 
 SUMS = ("policy_loss", "value_loss", "approx_kl", "clip_fraction")
-"""What `differentiate` adds up over the samples of a minibatch."""
+"""Sums over the samples of a minibatch that `differentiate` computes."""
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _FRESH, _EPSILON = tuple(np.float32(1.0 - beta) for beta in BETAS), np.float32(EPSILON)
@@ -38,14 +39,14 @@ _LOG_TAU = np.float32(math.log(2.0 * math.pi))
 
 @kernel
 def _weights(vector, row, first, second):
-    """A layer's part of a vector of weights, as a matrix of row[first] by row[second]."""
+    """Part of a layer in a vector of weights, as a matrix of row[first] by row[second]."""
     begin, size = row[WEIGHTS], row[INPUTS] * row[OUTPUTS]
     return vector[begin : begin + size].reshape((row[first], row[second]))
 
 
 @kernel
 def _stored(outputs, row, rows):
-    """What a layer gives for `rows` samples: (rows, its outputs)."""
+    """Outputs of a layer for `rows` samples, (rows, outputs)."""
     first = TILE * row[STORED]
     return outputs[first : first + rows * row[OUTPUTS]].reshape((rows, row[OUTPUTS]))
 
@@ -67,7 +68,7 @@ def _activate(y, activation):
 
 @routine
 def _through_activation(delta, y, activation):
-    """Multiply delta by the derivative of the activation where its value is y."""
+    """Multiply delta by the derivative of the activation, given its value y."""
     d, v = delta.reshape(-1), y.reshape(-1)
     if activation == RELU:
         for i in range(v.size):
@@ -82,7 +83,7 @@ def _through_activation(delta, y, activation):
 
 @routine
 def _seen_by(table, x, spare):
-    """What a network sees of samples x: as many of the first columns as it takes, in one piece."""
+    """Inputs of a network in samples x: the first columns, as a contiguous array."""
     size = table[0, INPUTS]
     if size == x.shape[1]:
         return x
@@ -95,7 +96,7 @@ def _seen_by(table, x, spare):
 
 @routine
 def _forward(x, table, model, outputs):
-    """Run samples x (rows, inputs) through a network; `outputs` keeps what every layer gives."""
+    """Forward pass of samples x (rows, inputs); `outputs` stores the outputs of every layer."""
     params, flipped, _, _, activation = model
     h = x
     for layer in range(len(table)):
@@ -114,7 +115,7 @@ def _forward(x, table, model, outputs):
 
 @routine
 def _backward(x, table, model, room, gradient):
-    """Add a tile's gradient; deltas[0] begins with the loss's with respect to the output."""
+    """Add the gradient of a tile; deltas[0] begins with the gradient with respect to the output."""
     params, _, _, _, activation = model
     _, outputs, deltas, product = room
     rows = len(x)
@@ -139,10 +140,10 @@ def _backward(x, table, model, room, gradient):
 
 @routine
 def _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, d_log_std, sums):
-    """The policy's loss of a tile, and its gradient with respect to means and log_std.
+    """Policy loss of a tile, and its gradient with respect to means and log_std.
 
-    L = -min(r A, clip(r, 1 - c, 1 + c) A) - k H, where r is the ratio of an action's probabilities
-    now and when it was taken, A its advantage and H the entropy (Schulman et al. 2017, eqs. 7, 9).
+    L = -min(r A, clip(r, 1 - c, 1 + c) A) - k H, where r is the ratio of the action's present to
+    its former probability, A its advantage and H the entropy (Schulman et al. 2017, eqs. 7, 9).
     """
     _, actions, log_probs, _ = samples
     clip, entropy_weight = np.float32(recipe[0]), np.float32(recipe[1])
@@ -168,7 +169,7 @@ def _policy_loss(mean, log_std, chosen, samples, advantages, recipe, share, d, d
 
 @routine
 def _differentiate_tile(chosen, advantages, share, model, samples, recipe, room, gradient, sums):
-    """Add the gradient of the loss of a tile; each sample's loss counts as `share`."""
+    """Add the gradient of the loss of a tile; each sample has the weight `share`."""
     params, _, actor, critic, _ = model
     observations, _, _, returns = samples
     inputs, outputs, deltas, _ = room
@@ -195,7 +196,7 @@ def _differentiate_tile(chosen, advantages, share, model, samples, recipe, room,
 
 @routine
 def _differentiate_part(part, minibatch, model, samples, recipe, rooms, written):
-    """The gradient of one part of a minibatch, and its SUMS."""
+    """Compute the gradient of one part of a minibatch, and its `SUMS`."""
     span, order, advantages = minibatch
     inputs, outputs, deltas, product = rooms
     gradient, sums = written[0][part], written[1][part]
@@ -215,28 +216,29 @@ def _differentiate_part(part, minibatch, model, samples, recipe, rooms, written)
 def differentiate(
     board, number, command, serving, minibatch, model, samples, recipe, rooms, written
 ):
-    """The gradient of the loss of a minibatch, in parts that threads share at a board.
+    """Compute the gradient of the loss of a minibatch, in parts that threads share on a board.
 
     Args:
-        board: See `quad_gym.kernels.board`; its blocks are the parts.
-        number: Of this thread; the one that posts is 0.
-        command: 0 to post a minibatch; negative to wait for the one that was posted before.
-        serving: Whether to work on what others post, until nothing comes for a while.
-        minibatch: (2,) where it begins and ends in the order of this epoch; that order (n,); the
-            advantages (n,) in that order, normalized.
+        board: Board whose blocks are the parts, see `quad_gym.kernels.board`.
+        number: Number of this thread; 0 posts the minibatches.
+        command: 0 to post a minibatch; negative to wait for the last one that was posted.
+        serving: True to work on minibatches posted by others, until none is posted for a while.
+        minibatch: Begin and end in the order of this epoch, (2,); this order, (n,); advantages in
+            this order, normalized, (n,).
         model: Parameters (p,), flipped weights (p,), tables of actor and critic, activation.
-        samples: Observations (n, o), of which the actor sees the first columns; actions (n, a), log
+        samples: Observations (n, o), of which the actor uses the first columns; actions (n, a), log
             probabilities (n,), returns (n,).
-        recipe: (3,) clip range, weights of the entropy and of the value function's error.
-        rooms: For each part: inputs (2, TILE, o), outputs, deltas (2, ...), a product of matrices.
-        written: Of each part: its gradient (p,) and SUMS (4,).
+        recipe: Clip range, weight of the entropy, and weight of the value loss, (3,).
+        rooms: Work memory of each part: inputs (2, TILE, o), outputs, deltas (2, ...), and a matrix
+            product.
+        written: Results of each part: gradient (p,) and `SUMS` (4,).
 
     Returns:
-        Whether all parts are finished; where not, another thread is still at work.
+        True if all parts are finished; False if another thread is still working.
     """
     if not serving and command >= 0:
         post(board, command)
-    while True:  # once, where nobody serves
+    while True:  # once, unless serving
         seen = read_shared(board, TICKET)
         while True:
             first, last = take(board, number)
@@ -253,10 +255,10 @@ def differentiate(
 
 @entry
 def descend(gradients, params, moments, rate, max_norm, corrections):
-    """One step of Adam (Kingma and Ba 2015) along the sum of the parts' gradients (parts, p).
+    """Take a step of Adam (Kingma and Ba 2015) along the sum of the parts' gradients (parts, p).
 
-    A sum longer than max_norm is shortened to it. `corrections` are 1 - beta^t of both moments.
-    Changes params (p,) and moments (2, p); returns the norm of the sum.
+    The norm of the sum is clipped to max_norm. `corrections` are 1 - beta^t of both moments.
+    Changes params (p,) and moments (2, p); returns the norm of the sum before clipping.
     """
     g, m, v = gradients[0], moments[0], moments[1]
     for part in range(1, len(gradients)):
@@ -276,7 +278,7 @@ def descend(gradients, params, moments, rate, max_norm, corrections):
 
 @entry
 def flip(model):
-    """Keep the flipped weights in step with the parameters."""
+    """Update the flipped weights from the parameters."""
     params, flipped, actor, critic, _ = model
     for table in (actor, critic):
         for layer in range(len(table)):
@@ -286,7 +288,7 @@ def flip(model):
 
 @entry
 def evaluate(x, model, inputs, outputs, means, values):
-    """What both networks say of observations x (n, o): means (n, a) and values (n,), written."""
+    """Evaluate both networks on observations x (n, o); writes means (n, a) and values (n,)."""
     _, _, actor, critic, _ = model
     for a in range(0, len(x), TILE):
         b = min(a + TILE, len(x))

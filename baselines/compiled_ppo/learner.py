@@ -1,4 +1,4 @@
-"""The learning half of PPO: epochs of minibatches, on as many threads as pay off."""
+"""Update step of PPO: epochs of minibatches, on as many threads as are worthwhile."""
 
 from typing import Any
 
@@ -10,23 +10,23 @@ from baselines.compiled_ppo.networks import Networks
 from quad_gym.batch.threads import MIN_BLOCKS_PER_THREAD, POSTED_BEFORE, Crew, board_of
 
 PARTS = 2 * MIN_BLOCKS_PER_THREAD
-"""Into which a minibatch is divided, for two threads: more parts would take longer to add. They are
-added in order, so that no number of threads changes the sum."""
+"""Number of parts of a minibatch, enough for two threads: adding more parts would take longer. They
+are added in order, so that the sum does not depend on the number of threads."""
 
 Samples = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""Observations (n, o), actions (n, a), their log probabilities (n,) when they were taken, and
-returns (n,) that the critic is to predict."""
+"""Observations (n, o), actions (n, a), their log probabilities (n,) in the rollout, and returns
+(n,) as targets of the critic."""
 
 
 class Learner:
-    """Improves networks on samples, as `stable_baselines3.PPO.train` does.
+    """Training of networks on samples, as in `stable_baselines3.PPO.train`.
 
     Args:
-        networks: What learns.
-        samples: Read anew in each `learn`.
-        advantages: (n,) likewise.
-        parameters: Those of a recipe, complete.
-        threads: To use.
+        networks: Networks to train.
+        samples: Samples, read again in each `learn`.
+        advantages: Advantages of the samples, (n,), read again in each `learn`.
+        parameters: Complete parameters of a recipe.
+        threads: Number of threads.
     """
 
     def __init__(
@@ -56,17 +56,17 @@ class Learner:
         self._crew = Crew(differentiate, PARTS, threads)
 
     def prepare(self) -> None:
-        """Call every kernel once, so that it is compiled, and change nothing."""
+        """Call every kernel once to compile it, without changing the networks."""
         kernels.flip(self.networks.model)
         self._differentiate(board_of(0, 1), 0, POSTED_BEFORE, False)
         copies = self.networks.params.copy(), self.moments.copy()
         kernels.descend(self.gradients, *copies, 0.0, 1.0, np.ones(2))
 
     def learn(self, rate: float, rng: np.random.Generator) -> dict[str, float]:
-        """Go through all samples `n_epochs` times; returns means of the SUMS over the last.
+        """Train on all samples for `n_epochs` epochs; returns means of `SUMS` over the last one.
 
         Raises:
-            FloatingPointError: If a gradient is not finite: the training has diverged.
+            FloatingPointError: If a gradient is not finite because the training has diverged.
         """
         count, size = len(self.order), self.parameters["batch_size"]
         for _ in range(self.parameters["n_epochs"]):
@@ -81,14 +81,14 @@ class Learner:
         return dict(zip(kernels.SUMS, (sums / count).tolist(), strict=True))
 
     def differentiate(self, first: int, last: int) -> NDArray[np.float64]:
-        """The gradient of a minibatch of this epoch's order, in parts; returns its SUMS."""
+        """Compute the gradient of a minibatch of this epoch, in parts; returns its `SUMS`."""
         self.span[:] = first, last
         self._crew.gather()
         self._crew.run(0)
         return self.sums.sum(axis=0)
 
     def descend(self, rate: float) -> None:
-        """A step along the gradient."""
+        """Take a step along the gradient."""
         self.steps += 1
         norm = kernels.descend(
             self.gradients,
@@ -104,7 +104,7 @@ class Learner:
 
 
 def _normalize(advantages: NDArray[np.float32]) -> None:
-    """Give advantages zero mean and unit variance, in place; one alone stays as it is."""
+    """Normalize advantages to zero mean and unit variance, in place; a single one is unchanged."""
     if len(advantages) > 1:
         advantages -= advantages.mean()
         advantages /= np.sqrt(advantages @ advantages / (len(advantages) - 1)) + 1e-8

@@ -1,4 +1,4 @@
-"""Actor and critic in one vector of parameters: the place of each layer, and its initial values."""
+"""Actor and critic in one vector of parameters: offsets of the layers and initial values."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -13,17 +13,17 @@ from baselines.recipes import ACTIVATIONS, Recipe
 
 
 class Networks:
-    """A Gaussian policy and a value function.
+    """Gaussian policy and value function.
 
-    The vector of parameters holds the actor's layers, the logarithms of the policy's standard
-    deviations, and the critic's layers. First values are drawn as Stable-Baselines3 draws them.
+    The vector of parameters contains the actor's layers, the logarithms of the policy's standard
+    deviations, and the critic's layers. Initial values are drawn as in Stable-Baselines3.
 
     Args:
-        inputs: Numbers in an observation in training.
-        outputs: Numbers in an action.
-        recipe: Layers, activation and the first standard deviations.
-        rng: Draws the first weights.
-        critic_only: How many of the inputs, the last ones, the critic sees and the actor does not.
+        inputs: Length of an observation in training.
+        outputs: Length of an action.
+        recipe: Recipe with layers, activation and initial standard deviations.
+        rng: Generator for the initial weights.
+        critic_only: Number of inputs, at the end, for the critic only.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Networks:
         ]
 
     def rooms(self, parts: int) -> tuple[NDArray[np.float32], ...]:
-        """Memory that `kernels.differentiate` computes in."""
+        """Work memory for `kernels.differentiate`."""
         tables = (self.actor, self.critic)
         sizes = (
             (2, TILE, self.critic[0, INPUTS]),
@@ -67,7 +67,7 @@ class Networks:
         return tuple(np.zeros((parts, *size), np.float32) for size in sizes)
 
     def policy(self, record: Mapping[str, Any]) -> MlpPolicy:
-        """A copy of the actor, which needs NumPy alone."""
+        """Copy the actor to a policy that requires only NumPy."""
         layers = self.layers(self.actor)
         activations = [self._activation] * (len(layers) - 1) + ["none"]
         return MlpPolicy(
@@ -76,7 +76,7 @@ class Networks:
 
 
 def _table(sizes: Sequence[int], first: int) -> tuple[NDArray[np.int64], int]:
-    """The table of a network whose parameters begin at `first`, and where they end."""
+    """Table of a network whose parameters begin at `first`, and the end of its parameters."""
     rows, stored = [], 0
     for inputs, outputs in pairwise(sizes):
         rows.append((inputs, outputs, first, first + inputs * outputs, stored))
@@ -86,7 +86,7 @@ def _table(sizes: Sequence[int], first: int) -> tuple[NDArray[np.int64], int]:
 
 
 def _orthogonal(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[Any]:
-    """A random matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014)."""
+    """Draw a matrix with orthonormal rows or columns, whichever are fewer (Saxe et al. 2014)."""
     Q, R = np.linalg.qr(rng.standard_normal((max(shape), min(shape))))
     Q *= np.sign(np.diag(R))
     return Q if shape[0] >= shape[1] else Q.T

@@ -31,29 +31,29 @@ PARAMETERS = {
     "max_grad_norm": 0.5,
     "critic_only": 0,
 }
-"""Parameters of a recipe, with the defaults of Stable-Baselines3. It lacks `critic_only`: so many
-numbers at the end of an observation are for the critic alone, such as the true state."""
+"""Parameters of a recipe, with the defaults of Stable-Baselines3, which lacks `critic_only`: the
+number of values at the end of an observation for the critic only, such as the true state."""
 
 _EPISODES = 100
-"""Whose mean return is `training_return`: the latest."""
+"""Number of latest episodes whose mean return is `training_return`."""
 
 
 class CompiledPPO:
-    """PPO (Schulman et al. 2017) as `stable_baselines3.PPO` does it, but for the random numbers.
+    """PPO (Schulman et al. 2017) as in `stable_baselines3.PPO`, except for the random numbers.
 
-    The same seed gives the same policy bit for bit, with any number of threads. With `critic_only`
-    among the recipe's parameters, the policy takes observations without that part.
+    The same seed gives bitwise the same policy, with any number of threads. With `critic_only`
+    among the recipe's parameters, the policy takes observations without this part.
 
     Args:
-        env: Its observations are vectors, its actions vectors in [-1, 1], and it begins the next
-            episode in the step that ends one (`autoreset_mode="SameStep"`).
-        recipe: All hyper-parameters.
-        seed: Of the networks, the actions and the order of samples.
-        env_seed: Of the environment; None: `seed`.
-        threads: To learn with; None: as many as there are cores.
+        env: Vector environment with vectors as observations, vectors in [-1, 1] as actions, and
+            same-step autoreset (`autoreset_mode="SameStep"`).
+        recipe: All hyperparameters.
+        seed: Seed of the networks, the actions and the order of samples.
+        env_seed: Seed of the environment; None: `seed`.
+        threads: Number of threads for learning; None: one per core.
 
     Raises:
-        ValueError: If the environment does not fit, or the recipe asks for what is not there.
+        ValueError: If the environment does not fit, or the recipe is not supported.
     """
 
     def __init__(
@@ -99,12 +99,12 @@ class CompiledPPO:
         *,
         quiet: bool = False,
     ) -> None:
-        """Train until `steps` environment steps have been made in all.
+        """Train until a total number of environment steps is reached.
 
         Args:
-            steps: Over all flights; the last rollout is completed.
-            watch: Called before every rollout, where nothing is half done; False ends the training.
-            quiet: Whether to leave out the progress bar.
+            steps: Number of steps, summed over all flights; the last rollout is completed.
+            watch: Function called between rollouts; the training stops if it returns False.
+            quiet: True to hide the progress bar.
         """
         from tqdm.auto import tqdm
 
@@ -121,7 +121,7 @@ class CompiledPPO:
                 bar.update(min(self.num_timesteps, steps) - bar.n)
 
     def prepare(self) -> None:
-        """Begin the first episodes, and compile what is not compiled yet."""
+        """Begin the first episodes, and compile all kernels."""
         if self._seen is None:
             self._seen = _floats(self.env.reset(seed=self._env_seed)[0])
         self._evaluate(self._seen[:1])
@@ -134,13 +134,13 @@ class CompiledPPO:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], None]:
-        """Actions for observations (..., n), with the critic's part or without; deterministic."""
+        """Return deterministic actions for observations (..., n), with or without critic's part."""
         policy, x = self.policy(), np.asarray(observation, np.float32)
         whole = x.shape[-1:] == self._observations.shape[-1:]
         return policy.predict(x[..., : policy.inputs] if whole else x)
 
     def policy(self, record: dict[str, Any] | None = None) -> MlpPolicy:
-        """A copy of the present policy, which needs NumPy alone."""
+        """Copy the present policy to one that requires only NumPy."""
         return self.networks.policy(record or {"interface": {}})
 
     @property
@@ -149,13 +149,13 @@ class CompiledPPO:
         return float(np.mean(self._finished)) if self._finished else float("nan")
 
     def state(self) -> bytes:
-        """All that a training consists of, the environment included, to go on exactly from."""
+        """Serialize the state of the training and the environment, to resume exactly."""
         kept = {name: getattr(self, name) for name in _STATE}
         arrays = (self.networks.params, self.learner.moments, self.learner.steps)
         return pickle.dumps((kept, arrays))
 
     def restore(self, state: bytes) -> None:
-        """Go on from a `state` of the same recipe; unpickling can run code: trust its source."""
+        """Restore a `state` with the same recipe; unpickling can run code, so trust its source."""
         kept, (params, moments, self.learner.steps) = pickle.loads(state)
         self.networks.params[:], self.learner.moments[:] = params, moments
         self.__dict__.update(kept)
@@ -163,7 +163,7 @@ class CompiledPPO:
     # ---- a rollout ------------------------------------------------------------------------------
 
     def _roll_out(self) -> None:
-        """Fly `n_steps` steps, and estimate advantages."""
+        """Run `n_steps` steps, and estimate advantages."""
         actions = self._actions.shape[-1]
         log_std = self.networks.log_std
         spread, peak = np.exp(log_std), log_std.sum() + 0.5 * actions * np.log(2.0 * np.pi)
@@ -181,7 +181,7 @@ class CompiledPPO:
             self._rewards[t] = np.float32(self.recipe.reward_scale) * reward.astype(np.float32)
             self._ended[t] = terminated | truncated
             cut = np.flatnonzero(truncated & ~terminated)
-            if cut.size:  # the episode would have gone on, and have earned what the critic says
+            if cut.size:  # bootstrap truncated episodes with the critic's value
                 last = _floats(np.stack(info["final_obs"][cut]))
                 self._rewards[t, cut] += self.parameters["gamma"] * self._evaluate(last)[1]
             self._returns += reward
@@ -199,7 +199,7 @@ class CompiledPPO:
         self._targets[:] = self._advantages + self._values
 
     def _evaluate(self, x: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Means of actions (n, a) and values (n,) for observations (n, o)."""
+        """Evaluate means of actions (n, a) and values (n,) for observations (n, o)."""
         means = np.empty((len(x), self._actions.shape[-1]), np.float32)
         values = np.empty(len(x), np.float32)
         kernels.evaluate(x, self.networks.model, *self._room, means, values)
@@ -207,7 +207,7 @@ class CompiledPPO:
 
 
 _STATE = ("env", "num_timesteps", "losses", "_rng", "_seen", "_returns", "_finished")
-"""Attributes that a training goes on from, beside what learns."""
+"""Attributes of the state of a training, in addition to the networks."""
 
 
 def advantages(
@@ -220,19 +220,19 @@ def advantages(
 ) -> NDArray[np.float32]:
     """Generalized advantage estimation (Schulman et al. 2016, eq. 16).
 
-    A_t = d_t + gamma lambda A_{t+1}, d_t = r_t + gamma V(s_{t+1}) - V(s_t); nothing comes from
-    beyond the end of an episode.
+    A_t = d_t + gamma lambda A_{t+1}, d_t = r_t + gamma V(s_{t+1}) - V(s_t); both recursions stop at
+    the end of an episode.
 
     Args:
-        rewards: (T, n) of steps, with what a truncated episode would still have earned.
-        values: (T, n) that the critic gave the observations before them.
-        ended: (T, n) whether an episode ended with the step.
-        next_values: (n,) of the observations after the last step.
-        gamma: Discount.
-        gae_lambda: From 0 (one step) to 1 (all that was seen).
+        rewards: Rewards of steps, (T, n), with the bootstrapped value at a truncation.
+        values: Values of the observations before the steps, (T, n).
+        ended: True if an episode ended with the step, (T, n).
+        next_values: Values of the observations after the last step, (n,).
+        gamma: Discount factor.
+        gae_lambda: Trade-off between bias and variance, from 0 (one step) to 1 (full returns).
 
     Returns:
-        (T, n).
+        Advantages, (T, n).
     """
     found = np.empty_like(values)
     ahead = np.zeros_like(next_values)
@@ -248,17 +248,17 @@ def _floats(observations: Any) -> NDArray[np.float32]:
 
 
 def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
-    """Numbers in an observation and in an action, if these are what they have to be."""
+    """Check the spaces and the autoreset mode; return lengths of observation and action."""
     sizes = []
     for name, space in (
         ("observations", env.single_observation_space),
         ("actions", env.single_action_space),
     ):
         if not isinstance(space, Box) or len(space.shape) != 1:
-            raise ValueError(f"env must have vectors as {name} for the compiled PPO, got {space}")
+            raise ValueError(f"env must have vectors as {name} for compiled PPO, got {space}")
         sizes.append(space.shape[0])
     if space != Box(-1.0, 1.0, space.shape, space.dtype):  # type: ignore[arg-type]
-        raise ValueError(f"env must have actions in [-1, 1], as RescaleAction makes them: {space}")
+        raise ValueError(f"env must have actions in [-1, 1] (see RescaleAction), got {space}")
     mode = env.metadata.get("autoreset_mode")
     if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
         raise ValueError(f"env must have the autoreset mode SameStep, got {mode}")
@@ -266,7 +266,7 @@ def _sizes(env: VectorEnv[Any, Any, Any]) -> tuple[int, int]:
 
 
 def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
-    """All parameters of a recipe for so many inputs, if the compiled PPO has what it asks for."""
+    """Check a recipe for a number of inputs; return its parameters with defaults."""
     check.choice("algorithm of the compiled engine", recipe.algorithm, ("ppo",))
     check.keywords(recipe.parameters, tuple(PARAMETERS), "the compiled PPO")
     check.keywords(recipe.policy, ("log_std_init",), "the policy of the compiled PPO")
@@ -284,7 +284,7 @@ def _checked(recipe: Recipe, inputs: int) -> dict[str, Any]:
     found["critic_only"] = check.whole("critic_only", found["critic_only"], least=0)
     if found["critic_only"] >= inputs:
         raise ValueError(
-            f"critic_only must leave the actor some of the {inputs} numbers of an observation, "
+            f"critic_only must leave the actor at least one of {inputs} observed values, "
             f"got {found['critic_only']}"
         )
     return found

@@ -1,4 +1,4 @@
-"""Running a plan with the compiled PPO."""
+"""Training of a plan with the compiled PPO."""
 
 import io
 import pickle
@@ -17,10 +17,10 @@ from baselines.seeds import first_seed
 
 
 class CompiledKeeper(RunKeeper):
-    """Keeps a training with the compiled PPO."""
+    """`RunKeeper` for the compiled PPO."""
 
     events: Events | None = None
-    """TensorBoard's files, if they are wanted"""
+    """Writer for TensorBoard; None: no files"""
 
     def _training_return(self, model: CompiledPPO) -> float:
         return model.training_return
@@ -41,10 +41,10 @@ class CompiledKeeper(RunKeeper):
 
 
 def make_compiled(plan: Plan) -> CompiledPPO:
-    """The untrained model of a plan, with its flights.
+    """Make the untrained model of a plan, with its environment.
 
     Raises:
-        ValueError: If the compiled PPO lacks what the plan asks for.
+        ValueError: If the compiled PPO does not support the plan.
     """
     seed = first_seed("training", plan.seed, plan.recipe.n_envs)
     flights = plan.make_vector_flights()
@@ -60,10 +60,10 @@ def make_compiled(plan: Plan) -> CompiledPPO:
 
 
 def _require_leaving(plan: Plan, flights: Any) -> None:
-    """Refuse a `critic_only` that does not leave the actor what the policy will observe.
+    """Check that `critic_only` leaves the actor exactly the observation of the policy in tests.
 
     Raises:
-        ValueError: If the flights in training show other numbers before those for the critic.
+        ValueError: If the observation in training without the critic's part is another one.
     """
     judge: Any = plan.make_judge()
     learned, judged = (env.unwrapped.flights.table for env in (flights, judge))
@@ -72,9 +72,8 @@ def _require_leaving(plan: Plan, flights: Any) -> None:
     given = plan.recipe.parameters["critic_only"]
     if given != more or learned[: len(judged)] != judged:
         raise ValueError(
-            "critic_only must count the numbers that end the observation in training alone: "
-            f"{max(more, 0)} of {learned[-1].slice.stop}, after those that the policy observes, "
-            f"got {given}"
+            "critic_only must be the number of values that the observation has only in training, "
+            f"at its end: {max(more, 0)} of {learned[-1].slice.stop}, got {given}"
         )
 
 
@@ -86,7 +85,7 @@ def run(
     tensorboard: bool,
     quiet: bool,
 ) -> CompiledKeeper:
-    """Train, or go on from the folder's checkpoint; see `baselines.training.train`."""
+    """Train, or resume from the folder's checkpoint; see `baselines.training.train`."""
     model, keeper = make_compiled(plan), CompiledKeeper(plan, folder, judge, quiet=quiet)
     if (file := last_file(plan, folder)).exists():
         try:
@@ -107,7 +106,7 @@ def run(
     with keeper:
         model.prepare()
         keeper.begin(model.num_timesteps)
-        model.learn(plan.recipe.steps, watch, quiet=True)  # the keeper has a bar
+        model.learn(plan.recipe.steps, watch, quiet=True)  # the keeper has a progress bar
         keeper.finish(model, model.num_timesteps)
     if keeper.events is not None:
         keeper.events.close()

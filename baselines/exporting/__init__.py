@@ -1,4 +1,4 @@
-"""Exporting for autopilots: trained policies as ONNX or C99, and the numbers of a filter."""
+"""Export for autopilots: trained policies as ONNX or C99, and the parameters of a filter."""
 
 from baselines.exporting.controller import Controller, controller_of
 from baselines.exporting.filter_numbers import filter_header, filter_numbers

@@ -1,4 +1,4 @@
-"""What the four numbers of an action mean, in the units of a vehicle."""
+"""Meaning of the four components of an action, in physical units."""
 
 from typing import Any, NamedTuple
 
@@ -6,18 +6,18 @@ from quad_gym.params import checks as check
 
 
 class ActionField(NamedTuple):
-    """One number of an action: `quantity = offset + scale a`, held to at most `most`."""
+    """Component a of an action: `quantity = offset + scale a`, limited to `most`."""
 
     name: str
     offset: float
     scale: float
     unit: str
     frame: str
-    """B: body; H: level, x along the body's heading, y to its left, z up; "-": none"""
+    """Frame. B: body; H: level, x along the body's heading, y to its left, z up; "-": none"""
     most: float | None = None
 
     def formula(self, number: int) -> str:
-        """How to compute it, such as `thrust = 7.644 (1 + a[0]) N`."""
+        """Formula for the quantity, such as `thrust = 7.644 (1 + a[0]) N`."""
         a = f"a[{number}]"
         value = f"{self.scale:.6g} {a}"
         if self.offset == self.scale:
@@ -28,14 +28,14 @@ class ActionField(NamedTuple):
 
 
 def action_fields(action: str, params: Any) -> tuple[ActionField, ...]:
-    """The four numbers of an action.
+    """Describe the four components of an action.
 
     Args:
-        action: The environment's `action`.
-        params: The nominal parameters, one scalar PARAMS record (`packing.flight.params_record`).
+        action: Keyword `action` of the environment.
+        params: Nominal parameters, one scalar PARAMS record (`packing.flight.params_record`).
 
     Raises:
-        ValueError: If there is no such action.
+        ValueError: If the action is unknown.
     """
     check.choice("action", action, ("ctbr", "motor", "wrench", "attitude", "velocity"))
     weight = float(params["mass"] * params["gravity"])

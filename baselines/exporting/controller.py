@@ -1,4 +1,4 @@
-"""`Controller`: a trained network, with all that is needed to run it elsewhere."""
+"""`Controller`: a trained network with all information for running it elsewhere."""
 
 import json
 from collections.abc import Mapping
@@ -19,48 +19,48 @@ from quad_gym.packing.flight import params_record
 from quad_gym.params import checks as check
 
 _AGREEMENT = 1e-4
-"""Largest difference between a network and the policy that it was taken from."""
+"""Largest difference accepted between a network and the policy that it represents."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Controller:
-    """A network, the table of its observations and the meaning of its actions."""
+    """Network with descriptions of its observations and actions."""
 
     policy: MlpPolicy
     source: str
-    """the name or file that it was taken from"""
+    """Name or file of the policy"""
     env_id: str
     keywords: Mapping[str, Any]
-    """of the environment that it was trained for"""
+    """Keywords of the environment for which it was trained"""
     table: tuple[ObservationField, ...]
     action: str
-    """the environment's `action`"""
+    """Keyword `action` of the environment"""
     action_fields: tuple[ActionField, ...]
     control_rate: float
     """[Hz]"""
 
     @property
     def bounds(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(low, high) that each number of an observation is held to, (n,) float32 each."""
+        """Lower and upper bounds to which observations are clipped, (n,) float32 each."""
         low, high = layout_bounds(self.table)
         return low.astype(np.float32), high.astype(np.float32)
 
     def act(self, observations: Any) -> NDArray[np.float32]:
-        """What an exported controller has to answer: the policy on observations within bounds.
+        """Return the actions that an exported controller must return.
 
         Args:
-            observations: (..., n) as `table` describes them.
+            observations: Observations described by `table`, (..., n); they are clipped to bounds.
 
         Returns:
-            Actions (..., 4) in [-1, 1].
+            Actions, (..., 4) in [-1, 1].
         """
         within = np.clip(np.asarray(observations, np.float32), *self.bounds)
         return self.policy.predict(within)[0]
 
     def samples(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Observations (count, n) to compare controllers on.
+        """Draw observations (count, n) for comparing controllers.
 
-        Half of them are of the size of those in flight, the others reach beyond the bounds.
+        Half of them have typical magnitudes of flights, the others exceed the bounds.
         """
         low, high = self.bounds
         near = rng.standard_normal((count - count // 2, len(low)))
@@ -71,25 +71,25 @@ class Controller:
 def controller_of(
     policy: str, env_id: str | None = None, keywords: Mapping[str, Any] | None = None
 ) -> Controller:
-    """A trained policy with the meaning of its observations and actions.
+    """Load a trained policy with descriptions of its observations and actions.
 
     Args:
-        policy: "pretrained", or a file: `.npz` (of the compiled engine, or `quad-gym train
+        policy: "pretrained", or a file: `.npz` (written by the compiled engine, or `quad-gym train
             --export`) or `.zip` of Stable-Baselines3, which can run code while it is loaded.
-        env_id: What it flies; None: as its training record says.
-        keywords: Of the environment; None: as its training record says.
+        env_id: Id of the environment; None: from the training record.
+        keywords: Keywords of the environment; None: from the training record.
 
     Raises:
-        ValueError: If there is no such policy, it is no plain network, it has no training record
-            and `env_id` is None, or it does not fit the environment.
+        ValueError: If the policy does not exist, is not a multilayer perceptron, has no training
+            record while `env_id` is None, or does not fit the environment.
         ImportError: If a `.zip` is to be loaded and Stable-Baselines3 is not installed.
     """
     if policy == "pd" or policy.startswith("pd:"):
         raise ValueError(f"policy must be a trained network, got {policy!r}")
     if policy == "pretrained" and env_id is None:
-        raise ValueError("policy pretrained needs an ENV_ID: one ships for each of several tasks")
+        raise ValueError("policy pretrained needs an ENV_ID: several tasks have one")
     if env_id is not None:
-        keywords_of(env_id)  # refuses unknown ids
+        keywords_of(env_id)  # rejects unknown ids
     file = pretrained_file(env_id) if policy == "pretrained" and env_id else Path(policy)
     if not file.exists():
         meant = check.did_you_mean(policy, ("pretrained", "filter"))
@@ -100,7 +100,7 @@ def controller_of(
     plan = record.get("plan", {})
     if env_id is None:
         if "env_id" not in plan:
-            raise ValueError(f"{file} has no training record that names an ENV_ID: give it")
+            raise ValueError(f"{file} has no training record with an ENV_ID: specify ENV_ID")
         env_id = plan["env_id"]
     if keywords is None:
         keywords = plan.get("environment", {}) if plan.get("env_id") == env_id else {}
@@ -109,7 +109,9 @@ def controller_of(
         found: Any = load_policy(str(file), env)
         flights = env.unwrapped.flights  # type: ignore[attr-defined]
         if not isinstance(env.single_observation_space, gymnasium.spaces.Box):
-            raise ValueError(f"{file} sees the truth (privileged=True), which no vehicle has")
+            raise ValueError(
+                f"{file} observes the truth (privileged=True), which no vehicle can measure"
+            )
         batch = flights.batch
         params = params_record(batch.vehicle, batch.sensors, action_params=batch.action_params)[0]
         controller = Controller(
@@ -129,7 +131,7 @@ def controller_of(
 
 
 def _record_of(file: Path) -> dict[str, Any]:
-    """The training record of a policy: in a `.npz`, beside a `.zip`; empty where there is none."""
+    """Training record of a policy: in a `.npz`, next to a `.zip`; empty if there is none."""
     if file.suffix == ".npz":
         return MlpPolicy.load(file).record
     record = file.parent / "training.json"
@@ -139,9 +141,9 @@ def _record_of(file: Path) -> dict[str, Any]:
 
 
 def _require_same(controller: Controller, model: Any, file: Path) -> None:
-    """Refuse a network that is not all of the policy, as with an extractor of features."""
+    """Reject a network that is only a part of the policy, as with a feature extractor."""
     low, high = controller.bounds
     seen = np.clip(controller.samples(256, np.random.default_rng(0)), low, high)
     error = np.abs(controller.policy.predict(seen)[0] - model.predict(seen, deterministic=True)[0])
     if not error.max() <= _AGREEMENT:
-        raise ValueError(f"{file} is no plain network: without the rest it acts differently")
+        raise ValueError(f"{file} is not a plain network: its layers alone act differently")

@@ -1,4 +1,4 @@
-"""The numbers that a suite's filter is computed with, as JSON or a header of C."""
+"""Numerical parameters of a suite's filter, as JSON or a C header."""
 
 import json
 import re
@@ -38,55 +38,56 @@ _FIELDS = {
         ),
     ),
 }
-"""What the filter's kernels read of the parameters: of any suite, of one with two antennas or with
-the mark that stands for them, and of one with a camera."""
+"""Parameters read by the filter's kernels: for any suite, for suites with two antennas or with the
+landing mark that replaces them, and for suites with a camera."""
 
 _SLOW = ("slow_sigma", "slow_decay", "slow_drive")
 _AIDS = ("aid_sigma", "aid_gate", "aid_numbers")
-"""Of suites with slow errors among the states, and with aiding sensors, in the order of `Aid`."""
+"""Parameters for suites with time-correlated errors in the state, and with aiding sensors, in the
+order of `Aid`."""
 
 _MEANINGS = {
     "accel_error_noise": "noise of a sample per m/s^2 of f_B - (0, 0, g), for scale and alignment",
-    "accel_noise": "noise of a sample in hover that the filter takes for white",
+    "accel_noise": "noise of a sample in hover that the filter models as white",
     "accel_thrust_noise": "noise per m/s^2 by which |f_B| differs from g: sigma^2 (f_B^2 - g^2)",
     "gyro_thrust_noise": "likewise",
-    "gyro_noise": "noise of a sample that the filter takes for white",
-    "accel_bias_decay": "of the bias over a tick: exp(-dt/tau)",
-    "gyro_bias_decay": "of the bias over a tick: exp(-dt/tau)",
+    "gyro_noise": "noise of a sample that the filter models as white",
+    "accel_bias_decay": "decay of the bias over a tick: exp(-dt/tau)",
+    "gyro_bias_decay": "decay of the bias over a tick: exp(-dt/tau)",
     "accel_bias_drive": "standard deviation of the bias's driving noise over a tick",
     "gyro_bias_drive": "standard deviation of the bias's driving noise over a tick",
     "accel_bias_sigma": "standard deviation of the bias at the start",
     "gyro_bias_sigma": "standard deviation of the bias at the start",
     "baseline_length": "length of the baseline",
     "first_baseline_sigma": "direction noise of the first baseline",
-    "heading_sigma": "of the heading where the place of the start tells it",
+    "heading_sigma": "standard deviation of the heading if the initial pose defines it",
     "velocity_sigma": "noise of a GNSS velocity per axis; 0: not measured",
-    "slow_sigma": "standard deviation at the start, of each slow error among the states",
-    "slow_decay": "of each slow error over a tick",
-    "slow_drive": "standard deviation of its driving noise over a tick",
-    "aid_numbers": "further numbers of each sensor; of the magnetometer: the field in I [T]",
+    "slow_sigma": "standard deviation at the start, of each time-correlated error in the state",
+    "slow_decay": "decay of each time-correlated error over a tick",
+    "slow_drive": "standard deviation of the driving noise of each of them over a tick",
+    "aid_numbers": "further numbers of each sensor; for the magnetometer, the field in I [T]",
     "camera": "projection center of the camera in B",
     "pixel_sigma": "noise of a pixel per axis",
     "blur": "noise of a pixel per body rate",
-    "initial_velocity_variance": "of the velocity at the start",
+    "initial_velocity_variance": "variance of the velocity at the start",
     "initial_covariance_scale": "factor on the first fix's covariance at the start",
-    "initial_tilt_sigma": "of roll and pitch at the start; 0: attitude by Wahba's problem",
+    "initial_tilt_sigma": "standard deviation of roll and pitch at the start; 0: Wahba's problem",
 }
-"""Words for those that `PARAMS_FIELDS` explains by what stands beside them."""
+"""Meanings of parameters whose description in `PARAMS_FIELDS` depends on neighboring entries."""
 
 _CHOICES = ("kind", "integration", "attitude_reset", "bearing_noise_at", "delay_compensation")
-"""Words among the parameters of a filter."""
+"""Parameters of a filter that are words."""
 
 
 def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
-    """All that the filter of a suite is computed with, in the types of JSON.
+    """Parameters with which the filter of a suite computes, in JSON types.
 
     Args:
-        suite: The sensors, with the filter that fuses them.
+        suite: Sensor suite with its filter.
 
     Returns:
-        "choices", words; "rates", Hz; "latencies", s; "numbers", each with "value", "unit" and
-        "meaning", in the form in which the equations take them (noise of a sample, not a density).
+        "choices", words; "rates" [Hz]; "latencies" [s]; "numbers", each with "value", "unit" and
+        "meaning", in the form used in the equations (noise of a sample, not a density).
     """
     record = params_record(vehicle_params("lab"), suite)[0]
     names = _FIELDS["any"] + (_FIELDS["camera"] if suite.camera is not None else ())
@@ -96,13 +97,13 @@ def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
     numbers = {}
     for name in names:
         value = record[name]
-        if name == "gravity":  # a filter that works by itself has its own
+        if name == "gravity":  # a stand-alone filter has its own
             value = np.float64(suite.estimator.gravity)
         if name in _SLOW:
             value = value[: slow_states(suite).estimated]
         if name == "features" and suite.camera is not None:
             value = value[: len(suite.camera.features_I)]
-        if not np.isfinite(value).all():  # gates that are open, the range of cameras
+        if not np.isfinite(value).all():  # open gates, unlimited camera range
             continue
         numbers[name] = {
             "value": as_json(value),
@@ -128,16 +129,16 @@ def filter_numbers(suite: SensorSuite) -> dict[str, Any]:
 
 
 def filter_json(suite: SensorSuite) -> str:
-    """`filter_numbers` as text."""
+    """Format `filter_numbers` as JSON text."""
     return json.dumps(filter_numbers(suite), indent=2, allow_nan=False) + "\n"
 
 
 def filter_header(suite: SensorSuite, name: str) -> str:
-    """`filter_numbers` as a header of C99, each number a constant with its unit and meaning.
+    """Format `filter_numbers` as a C99 header, each number a constant with its unit and meaning.
 
     Args:
-        suite: The sensors, with the filter that fuses them.
-        name: Of the suite, for the comment and the guard.
+        suite: Sensor suite with its filter.
+        name: Name of the suite, for the comment and the include guard.
     """
     found = filter_numbers(suite)
     guard = f"QUAD_GYM_FILTER_{re.sub(r'[^A-Z0-9]', '_', name.upper())}_H"

@@ -1,4 +1,4 @@
-"""A controller as an ONNX model, checked with onnxruntime against the policy."""
+"""Controllers as ONNX models, checked with onnxruntime against the policy."""
 
 import json
 from pathlib import Path
@@ -10,21 +10,21 @@ import quad_gym
 from baselines.exporting.controller import Controller
 
 OPSET = 17
-"""Version of the operators; old enough for the runtimes on companion computers."""
+"""Version of the operator set, old enough for runtimes on companion computers."""
 _IR_VERSION = 8
-"""Version of the file format that belongs to it."""
+"""Corresponding version of the file format."""
 
 AGREEMENT = 1e-4
-"""Largest difference between actions of the model and of the policy that is accepted;
-saturated ones are differences of large sums."""
+"""Largest difference accepted between actions of the model and of the policy; saturated actions are
+differences of large sums."""
 
 _ACTIVATIONS = {"relu": "Relu", "tanh": "Tanh", "elu": "Elu"}
 
 
 def onnx_model(controller: Controller) -> Any:
-    """A controller as an `onnx.ModelProto`: `observation` (batch, n) to `action` (batch, 4).
+    """Convert a controller to an `onnx.ModelProto`, from `observation` (batch, n) to `action`.
 
-    What observation and actions are is in its metadata, as JSON.
+    The metadata describe observation and action, as JSON.
 
     Raises:
         ImportError: If onnx is missing.
@@ -74,15 +74,15 @@ def save_onnx(controller: Controller, file: Path) -> float:
     """Write a controller as ONNX, after a comparison with the policy in onnxruntime.
 
     Args:
-        controller: What to write.
-        file: Where.
+        controller: Controller to write.
+        file: Path of the file.
 
     Returns:
-        The largest difference of an action over 1,000 observations.
+        Largest difference of an action over 1,000 observations.
 
     Raises:
         ImportError: If onnx or onnxruntime is missing.
-        RuntimeError: If the model acts differently.
+        RuntimeError: If the actions of model and policy differ.
     """
     content = onnx_model(controller).SerializeToString()
     runtime = _require("onnxruntime")

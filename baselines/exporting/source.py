@@ -1,4 +1,4 @@
-"""A controller as one file of C99: weights, bounds and one function, for any compiler."""
+"""Controllers as one C99 file: weights, bounds and one function, for any compiler."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -32,27 +32,27 @@ static float dot(const float *w, const float *x, int n)
     return (s0 + s1) + (s2 + s3);
 }
 """
-"""Four sums round less than one."""
+"""Dot product with four partial sums, which have smaller rounding errors than one."""
 
 
 def c_source(controller: Controller, name: str) -> str:
-    """A controller as C99 that needs the mathematical library alone.
+    """Generate C99 code of a controller that requires only the math library.
 
-    It holds no state and allocates nothing; arithmetic is single precision, as on the processors of
+    It has no state and allocates no memory; arithmetic is single precision, as on processors of
     autopilots.
 
     Args:
-        controller: What to write.
+        controller: Controller to convert.
         name: Name of the function.
 
     Returns:
-        The text of the file.
+        Text of the file.
 
     Raises:
-        ValueError: If `name` is no identifier of C.
+        ValueError: If `name` is not a C identifier.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise ValueError(f"name must be an identifier of C, got {name!r}")
+        raise ValueError(f"name must be a C identifier, got {name!r}")
     policy = controller.policy
     low, high = controller.bounds
     widest = max(len(b) for b in policy.biases)
@@ -73,7 +73,7 @@ def c_source(controller: Controller, name: str) -> str:
 
 
 def observation_lines(controller: Controller) -> Iterator[str]:
-    """What each part of an observation is: place, name, unit, frame."""
+    """Describe each part of an observation: indices, name, unit, frame."""
     rows = []
     for field in controller.table:
         last = field.slice.stop - 1
@@ -85,7 +85,7 @@ def observation_lines(controller: Controller) -> Iterator[str]:
 
 
 def about(controller: Controller) -> str:
-    """Where a controller comes from."""
+    """Origin of a controller: policy, environment and version."""
     keywords = "".join(f" {key}={value}" for key, value in controller.keywords.items())
     return f"{controller.source}, {controller.env_id}{keywords}; quad_gym {quad_gym.__version__}"
 
@@ -96,21 +96,21 @@ def _comment(controller: Controller, name: str) -> str:
         "",
         f"int {name}(const float observation[{controller.policy.inputs}], float action[4])",
         "",
-        "returns 0; or 1, with an action of zeros, if a number of the observation is not finite.",
-        f"Call it {controller.control_rate:g} times a second.",
+        "returns 0, or 1 with an action of zeros if the observation is not finite.",
+        f"Call it {controller.control_rate:g} times per second.",
         "",
         "Observation (SI units; I: inertial, east, north, up; B: body, x ahead, y left, z up;",
-        "numbers beyond their bounds, low and high below, are held to them):",
+        "values are clipped to the bounds low and high below):",
         *(f"  {line}" for line in observation_lines(controller)),
         "",
-        "Action, each number a in [-1, 1]:",
+        "Action, each component a in [-1, 1]:",
         *(f"  {field.formula(i)}" for i, field in enumerate(controller.action_fields)),
     ]
     return "/*\n" + "".join(f" * {line}".rstrip() + "\n" for line in lines) + " */\n"
 
 
 def _number(value: float) -> str:
-    """A float that C reads back bit for bit."""
+    """Format a float so that C reads the same bits."""
     text = f"{np.float32(value):.9g}"
     return text + ("f" if set(text) & set(".e") else ".0f")
 
@@ -122,7 +122,7 @@ def _rows(numbers: Iterable[float]) -> str:
 
 
 def _array(name: str, values: NDArray[np.float32]) -> str:
-    """A constant; a matrix row by row."""
+    """Define a constant array; matrices are stored row by row."""
     return f"static const float {name}[{values.size}] = {_rows(values.ravel().tolist())};\n"
 
 

@@ -73,7 +73,7 @@ def test_evaluate_flies_what_there_is(tmp_path, capsys):
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "results/evaluate/trajectory/summary.json").read_text())
     assert summary["arguments"]["policy"] == ["pd"]
-    told = "PD control flies alone: no policy ships for QuadGym/Trajectory-v0"
+    told = "PD control flies alone: no policy is included for QuadGym/Trajectory-v0"
     assert done.stdout.startswith(told)
     assert "pd on truth" in done.stdout
     for args, told, policies in (
@@ -94,7 +94,7 @@ def test_evaluate_flies_what_there_is(tmp_path, capsys):
 def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path, asked):
     done = run("evaluate", "trajectory", "--policy", *asked, where=tmp_path)
     assert done.returncode == 2
-    assert "error: no policy ships for QuadGym/Trajectory-v0" in done.stderr
+    assert "error: no policy is included for QuadGym/Trajectory-v0" in done.stderr
     wrong = run("evaluate", "circle", "--env", "acton=motor", where=tmp_path)
     assert wrong.returncode == 2
     assert "did you mean action?" in wrong.stderr
@@ -113,7 +113,7 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
         (["--observation", "estimat"], "did you mean estimate?"),
         (
             ["--policy", "pretrained", "--env", "include_std=true"],
-            "trained with observations of 9 fields, and the environment gives 14 (it adds "
+            "trained with observations of 9 fields, but the environment returns 14 (it adds "
             "position_sigma, velocity_sigma, attitude_sigma, accel_bias_sigma, gyro_bias_sigma):",
         ),
         (

@@ -119,13 +119,13 @@ def test_a_training_with_such_a_critic_that_died_goes_on_as_if_it_had_not(tmp_pa
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        (asymmetric_plan(critic_only=14), "15 of 47, after .* got 14"),
-        (asymmetric_plan(learning={}), "0 of 32, .* got 15"),
+        (asymmetric_plan(critic_only=14), "15 of 47, got 14"),
+        (asymmetric_plan(learning={}), "0 of 32, got 15"),
         (asymmetric_plan(environment={"include_std": True}), "got 15"),
     ],
 )
 def test_a_critic_sees_more_than_the_policy_by_so_many_numbers(tmp_path, plan, message):
-    with pytest.raises(ValueError, match="critic_only must count the numbers that .*" + message):
+    with pytest.raises(ValueError, match="critic_only must be the number of values .*" + message):
         run(plan, tmp_path)
 
 

@@ -119,7 +119,7 @@ def test_steps_are_told_of_each_algorithm():
         (["--env", "observation=truth"], "--env must leave observation to --arms"),
         (["--set", "gammma=0.9"], "gammma"),
         (["--arms", "recurrent", "--set", "clip=0.1"], "clip is not a keyword of RecurrentPPO"),
-        (["--arms", "truth", "--set", "critic_only=3"], "critic_only must count the numbers"),
+        (["--arms", "truth", "--set", "critic_only=3"], "critic_only must be the number of values"),
     ],
 )
 def test_wrong_options_end_the_study_before_it_begins(words, message, tmp_path, capsys):
@@ -135,11 +135,11 @@ def test_wrong_arms_are_refused():
         Arm(name="a b", label="x")
     with pytest.raises(ValueError, match="must not be trained"):
         Arm(name="a", label="x", policy="pd", training={"observation": "truth"})
-    with pytest.raises(ValueError, match="must not be trained, as its policy is that of truth"):
+    with pytest.raises(ValueError, match="must not be trained, because its policy is taken from"):
         Arm(name="a", label="x", flies="truth", parameters={"gamma": 0.9})
-    with pytest.raises(ValueError, match="have a policy, or fly that of another"):
+    with pytest.raises(ValueError, match="must have either a policy or the name of another arm"):
         Arm(name="a", label="x", flies="truth", policy="pd")
-    with pytest.raises(ValueError, match="must not be trained, as its policy is pd"):
+    with pytest.raises(ValueError, match="must not be trained, because its policy is pd"):
         Arm(name="a", label="x", policy="pd", algorithm="sac")
     with pytest.raises(ValueError, match=r"algorithm must be one of ppo, .*, got 'a2c'"):
         Arm(name="a", label="x", algorithm="a2c")

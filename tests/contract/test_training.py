@@ -228,7 +228,7 @@ def test_a_run_that_is_not_there_begins_and_says_so(tmp_path):
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
     train(small_plan(), tmp_path, quiet=True, tensorboard=False)
-    with pytest.raises(ValueError, match="holds a run already"):
+    with pytest.raises(ValueError, match="already contains a run"):
         train(small_plan(), tmp_path, quiet=True, tensorboard=False)
     with pytest.raises(ValueError, match=r"another plan \(different: seed, first_flights\)"):
         train(small_plan(seed=3), tmp_path, resume=True, quiet=True, tensorboard=False)
@@ -267,7 +267,7 @@ def test_policies_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no policy of Stable-Baselines3"):
         load_policy(str(tmp_path / "broken.zip"), env())
     (tmp_path / "broken.npz").write_bytes(b"PK nonsense")
-    with pytest.raises(ValueError, match="is no policy"):
+    with pytest.raises(ValueError, match="is not a policy"):
         load_policy(str(tmp_path / "broken.npz"), env())
     with pytest.raises(ValueError, match="policy must be"):
         load_policy("ppo", env())

@@ -56,7 +56,7 @@ def test_refuses_nonsense(options, message):
 def test_refuses_files_without_gains(tmp_path, text):
     env = gymnasium.make_vec("QuadGym/Hover-v0", num_envs=1)
     (tmp_path / "gains.json").write_text(text)
-    with pytest.raises(ValueError, match="holds no PD gains"):
+    with pytest.raises(ValueError, match="does not contain PD gains"):
         load_policy(f"pd:{tmp_path / 'gains.json'}", env)
     with pytest.raises(ValueError, match="there are no gains"):
         load_policy("pd:missing.json", env)

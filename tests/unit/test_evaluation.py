@@ -131,7 +131,7 @@ def test_what_cannot_be_rolled_out_is_refused():
 
 def test_a_policy_of_another_task_flies_with_a_warning():
     env = gymnasium.make_vec("QuadGym/Waypoints-v0", num_envs=1)
-    with pytest.warns(UserWarning, match=r"trained on QuadGym/Circle-v0, and flies QuadGym/Waypo"):
+    with pytest.warns(UserWarning, match=r"trained on QuadGym/Circle-v0, but flies QuadGym/Waypo"):
         load_policy(str(pretrained_file("QuadGym/Circle-v0")), env)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -251,7 +251,7 @@ def test_what_cannot_be_exported_is_refused(policy, env_id, keywords, message):
 def test_a_policy_that_sees_the_truth_is_refused(tmp_path):
     keywords = {"privileged": True}
     file = stable_baselines_file(tmp_path, "ppo", keywords)
-    with pytest.raises(ValueError, match="sees the truth"):
+    with pytest.raises(ValueError, match="observes the truth"):
         controller_of(str(file), CIRCLE, keywords)
 
 

@@ -289,7 +289,7 @@ def test_pd_control_is_not_shown_other_observations():
         VecNormalize(sb3),
         VecFrameStack(sb3, 2),
     ):
-        refused("env must show observations as they are", PDPolicy, wrapped)
+        refused("env must return its original observations", PDPolicy, wrapped)
     for plain in (
         wrappers.TimeLimit(single, 10),
         wrappers.RecordEpisodeStatistics(single),
