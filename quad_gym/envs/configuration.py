@@ -127,7 +127,7 @@ class Flights:
         self.task: TaskParams = defaults.replace(**given)
         if "pad" in given and not self.task.may_start_on_ground:
             raise ValueError(
-                f'pad means nothing with start="{self.task.start}", and must not be given'
+                f'pad has no effect with start="{self.task.start}", and must not be given'
             )
         if "trajectory" in given and "duration" not in given:  # all of it, or a round
             longest = max(path.duration for path in self.task.trajectories)
@@ -207,7 +207,7 @@ class Flights:
         felt = [fault for fault in befall if needs_sensors(fault)]
         if idle and felt:
             raise ValueError(
-                f"faults must concern what is simulated: {type(felt[0]).__name__} concerns "
+                f"faults must concern simulated parts: {type(felt[0]).__name__} concerns "
                 f'sensors, and none runs with observation="{observation}" (unless '
                 "include_std or innovations ask for the filter)"
             )

@@ -40,7 +40,7 @@ def require_own_task(given: Collection[str], name: str, kind: str) -> None:
                 f"given for {name}"
             )
         if keyword in KEYWORDS_WITHOUT_EFFECT.get(kind, ()):
-            raise ValueError(f"{keyword} means nothing to the task {name}, and must not be given")
+            raise ValueError(f"{keyword} has no effect on the task {name}, and must not be given")
 
 
 def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
@@ -52,8 +52,8 @@ def require_effect(asked: Collection[str], keywords: Mapping[str, Any]) -> None:
     observation, action = keywords["observation"], keywords["action"]
     if "layout" in asked and observation == "measurements":
         raise ValueError(
-            f'layout must not be given with observation="measurements", which has a layout of its '
-            f"own, got {keywords['layout']!r}"
+            'layout must not be given with observation="measurements", which has its own layout, '
+            f"got {keywords['layout']!r}"
         )
     for name in FILTER_KEYWORDS:
         if name in asked and keywords[name] is not None and runs_no_sensor(keywords):

@@ -1,8 +1,8 @@
-"""Positions with correlated errors, by a filter that knows deviations along the axes of I alone.
+"""Positions with correlated errors, for filters with standard deviations along the axes of I.
 
-With the covariance C = T^T diag(s^2) T the errors are independent along the rows of T. So the state
-is turned into the frame of T (r, v, the drift of GNSS, R_BI; error angles and biases are in B
-already), updated with the deviations s, and turned back. Nothing is approximated.
+With the covariance C = T^T diag(s^2) T the errors are independent along the rows of T. The state is
+therefore rotated into the frame of T (r, v, the drift of GNSS, R_BI; error angles and biases are in
+B already), updated with the standard deviations s, and rotated back. Nothing is approximated.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from quad_gym.records import POSITION_BLOCK
 
 
 def in_principal_axes(covariance: Floats) -> tuple[Floats, Floats]:
-    """The rotation T and the deviations s of a covariance T^T diag(s^2) T."""
+    """Return the rotation T and the standard deviations s of a covariance T^T diag(s^2) T."""
     variances, axes = np.linalg.eigh(covariance)
     T = axes.T
     if np.linalg.det(T) < 0.0:
@@ -26,7 +26,7 @@ def in_principal_axes(covariance: Floats) -> tuple[Floats, Floats]:
 
 
 def turn_state(engine: Engine, T: Floats) -> None:
-    """Turn everything of the estimate that is in I, and what turns GNSS positions into I."""
+    """Rotate all parts of the estimate that are in I, and the rotation of GNSS positions to I."""
     n = int(engine.settings["slow_states"][0])
     drifts = bool(engine.settings["estimates_drift"][0])
     for name in ("r_hat", "v_hat"):
@@ -55,13 +55,13 @@ def update_with_correlated(
     measurement: Measurement,
     covariance: Floats,
 ) -> None:
-    """Update with a position alone whose errors have a covariance.
+    """Update with a single position whose errors have a covariance.
 
     Args:
         engine: The filter's memory.
-        condition: Gives the filter a measurement.
+        condition: Updates the filter with a measurement.
         measurement: The position.
-        covariance: (3, 3) of its errors in I [m^2].
+        covariance: (3, 3) covariance of its errors in I [m^2].
     """
     T, sigmas = in_principal_axes(covariance)
     expected = _innovation_sigmas(engine, covariance)
@@ -83,7 +83,7 @@ def update_with_correlated(
 
 
 def _innovation_sigmas(engine: Engine, covariance: Floats) -> Floats:
-    """(lanes, 3) deviations of a position's innovation in I, to first order."""
+    """Return the standard deviations (lanes, 3) of a position's innovation in I, to first order."""
     gnss, L, R_BI = engine.sensors.gnss, engine.read("L"), engine.read("R_hat")
     assert gnss is not None
     x, y, z = gnss.primary_antenna_B

@@ -1,7 +1,7 @@
 """The memory of a filter for one vehicle, and the stages of flights that run on it.
 
-All lanes of its block hold the same flight, or, as long as nobody knows the heading, each lane of
-some blocks a flight of another heading (`headings.py`).
+All lanes of its block hold the same flight, or, while the heading is unknown, each lane of several
+blocks holds a flight with another heading (`headings.py`).
 """
 
 import math
@@ -48,7 +48,7 @@ class Engine:
     """Records, parameters and stages of one filter.
 
     Args:
-        sensors: What the filter believes in.
+        sensors: The suite that the filter assumes.
         kind: "ukf" or "ekf".
     """
 
@@ -76,15 +76,15 @@ class Engine:
 
     @property
     def lanes(self) -> int:
-        """How many flights there are in memory, equal ones included."""
+        """Number of flights in memory, equal ones included."""
         return len(self.blocks) * WIDTH
 
     def allocate(self, count: int) -> None:
-        """Make room for flights, at least one block of them; what there was is lost."""
+        """Make room for flights, at least one block of them; earlier contents are lost."""
         self.blocks = aligned_zeros(max(1, -(-count // WIDTH)), FLIGHT_BLOCK)
 
     def read(self, name: str) -> NDArray[Any]:
-        """A field of all lanes, (lanes, ...): a copy."""
+        """Return a copy of a field of all lanes, (lanes, ...)."""
         values = np.moveaxis(self.blocks[name], -1, 1)
         return values.reshape(-1, *values.shape[2:]).copy()
 
@@ -94,22 +94,22 @@ class Engine:
         self.blocks[name] = np.moveaxis(lanes, 1, -1)
 
     def fill(self, name: str, value: NDArray[Any]) -> None:
-        """Write the same into a field of all lanes."""
+        """Write one value into a field of all lanes."""
         self.blocks[name] = value[..., np.newaxis]
 
     def copy(self) -> NDArray[Any]:
-        """What the filter knows, for `restore`: one lane of it if all are equal."""
+        """Return a copy of the filter's memory for `restore`: one lane if all are equal."""
         words = self._words()
         return words[:, :, :1].copy() if len(words) == 1 else words.copy()
 
     def restore(self, words: NDArray[Any]) -> None:
-        """Go back to a copy."""
+        """Restore a copy."""
         if len(words) != len(self.blocks):
             self.allocate(len(words) * WIDTH)
         self._words()[...] = words
 
     def _words(self) -> NDArray[Any]:
-        """The memory of the parts that the filter uses, (blocks, words, WIDTH)."""
+        """Return the memory of the parts that the filter uses, (blocks, words, WIDTH)."""
         raw = self.blocks.view(np.uint64).reshape(len(self.blocks), -1, WIDTH)
         first = self._room.skipped // (8 * WIDTH)
         return raw[:, first : first + self._room.dtype.itemsize // (8 * WIDTH)]
@@ -117,7 +117,7 @@ class Engine:
     # ---- stages -------------------------------------------------------------------------------
 
     def start(self, x_I: Floats) -> None:
-        """Start from the fix in the record, with clocks at zero and nothing remembered."""
+        """Start from the fix in the record, with clocks at zero and all memory cleared."""
         self._table()
         self.blocks["tick"], self.blocks["w_before"] = 0.0, np.nan
         for k in range(len(self.blocks)):
@@ -125,19 +125,19 @@ class Engine:
             single.start_filter(block, self.params, self.settings, self._work, x_I)
 
     def predict(self, sample: Sample) -> None:
-        """Carry the estimate over the time of a sample."""
+        """Propagate the estimate over the time of a sample."""
         self._set_dt(sample.dt)
         blocks = self.blocks
-        blocks["tick"] += sample.dt / self.sensors.imu.dt  # a clock, whatever pieces it goes in
+        blocks["tick"] += sample.dt / self.sensors.imu.dt  # a clock, independent of the steps
         self.fill("gyro", sample.gyro)
         self.fill("accel", sample.accel)
-        # they turn the lever arms of a velocity and of the accelerometer
+        # for the lever arms of a velocity and of the accelerometer
         self.fill("w_before", sample.gyro_before)
         self.fill("w_meas", sample.gyro)
         self._run(Stage.PREDICT, Stage.PREDICT_WITH_SLOW)
 
     def update(self, measurement: Measurement) -> None:
-        """Condition the estimate on measurements."""
+        """Update the estimate with measurements."""
         m, blocks = measurement, self.blocks
         blocks["position_valid"] = m.position_G is not None
         blocks["baseline_valid"] = m.baseline_G is not None
@@ -165,7 +165,7 @@ class Engine:
         self.restore_noise(kept)
 
     def impose(self, noise: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        """Give parameters the noise of a measurement; returns what they were."""
+        """Set the noise of a measurement in the parameters; return the earlier values."""
         kept = {name: self.params[name].copy() for name in noise}
         for name, value in noise.items():
             if name == "aid_sigma":
@@ -176,14 +176,14 @@ class Engine:
         return kept
 
     def restore_noise(self, kept: dict[str, NDArray[Any]]) -> None:
-        """Give parameters back the noise that they had before `impose`."""
+        """Restore the noise from before `impose`."""
         for name, numbers in kept.items():
             self.params[name] = numbers
 
     def _set_dt(self, dt: float) -> None:
-        """Give parameters the length of a prediction.
+        """Set the duration of a prediction in the parameters.
 
-        White noise is a density: its samples are the smaller the longer they average.
+        White noise is a density: longer averages have smaller noise.
         """
         if dt == self._dt:
             return
@@ -205,13 +205,13 @@ class Engine:
             p["slow_drive"][0, : len(drive)] = drive[:, np.newaxis]
 
     def _table(self) -> NDArray[Any]:
-        """The table of the stages that the filter runs."""
+        """Return the table of the stages that the filter runs."""
         stages = single.SLOW_FILTER_STAGES if self.slow else single.FILTER_STAGES
         own = {Stage[aid.name] for aid in self.sensors.aids}
         return linked_table(stages | own, single.FILTER_ENTRIES)
 
     def _run(self, stage: Stage, with_slow: Stage) -> None:
-        """Run a stage, or the one of a filter that estimates slow errors."""
+        """Run a stage, or the stage of a filter with time-correlated errors."""
         chosen, p = with_slow if self.slow else stage, self.params
         others = (p, p, self.settings, self._work, self._table(), self.features)
         address, count = self.blocks.ctypes.data, len(self.blocks)

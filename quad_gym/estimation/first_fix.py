@@ -1,4 +1,4 @@
-"""The arguments of `initialize`, checked, and what a filter starts from."""
+"""The arguments of `initialize`, checked, and the first estimate that follows from them."""
 
 import math
 from dataclasses import dataclass, field
@@ -32,24 +32,24 @@ FARTHEST_FIX = 1e6
 """Largest distance of a fix from the reference antenna [m]; the center of the Earth is farther."""
 
 LEAST_COURSE = 5.0
-"""Speed over its deviation from which a course tells the heading."""
+"""Speed divided by its standard deviation from which a course determines the heading."""
 
 
 @dataclass(frozen=True)
 class FirstFix:
-    """What is measured at the start."""
+    """Measurements at the start."""
 
     position_G: Floats
     sigmas: Floats
-    """(3,) of the position in I [m]"""
+    """(3,) standard deviations of the position in I [m]"""
     velocity_I: Floats | None
     speeds: Floats
-    """(3,) deviations of the velocity [m/s]"""
+    """(3,) standard deviations of the velocity [m/s]"""
     baseline_G: Floats
     x_I: Floats
-    """level direction of the body x axis, beside a steep baseline; zero: not known"""
+    """horizontal direction of the body x axis, for a steep baseline; zero: unknown"""
     starts: list[FirstEstimate] = field(default_factory=list)
-    """starts of a known tilt, one or one for each heading; none by Wahba's problem"""
+    """starts with a known tilt, one or one for each heading; empty with Wahba's problem"""
 
     def write(self, engine: Engine) -> None:
         """Start the filters in an engine's memory."""
@@ -83,10 +83,10 @@ def checked_fix(
     accel: ArrayLike | None,
     accel_sigma: float | None,
 ) -> FirstFix:
-    """The arguments of `initialize`.
+    """Check the arguments of `initialize`.
 
     Raises:
-        ValueError: As `initialize` says.
+        ValueError: As in `initialize`.
     """
     require_gnss(sensors, "initialize: start with set_state() instead")
     position = check.array("gnss_position_G", gnss_position_G, (3,))
@@ -130,7 +130,7 @@ def checked_fix(
             raise ValueError("heading_sigma must come with heading or course")
         own = check.positive("heading_sigma", heading_sigma, most=math.pi)
 
-    # by halves of the distance to the next one they overlap as one uniform distribution
+    # with half the spacing as standard deviation they overlap to a uniform distribution
     headings = [known_heading(k * SPACING, 0.5 * SPACING, tilt) for k in range(COUNT)]
     if heading is not None:
         headings = [known_heading(check.number("heading", heading), own, tilt)]
@@ -149,24 +149,24 @@ def checked_fix(
 
 
 def _require_relative(position_G: Floats) -> None:
-    """Refuse a first fix that is no place near the reference antenna."""
+    """Refuse a first fix that is not near the reference antenna."""
     if np.abs(position_G).max() > FARTHEST_FIX:
         raise ValueError(
             "gnss_position_G must be relative to the reference antenna "
             f"(GnssParams.reference_antenna_G), within {FARTHEST_FIX:g} m of it, got "
-            f"{position_G}; from an absolute position in ECEF subtract that of the antenna"
+            f"{position_G}; subtract the antenna's position from an absolute position in ECEF"
         )
 
 
 def _refuse_beside_baseline(**given: Any) -> None:
-    """Refuse what a start with a baseline does not take."""
+    """Refuse arguments that a start with a baseline does not use."""
     for name, value in given.items():
         if value is not None:
             raise ValueError(f"{name} must not be given with gnss_baseline_G")
 
 
 def _root(sigmas: Floats, covariance: Floats | None) -> Floats:
-    """A root of the covariance of the position."""
+    """Return a root of the covariance of the position."""
     if covariance is None:
         return np.diag(sigmas)
     T, s = in_principal_axes(covariance)
@@ -183,7 +183,7 @@ def _position_noise(sensors: SensorSuite, given: ArrayLike | None) -> tuple[Floa
 def _first_velocity(
     sensors: SensorSuite, given_G: ArrayLike | None, sigma: float | None
 ) -> tuple[Floats | None, Floats]:
-    """The velocity in I at the start, or None, and the deviations of what is taken for it."""
+    """Return the velocity in I at the start, or None, and its standard deviations."""
     gnss = sensors.gnss
     assert gnss is not None
     if given_G is None:
@@ -203,7 +203,7 @@ def _first_tilt(
     accel: ArrayLike | None,
     accel_sigma: float | None,
 ) -> Tilt:
-    """Level, or as an accelerometer at rest tells."""
+    """Return a level tilt, or the tilt from an accelerometer at rest."""
     if accel is None:
         if accel_sigma is not None:
             raise ValueError("accel_sigma must come with accel")
@@ -212,7 +212,7 @@ def _first_tilt(
             sigma = check.positive("tilt_sigma", tilt_sigma, most=1.0)
         return LEVEL._replace(sigma=sigma)
     if tilt_sigma is not None:
-        raise ValueError("tilt_sigma must not be given with accel, which tells the tilt")
+        raise ValueError("tilt_sigma must not be given with accel, which measures the tilt")
     white = sensors.imu.accel_noise_density / math.sqrt(sensors.imu.dt)
     if accel_sigma is not None:
         white = check.positive("accel_sigma", accel_sigma)
@@ -239,8 +239,8 @@ def _by_baseline(sensors: SensorSuite, baseline_G: Floats, tilt: Tilt) -> Headin
     found = baseline_heading(np.array(gnss.baseline_B), baseline_I, sigma, tilt)
     if found is None:
         raise ValueError(
-            "gnss_baseline_G must not be within 12 degrees of the vertical where accel tells the "
-            "tilt: give a heading in its place"
+            "gnss_baseline_G must not be within 12 degrees of the vertical where accel gives the "
+            "tilt: use a heading in its place"
         )
     return found
 
@@ -251,8 +251,8 @@ def _by_course(velocity: Floats | None, sigma: float, own: float, tilt: Tilt) ->
     speed = math.hypot(velocity[0], velocity[1])
     if speed < LEAST_COURSE * sigma:
         raise ValueError(
-            f"course must be that of a vehicle that moves, at least {LEAST_COURSE * sigma:g} m/s "
-            f"over the ground, got {speed:g} m/s"
+            f"course must belong to a moving vehicle, at least {LEAST_COURSE * sigma:g} m/s over "
+            f"the ground, got {speed:g} m/s"
         )
     angle = math.atan2(velocity[1], velocity[0])
     return known_heading(angle, math.hypot(own, sigma / speed), tilt)

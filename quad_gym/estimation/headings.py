@@ -1,14 +1,14 @@
-"""A filter whose heading is unknown: a sum of Gaussians, one for each of many headings.
+"""Filters with unknown heading: a Gaussian sum, with one Gaussian for each of many headings.
 
-A filter that linearizes about one heading fails if the true one is far from it. So each lane of
-some blocks starts from another heading, with half the distance to the next as its deviation: their
-sum is nearly uniform. Each measurement weighs them by its likelihood in each,
+A filter that linearizes about one heading fails if the true heading is far from it. Therefore each
+lane of several blocks starts from another heading, with half the spacing as its standard deviation:
+their sum is nearly uniform. Each measurement weights the lanes by its likelihood,
 
     log w += -(nu^T S^-1 nu + log det S) / 2,   det S = det R (det L- / det L+)^2,
 
-where R is the same in all. Acceleration reveals the heading; without it the heading stays
-unknown. When the deviation of the heading is below `RESOLVED`, one Gaussian with the mean and the
-covariance of the sum takes over.
+where R is the same for all. Acceleration reveals the heading; without it the heading stays unknown.
+When the standard deviation of the heading is below `RESOLVED`, a single Gaussian with the mean and
+the covariance of the sum takes over.
 
 Source: D. L. Alspach and H. W. Sorenson, IEEE Trans. Automatic Control 17(4), 1972.
 """
@@ -27,11 +27,11 @@ from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 Floats = NDArray[np.float64]
 
 COUNT = 48
-"""Headings; a multiple of the lanes of any machine."""
+"""Number of headings; a multiple of the lanes of any machine."""
 SPACING = 2.0 * math.pi / COUNT
-"""Between two of them [rad]."""
+"""Angle between two headings [rad]."""
 RESOLVED = 0.07
-"""Deviation of the heading below which one Gaussian takes over [rad]."""
+"""Standard deviation of the heading below which a single Gaussian takes over [rad]."""
 
 _VECTORS = ("r_hat", "v_hat", "b_a_hat", "b_g_hat")
 
@@ -40,7 +40,7 @@ class Moments(NamedTuple):
     """Mean and covariance of a sum of Gaussians."""
 
     vectors: dict[str, Floats]
-    """(3,) each: r_hat, v_hat, b_a_hat, b_g_hat; (n,) slow_hat"""
+    """r_hat, v_hat, b_a_hat and b_g_hat (3,), slow_hat (n,)"""
     R_hat: Floats
     covariance: Floats
     """(15 + n, 15 + n)"""
@@ -71,7 +71,7 @@ def _write_factors(engine: Engine, factors: Floats, n: int) -> None:
 
 
 def _factors(engine: Engine) -> Floats:
-    """(lanes, 15 + n, 15 + n) joint factors."""
+    """Return the joint factors (lanes, 15 + n, 15 + n)."""
     n = int(engine.settings["slow_states"][0])
     joint = np.zeros((engine.lanes, 15 + n, 15 + n))
     joint[:, :15, :15] = engine.read("L")
@@ -80,13 +80,13 @@ def _factors(engine: Engine) -> Floats:
 
 
 def _log_determinant(factors: Floats) -> Floats:
-    """Of each lane's covariance; errors that are known exactly, drift at the start, left out."""
+    """Return the log determinant of each lane's covariance, without exactly known errors."""
     diagonal = np.diagonal(factors, axis1=1, axis2=2)
     return 2.0 * np.log(np.where(diagonal > 0.0, diagonal, 1.0)).sum(axis=1)
 
 
 def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floats) -> Floats:
-    """Update all lanes with a measurement; returns their new weights, normalized."""
+    """Update all lanes with a measurement; return their new weights, normalized."""
     before, failures = _log_determinant(_factors(engine)), engine.read("update_failures")
     engine.update(measurement)
     after = _log_determinant(_factors(engine))
@@ -106,7 +106,7 @@ def update_and_weigh(engine: Engine, measurement: Measurement, log_weights: Floa
 
 
 def moments(engine: Engine, log_weights: Floats) -> Moments:
-    """Mean and covariance of all lanes together; of the attitude about a mean on the circle."""
+    """Return mean and covariance of all lanes; for the attitude, about a mean on the circle."""
     w, n = np.exp(log_weights), int(engine.settings["slow_states"][0])
     R = engine.read("R_hat")
     R_mean, turns = R[int(np.argmax(w))], np.zeros((len(w), 3))
@@ -126,7 +126,7 @@ def moments(engine: Engine, log_weights: Floats) -> Moments:
 
 
 def collapse(engine: Engine, log_weights: Floats, m: Moments) -> None:
-    """Go on with one Gaussian of these moments; what else is remembered is the likeliest lane's."""
+    """Continue with one Gaussian with these moments; other memory comes from the likeliest lane."""
     words = engine.copy()
     best = int(np.argmax(log_weights))
     width = words.shape[2]

@@ -1,13 +1,13 @@
-"""What a filter was given within its window of time, so that it can include late measurements.
+"""Inputs of a filter within a window of time, for the processing of delayed measurements.
 
-A late measurement is put where it belongs by its time stamp, and everything since then is filtered
-again: the result is, to the bit, that of the same samples and measurements in the order of their
-stamps. A sample of the IMU in whose time a stamp lies is split there, the same sample on both
+A delayed measurement is inserted at its time stamp, and everything since then is filtered again:
+the result is bitwise the result with the same samples and measurements in the order of their
+stamps. An IMU sample whose interval contains the stamp is split there, with the same sample on both
 sides.
 
-Flights in an environment use another method, `kernels/filter/late.py`: they keep what the IMU
-has summed up, and carry estimate and covariance back over it. That costs less, but needs stamps on
-ticks and sensors whose measurements arrive in order, and it is exact to first order alone.
+Flights in an environment use another method, `kernels/filter/late.py`: they keep sums of the IMU
+samples, and retrodict estimate and covariance over them. That costs less, but requires stamps on
+ticks and sensors whose measurements arrive in order, and is exact to first order only.
 """
 
 from collections.abc import Callable
@@ -26,13 +26,13 @@ _EVERY = 8  # events between two copies of the state: a copy costs about as much
 class _Event:
     given: Sample | Measurement
     time: float
-    """after it"""
+    """time after the event"""
     before: Any = None
-    """a copy of the state before it, or None"""
+    """copy of the state before the event, or None"""
 
     @property
     def start(self) -> float:
-        """When it begins."""
+        """Time at which the event begins."""
         return self.time - self.given.dt if isinstance(self.given, Sample) else self.time
 
 
@@ -40,10 +40,10 @@ class History:
     """The samples and measurements of a window of time, and states to filter them again from.
 
     Args:
-        window: Its length [s].
-        apply: Gives the filter a sample or a measurement.
+        window: Length of the window [s].
+        apply: Processes a sample or a measurement with the filter.
         copy: Returns a copy of the filter's state.
-        restore: Goes back to such a copy.
+        restore: Restores such a copy.
     """
 
     def __init__(
@@ -60,17 +60,17 @@ class History:
         self.time = 0.0
 
     def begin(self, time: float) -> None:
-        """Begin anew at a time [s]."""
+        """Begin at a time [s], with no events."""
         self.time, self._events = time, []
 
     @property
     def oldest(self) -> float:
-        """The earliest time stamp that can still be included [s]."""
+        """Earliest time stamp that can still be included [s]."""
         reach = self.time - self.window
         return max(reach, self._events[0].start) if self._events else self.time
 
     def add(self, given: Sample | Measurement) -> None:
-        """Give the filter what comes next."""
+        """Process the next input."""
         time = self.time + (given.dt if isinstance(given, Sample) else 0.0)
         event = _Event(given, time)
         if self.window > 0.0:
@@ -83,11 +83,11 @@ class History:
         self._forget()
 
     def insert(self, measurement: Measurement, time: float) -> None:
-        """Include a measurement of a time that is past, and filter again what came after it.
+        """Insert a delayed measurement, and filter again all inputs after it.
 
         Args:
-            measurement: What was measured.
-            time: When, at least `oldest` and less than the present [s].
+            measurement: The measurement.
+            time: Its time stamp, at least `oldest` and less than the present [s].
         """
         events = self._events
         i = next(k for k, e in enumerate(events) if e.time > time + SAME_TIME)
@@ -109,7 +109,7 @@ class History:
             self._apply(events[k].given)
 
     def _forget(self) -> None:
-        """Drop what lies before the last copy that is older than the window."""
+        """Drop events before the last copy that is older than the window."""
         reach, events = self.time - self.window, self._events
         keep = 0
         for k, event in enumerate(events):

@@ -23,11 +23,11 @@ from quad_gym.rotations import dcm_to_quaternion
 ESTIMATORS = {"ukf": UnscentedKalmanFilter, "ekf": ExtendedKalmanFilter}
 
 PATIENCE = 2.0
-"""How long a start waits for the first magnetic field [s]."""
+"""Time for which a start waits for the first magnetic field [s]."""
 
 
 class Player:
-    """Gives a filter what a log holds, in the order in which it arrived."""
+    """Processes the contents of a log with a filter, in the order of arrival."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Player:
         self.averages = suite.imu.samples == "average"
         self.running = False
         self.held: list[int] = []  # samples before the start
-        self.waiting: list[tuple[float, str, int]] = []  # stamped later than the filter is
+        self.waiting: list[tuple[float, str, int]] = []  # time stamps after the filter's time
         self.before: int | None = None  # the sample that holds now, of an IMU of instants
         self.field: int | None = None  # the last magnetic field before the start
         self.pressure_level = 0.0 if not log.barometer_from_start else math.nan
@@ -56,7 +56,7 @@ class Player:
         self._choose_streams()
 
     def _choose_streams(self) -> None:
-        """The streams that the suite has a use for, and what is left."""
+        """Select the streams that the suite uses, and list the others."""
         suite, log = self.suite, self.log
         unused = []
         self.streams = {"imu": log.imu}
@@ -122,7 +122,7 @@ class Player:
         self._predict(i)
 
     def _predict(self, i: int) -> None:
-        """Carry the estimate to the time of a sample."""
+        """Propagate the estimate to the time of a sample."""
         imu, ukf = self.log.imu, self.filter
         time = float(imu.time[i])
         chosen = i if self.averages else self.before
@@ -161,7 +161,7 @@ class Player:
         self.reports.append((stamp, float(stream.received[k]), self.filter.last_update))
 
     def _keywords(self, name: str, stream: Stream, k: int) -> dict[str, Any]:
-        """A measurement as keywords of `update`."""
+        """Return a measurement as keywords of `update`."""
         if name == "gnss":
             return self._fix(stream, k)
         value = stream.values[{"camera": "pixels"}.get(name, name)][k]
@@ -170,13 +170,13 @@ class Player:
         if not np.isfinite(value).all():
             return {}
         if name == "barometer":
-            if math.isnan(self.pressure_level):  # it counts from where the vehicle is
+            if math.isnan(self.pressure_level):  # relative to the height of the vehicle
                 self.pressure_level = float(value - self.filter.position[2])
             return {"barometer": float(value - self.pressure_level)}
         return {name: value}
 
     def _fix(self, stream: Stream, k: int) -> dict[str, Any]:
-        """What GNSS measured at one instant, as keywords of `update`."""
+        """Return the GNSS measurements of one instant as keywords of `update`."""
         position, velocity, baseline = (
             self._vector_G(stream, quantity, k) for quantity in ("position", "velocity", "baseline")
         )
@@ -192,7 +192,7 @@ class Player:
         return found
 
     def _vector_G(self, stream: Stream, quantity: str, k: int) -> Floats | None:
-        """A vector in G, positions from the origin; None: not measured."""
+        """Return a vector in G, positions relative to the origin; None: not measured."""
         for frame in "GI":
             values = stream.values.get(f"{quantity}_{frame}")
             if values is not None and np.isfinite(values[k]).all():
@@ -211,7 +211,7 @@ class Player:
     # ---- the start -----------------------------------------------------------------------------
 
     def _try_to_start(self, name: str, k: int) -> None:
-        """Start if a fix has come, with what else tells the heading."""
+        """Start with the first fix, and other measurements of the heading."""
         if name == "magnetometer":
             self.field = k
         if name != "gnss":
@@ -239,7 +239,7 @@ class Player:
         self._go_on()
 
     def _start_from_state(self) -> None:
-        """Start from what the caller knows."""
+        """Start from the state that the caller gives."""
         state = {"time": float(self.log.imu.time[0]), **self.start}
         if not {"R_BI", "covariance"} & set(state):
             check.keywords(state, ("position", "heading", "time"), "a start at a position")
@@ -256,7 +256,7 @@ class Player:
         self._go_on()
 
     def _go_on(self) -> None:
-        """Take the samples that have come since the time of the start."""
+        """Process the samples since the time of the start."""
         self.running, begin = True, self.filter.time
         for i in self.held:
             if self.log.imu.time[i] > begin + SAME_TIME:
@@ -268,7 +268,7 @@ class Player:
     # ---- results -------------------------------------------------------------------------------
 
     def _keep_row(self) -> None:
-        """Keep what is known before the next sample comes."""
+        """Store the estimate before the next sample arrives."""
         f = self.filter
         if not self.running:
             return
@@ -312,7 +312,7 @@ class Player:
 def _measured(
     suite: SensorSuite, reports: list[tuple[float, float, Innovations]]
 ) -> dict[str, Measured]:
-    """Innovations by kind, those that came at all."""
+    """Return innovations by kind of measurement, for the kinds that occurred."""
     if not reports:
         return {}
     time, received = (np.array([report[k] for report in reports]) for k in (0, 1))
@@ -335,7 +335,7 @@ def _measured(
 
 
 def _name_of(block: int) -> str:
-    """The name of a block of innovations."""
+    """Return the name of a block of innovations."""
     if block < FEATURE_BLOCKS:
         return ("gnss_position", "gnss_baseline", "gnss_velocity")[block]
     if block >= AID_BLOCKS:

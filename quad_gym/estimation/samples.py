@@ -1,4 +1,4 @@
-"""What a filter is given: samples of the IMU, and measurements of one instant, each checked."""
+"""Inputs of a filter, checked: IMU samples, and measurements of one instant."""
 
 import math
 from dataclasses import dataclass, field
@@ -25,21 +25,22 @@ SIGMA_KEYWORDS = (
 
 @dataclass(frozen=True)
 class Sample:
-    """A sample of the IMU that carries the estimate over a time."""
+    """An IMU sample that propagates the estimate over a time."""
 
     gyro: Floats
-    """(3,) in B [rad/s]"""
+    """(3,) angular rate in B [rad/s]"""
     accel: Floats
-    """(3,) in B [m/s^2]"""
+    """(3,) specific force in B [m/s^2]"""
     dt: float
-    """the time [s]"""
+    """duration of the sample [s]"""
     gyro_before: Floats
-    """(3,) what the gyro read one sample earlier; the lever arm's acceleration follows from both"""
+    """(3,) angular rate of the sample before; the lever arm's acceleration follows from both
+    [rad/s]"""
 
     def split(self, first: float) -> tuple["Sample", "Sample"]:
-        """The same sample over the first part [s] of its time, and over the rest.
+        """Return this sample over the first part [s] of its time, and over the rest.
 
-        The gyro's rate of change is that of the whole sample in both.
+        The gyro's rate of change is the whole sample's in both.
         """
         change = (self.gyro - self.gyro_before) / self.dt
         parts = (first, self.dt - first)
@@ -49,31 +50,31 @@ class Sample:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What was measured at one instant; None: not measured."""
+    """Measurements of one instant; None: not measured."""
 
     position_G: Floats | None = None
-    """(3,) [m]"""
+    """(3,) antenna position [m]"""
     baseline_G: Floats | None = None
-    """(3,) [m], scaled to about one"""
+    """(3,) baseline, scaled to a length near one [-]"""
     velocity_G: Floats | None = None
-    """(3,) [m/s]"""
+    """(3,) antenna velocity [m/s]"""
     pixels: Floats | None = None
-    """(n_features, 2), NaN: not seen [pixels]"""
+    """(n_features, 2) image coordinates, NaN: not seen [pixels]"""
     aids: dict[Aid, Floats] = field(default_factory=dict)
     noise: dict[str, Any] = field(default_factory=dict)
-    """fields of the parameter record that this measurement has in place of the suite's"""
+    """fields of the parameter record that replace the suite's for this measurement"""
     position_covariance_I: Floats | None = None
-    """(3, 3) of a position whose errors are correlated [m^2]"""
+    """(3, 3) covariance of a position with correlated errors [m^2]"""
 
     @property
     def empty(self) -> bool:
-        """Whether nothing was measured."""
+        """True if nothing was measured."""
         values = (self.position_G, self.baseline_G, self.velocity_G, self.pixels)
         return all(v is None for v in values) and not self.aids
 
     @property
     def blocks(self) -> list[int]:
-        """The blocks of innovations that it has."""
+        """Blocks of innovations of the measurement."""
         triples = enumerate((self.position_G, self.baseline_G, self.velocity_G))
         found = [POSITION_BLOCK + k for k, values in triples if values is not None]
         if self.pixels is not None:
@@ -82,11 +83,11 @@ class Measurement:
         return found + [AID_BLOCKS + int(aid) for aid in self.aids]
 
     def only_position(self) -> "Measurement":
-        """Its position alone."""
+        """Return a measurement with its position alone."""
         return Measurement(position_G=self.position_G, noise=self.noise)
 
     def without_position(self) -> "Measurement":
-        """All but its position."""
+        """Return a measurement without its position."""
         return Measurement(
             baseline_G=self.baseline_G,
             velocity_G=self.velocity_G,
@@ -104,19 +105,19 @@ def checked_measurement(
     velocity_G: ArrayLike | None,
     others: dict[str, Any],
 ) -> Measurement:
-    """The arguments of `update`, checked.
+    """Check the arguments of `update`.
 
     Args:
         sensors: The filter's suite.
-        position_G: As of `update`.
-        baseline_G: Likewise.
-        pixels: Likewise.
-        velocity_G: Likewise.
+        position_G: As in `update`.
+        baseline_G: As in `update`.
+        pixels: As in `update`.
+        velocity_G: As in `update`.
         others: Measurements of aiding sensors by name, and noise by SIGMA_KEYWORDS.
 
     Raises:
         ValueError: If one has another shape or is not finite, the suite lacks its sensor, or noise
-            is given for what was not measured.
+            is given without its measurement.
     """
     aids = _checked_aids(sensors, others) if others else {}
     if position_G is not None or baseline_G is not None:
@@ -147,13 +148,13 @@ def checked_measurement(
 
 
 def require_gnss(sensors: SensorSuite, what: str) -> None:
-    """Refuse to do something without GNSS."""
+    """Refuse an operation that requires GNSS."""
     if sensors.gnss is None:
         raise ValueError(f"the sensor suite has no GNSS to {what}")
 
 
 def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats:
-    """A baseline, scaled by a power of two: its length does not count.
+    """Return a baseline, scaled by a power of two: its length is not used.
 
     Raises:
         ValueError: If it has another shape, is not finite or zero, or GNSS has one antenna.
@@ -164,12 +165,12 @@ def checked_baseline(sensors: SensorSuite, gnss_baseline_G: ArrayLike) -> Floats
     largest = np.abs(baseline).max()
     if largest == 0.0:
         raise ValueError("gnss_baseline_G must have a direction, got zeros")
-    # by a power of two it comes near one, exactly
+    # a power of two brings it near one without rounding
     return np.ldexp(baseline, -int(np.frexp(largest)[1]))
 
 
 def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Floats]:
-    """What aiding sensors measure, as arrays; None: not measured."""
+    """Return the measurements of aiding sensors as arrays; None: not measured."""
     names = tuple(aid.name.lower() for aid in Aid)
     check.keywords(others, names + SIGMA_KEYWORDS, "update")
     found = {}
@@ -186,11 +187,11 @@ def _checked_aids(sensors: SensorSuite, others: dict[str, Any]) -> dict[Aid, Flo
 
 
 def gnss_noise(name: str, value: Any) -> tuple[Floats, Floats | None]:
-    """Noise of a position: (3,) deviations in I [m], and its covariance where it is correlated.
+    """Return the noise of a position: standard deviations (3,) in I [m], covariance or None.
 
     Args:
-        name: Of the argument.
-        value: A deviation, three of them, or a (3, 3) covariance.
+        name: Name of the argument in messages.
+        value: A standard deviation, three of them, or a (3, 3) covariance.
 
     Raises:
         ValueError: If it is none of these, or not positive (definite).
@@ -215,7 +216,7 @@ def gnss_noise(name: str, value: Any) -> tuple[Floats, Floats | None]:
 def _checked_noise(
     others: dict[str, Any], measured: dict[str, bool]
 ) -> tuple[dict[str, Any], Floats | None]:
-    """Noise by fields of the parameter record, and the covariance of a position."""
+    """Return noise by fields of the parameter record, and the covariance of a position."""
     noise: dict[str, Any] = {}
     covariance = None
     for name in SIGMA_KEYWORDS:
@@ -223,7 +224,7 @@ def _checked_noise(
         if value is None:
             continue
         if not measured[name]:
-            raise ValueError(f"{name} must come with what it is the noise of")
+            raise ValueError(f"{name} must come with its measurement")
         if name == "gnss_sigma":
             noise["gnss_sigma"], covariance = gnss_noise(name, value)
             continue

@@ -1,4 +1,4 @@
-"""Starts from one fix without Wahba's problem: level, or tilted as an accelerometer at rest tells.
+"""Starts from one fix without Wahba's problem: level, or tilted as measured at rest.
 
 All that is uncertain at the start is a linear function of independent errors s,
 
@@ -6,8 +6,8 @@ All that is uncertain at the start is a linear function of independent errors s,
 
 so that `L L^T = G diag(s^2) G^T` follows from a QR factorization, also where it is singular. The
 position depends on the attitude, as the antenna was measured and not the center of mass: with r =
-antenna - R^T l its error is that of the fix and J e, J = R_hat^T [l x]. The heading depends on what
-tells it (`magnetic_heading`, `baseline_heading`).
+antenna - R^T l its error is the error of the fix plus J e, J = R_hat^T [l x]. The heading depends
+on its source (`magnetic_heading`, `baseline_heading`).
 
 R_hat is T level(heading): T turns the level frame, whose x axis is the body's without its vertical
 part, into B. Errors are taken in the level frame and turned, e = T e_L. A resting accelerometer
@@ -17,8 +17,8 @@ measures `f = g k + g k x e + b_a + v` with the vertical k = T e3, so that
 
 An accelerometer is so good that an error theta of the heading matters to higher orders: the error
 angles of a turn by theta about k are `theta k + theta^2 q / 2 + ...`, q = (k_y k_z, -k_x k_z,
--k_x k_y), while those of a level vehicle are theta alone. `still_start` counts the term with q as
-an error of its own with the same mean square, and bounds the third order by theta^3 / 6.
+-k_x k_y), while for a level vehicle they are theta alone. `still_start` models the term with q as
+a separate error with the same mean square, and bounds the third order by theta^3 / 6.
 """
 
 import math
@@ -35,19 +35,19 @@ from quad_gym.records import Aid
 Floats = NDArray[np.float64]
 
 LEVEL_SIGMA = 0.03
-"""Of roll and pitch of a vehicle put down or hovering, where the suite says nothing [rad]; as in
-`quad_gym.params.suites`."""
+"""Standard deviation of roll and pitch of a vehicle put down or hovering, if the suite has none
+[rad]; as in `quad_gym.params.suites`."""
 
 MOST_MOTION = 0.1
-"""Share of gravity by which the specific force of a vehicle at rest may differ from it: twice what
-the bias of a cheap accelerometer does."""
+"""Fraction of gravity by which the specific force of a vehicle at rest may differ from it: twice
+the effect of the bias of a cheap accelerometer."""
 
 STEEPEST_NOSE = 0.05
-"""Level share of the x axis below which nobody could say where it points."""
+"""Horizontal fraction of the x axis below which its heading is undefined."""
 
 STEEP = 0.2
-"""Level share of a baseline, 12 degrees from the vertical, that tells no heading; as in
-`kernels/filter/align.py`."""
+"""Horizontal fraction of a baseline, 12 degrees from the vertical, below which it does not observe
+the heading; as in `kernels/filter/align.py`."""
 
 _R, _V, _E, _BA, _BG, _D = 0, 3, 6, 9, 12, 15
 
@@ -56,96 +56,97 @@ class Heading(NamedTuple):
     """A heading, and the errors on which it depends."""
 
     angle: float
-    """of the body x axis, from east toward north [rad]"""
+    """heading of the body x axis, from east toward north [rad]"""
     sigma: float
-    """of what is its own [rad]"""
+    """standard deviation of its independent error [rad]"""
     of_tilt: tuple[float, float] = (0.0, 0.0)
-    """by which it errs per error of the tilt, about the first two axes of the level frame [-]"""
+    """error of the heading per error of the tilt, about the first two axes of the level frame
+    [-]"""
     of_slow: dict[int, float] = {}  # noqa: RUF012  (a NamedTuple's default is not changed)
-    """by which it errs per slow error, by its place [rad per unit]"""
+    """error of the heading per time-correlated sensor error, by its index [rad per unit]"""
 
 
 class Tilt(NamedTuple):
-    """Where the vertical is in the body, and on what that depends."""
+    """Direction of the vertical in the body, and the errors on which it depends."""
 
     T: Floats
-    """(3, 3) from the level frame to B"""
+    """(3, 3) rotation from the level frame to B"""
     sigma: float
-    """of what is its own, about each level axis [rad]"""
+    """standard deviation of its independent error, about each level axis [rad]"""
     of_bias: float = 0.0
-    """by which it errs per accelerometer bias across the vertical [rad s^2/m]"""
+    """error of the tilt per accelerometer bias across the vertical [rad s^2/m]"""
 
 
 LEVEL = Tilt(np.eye(3), 0.0)
-"""Not tilted at all."""
+"""A level vehicle."""
 
 
 class FirstEstimate(NamedTuple):
-    """What a filter starts from."""
+    """First estimate of a filter."""
 
     position: Floats
-    """(3,) in I [m]"""
+    """(3,) position in I [m]"""
     velocity: Floats
-    """(3,) in I [m/s]"""
+    """(3,) velocity in I [m/s]"""
     R_BI: Floats
-    """(3, 3)"""
+    """(3, 3) attitude"""
     factor: Floats
-    """(15 + n, 15 + n) lower, of the covariance, n slow errors last"""
+    """(15 + n, 15 + n) lower factor of the covariance, with n time-correlated errors last"""
 
 
 def level(angle: float) -> Floats:
-    """R_BI of a level vehicle whose x axis has a heading."""
+    """Return R_BI of a level vehicle whose x axis has a heading."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def resting_tilt(accel: Floats, sigma: float, gravity: float) -> Tilt:
-    """The tilt of a vehicle at rest by its accelerometer.
+    """Return the tilt of a vehicle at rest from its accelerometer.
 
     Args:
         accel: (3,) measured specific force in B [m/s^2].
-        sigma: White noise per axis [m/s^2].
-        gravity: As the filter believes it [m/s^2].
+        sigma: Standard deviation of its white noise, per axis [m/s^2].
+        gravity: Gravitational acceleration that the filter assumes [m/s^2].
 
     Raises:
-        ValueError: If the vehicle does not rest, by what is measured, or its x axis is vertical.
+        ValueError: If the measurement is not from a vehicle at rest, or its x axis is vertical.
     """
     size = float(np.linalg.norm(accel))
     if abs(size - gravity) > MOST_MOTION * gravity:
         raise ValueError(
-            f"accel must be that of a vehicle at rest, within {100 * MOST_MOTION:g} % of gravity, "
+            f"accel must be from a vehicle at rest, within {100 * MOST_MOTION:g} % of gravity, "
             f"{gravity:g} m/s^2, got {size:g} m/s^2"
         )
     k = accel / size
     x = np.array([1.0, 0.0, 0.0]) - k[0] * k
     share = float(np.linalg.norm(x))
     if share < STEEPEST_NOSE:
-        raise ValueError(f"accel must be that of a vehicle whose x axis is not vertical, got {k}")
+        raise ValueError(f"accel must be from a vehicle whose x axis is not vertical, got {k}")
     x /= share
     return Tilt(np.column_stack([x, np.cross(k, x), k]), sigma / gravity, 1.0 / gravity)
 
 
 def known_heading(angle: float, sigma: float, tilt: Tilt) -> Heading:
-    """A heading of the body x axis, which a roll changes where that axis is not level."""
+    """Return a given heading of the body x axis, which roll changes if that axis is not level."""
     return Heading(angle, sigma, (float(tilt.T[0, 2] / tilt.T[0, 0]), 0.0))
 
 
 def magnetic_heading(
     sensors: SensorSuite, field_B: Floats, sigma: float | None, tilt: Tilt = LEVEL
 ) -> Heading:
-    """The heading of a vehicle of known tilt by its magnetometer.
+    """Return the heading of a vehicle of known tilt from its magnetometer.
 
     To first order `m = f + f x e + delta g + T^T b + v` in the level frame with f = R m_I and g = R
-    (m_I x e3), where R is the turn by the heading. The heading makes the part of m across the level
-    field f_h u vanish, along t = e3 x u:
+    (m_I x e3), where R is the rotation by the heading. The heading makes the part of m across the
+    level field f_h u vanish, along t = e3 x u:
 
         e_z = (f_z u . e + delta t . g + T t . b + t . v) / f_h
 
     Args:
         sensors: A suite with a magnetometer.
-        field_B: (3,) measured [T].
-        sigma: White noise per axis [T]; None: as the suite says.
-        tilt: Of the vehicle.
+        field_B: (3,) measured field [T].
+        sigma: Standard deviation of the white noise, per axis [T]; None: the suite's value.
+        tilt: Tilt of the vehicle.
 
     Raises:
         ValueError: If the measured field has no level part.
@@ -175,15 +176,15 @@ def magnetic_heading(
 def baseline_heading(
     baseline_B: Floats, baseline_I: Floats, sigma: float, tilt: Tilt
 ) -> Heading | None:
-    """The heading of a vehicle of known tilt by two antennas; None where they stand too steep.
+    """Return the heading of a vehicle of known tilt from two antennas; None if too steep.
 
-    As for a magnetic field of a direction that is measured in I.
+    The baseline acts as a magnetic field whose direction is measured in I.
 
     Args:
         baseline_B: (3,) primary to secondary antenna in B.
-        baseline_I: (3,) the same, measured in I.
-        sigma: Of its direction [rad].
-        tilt: Of the vehicle.
+        baseline_I: (3,) primary to secondary antenna, measured in I.
+        sigma: Standard deviation of its direction [rad].
+        tilt: Tilt of the vehicle.
     """
     f = tilt.T.T @ (baseline_B / np.linalg.norm(baseline_B))
     f_h = math.hypot(f[0], f[1])
@@ -203,16 +204,16 @@ def still_start(
     tilt: Tilt,
     heading: Heading,
 ) -> FirstEstimate:
-    """The first estimate of a vehicle of known tilt, and the factor of its covariance.
+    """Return the first estimate of a vehicle of known tilt, with the factor of its covariance.
 
     Args:
         sensors: A suite with GNSS.
-        antenna_I: (3,) the primary antenna [m].
-        position_root: (3, 3) a root of the covariance of this [m].
-        velocity: (3,) in I [m/s].
-        velocity_sigma: (3,) deviations of this.
-        tilt: Level, or as an accelerometer tells.
-        heading: Of the level frame.
+        antenna_I: (3,) primary antenna [m].
+        position_root: (3, 3) a root of the covariance of the antenna's position [m].
+        velocity: (3,) velocity in I [m/s].
+        velocity_sigma: (3,) standard deviations of the velocity [m/s].
+        tilt: Level, or from an accelerometer.
+        heading: Heading of the level frame.
     """
     assert sensors.gnss is not None
     imu, slow = sensors.imu, slow_states(sensors).first_sigmas
@@ -249,14 +250,14 @@ def still_start(
 def state_at_rest(
     sensors: SensorSuite, position: ArrayLike, heading: float, time: float
 ) -> dict[str, Any]:
-    """Keywords of `set_state` for a level vehicle at rest at a known place.
+    """Return keywords of `set_state` for a level vehicle at rest at a known place.
 
-    Errors of position and heading are those of `SensorSuite.initial_pose`.
+    `SensorSuite.initial_pose` gives the errors of position and heading.
 
     Args:
         sensors: The suite of the filter.
-        position: (3,) in I [m].
-        heading: Of the body x axis, from east toward north [rad].
+        position: (3,) position in I [m].
+        heading: Heading of the body x axis, from east toward north [rad].
         time: Time stamp of the start [s].
     """
     pose, form, imu = sensors.initial_pose, sensors.estimator, sensors.imu
@@ -282,7 +283,7 @@ def state_at_rest(
 
 
 def lower_factor(root: Floats) -> Floats:
-    """The lower factor L, with a diagonal of at least zero, of L L^T = root root^T."""
+    """Return the lower factor L, with a nonnegative diagonal, of L L^T = root root^T."""
     upper = np.linalg.qr(root.T, mode="r")
     signs = np.where(np.diag(upper) < 0.0, -1.0, 1.0)
     return np.ascontiguousarray((signs[:, np.newaxis] * upper).T)

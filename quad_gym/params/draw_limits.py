@@ -65,8 +65,8 @@ def check_bounds(
             except ValueError as error:
                 reached = ", ".join(f"{end:g}" for end in ends)
                 raise ValueError(
-                    f"randomization of {name!r} must stay within the bounds of what it draws, and "
-                    f"reaches {reached}: {error}"
+                    f"randomization of {name!r} must stay within the bounds of the parameter, got "
+                    f"{reached}: {error}"
                 ) from None
     if "inertia" in table.names:
         _check_inertia(table)

@@ -196,7 +196,7 @@ class SensorSuite(Checked):
             raise ValueError("true_sensors must have the IMU rate of sensors, as it is the tick")
         if true_sensors.imu.samples != self.imu.samples:
             raise ValueError(
-                "true_sensors must have the IMU samples of sensors, as they order the tick: "
+                "true_sensors must have the IMU samples of sensors, which order a tick: "
                 f"{true_sensors.imu.samples!r} is not {self.imu.samples!r}"
             )
         for name in ("gnss", "camera", *AID_PARAMS):

@@ -101,7 +101,7 @@ class VehicleParams(Checked):
         check_moments("VehicleParams.inertia", moments)
         if self.hover_voltage >= self.max_voltage:
             raise ValueError(
-                f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: it takes "
+                f"VehicleParams.mass must be light enough to hover, got {self.mass} kg: that takes "
                 f"{self.hover_voltage:.3g} V of {self.max_voltage:g} V (by mass, gravity, "
                 "thrust_coefficient, motor_speed_per_volt and max_voltage)"
             )

@@ -145,7 +145,7 @@ class WorldParams(Checked):
             low, high = self.geofence
             if not all(a < b for a, b in zip(low, high, strict=True)):
                 raise ValueError(
-                    f"WorldParams.geofence must be a lower and a higher corner, got {self.geofence}"
+                    f"WorldParams.geofence must be a lower and an upper corner, got {self.geofence}"
                 )
 
 

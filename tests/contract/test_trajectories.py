@@ -287,8 +287,8 @@ def test_what_does_not_fit_is_refused():
         ({"trajectory": []}, "must be a Trajectory or a sequence of them"),
         ({"trajectory": [OPEN, 3]}, "trajectory must be a Trajectory"),
         ({"trajectory": far}, "must stay within 1000 m"),
-        ({"radius": 3.0}, "radius means nothing to the task trajectory"),
-        ({"period": 3.0}, "period means nothing to the task trajectory"),
+        ({"radius": 3.0}, "radius has no effect on the task trajectory"),
+        ({"period": 3.0}, "period has no effect on the task trajectory"),
         ({"max_speed": 3.0}, "max_speed belongs to the task random_trajectory"),
     ):
         with pytest.raises(ValueError, match=message):

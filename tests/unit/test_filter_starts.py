@@ -238,7 +238,7 @@ FIX, SPEED = np.zeros(3), np.array([1.0, 0.0, 0.0])
         ({"magnetometer": [1e-5, 1e-5]}, "magnetometer must have shape"),
         ({"magnetometer_sigma": 1e-6}, "magnetometer_sigma must come with"),
         ({"course": True}, "course must come with gnss_velocity_G"),
-        ({"course": True, "gnss_velocity_G": [0.01, 0.0, 0.0]}, "course must be that of a vehicle"),
+        ({"course": True, "gnss_velocity_G": [0.01, 0.0, 0.0]}, "course must belong to a moving"),
         ({"course": 1}, "course must be True or False"),
         ({"velocity_sigma": 0.1}, "velocity_sigma must come with"),
         ({"tilt_sigma": -0.1}, "tilt_sigma"),

@@ -109,7 +109,7 @@ def test_every_task_can_start_moving(env_id):
 @pytest.mark.parametrize("pad", [True, False])
 @pytest.mark.parametrize("start", ["hover", "moving"])
 def test_a_pad_for_a_start_in_the_air_is_refused(start, pad):
-    with pytest.raises(ValueError, match=f'pad means nothing with start="{start}"'):
+    with pytest.raises(ValueError, match=f'pad has no effect with start="{start}"'):
         gymnasium.make("QuadGym/Circle-v0", pad=pad, start=start)
 
 

@@ -323,7 +323,7 @@ def test_a_new_episode_has_new_places_and_has_touched_nothing():
         (lambda: WorldParams(vehicle_radius=0.0), "WorldParams.vehicle_radius must be greater"),
         (
             lambda: WorldParams(geofence=((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))),
-            "geofence must be a lower and a higher corner",
+            "geofence must be a lower and an upper corner",
         ),
         (lambda: WorldParams(geofence=(0.0, 1.0)), "WorldParams.geofence must have shape"),
     ],

@@ -119,8 +119,8 @@ def test_motion_tells_the_heading_of_a_tilted_vehicle_too():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"accel": [0.0, 0.0, 12.0]}, "accel must be that of a vehicle at rest"),
-        ({"accel": [0.0, 0.0, 0.0]}, "accel must be that of a vehicle at rest"),
+        ({"accel": [0.0, 0.0, 12.0]}, "accel must be from a vehicle at rest"),
+        ({"accel": [0.0, 0.0, 0.0]}, "accel must be from a vehicle at rest"),
         ({"accel": [GRAVITY, 0.0, 0.0]}, "x axis is not vertical"),
         ({"accel": [0.0, GRAVITY]}, "accel must have shape"),
         ({"accel_sigma": 0.1}, "accel_sigma must come with accel"),
