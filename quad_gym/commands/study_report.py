@@ -144,11 +144,6 @@ def write_report(results: Results, film: Path | None = None) -> list[Path]:
 def page_text(results: Results) -> str:
     """The setting, the table and the conclusions, in Markdown."""
     study = results.study
-    gains = [
-        f"{results.arm(name).label}: {number(results.improvement(name, 'truth'), 2)}"
-        for name in results.trained()
-        if name != "truth" and "truth" in results.trained() and len(study.seeds) > 1
-    ]
     return "\n".join(
         [
             f"{_trainings(results)}{study.episodes:,} test episodes with each policy. Success: "
@@ -157,15 +152,6 @@ def page_text(results: Results) -> str:
             table_markdown(results),
             "",
             *(f"- {sentence}" for sentence in conclusions(results)),
-            *(
-                [
-                    "- Probability that a training returns more than one on truth: "
-                    + "; ".join(gains)
-                    + "."
-                ]
-                if gains
-                else []
-            ),
             "",
         ]
     )

@@ -51,7 +51,7 @@ def conclusions(results: Results) -> list[str]:
 
 def _label(results: Results, name: str) -> str:
     arm = results.arm(name)
-    return f"training on {arm.label}" if arm.trained else arm.label
+    return f'the arm "{arm.label}"' if arm.trained else arm.label
 
 
 def _against_truth(results: Results, best: str) -> list[str]:
@@ -63,8 +63,8 @@ def _against_truth(results: Results, best: str) -> list[str]:
     if change.holds(0.0):
         verdict = f"no significant difference ({points} percentage points)"
     return [
-        f"Flown on the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
-        f"training on truth in {share(truth['success'])}: {verdict}.",
+        f"On the estimate, {label} succeeds in {share(ours['success'])} of the episodes, and "
+        f"{_label(results, 'truth')} in {share(truth['success'])}: {verdict}.",
         _how(results, ours, truth),
     ]
 
@@ -72,16 +72,16 @@ def _against_truth(results: Results, best: str) -> list[str]:
 def _how(results: Results, ours: Mapping[str, Estimated], truth: Mapping[str, Estimated]) -> str:
     """What else tells two arms apart, by the task's column for it."""
     telling = results.study.about.telling
-    crashes = f"It crashes in {share(ours['crashed'])} against {share(truth['crashed'])}"
+    crashes = f"It crashes in {share(ours['crashed'])}, compared with {share(truth['crashed'])}"
     if telling != "error":
         column = results.study.about.columns[telling]
         a, b = (number(row[telling], column.digits or 0) for row in (ours, truth))
-        return f"{crashes}; {column.heading}: {a} against {b}."
+        return f"{crashes}; {column.heading}: {a}, compared with {b}."
     ratio = truth["error"].value / ours["error"].value
     if ratio > 1.0:
         return (
-            f"{crashes}, and its mean position error is {ours['error'].value:.3f} m against "
-            f"{truth['error'].value:.3f} m, {ratio:.1f} times smaller."
+            f"{crashes}, and its mean position error is {ours['error'].value:.3f} m, compared with "
+            f"{truth['error'].value:.3f} m ({ratio:.1f} times smaller)."
         )
     return (
         f"Its mean position error is {ours['error'].value:.3f} m, not smaller than "
@@ -106,6 +106,7 @@ def _against_rules(results: Results, best: str) -> str:
 def _of_pair(results: Results, first: str, second: str) -> str:
     chance = results.improvement(first, second)
     a, b = _label(results, first), _label(results, second)
-    return f"A {a} returns more than a {b} with probability {number(chance, 2)}" + (
-        ", which decides nothing." if chance.low <= 0.5 <= chance.high else "."
+    return (
+        f"A training of {a} returns more than one of {b} with probability {number(chance, 2)}"
+        + (", which is not significant." if chance.low <= 0.5 <= chance.high else ".")
     )
