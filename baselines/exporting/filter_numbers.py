@@ -26,7 +26,13 @@ _FIELDS = {
         *("initial_velocity_variance", "initial_covariance_scale", "initial_tilt_sigma"),
         *("gate_position", "gate_direction", "gate_uncertainty", "max_rejections"),
     ),
-    "baseline": ("baseline_noise", "first_baseline_sigma", "baseline", "baseline_length"),
+    "baseline": (
+        "baseline_sigma",
+        "baseline_noise",
+        "first_baseline_sigma",
+        "baseline",
+        "baseline_length",
+    ),
     "camera": (
         *("camera", "R_CB", "focal_length", "half_image", "pixel_sigma"),
         *(
@@ -60,6 +66,7 @@ _MEANINGS = {
     "gyro_bias_sigma": "standard deviation of the bias at the start",
     "baseline_length": "length of the baseline",
     "first_baseline_sigma": "direction noise of the first baseline",
+    "baseline_sigma": "direction noise of a baseline, without constant errors",
     "heading_sigma": "standard deviation of the heading if the initial pose defines it",
     "velocity_sigma": "noise of a GNSS velocity per axis; 0: not measured",
     "slow_sigma": "standard deviation at the start, of each time-correlated error in the state",

@@ -121,7 +121,7 @@ def test_another_checkout_is_timed_by_turns_and_compared(tmp_path, capsys, monke
     every = against.rows_to_compare
     without_torch = lambda *of: [row for row in every(*of) if row["interface"] != "sb3"]  # noqa: E731
     monkeypatch.setattr(against, "rows_to_compare", without_torch)
-    found = run(tmp_path, "--against", str(ROOT), "--envs", "8", "--threads", "1")
+    found = run(tmp_path, "--against", str(ROOT), "--n-envs", "8", "--threads", "1")
     assert list(found["sections"]) == ["against"]
     rows = found["sections"]["against"]
     assert {"vector", "single"} <= {row["interface"] for row in rows}

@@ -237,8 +237,9 @@ PARAMETERS = {
 )
 def test_fields_of_parameters(kind, name):
     nominal, use = PARAMETERS[kind]
-    moves = kind in ("VehicleParams", "PDGains", "ActionParams", "TaskParams")
-    controls = (Control.PD, Control.VELOCITY) if moves else (Control.PD,)
+    both = (Control.PD, Control.VELOCITY)
+    moved = {"VehicleParams": both, "TaskParams": both, "ActionParams": (Control.VELOCITY,)}
+    controls = moved.get(kind, (Control.PD,))
     present = getattr(nominal, name)
     values = [*NUMBERS, *OTHERS]
     if isinstance(present, tuple):

@@ -137,7 +137,7 @@ def test_a_task_that_says_what_is_built_in_changes_nothing(task, sensors, faults
         np.testing.assert_array_equal(other.results, batch.results)
         for name in ("reward", "terminated", "truncated", "ending", "episode_return"):
             np.testing.assert_array_equal(other.record(name), batch.record(name), name)
-        seen |= set(batch.result("ending").astype(int))
+        seen |= {Ending(code) for code in batch.result("ending").astype(int)}
         over = step[2] | step[3]
         if mode == "Disabled" and over.any():
             options = {"reset_mask": over}

@@ -264,7 +264,7 @@ def test_without_a_filter_the_estimate_says_what_is_missing():
     _, view = flown(observation="truth")
     with pytest.raises(ValueError, match=r"view.estimate needs a filter"):
         _ = view.estimate.sigma
-    with pytest.raises(ValueError, match=r"view.measured needs sensors"):
+    with pytest.raises(ValueError, match=r"view.measured needs simulated sensors"):
         _ = view.measured.gyro
     np.testing.assert_array_equal(view.observed.position, view.position)
 
@@ -490,7 +490,7 @@ def test_arrays_of_a_view_cannot_be_deleted_or_made_writable():
     env.step(np.zeros((FLIGHTS, 4)))
     for group, name in ((view, "gates"), (view.truth, "position"), (view.truth, "wind")):
         getattr(group, name)
-        with pytest.raises(AttributeError, match=f"view.{name} .* cannot be deleted"):
+        with pytest.raises(AttributeError, match=f"view.{name} .*cannot be deleted"):
             delattr(group, name)
     for array in (
         view.position,

@@ -24,9 +24,9 @@ RIGHT = stats.chi2.ppf(0.9973, 9)
 
 
 def hovering(**keywords):
-    batch = FlightBatch(
-        16, task=TASK_DEFAULTS["hover"], gains="tuned", filter_start="warm", **keywords
-    )
+    if keywords.get("source") is not Source.TRUTH:
+        keywords["filter_start"] = "warm"
+    batch = FlightBatch(16, task=TASK_DEFAULTS["hover"], gains="tuned", **keywords)
     batch.reset(seeds=range(16))
     return batch
 

@@ -109,7 +109,9 @@ def time_options(count: int, effort: Effort) -> list[Row]:
     turns: dict[str, Callable[[], float]] = {}
     for name, options in {**OPTIONS, **STARTS}.items():
         options = {"sensors": "lab", **options}
-        batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
+        if options.get("control", Control.PD) is Control.PD:
+            options["gains"] = "tuned"
+        batch = FlightBatch(count, task=task, threads=1, **options)
         batch.reset(seeds=range(count))
         for _ in range(50):  # the start, where images are processed in steps, is not what counts
             batch.step()
