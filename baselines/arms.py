@@ -130,7 +130,7 @@ ARMS = (
 _TRUTH = {"observation": "truth"}
 _STD = {"include_std": True}
 _STALE = sensor_suite("stale")
-_STAMPED = {
+_COMPENSATED = {
     "sensors": _STALE.replace(estimator=_STALE.estimator.replace(delay_compensation="retrodict"))
 }
 """Sensors of the race, with a filter that uses the time stamps of their measurements."""
@@ -155,16 +155,16 @@ STALE_RACE = (
         name="truth_on_truth", label="truth, tested on the truth", flies="truth", environment=_TRUTH
     ),
     Arm(
-        name="truth_stamped",
+        name="truth_delay_compensated",
         label="truth, tested with delay compensation",
         flies="truth",
-        environment=_STAMPED,
+        environment=_COMPENSATED,
     ),
     Arm(
-        name="std_stamped",
+        name="std_delay_compensated",
         label="estimate + 15 standard deviations, tested with delay compensation",
         flies="std",
-        environment={**_STD, **_STAMPED},
+        environment={**_STD, **_COMPENSATED},
     ),
 )
 """Arms of `QuadGym/StaleRace-v0`."""

@@ -101,8 +101,8 @@ STUDIED: Mapping[str, StudiedTask] = {
     "stale_race": StudiedTask(
         arms=ARMS_OF["stale_race"],
         carrying=(
-            *("pd", "truth", "std", "truth_on_truth", "truth_stamped"),
-            "std_stamped",
+            *("pd", "truth", "std", "truth_on_truth", "truth_delay_compensated"),
+            "std_delay_compensated",
         ),
         evaluations=8,
         success=lambda run: passes(run, 8),

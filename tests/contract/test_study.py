@@ -54,7 +54,7 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("task", "arms"),
     [
-        ("stale_race", ["pd", "truth", "std", "truth_on_truth", "std_stamped"]),
+        ("stale_race", ["pd", "truth", "std", "truth_on_truth", "std_delay_compensated"]),
         ("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
     ],
 )
@@ -112,7 +112,7 @@ def test_steps_are_told_of_each_algorithm():
         (["--success-within", "-1"], "--success-within must be"),
         (["stale_race", "--success-within", "1"], "--success-within belongs to LookAround"),
         (
-            ["stale_race", "--arms", "truth_stamped"],
+            ["stale_race", "--arms", "truth_delay_compensated"],
             "--arms must name truth, whose policies",
         ),
         (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
