@@ -1,13 +1,13 @@
-"""Fly the report's circle on the true state, on the estimate, and on it without the camera.
+"""Fly the report's circle on the true state, and on estimates with and without the camera.
 
     quad-gym circle
     quad-gym circle --episodes 100 --gains tuned --gnss-rate 10
 
 A quadrotor starts at rest on the ground, below a point that moves on a horizontal circle, and a PD
-controller follows that point at every IMU sample. The controller is told either the true state or
-the estimate of an unscented Kalman filter that fuses GNSS, IMU and camera. What is lost by flying
-on the estimate, and does the camera help? Flights with the same seed have the same noise and
-biases, so cases are compared flight by flight.
+controller tracks that point at every IMU sample. The controller receives either the true state or
+the estimate of an unscented Kalman filter that fuses GNSS, IMU and camera. How much accuracy is
+lost by flying on the estimate, and does the camera help? Flights with equal seeds have the same
+noise and biases, so cases are compared flight by flight.
 
 Prints a table, and writes figures (PNG and SVG), the numbers of every flight (flights.csv), and a
 summary with the whole configuration (summary.json).
@@ -40,7 +40,7 @@ from quad_gym.records import Source
 
 TRUTH, ESTIMATE, NO_CAMERA = "truth", "estimate", "estimate_without_camera"
 LABELS = {TRUTH: "truth", ESTIMATE: "estimate", NO_CAMERA: "estimate, no camera"}
-NEES_TAIL = 0.001  # share of a consistent filter's NEES beyond the bound in the table
+NEES_TAIL = 0.001  # probability that the NEES of a consistent filter exceeds the bound in the table
 
 
 @dataclass(frozen=True)
@@ -48,50 +48,50 @@ class Args:
     """Options of the experiment."""
 
     episodes: int = 1000
-    """flights in each case"""
+    """number of flights in each case"""
     seed: int = 0
-    """of the first flight; the others follow it"""
+    """seed of the first flight; the others have consecutive seeds"""
     duration: float = 10.0
     """length of a flight [s]"""
     output: Path = Path("results/circle")
-    """folder for figures and numbers; made if it is missing"""
+    """folder for figures and numbers, created if it is missing"""
     threads: int | None = None
-    """threads; if not given, as many as there are cores; results do not depend on it"""
+    """number of threads; if not given, one per core; it does not affect results"""
 
     radius: float = 4.0
     """radius of the circle [m]"""
     period: float = 10.0
-    """time for one round [s]"""
+    """time for one lap [s]"""
     height: float = 1.0
     """height of the circle above the start [m]"""
 
     gains: Literal["lab", "tuned"] = "lab"
-    """the report's gains, or gains tuned for the smallest error"""
+    """gains of the report, or gains tuned for the smallest error"""
     position_gain: float | None = None
-    """k, in place of that of --gains [N/m]"""
+    """position gain k, overrides --gains [N/m]"""
     velocity_gain: float | None = None
-    """kd, in place of that of --gains [N s/m]"""
+    """velocity gain kd, overrides --gains [N s/m]"""
     attitude_gain: tuple[float, float, float] | None = None
-    """diagonal of K, in place of that of --gains [N m]"""
+    """diagonal of the attitude gain K, overrides --gains [N m]"""
     body_rates_gain: tuple[float, float, float] | None = None
-    """diagonal of Kd, in place of that of --gains [N m s]"""
+    """diagonal of the body rate gain Kd, overrides --gains [N m s]"""
 
     camera: bool = True
-    """fly the case with the camera too"""
+    """include the case with the camera"""
     imu_rate: float = 200.0
-    """IMU samples, filter cycles and controls per second [Hz]"""
+    """rate of the IMU, the filter and the controller [Hz]"""
     gnss_rate: float | None = None
-    """GNSS fixes per second [Hz]; if not given, one at every IMU sample"""
+    """rate of GNSS fixes [Hz]; if not given, the IMU rate"""
     camera_rate: float | None = None
-    """camera images per second [Hz]; if not given, one at every IMU sample"""
+    """rate of camera images [Hz]; if not given, the IMU rate"""
     bearing_noise_at: Literal["measured", "predicted"] = "measured"
-    """direction across which the filter takes the camera's noise to lie: measured, as in the
+    """direction to which the filter assumes camera noise is perpendicular: measured, as in the
     report, makes it overconfident; predicted hardly does"""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What the options amount to."""
+    """Setup of the experiment that the options select."""
 
     cases: dict[str, tuple[Source, SensorSuite]]
     gains: PDGains
@@ -103,16 +103,16 @@ class Setup:
 
 
 def configure(args: Args) -> Setup:
-    """Check all options before anything is flown.
+    """Check all options before the flights.
 
     Raises:
         ValueError: If an option is invalid.
-        OSError: If nothing can be written to the output folder.
+        OSError: If the output folder is not writable.
         ImportError: If matplotlib or tqdm is missing.
     """
     require_at_least(args, episodes=1, seed=0, threads=1)
     if args.camera_rate is not None and not args.camera:
-        raise ValueError("--camera-rate has no meaning with --no-camera")
+        raise ValueError("--camera-rate has no effect with --no-camera")
     task = TaskParams(
         kind="circle",
         start="ground",
@@ -121,7 +121,7 @@ def configure(args: Args) -> Setup:
         period=args.period,
         height=args.height,
         duration=0.0,
-        out_of_bounds=3.0 + args.height,  # the climb from the ground is no crash
+        out_of_bounds=3.0 + args.height,  # do not count the climb from the ground as a crash
     )
     wanted = {
         "position": args.position_gain,
@@ -160,7 +160,7 @@ def configure(args: Args) -> Setup:
 
 
 def fly(case: str, setup: Setup) -> Recording:
-    """Fly all seeds of one case to the end."""
+    """Fly and record all seeds of one case."""
     from tqdm import tqdm
 
     source, sensors = setup.cases[case]
@@ -181,7 +181,7 @@ def fly(case: str, setup: Setup) -> Recording:
 
 
 def error_table(results: dict[str, Recording]) -> str:
-    """Errors and endings of each case, for people."""
+    """Format a table of errors and endings of each case."""
 
     def cells(summary: TrackingSummary | None, done: NDArray[np.bool_]) -> list[str]:
         if summary is None or not done.any():
@@ -213,7 +213,7 @@ def error_table(results: dict[str, Recording]) -> str:
 
 
 def consistency_table(results: dict[str, Recording]) -> str:
-    """How the filters' errors compare with what the filters claimed, for people."""
+    """Format a table of filter consistency."""
     bound = chi_square_quantile(STATE_DIMENSION, 1.0 - NEES_TAIL)
     median = chi_square_quantile(STATE_DIMENSION, 0.5)
 
@@ -237,7 +237,7 @@ def consistency_table(results: dict[str, Recording]) -> str:
 
 
 def in_words(results: dict[str, Recording], args: Args) -> str:
-    """What flying on the estimate costs, and what the camera changes."""
+    """Describe the effects of flying on the estimate, and of the camera."""
     seen = ESTIMATE if args.camera else NO_CAMERA
     sentences = [in_a_sentence("Flying on the estimate", compare(results, seen, TRUTH))]
     if args.camera:
@@ -246,8 +246,8 @@ def in_words(results: dict[str, Recording], args: Args) -> str:
         harmful = found.significant and found.spread.mean > 0.0
         if harmful and args.bearing_noise_at == "measured":
             sentences.append(
-                "The report's form of the camera's noise makes the filter overconfident, as its "
-                "NEES shows; compare with --bearing-noise-at predicted."
+                "The report's model of camera noise makes the filter overconfident, as the NEES "
+                "shows; compare with --bearing-noise-at predicted."
             )
     return "\n".join(
         textwrap.fill(text, 98, subsequent_indent="  ", break_on_hyphens=False)
@@ -256,7 +256,7 @@ def in_words(results: dict[str, Recording], args: Args) -> str:
 
 
 def compare(results: dict[str, Recording], first: str, second: str) -> PairedDifference:
-    """Mean tracking error of one case less that of another, where both finished [m]."""
+    """Difference of the mean tracking errors of two cases over flights completed in both [m]."""
     both = results[first].finished & results[second].finished
     return paired_difference(
         results[first].tracking.mean[both], results[second].tracking.mean[both]
@@ -264,11 +264,11 @@ def compare(results: dict[str, Recording], first: str, second: str) -> PairedDif
 
 
 def in_a_sentence(what: str, found: PairedDifference) -> str:
-    """How much of a difference something makes."""
+    """Describe a difference of mean tracking errors in one sentence."""
     if found.interval is None:
-        return f"{what}: too few flights finished in both cases to say what it changes."
+        return f"{what}: too few flights were completed in both cases for a comparison."
     low, high, mean = (1e3 * x for x in (*found.interval, found.spread.mean))
-    change = f"adds {mean:.2f} mm to" if mean > 0.0 else f"takes {-mean:.2f} mm off"
+    change = f"adds {mean:.2f} mm to" if mean > 0.0 else f"subtracts {-mean:.2f} mm from"
     verdict = f"{change} the mean tracking error"
     if not found.significant:
         verdict = "makes no significant difference to the mean tracking error"
@@ -279,7 +279,7 @@ def in_a_sentence(what: str, found: PairedDifference) -> str:
 
 
 def write_figures(results: dict[str, Recording], setup: Setup) -> list[Path]:
-    """The report's figures, and one that shows the experiment at a glance."""
+    """Write the figures of the report, and an overview."""
     limits = plots.error_limits(
         [flights.trace for flights in results.values()],
         [flights.band for flights in results.values()],
@@ -310,7 +310,7 @@ def write_figures(results: dict[str, Recording], setup: Setup) -> list[Path]:
 
 
 def write_numbers(results: dict[str, Recording], setup: Setup) -> Path:
-    """One row per case and seed."""
+    """Write one row per case and seed."""
     columns: dict[str, list[Any]] = {}
     for case, flights in results.items():
         nothing = np.full(len(setup.seeds), np.nan)
@@ -333,7 +333,7 @@ def write_numbers(results: dict[str, Recording], setup: Setup) -> Path:
 def summary_of(
     results: dict[str, Recording], setup: Setup, args: Args, seconds: float
 ) -> dict[str, Any]:
-    """Everything that was found and everything that it was found with."""
+    """Summary of all results and the configuration."""
     cases: dict[str, dict[str, Any]] = {}
     for case, flights in results.items():
         done, estimated = flights.finished, flights.estimation

@@ -1,17 +1,17 @@
-"""Compile the kernels ahead of their first use, into the cache.
+"""Compile the kernels into the cache before their first use.
 
-Environments compile what they fly through when the first one is reset, which takes some tens of
-seconds once. A container or a CI job that does it beforehand starts at once:
+Environments compile the kernels that they need at the first reset, which takes some tens of seconds
+once. A container or a CI job that compiles them in advance starts without delay:
 
     RUN quad-gym compile                     # in a Dockerfile: everything
     quad-gym compile --stages truth          # training on the true state: seconds
     quad-gym compile --stages plain single
-    NUMBA_CACHE_DIR=/cache quad-gym compile  # and set it so where the environments run
+    NUMBA_CACHE_DIR=/cache quad-gym compile  # set it for the environments, too
 
-What is in the cache is not compiled again. The code is for the processor, the versions of Python
-and Numba, and the sources that it was compiled with; elsewhere it is compiled again on first use.
+Functions that are in the cache are not compiled again. Cached code is valid only for the same
+processor, versions of Python and Numba, and sources; otherwise it is compiled again on first use.
 
-The exit code is 1 if the code cannot be kept.
+The exit code is 1 if code cannot be written to the cache.
 """
 
 import sys
@@ -27,24 +27,24 @@ Kind = Literal["plain", "truth", "single", "all"]
 
 @dataclass(frozen=True)
 class Args:
-    """What to compile."""
+    """Options of the compilation."""
 
     stages: tuple[Kind, ...] = ("all",)
-    """truth (an environment that observes the truth), plain (the default environment, with
-    sensors and filter), single (the classes for one vehicle, such as UnscentedKalmanFilter), all
-    (these, and every option of the environments)"""
+    """functions to compile: truth (for environments that observe the truth), plain (for default
+    environments with sensors and filter), single (for single vehicles, such as
+    UnscentedKalmanFilter), all (these, and every option of the environments)"""
     jobs: int | None = None
-    """processes that compile; if not given, one per core"""
+    """number of processes that compile; if not given, one per core"""
 
     def __post_init__(self) -> None:
-        """Check that there is something to compile, and someone who does it."""
+        """Check the numbers of stages and processes."""
         if not self.stages:
-            raise ValueError("--stages must name at least one, got none")
+            raise ValueError("--stages must have at least one value, got none")
         require_at_least(self, jobs=1)
 
 
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
-    """The compiled functions that some of KINDS stand for, the longest to compile first."""
+    """Names of the compiled functions of some kinds, slowest to compile first."""
     from quad_gym.envs.configuration import Flights
     from quad_gym.kernels.compiling.linked import FLY, SETTLE, names_of
     from quad_gym.kernels.compiling.stages import Stage, needed_stages
@@ -72,10 +72,10 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
 
 
 def main(args: Args) -> int:
-    """Compile, and list on stdout what was compiled and what was in the cache.
+    """Compile, and list on stdout the functions compiled and found in the cache.
 
     Returns:
-        The exit code.
+        Exit code.
     """
     from quad_gym.kernels.compiling.cache import where_cached
     from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
@@ -99,5 +99,5 @@ def main(args: Args) -> int:
 
 
 def _is_kept(dispatcher: Any) -> bool:
-    """Whether the code is on disk."""
+    """True if the code is on disk."""
     return bool(dispatcher._cache.holds(dispatcher.signature, dispatcher.targetctx))

@@ -1,7 +1,7 @@
-"""Print a script that completes commands and options with the Tab key.
+"""Print a script for the completion of commands and options in a shell.
 
-Put the first line into ~/.bashrc; for zsh, write what the second prints to a file _quad-gym in a
-folder of fpath:
+For bash, put the first line into ~/.bashrc; for zsh, write the output of the second one to a file
+_quad-gym in a folder of fpath:
 
   source <(quad-gym completion bash)
   quad-gym completion zsh
@@ -17,14 +17,14 @@ from quad_gym.commands.help_texts import registry
 
 @dataclass(frozen=True)
 class Args:
-    """For which shell."""
+    """Option of the script."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
-    """the shell"""
+    """name of the shell"""
 
 
 def main(args: Args) -> None:
-    """Print it: one script for all commands, as shells know it by the name of the program."""
+    """Print one script for all commands, because shells identify it by the program's name."""
     from quad_gym.commands.main import COMMANDS, PROGRAM, module_of
 
     kinds = {name: module_of(name).Args for name in COMMANDS}

@@ -1,11 +1,11 @@
-"""Fly policies on their observations, and evaluate them by the true state.
+"""Evaluate policies over many episodes by the true state.
 
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pretrained
     quad-gym evaluate --policy results/train/circle/ppo_seed_0/best.zip --sensors rtk
 
-Every policy flies the same episodes (the same seeds) on every observation. Prints a table, and
-writes episodes.csv (one row per episode), summary.json (all numbers, and what they were found
-with), and figures of paths and errors over time (PNG and SVG).
+Every policy flies the same episodes (the same seeds) on each observation. Prints a table, and
+writes episodes.csv (one row per episode), summary.json (all numbers and the configuration), and
+figures of paths and errors over time (PNG and SVG).
 """
 
 import time
@@ -55,28 +55,28 @@ class Args:
 
     env_id: EnvId = "QuadGym/Circle-v0"
     policy: tuple[str, ...] | None = None
-    """who flies: pd (tuned gains), pd:lab (the report's), pd:FILE.json (of quad-gym tune),
-    pretrained (the one that ships for the task), or files of quad-gym train (.zip or .npz); if not
-    given, pd, and pretrained where it fits"""
+    """policies: pd (tuned gains), pd:lab (gains of the report), pd:FILE.json (gains of quad-gym
+    tune), pretrained (the included policy for the task), or files of quad-gym train (.zip or .npz);
+    if not given, pd, and pretrained if it fits"""
     observation: tuple[str, ...] = ("truth", "estimate")
-    """what to fly on: truth, estimate, noisy, or sensors (raw measurements, for policies that have
-    learned on them)"""
+    """observations on which the policies fly: truth, estimate, noisy, or measurements (for policies
+    trained on raw measurements)"""
     sensors: OwnSuite = None
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as camera=false control_rate=100"""
     episodes: int = 1000
-    """flown in each case"""
+    """number of episodes of each policy on each observation"""
     seed: int = 0
-    """of the first episode; the others follow it; no training has flown any of them"""
+    """seed of the first episode; the others have consecutive seeds; trainings use different ones"""
     threads: int | None = None
-    """threads; if not given, one per core"""
+    """number of threads; if not given, one per core"""
     video: Literal["none", "mp4", "gif", "webp"] = "none"
-    """also write a video of the first episode of each case, of this kind"""
+    """format of a video of the first episode of each case; none: no video"""
     output: Path | None = None
     """folder for figures and numbers; if not given, results/evaluate/TASK, or TASK_2 and so on
-    where there are results already"""
+    if there are results already"""
     overwrite: bool = False
-    """replace the results in the folder, if there are any"""
+    """replace earlier results in the folder"""
 
 
 Case = tuple[str, str]
@@ -88,21 +88,21 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
 
     Raises:
         ValueError: If an option is invalid or a policy does not fit.
-        OSError: If nothing can be written to the folder.
+        OSError: If the folder is not writable.
         ImportError: If a package is missing.
     """
     args = with_full_id(args)
     require_at_least(args, episodes=1, seed=0, threads=1)
     if not args.observation:
-        raise ValueError("--observation must name at least one, got none")
+        raise ValueError("--observation must have at least one value, got none")
     if args.policy == ():
-        raise ValueError("--policy must name at least one, got none")
+        raise ValueError("--policy must have at least one value, got none")
     if args.policy is None and "measurements" in args.observation:
         raise ValueError(
-            "--observation measurements shows no state, which PD control needs: name a --policy "
-            "that was trained on it"
+            "--observation measurements contains no state, which PD control needs: select a "
+            "--policy that was trained on measurements"
         )
-    first_seed("test", args.seed, args.episodes)  # refuses what may have been trained on
+    first_seed("test", args.seed, args.episodes)  # rejects seeds of trainings
     plots.require_matplotlib()
     folder = args.output or Path("results/evaluate") / IDS[args.env_id]
     if args.output is None and not args.overwrite:
@@ -121,7 +121,7 @@ def configure(args: Args) -> tuple[dict[Case, tuple[Policy, Any]], Path]:
 
 
 def default_policies(args: Args) -> tuple[str, ...]:
-    """Tuned PD control, and the policy that ships, unless none does or it does not fit.
+    """Tuned PD control, and the included policy if there is one that fits.
 
     Raises:
         ValueError: If an option is invalid.
@@ -130,13 +130,13 @@ def default_policies(args: Args) -> tuple[str, ...]:
     try:
         load_policy("pretrained", make_flights(args, args.observation[0], 1, "pretrained"))
     except ValueError as error:
-        print(f"PD control flies alone: {error}.")
+        print(f"Only PD control is evaluated: {error}.")
         return ("pd",)
     return ("pd", "pretrained")
 
 
 def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
-    """The environment of an observation, as a policy needs it."""
+    """Make the environment with an observation, for a policy."""
     names = ("observation", "sensors", "threads")
     given = leave(args.env, {name: f"--{name}" for name in names})
     keywords = {**keywords_of_policy(policy, args.env_id), **given}
@@ -153,7 +153,7 @@ def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
 
 
 def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path) -> list[Path]:
-    """A video of the first episode of each case."""
+    """Write a video of the first episode of each case."""
     from tqdm import tqdm
 
     files = []
@@ -168,7 +168,7 @@ def write_videos(cases: dict[Case, tuple[Policy, Any]], args: Args, folder: Path
 
 
 def table(results: dict[Case, Episodes], env: Any) -> str:
-    """Errors and endings of each case, for people."""
+    """Format a table of errors and endings of each case."""
     gates = env.unwrapped.flights.task.gate_count
     course = task_of(env) == "QuadGym/Waypoints-v0"
     rows = []
@@ -219,7 +219,7 @@ def _rate(happened: Any) -> str:
 def write(
     results: dict[Case, Episodes], tracers: dict[Case, Tracer], args: Args, folder: Path
 ) -> list[Path]:
-    """Numbers and figures."""
+    """Write numbers and figures; return the files."""
     columns: dict[str, list[Any]] = {}
     for (name, observation), episodes in results.items():
         block = {

@@ -1,10 +1,10 @@
-"""Take the parameters of a filter to an autopilot.
+"""Export the parameters of a filter to an autopilot.
 
     quad-gym export filter --sensors rtk
     quad-gym export filter --sensors rtk --to json
 
-A filter becomes JSON or a header of C, with the numbers that its equations take. docs/deployment.md
-explains them.
+The parameters are written as a C header or JSON, in the form used in the equations of the filter.
+docs/deployment.md explains them.
 """
 
 from dataclasses import dataclass
@@ -22,22 +22,22 @@ class Args:
 
     sensors: SuiteName = "standard"
     to: Literal["header", "json"] = "header"
-    """kind of file"""
+    """format of the file"""
     output: Path | None = None
     """file to write; if not given, in results/export"""
     overwrite: bool = False
-    """replace the file if there is one"""
+    """replace an existing file"""
 
 
 def configure(args: Args) -> Path:
-    """Check the options, and make the folder.
+    """Check the options, and create the folder.
 
     Returns:
-        The file to write.
+        File to write.
 
     Raises:
-        ValueError: If options do not belong together, or the file is there already.
-        OSError: If nothing can be written to the folder.
+        ValueError: If options contradict each other, or the file exists.
+        OSError: If the folder is not writable.
     """
     from quad_gym.params.suites import suite_label
 
@@ -46,14 +46,14 @@ def configure(args: Args) -> Path:
 
 
 def export(args: Args, file: Path) -> str:
-    """Write the numbers of a filter; returns a message for the user."""
+    """Write the parameters of a filter; return a message for the user."""
     from baselines.exporting.filter_numbers import filter_header, filter_json
     from quad_gym.params.suites import sensor_suite, suite_label
 
     suite, name = sensor_suite(args.sensors), suite_label(args.sensors)
     text = filter_json(suite) if args.to == "json" else filter_header(suite, name)
     file.write_text(text, encoding="utf-8")
-    return f'The numbers of the {suite.estimator.kind.upper()} of the suite "{args.sensors}".'
+    return f'Parameters of the {suite.estimator.kind.upper()} of the suite "{args.sensors}".'
 
 
 def main(args: Args) -> None:

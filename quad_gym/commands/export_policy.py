@@ -1,11 +1,11 @@
-"""Take a trained policy to an autopilot.
+"""Export a trained policy to an autopilot.
 
     quad-gym export policy pretrained QuadGym/Circle-v0 --to c
     quad-gym export policy results/train/circle/ppo_seed_0/best.zip --to onnx
 
-A policy becomes one file of C99 that needs nothing else, or an ONNX model, which is compared with
-the policy in onnxruntime. Both clip observations to their bounds, and describe observation and
-action: names, units, frames, rate. docs/deployment.md explains how to feed them.
+The policy is written as one self-contained C99 file, or as an ONNX model, which is compared with
+the policy in onnxruntime. Both clip observations to their bounds and document observation and
+action: names, units, frames, rate. docs/deployment.md explains how to use them.
 """
 
 import re
@@ -24,7 +24,7 @@ _C_KEYWORDS = re.compile(
     "inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef|"
     "union|unsigned|void|volatile|while"
 )
-"""The keywords of C99 that begin with a letter; no function can have them as its name."""
+"""Keywords of C99 that begin with a letter, which are not valid names of functions."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Args:
             str,
             tyro.conf.arg(
                 metavar="POLICY",
-                help="pretrained (the pretrained policy of the task), or a file of quad-gym train "
-                "(.zip or .npz)",
+                help="policy: pretrained (the included policy for the task), or a file of quad-gym "
+                "train (.zip or .npz)",
             ),
         ]
     ]
@@ -46,35 +46,35 @@ class Args:
             str | None,
             tyro.conf.arg(
                 metavar="[ENV_ID]",
-                help="the environment of the policy; if not given, as in its training record",
+                help="environment of the policy; if not given, from its training record",
             ),
         ]
     ] = None
     to: Literal["c", "onnx"] = "c"
-    """kind of file"""
+    """format of the file"""
     env: Keywords = field(default_factory=dict)
-    """keywords of the environment; if not given, as in the training record"""
+    """keywords of the environment; if not given, from the training record"""
     output: Path | None = None
-    """file to write; if not given, in results/export; it names the function, too"""
+    """file to write; if not given, in results/export; its name is also the function's name"""
     overwrite: bool = False
-    """replace the file if there is one"""
+    """replace an existing file"""
 
 
 def configure(args: Args) -> Path:
-    """Check the options that do not need the policy, and make the folder.
+    """Check the options that do not depend on the policy, and create the folder.
 
     Returns:
-        The file to write.
+        File to write.
 
     Raises:
-        ValueError: If options do not belong together, or the file is there already.
-        OSError: If nothing can be written to the folder.
+        ValueError: If options contradict each other, or the file exists.
+        OSError: If the folder is not writable.
     """
     return writable_file(args.output, _name(args), _SUFFIXES[args.to], args.overwrite)
 
 
 def _name(args: Args) -> str:
-    """The stem of the file if none is given."""
+    """Default name of the file, without extension."""
     from quad_gym import IDS
 
     if args.policy == "pretrained":
@@ -84,13 +84,13 @@ def _name(args: Args) -> str:
 
 
 def function_name(file: Path) -> str:
-    """The name of the C function in a file: its stem, as an identifier."""
+    """Name of the C function in a file: its name without extension, as an identifier."""
     name = re.sub(r"\W", "_", file.stem, flags=re.ASCII)
     return name if name[:1].isalpha() and not _C_KEYWORDS.fullmatch(name) else f"policy_{name}"
 
 
 def export(args: Args, file: Path) -> str:
-    """Write a policy; returns a message for the user."""
+    """Write a policy; return a message for the user."""
     from baselines.exporting import c_source, controller_of, save_onnx
 
     env_id = None if args.env_id is None else full_id(args.env_id)
@@ -101,8 +101,8 @@ def export(args: Args, file: Path) -> str:
     name = function_name(file)
     file.write_text(c_source(controller, name), encoding="utf-8")
     return (
-        f"Call {name}(observation, action) {controller.control_rate:g} times a second; "
-        "the comment at its beginning explains both."
+        f"Call {name}(observation, action) {controller.control_rate:g} times per second; "
+        "the comment at the top of the file explains both arguments."
     )
 
 

@@ -1,4 +1,4 @@
-"""Watch a flight: live in a window, as a video, or in the Rerun viewer; and keep its numbers.
+"""Show a flight live in a window, as a video, or in the Rerun viewer, and save its data.
 
     quad-gym fly lemniscate
     quad-gym fly circle --no-camera --faults gnss_outage --fault-time 4 7
@@ -7,11 +7,10 @@
     quad-gym fly --replay results/outage.npz --output results/outage.rrd
 
 The blue vehicle is the truth. The orange ghost is the filter's estimate, with its 3-sigma
-ellipsoid; the controller flies on the estimate, unless --observation says otherwise.
+ellipsoid; the controller flies on the estimate unless --observation selects another source.
 
-In the window: C and G switch camera and GNSS off and on, F makes the --faults come and go,
-V changes the view, the space bar stops time, R begins the next episode, and Q or Escape ends the
-program.
+Keys in the window: C and G switch camera and GNSS off and on, F switches the --faults on and off,
+V changes the view, the space bar pauses, R begins the next episode, and Q or Escape quits.
 """
 
 import math
@@ -56,16 +55,16 @@ class Args:
 
     env_id: EnvId = "QuadGym/Circle-v0"
     policy: str = "pd"
-    """who flies: pd (tuned gains), pd:lab (the report's), pretrained (the one that ships for the
-    task), or a file of quad-gym train (.zip or .npz)"""
+    """policy: pd (tuned gains), pd:lab (gains of the report), pretrained (the included policy for
+    the task), or a file of quad-gym train (.zip or .npz)"""
     observation: Literal["estimate", "truth", "noisy", "measurements"] = "estimate"
-    """what the controller sees"""
+    """observation of the controller"""
     action: Literal["ctbr", "motor", "wrench", "attitude", "velocity"] | None = None
-    """what the controller commands; if not given, the task's"""
+    """commands of the controller; if not given, the task's default"""
     seed: int = 0
-    """of the episode; in the window, the next ones follow it"""
+    """seed of the episode; in the window, the next episodes have consecutive seeds"""
     duration: float | None = None
-    """time limit [s]; if not given, the task's"""
+    """time limit [s]; if not given, the task's default"""
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as control_rate=100 estimator=ekf"""
 
@@ -79,38 +78,37 @@ class Args:
     faults: Annotated[
         tuple[str, ...],
         arg(
-            help="what goes wrong, one or several (also joined by +), in place of the task's own: "
+            help="faults, one or several (also joined by +), which replace the task's own: "
             f"{', '.join(FAULTS)}; or none",
         ),
     ] = ()
     fault_time: tuple[float, float] | None = None
-    """when it comes and when it goes [s]; if not given, as each fault has it"""
+    """start and end of the faults [s]; if not given, the defaults of each fault"""
 
     view: Literal["fixed", "chase"] = "fixed"
-    """from outside, or from behind the vehicle"""
+    """view of the whole scene from outside, or from behind the vehicle"""
     size: tuple[int, int] = (640, 480)
-    """width and height [pixels]"""
+    """width and height of the picture [pixels]"""
     speed: float = 1.0
-    """seconds of flight per second of watching; 0.5: slow motion"""
+    """playback speed, in seconds of flight per second; 0.5: slow motion"""
     fps: float = 25.0
     """pictures per second of a video"""
     output: Path | None = None
-    """write this file instead of opening a window: a video (.mp4, .gif or .webp), with the
-    flight as .npz beside it; numbers alone (.npz or .csv); or a recording for the Rerun
-    viewer (.rrd)"""
+    """file to write instead of opening a window: a video (.mp4, .gif or .webp), saved with the
+    flight as .npz; only the flight (.npz or .csv); or a recording for the Rerun viewer (.rrd)"""
     replay: Path | None = None
-    """show this .npz file instead of flying"""
+    """saved flight (.npz) to show instead of a new one"""
 
 
 class Switches:
-    """What the keys have switched: sensors off and on, and faults on and off."""
+    """State of sensors and faults as switched by keys."""
 
     def __init__(self) -> None:
         self._off = {"gnss": False, "camera": False}
         self._turn_faults = False
 
     def press(self, key: str) -> None:
-        """Take notice of a key."""
+        """Process a key."""
         for letter, sensor in (("c", "camera"), ("g", "gnss")):
             if key == letter:
                 self._off[sensor] = not self._off[sensor]
@@ -118,7 +116,7 @@ class Switches:
             self._turn_faults = True
 
     def apply(self, batch: FlightBatch) -> None:
-        """Switch a batch."""
+        """Apply the switches to a batch."""
         batch.switch_sensors(**{sensor: not off for sensor, off in self._off.items()})
         if self._turn_faults:
             there = any(active.any() for active in batch.active_faults().values())
@@ -127,11 +125,11 @@ class Switches:
 
 
 def check_options(args: Args) -> None:
-    """Refuse invalid options before anything is flown.
+    """Check the options before the flight.
 
     Raises:
-        ValueError: If one does.
-        ImportError: If a library that draws or writes a file is not installed.
+        ValueError: If an option is invalid.
+        ImportError: If a library for drawing or writing is not installed.
     """
     args = with_full_id(args)
     for name in ("speed", "fps"):
@@ -158,10 +156,10 @@ def check_options(args: Args) -> None:
 
 
 def faults_of_args(args: Args) -> tuple[Fault, ...]:
-    """What goes wrong, at its own time or at that of `--fault-time`.
+    """Faults, at their default times or at `--fault-time`.
 
     Raises:
-        ValueError: If there is no such fault, or the sensors lack what it concerns.
+        ValueError: If a fault is unknown, or concerns a sensor that the suite does not have.
     """
     sensors = sensor_suite(sensors_of(args.env_id, args.sensors))
     faults = faults_of(args.faults, sensors if args.camera else sensors.replace(camera=None))
@@ -172,17 +170,17 @@ def faults_of_args(args: Args) -> tuple[Fault, ...]:
 
 
 def suite_of(args: Args) -> SensorSuite:
-    """The sensor suite, at the rates that the options give.
+    """Sensor suite with the rates selected by options.
 
     Raises:
-        ValueError: If a rate is invalid, or of a sensor that the suite lacks.
+        ValueError: If a rate is invalid, or given for a sensor that the suite does not have.
     """
     suite = sensor_suite(sensors_of(args.env_id, args.sensors))
     return suite.with_rates(gnss=args.gnss_rate, camera=args.camera_rate)
 
 
 def make_env(args: Args) -> Any:
-    """An environment of one flight.
+    """Make an environment with one flight.
 
     Raises:
         ValueError: If an option is invalid.
@@ -210,7 +208,7 @@ def make_env(args: Args) -> Any:
 
 
 def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> Iterator[Flight]:
-    """Fly an episode, and yield the flight so far after every step; it ends with the episode."""
+    """Run an episode, and yield the flight so far after each step."""
     batch = env.unwrapped.flights.batch
     recorder = FlightRecorder(batch, about=about | {"seed": seed})
     observation, _ = env.reset(seed=seed)
@@ -231,13 +229,13 @@ def fly(env: Any, policy: Policy, seed: int, switches: Switches, about: Any) -> 
 
 
 def replayed(flight: Flight) -> Iterator[Flight]:
-    """A saved flight, yielded as if it were flown."""
+    """Yield a saved flight step by step."""
     for time in flight["time"]:
         yield flight.until(time)
 
 
 def in_words(flight: Flight) -> str:
-    """How long a flight was and how well it went."""
+    """Describe duration and mean errors of a flight."""
     error = 1e3 * flight["position_error"].mean()
     words = f"{flight['time'][-1]:.2f} s, mean tracking error {error:.1f} mm"
     if flight.scene.observation != "truth":
@@ -246,7 +244,7 @@ def in_words(flight: Flight) -> str:
 
 
 def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switches) -> bool:
-    """Show a flight while it is flown; return whether to go on to the next one."""
+    """Show a flight in a window; return True to continue with the next one."""
     renderer, waiting, flight = Renderer(args.view, args.size), math.inf, None
     for flight in flights:
         waiting += 1.0 / flight.scene.control_rate / args.speed
@@ -275,7 +273,7 @@ def watch(flights: Iterator[Flight], args: Args, window: Window, switches: Switc
 
 
 def open_window(args: Args) -> Window:
-    """A window to watch in.
+    """Open a window.
 
     Raises:
         OSError: If there is no display.
@@ -287,7 +285,7 @@ def open_window(args: Args) -> Window:
 
 
 def write(flight: Flight, path: Path, args: Args) -> list[Path]:
-    """Write the flight to a file, and a video's numbers beside it; return what was written."""
+    """Write the flight to a file, for videos together with its data; return the files."""
     from tqdm import tqdm
 
     if path.suffix.lower() == ".npz":
@@ -325,7 +323,7 @@ def main(args: Args) -> None:
         saved = Flight.load(args.replay) if args.replay else None
         env = make_env(args) if saved is None else None
         if env is not None and args.output and not env.unwrapped.flights.batch.max_steps:
-            raise ValueError("--output needs a flight with an end: a --duration above 0")
+            raise ValueError("--output needs a flight with a time limit: a --duration above 0")
         policy = None if env is None else load_policy(args.policy, env)
     sensors = sensors_of(args.env_id, args.sensors)
     about = {

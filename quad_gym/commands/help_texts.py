@@ -1,7 +1,7 @@
-"""How the parser writes types, defaults and explanations of options: as people would.
+"""Readable help texts: rules for types, defaults and explanations of options.
 
-tyro's own help has `{None}|INT` for a number that may be left out, and `(default: None)` behind it.
-The rules below, for all commands, leave that to the explanation, which says what happens then.
+For an optional number, tyro would print `{None}|INT` and `(default: None)`. With the rules below,
+which apply to all commands, only the explanation describes the default.
 """
 
 import shutil
@@ -26,7 +26,7 @@ _Spec = PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None
 
 
 def registry() -> ConstructorRegistry:
-    """The rules, for `tyro.cli`."""
+    """Registry of the rules, for `tyro.cli`."""
     rules = ConstructorRegistry()
     rules.primitive_rule(_name)
     rules.primitive_rule(_number)
@@ -35,11 +35,11 @@ def registry() -> ConstructorRegistry:
 
     @rules.struct_rule
     def options(info: StructTypeInfo) -> StructConstructorSpec | None:
-        """The options of a command as tyro finds them, with what their help says changed."""
+        """Options of a command as found by tyro, with other help texts."""
         nonlocal asking
         if asking or not is_dataclass(info.type):
             return None
-        asking = True  # so that tyro's own rule answers
+        asking = True  # delegate to tyro's own rule
         spec = ConstructorRegistry.get_struct_spec(info)
         asking = False
         if not isinstance(spec, StructConstructorSpec):
@@ -50,7 +50,7 @@ def registry() -> ConstructorRegistry:
 
 
 def wrapped(text: str) -> str:
-    """Paragraphs as wide as the terminal, at most 100 columns; indented lines as they are."""
+    """Wrap paragraphs to the width of the terminal, at most 100 columns, except indented lines."""
     width = min(shutil.get_terminal_size().columns, 100)
     found = []
     for paragraph in text.strip().split("\n\n"):
@@ -60,7 +60,7 @@ def wrapped(text: str) -> str:
 
 
 def _name(info: PrimitiveTypeInfo) -> _Spec:
-    """A text: all that commands take are names."""
+    """Rule for texts, which are all names."""
     if info.type is not str:
         return None
     return PrimitiveConstructorSpec(
@@ -73,7 +73,7 @@ def _name(info: PrimitiveTypeInfo) -> _Spec:
 
 
 def _number(info: PrimitiveTypeInfo) -> _Spec:
-    """A number, with an error that says what was expected."""
+    """Rule for numbers, with a readable error message."""
     if info.type not in (int, float):
         return None
     kind, wanted = info.type, "a whole number" if info.type is int else "a number"
@@ -98,7 +98,7 @@ def _number(info: PrimitiveTypeInfo) -> _Spec:
 
 
 def _optional(info: PrimitiveTypeInfo) -> _Spec:
-    """What may be left out, and is None then: it reads as what it is where it is given."""
+    """Rule for options whose default is None, which are displayed as their other type."""
     kinds = get_args(info.type)
     others = [kind for kind in kinds if kind is not NoneType]
     if get_origin(info.type) is tuple or len(kinds) != 2 or len(others) != 1:
@@ -114,7 +114,7 @@ def _optional(info: PrimitiveTypeInfo) -> _Spec:
 
 
 def _explained(field: StructFieldSpec) -> StructFieldSpec:
-    """An option with its default and its explanation in words."""
+    """Rule for an option's default and explanation."""
     kind, *about = get_args(field.type) if get_origin(field.type) is Annotated else (field.type,)
     several = get_origin(kind) is tuple and get_args(kind)[-1:] == (...,)
     hint = tyro.conf.arg(
@@ -130,13 +130,13 @@ def _explained(field: StructFieldSpec) -> StructFieldSpec:
 
 
 def _metavar(kind: Any) -> str | None:
-    """Several of a kind."""
+    """Placeholder for several values of a type."""
     spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, set()))
     return None if isinstance(spec, UnsupportedTypeAnnotationError) else f"{spec.metavar} ..."
 
 
 def _default(label: str) -> str:
-    """What is said of a default; nothing of one that stands for nothing: the text explains it."""
+    """Description of a default; empty for None and empty values, which the help text explains."""
     if label in ("", "None"):
         return ""
     return f"(default: {({'True': 'yes', 'False': 'no'}).get(label, label)})"

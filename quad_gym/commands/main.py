@@ -1,4 +1,4 @@
-"""`quad-gym COMMAND`: finds the command's module and runs it; each imports only what it needs."""
+"""`quad-gym COMMAND`: imports and runs the module of the command."""
 
 import importlib
 import sys
@@ -10,31 +10,31 @@ from quad_gym.commands.refusals import INTERRUPTED, USAGE_ERROR
 from quad_gym.params.checks import did_you_mean
 
 COMMANDS = {
-    "circle": "fly the laboratory's experiment over many seeds: tables and figures",
-    "train": "train a controller on the estimate, the truth, or anything else it may see",
-    "evaluate": "fly policies over many episodes: errors, crashes, films",
-    "compare": "train on truth, noise and the estimate with several seeds, and compare",
-    "study": "where the estimate decides: train arms with several seeds, and compare",
-    "sweep": "any set of trainings: on this machine, a cluster with Slurm, or Ray",
+    "circle": "reproduce the report's experiment over many seeds: tables and figures",
+    "train": "train a controller on the estimate, the truth, or another observation",
+    "evaluate": "evaluate policies over many episodes: errors, crashes, videos",
+    "compare": "train on the truth, on noise and on the estimate, and compare",
+    "study": "train variants of policies on a benchmark task with several seeds, and compare",
+    "sweep": "run sets of trainings on this machine, on a Slurm cluster, or with Ray",
     "tune": "tune the gains of the PD controller",
-    "fly": "watch one flight in a window, or film it",
-    "replay": "filter the log of a real flight: a table, or a log of PX4",
-    "consistency": "is the filter's covariance right? NEES and NIS over many flights",
-    "ablation": "what each correction of the filter is worth, and what wrong models cost",
-    "benchmark": "measure the speed of everything",
-    "export policy": "take a trained policy to an autopilot: C or ONNX",
-    "export filter": "take the parameters of a filter to an autopilot: C or JSON",
-    "compile": "compile the kernels ahead of their first use, into the cache",
-    "completion": "print a script that completes commands and options with the Tab key",
+    "fly": "show a flight in a window, or render a video",
+    "replay": "run the filter on the log of a real flight (CSV or PX4)",
+    "consistency": "test the filter's consistency: NEES and NIS over many flights",
+    "ablation": "measure the effects of filter corrections and of model mismatch",
+    "benchmark": "measure the speed of all parts",
+    "export policy": "export a trained policy to an autopilot: C or ONNX",
+    "export filter": "export the parameters of a filter to an autopilot: C or JSON",
+    "compile": "compile the kernels into the cache before their first use",
+    "completion": "print a script for the completion of commands and options in a shell",
     "version": "print the version",
 }
-"""Names of commands, of one word or two, and their descriptions."""
+"""Commands, of one or two words, and their descriptions."""
 
 PROGRAM = "quad-gym"
 
 
 def usage(group: str = "") -> str:
-    """The help of `quad-gym` itself, or of the commands that begin with a word."""
+    """Help text of `quad-gym` itself, or of the commands that begin with a word."""
     width = max(map(len, COMMANDS))
     shown = {name: text for name, text in COMMANDS.items() if name.startswith(group)}
     lines = "\n".join(f"  {name:{width}}   {text}" for name, text in shown.items())
@@ -48,10 +48,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Args:
-        argv: The command and its options; None: those of the process.
+        argv: Command and its options; None: the arguments of the process.
 
     Returns:
-        The exit code.
+        Exit code.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     groups = {name.split()[0] for name in COMMANDS if " " in name}
@@ -73,15 +73,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(command: str, argv: Sequence[str] | None = None, *, program: str | None = None) -> int:
-    """Parse the options of one command and run it; Ctrl-C ends it with a word, and code 130.
+    """Parse the options of a command and run it; Ctrl-C ends it with a message and exit code 130.
 
     Args:
-        command: One of COMMANDS.
-        argv: Its options; None: those of the process.
-        program: Its name in messages; None: that of the process.
+        command: One of `COMMANDS`.
+        argv: Options of the command; None: the arguments of the process.
+        program: Name of the program in messages; None: the name of the process.
 
     Returns:
-        The exit code.
+        Exit code.
     """
     try:
         module = module_of(command)
@@ -93,18 +93,18 @@ def run(command: str, argv: Sequence[str] | None = None, *, program: str | None 
         print("\nStopped by Ctrl-C.", file=sys.stderr)
         return INTERRUPTED
     finally:
-        if reports := sys.modules.get("quad_gym.analysis.reports"):  # else it has made none
+        if reports := sys.modules.get("quad_gym.analysis.reports"):
             reports.remove_unused_folders()
 
 
 def module_of(command: str) -> Any:
-    """The module of one of COMMANDS, with its `Args` and its `main`."""
+    """Import the module of one of `COMMANDS`, with its `Args` and its `main`."""
     name = "benchmark.main" if command == "benchmark" else command.replace(" ", "_")
     return importlib.import_module(f"quad_gym.commands.{name}")
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether an error comes of Ctrl-C: one in a compilation becomes another error."""
+    """True if an error was caused by Ctrl-C, which compilations turn into other errors."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

@@ -1,8 +1,8 @@
-"""Command lines: a frozen dataclass of options becomes a parser, through tyro.
+"""Command lines: parsers made by tyro from frozen dataclasses of options.
 
-A command declares its options once, with their types, defaults and, in the docstring below each,
-its help text. Wrong options end the program with a message on stderr and exit code 2, as is the
-custom on Unix.
+A command declares each option once, with its type, its default and, in the docstring below it, its
+help text. Invalid options end the program with a message on stderr and exit code 2, as is usual on
+Unix.
 """
 
 import ast
@@ -38,32 +38,32 @@ def parse(
     description: str | None = None,
     program: str | None = None,
 ) -> _Args:
-    """Options from the command line as an instance of a dataclass.
+    """Parse the command line to an instance of a dataclass.
 
-    A ValueError of the dataclass's own checks ends the program as a wrong option does.
+    A ValueError of the dataclass's own checks ends the program like an invalid option.
 
     Args:
         kind: Dataclass whose fields are the options.
-        argv: Arguments without the program's name; None: those of the process.
+        argv: Arguments without the program's name; None: the arguments of the process.
         description: Text above the options in the help.
-        program: Name of the program in its messages; None: that of the process.
+        program: Name of the program in its messages; None: the name of the process.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     program = program or Path(sys.argv[0]).name
     asked = bool({"-h", "--help"} & set(words))
     try:
         if asked:
-            words = ["--help"]  # with others, tyro leaves out what they give
-            if description:  # of which it would join the lines, and wrap none
+            words = ["--help"]  # tyro would hide the help of options that are given
+            if description:  # tyro would join its lines without wrapping
                 print(wrapped(description))
                 description = ""
         if any(word.startswith("--tyro-") for word in words):
-            raise refuse("completions of all commands are printed by quad-gym completion", program)
+            raise refuse("use quad-gym completion for all commands", program)
         with nullcontext() if asked else told_in_one_line(program):
             args = tyro.cli(
                 kind, args=words, description=description, prog=program, registry=registry()
             )
-    except BrokenPipeError:  # nobody reads the help to its end, as of `--help | head`
+    except BrokenPipeError:  # the reader has closed the pipe, as in `--help | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     _require_sound(args, words, program)
@@ -71,29 +71,29 @@ def parse(
 
 
 def _require_sound(args: Any, words: Sequence[str], program: str) -> None:
-    """End the program if an option has what no command takes: nothing, or a negative seed."""
+    """End the program if an option has no value, or is a negative seed."""
     for option in dataclasses.fields(args):
         name, value = option_name(option.name), getattr(args, option.name)
         if name in words and value in ((), {}):
-            raise refuse(f"{name} must name at least one, got none", program)
+            raise refuse(f"{name} must have at least one value, got none", program)
         if name == "--seed" and value < 0:
             raise refuse(f"{name} must be at least 0, got {value}", program)
 
 
 def option_name(field: str) -> str:
-    """The option that a field of a dataclass declares, as it is written."""
+    """Option declared by a field of a dataclass, as written on the command line."""
     return f"--{field.replace('_', '-')}"
 
 
 def require_at_least(args: Any, **least: int) -> None:
-    """Refuse numbers that are too small; options that were not given, None, pass.
+    """Reject numbers that are too small; options that were not given (None) are accepted.
 
     Args:
-        args: The dataclass of options.
-        least: The smallest number that each of these fields may have.
+        args: Dataclass of options.
+        least: Smallest valid number of each field, by name.
 
     Raises:
-        ValueError: If one is smaller.
+        ValueError: If a number is too small.
     """
     for field, limit in least.items():
         value = getattr(args, field)
@@ -105,10 +105,10 @@ def require_at_least(args: Any, **least: int) -> None:
 def usage_errors(
     kinds: tuple[type[Exception], ...] = (ValueError, OSError, ImportError),
 ) -> Iterator[None]:
-    """Turn what is raised while options are checked into one line on stderr and exit code 2.
+    """Context that turns errors of checks into one line on stderr and exit code 2.
 
     Args:
-        kinds: Errors that the user can correct.
+        kinds: Types of errors that the user can correct.
     """
     try:
         yield
@@ -117,52 +117,52 @@ def usage_errors(
         if isinstance(error, OSError) and error.filename is not None:
             told = f"{error.filename}: {error.strerror}"
             if isinstance(error, FileNotFoundError):
-                told = f"there is no {error.filename}"
+                told = f"{error.filename} does not exist"
         raise refuse(told) from None
 
 
 def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[str, Any]:
-    """Keywords of an environment given by `--env`, none of which has an option of its own.
+    """Check that `--env` contains no keyword for which there is a separate option.
 
     Args:
-        keywords: What was given.
-        options: Names of keywords, with the options that are there for them.
+        keywords: Keywords given by `--env`.
+        options: Options by name of the keyword that they replace.
 
     Raises:
-        ValueError: If one of them was given.
+        ValueError: If one of these keywords was given.
     """
     for name, instead in options.items():
         if name in keywords:
-            raise ValueError(f"--env must leave {name} to {instead}")
+            raise ValueError(f"--env must not contain {name}: use {instead} instead")
     return keywords
 
 
 def refuse_overwriting(file: Path, overwrite: bool) -> None:
-    """Refuse to replace the results of an earlier run unless it is told.
+    """Reject replacing the results of an earlier run without `--overwrite`.
 
     Args:
         file: One of the results.
-        overwrite: Whether it is told, by `--overwrite`.
+        overwrite: True to allow replacing it (`--overwrite`).
 
     Raises:
-        ValueError: If the file is there.
+        ValueError: If the file exists and `overwrite` is False.
     """
     if file.exists() and not overwrite:
-        raise ValueError(f"{file} exists: give --overwrite to replace it, or another --output")
+        raise ValueError(f"{file} exists: use --overwrite to replace it, or another --output")
 
 
 def writable_file(output: Path | None, name: str, suffix: str, overwrite: bool) -> Path:
-    """The file that an export writes, in a folder that can be written to.
+    """File that an export writes, in a writable folder.
 
     Args:
-        output: The file that is given by `--output`; None: one in results/export.
-        name: Its name then.
-        suffix: The end of its name.
-        overwrite: Whether it may be replaced.
+        output: File given by `--output`; None: a file in results/export.
+        name: Name of the file if `output` is None.
+        suffix: Required extension.
+        overwrite: True to allow replacing the file.
 
     Raises:
-        ValueError: If it ends otherwise, or is there already.
-        OSError: If nothing can be written to the folder.
+        ValueError: If the extension differs, or the file exists and `overwrite` is False.
+        OSError: If the folder is not writable.
     """
     from quad_gym.analysis.reports import require_writable
 
@@ -175,27 +175,27 @@ def writable_file(output: Path | None, name: str, suffix: str, overwrite: bool) 
 
 
 def sensors_of(env_id: str, given: str | None) -> str:
-    """The name of the sensor suite: what was given, or else the task's own."""
+    """Name of the sensor suite: the one given, or else the task's default."""
     own = BENCHMARKS.get(IDS[env_id])
     return given or ("standard" if own is None else own.keywords["sensors"])
 
 
 def without_idle_filter(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """Keywords of an environment, without those of a filter where none runs.
+    """Remove keywords of a filter if none runs.
 
-    A comparison flies several observations with the same keywords, and environments refuse
-    keywords that have no effect.
+    Comparisons use the same keywords for several observations, but environments reject keywords
+    that have no effect.
     """
     idle = FILTER_KEYWORDS if runs_no_sensor(keywords) else ()
     return {name: value for name, value in keywords.items() if name not in idle}
 
 
 def free_folder(folder: Path, result: str) -> Path:
-    """A folder that holds no results yet: this one, or else FOLDER_2, FOLDER_3, ...
+    """Folder without results: this one, or else FOLDER_2, FOLDER_3, ...
 
     Args:
-        folder: The first to try.
-        result: Name of a file that is there where there are results.
+        folder: First folder to try.
+        result: Name of a file that exists in folders with results.
     """
     number, found = 1, folder
     while (found / result).exists():
@@ -205,7 +205,7 @@ def free_folder(folder: Path, result: str) -> Path:
 
 
 def flying_options(keywords: Mapping[str, Any]) -> str:
-    """Options of `quad-gym evaluate` for keywords of an environment, each after a space."""
+    """Format keywords of an environment as options of `quad-gym evaluate`, each after a space."""
     rest = dict(keywords)
     words = [f"--{k} {rest.pop(k)}" for k in ("observation", "sensors") if k in rest]
     if rest:
@@ -217,7 +217,7 @@ _WORDS = {"true": "True", "false": "False", "none": "None"}
 
 
 def value_of(word: str) -> Any:
-    """A value as Python writes numbers, tuples, True and None; else the word itself."""
+    """Convert a word to a Python literal such as a number, tuple, True or None, if it is one."""
     try:
         return ast.literal_eval(_WORDS.get(word, word))
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
@@ -225,10 +225,10 @@ def value_of(word: str) -> Any:
 
 
 def _pairs(words: Sequence[str]) -> dict[str, Any]:
-    """`key=value` pairs, values as Python writes numbers, tuples, True and None; else texts.
+    """Parse `key=value` pairs, with values as in `value_of`.
 
     Raises:
-        ValueError: If a word is no pair.
+        ValueError: If a word is not a pair.
     """
     found = {}
     for word in words:
@@ -254,36 +254,36 @@ Keywords = Annotated[
 TRACKING = tuple(
     env_id for env_id, task in IDS.items() if task in TASK_DEFAULTS and task != "waypoints"
 )
-"""The ids of the general tasks in which a reference is followed."""
+"""Ids of the general tasks with a reference to track."""
 
 _ID_OF_TASK = {task: env_id for env_id, task in IDS.items()}
 
 
 def full_id(name: str) -> str:
-    """The id of a task that is given by its short name, such as "circle"; else as it is."""
+    """Convert the short name of a task, such as "circle", to its id; other names are unchanged."""
     return _ID_OF_TASK.get(name, name)
 
 
 def one_of(ids: Iterable[str]) -> str:
-    """The help of an option that chooses among ids."""
+    """Help text of an option with a choice of ids."""
     ids = list(ids)
-    return f"what to fly: {', '.join(IDS[env_id] for env_id in ids)}, or an id such as {ids[0]}"
+    return f"task: {', '.join(IDS[env_id] for env_id in ids)}, or an id such as {ids[0]}"
 
 
 def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
-    """The id that is given, as it is or by its short name.
+    """Convert an id or a short name to an id.
 
     Args:
-        name: Of the argument.
-        given: Its value.
-        ids: Those that it may be.
+        name: Name of the argument, for the message.
+        given: Value of the argument.
+        ids: Valid ids.
 
     Raises:
-        ValueError: If it is none of them.
+        ValueError: If the value is not valid.
     """
     found, ids = full_id(given), tuple(ids)
     if found not in ids:
-        # a task that is another command's is not misspelt
+        # a task for other commands is not misspelled
         near = () if found in IDS else (*ids, *(IDS[env_id] for env_id in ids))
         raise ValueError(
             f"{name} must be one of {', '.join(ids)}, got {given!r}{did_you_mean(given, near)}"
@@ -292,14 +292,14 @@ def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
 
 
 def with_full_id(args: _Args, ids: Iterable[str] = IDS) -> _Args:
-    """Options whose `env_id` is the id, if it was given by its short name.
+    """Replace a short name in the field `env_id` of options by its id.
 
     Args:
-        args: A dataclass with the field `env_id`.
-        ids: Those that it may be.
+        args: Dataclass with the field `env_id`.
+        ids: Valid ids.
 
     Raises:
-        ValueError: If it is none of them.
+        ValueError: If the id is not valid.
     """
     found = known_id("ENV_ID", args.env_id, ids)  # type: ignore[attr-defined]
     return replace(args, env_id=found)  # type: ignore[type-var]
@@ -318,26 +318,26 @@ EnvId = tyro.conf.Positional[
         tyro.conf.arg(help=one_of(IDS)),
     ]
 ]
-"""The id of an environment, or its task, given without the option's name."""
+"""Positional argument: id of an environment, or short name of its task."""
 
 TrackingId = Annotated[EnvId, tyro.conf.arg(help=one_of(TRACKING))]
-"""The same, of tasks in which a reference is followed."""
+"""Positional argument: id or short name of a task with a reference to track."""
 
 _OR_FILE = f"{', '.join(ALL_SUITES)}, or a file of SensorSuite.save (.toml)"
 
 SuiteName = Annotated[str, tyro.conf.arg(help=f"sensor suite: {_OR_FILE}")]
-"""The name of a sensor suite, or its file."""
+"""Name or file of a sensor suite."""
 
 OwnSuite = Annotated[
     str | None,
     tyro.conf.arg(
-        help=f"sensor suite: {_OR_FILE}; if not given, the task's own, which for most is standard"
+        help=f"sensor suite: {_OR_FILE}; if not given, the task's default, standard for most"
     ),
 ]
-"""The name of a sensor suite, or None for the task's own."""
+"""Name or file of a sensor suite; None: the task's default."""
 
 SuiteNames = Annotated[
     tuple[str, ...],
-    tyro.conf.arg(help=f"sensor suites, of {', '.join(SUITES)}, or files of suites (.toml)"),
+    tyro.conf.arg(help=f"sensor suites: {', '.join(SUITES)}, or files of suites (.toml)"),
 ]
-"""Names of sensor suites."""
+"""Names or files of sensor suites."""

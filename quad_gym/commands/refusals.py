@@ -1,7 +1,7 @@
-"""What a program says when it refuses its options: one line on stderr, and exit code 2.
+"""Error messages for invalid options: one line on stderr, and exit code 2.
 
-tyro frames its messages, and repeats the help of the option below them. What is made of them here
-reads as the checks of the commands do: what must be, and what came.
+tyro frames its messages and appends the help of the option. They are converted here to the form of
+the commands' own checks: the expected value and the one given.
 """
 
 import io
@@ -14,21 +14,21 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from quad_gym.params.checks import did_you_mean
 
 USAGE_ERROR = 2
-"""Exit code of a program that was called with invalid arguments."""
+"""Exit code of a program that was called with invalid options."""
 
 INTERRUPTED = 130
 """Exit code of a program that Ctrl-C has stopped."""
 
 _WIDE = "10000"
-"""Columns of a terminal on which no message is broken into lines."""
+"""Terminal width for tyro at which no message is wrapped."""
 
 
 def refuse(told: str, program: str | None = None) -> SystemExit:
-    """Say why options are refused; what it returns, raised, ends the program.
+    """Print why options are invalid; return the exception that ends the program.
 
     Args:
-        told: The reason.
-        program: Whose `--help` explains the options; None: none does.
+        told: Reason.
+        program: Program whose `--help` explains the options; None: no hint.
     """
     more = "" if program is None else f" ({program} --help explains the options)"
     print(f"error: {told}{more}", file=sys.stderr)
@@ -37,12 +37,12 @@ def refuse(told: str, program: str | None = None) -> SystemExit:
 
 @contextmanager
 def told_in_one_line(program: str) -> Iterator[None]:
-    """Tell what tyro refuses, in one line.
+    """Context that prints tyro's error messages in one line.
 
     Args:
-        program: Whose `--help` explains the options.
+        program: Program whose `--help` explains the options.
     """
-    # in UTF-8, as the frame depends on it, and no terminal, as colors do
+    # UTF-8, on which the frame depends, and no terminal, on which colors depend
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
     columns = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = _WIDE
@@ -54,7 +54,7 @@ def told_in_one_line(program: str) -> Iterator[None]:
             raise
         err.seek(0)
         raise refuse(sentence(err.read()), program) from None
-    except ValueError as error:  # of the dataclass, which former versions of tyro let pass
+    except ValueError as error:  # of the dataclass, in older versions of tyro
         raise refuse(str(error), program) from None
     finally:
         os.environ.pop("COLUMNS")
@@ -63,11 +63,11 @@ def told_in_one_line(program: str) -> Iterator[None]:
 
 
 def sentence(framed: str) -> str:
-    """A message of tyro as one sentence.
+    """Convert a message of tyro to one sentence.
 
     Args:
-        framed: A frame with parts divided by rules: the message, what may be meant, the help of
-            the option, how to get more help.
+        framed: Frame with parts separated by lines: message, suggestion, help of the option, and
+            hint on more help.
     """
     parts: list[list[str]] = [[]]
     for line in framed.splitlines():
@@ -81,7 +81,7 @@ def sentence(framed: str) -> str:
     told = " ".join(filter(None, parts[0]))
     if match := re.fullmatch(r"Error parsing (\S+): (.*)", told, re.DOTALL):
         option, why = match.groups()
-        if not option.startswith("-") and not option.isupper():  # the name of the dataclass
+        if not option.startswith("-") and not option.isupper():  # name of the dataclass
             return why
         return f"{option} {why}"
     if match := re.fullmatch(r"invalid choice '(.*)' for argument '(.*)'. .* \((.*)\)\.", told):
@@ -105,7 +105,7 @@ def sentence(framed: str) -> str:
 
 
 def _names(parts: list[list[str]]) -> Iterator[str]:
-    """The lines that name options similar to an unknown one."""
+    """Lines with options similar to an unknown one."""
     for part in parts[1:]:
         if part[0].startswith(("Perhaps you meant", "Arguments similar to")):
             yield from (line for line in part[1:] if line.startswith("--"))

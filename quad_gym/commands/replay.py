@@ -1,12 +1,11 @@
-"""Filter the log of a real flight: estimates, innovations, and what the gate left out.
+"""Run the filter on the log of a real flight: estimates, innovations, rejected measurements.
 
     quad-gym replay flight.csv --sensors rtk
     quad-gym replay flight.ulg --sensors consumer --estimator ekf --output results/replay/first
 
-A log is a table with commas, or a log of PX4 (which needs `pip install 'quad-gym[ulog]'`).
-docs/logs.md says which columns a table has, and what is taken from PX4. Where units or axes are
-implausible, the suite does not describe the log, or the filter diverges, the last lines say so, and
-the exit code is 1.
+A log is a CSV table, or a log of PX4 (which requires `pip install 'quad-gym[ulog]'`). docs/logs.md
+describes the columns of a table and the topics of PX4. If units or axes are implausible, the suite
+does not describe the log, or the filter diverges, the last lines report it and the exit code is 1.
 """
 
 import math
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
 RESULT = "replay.json"
 MISFIT = 1
-"""Exit code where the suite does not describe the log, or the filter diverged or failed."""
+"""Exit code if the suite does not describe the log, or the filter has diverged or failed."""
 
 
 @dataclass(frozen=True)
@@ -35,46 +34,45 @@ class Args:
     """Options of the replay."""
 
     log: tyro.conf.Positional[
-        Annotated[Path, tyro.conf.arg(metavar="LOG", help="a table (.csv) or a log of PX4 (.ulg)")]
+        Annotated[Path, tyro.conf.arg(metavar="LOG", help="table (.csv) or log of PX4 (.ulg)")]
     ]
     sensors: SuiteName = "standard"
     estimator: Literal["ukf", "ekf"] = "ukf"
-    """the filter"""
+    """filter: unscented or extended Kalman filter"""
     barometer: bool = False
-    """give the suite a barometer, with the package's numbers"""
+    """add a barometer with default parameters to the suite"""
     magnetometer: tuple[float, float, float] | None = None
-    """give the suite a magnetometer, with the package's numbers, in a magnetic field of this
-    strength [microtesla], declination and inclination [deg], as a model of the Earth's tells"""
+    """add a magnetometer with default parameters to the suite; the values are strength
+    [microtesla], declination and inclination [deg] of the magnetic field, from a model of the
+    Earth's field"""
     heading: float | None = None
-    """of the body x axis at the start, from east toward north [deg]; if not given, as a baseline or
-    a magnetometer tells it, or else unknown"""
+    """heading of the body x axis at the start, from east toward north [deg]; if not given, from a
+    baseline or a magnetometer, or else unknown"""
     start_position: tuple[float, float, float] | None = None
-    """start level and at rest at this position east, north and up [m], with --heading, as a log
-    without GNSS needs it"""
+    """initial position east, north and up [m], level and at rest, with --heading; required for logs
+    without GNSS"""
     course: bool = False
-    """take the direction of the first GNSS velocity for the heading: the vehicle flies nose
-    first"""
+    """use the direction of the first GNSS velocity as heading, for vehicles that fly nose first"""
     body: Literal["flu", "frd"] = "flu"
-    """axes of a table's IMU and magnetometer: x forward, y left, z up; or x forward, y right, z
-    down"""
+    """axes of IMU and magnetometer in a table: forward, left, up; or forward, right, down"""
     window: float = 0.5
-    """how late measurements may come [s]"""
+    """longest delay of measurements [s]"""
     reported_noise: bool = True
-    """let the accuracy that the receiver reports count, where the log has it"""
+    """use the accuracy reported by the receiver, if the log contains it"""
     figure: bool = True
-    """draw the figure"""
+    """draw a figure"""
     output: Path | None = None
-    """folder for the results, made if it is missing; if not given, results/replay/LOG"""
+    """folder for the results, created if it is missing; if not given, results/replay/LOG"""
     overwrite: bool = False
     """replace the results of an earlier replay"""
 
 
 def folder_of(args: Args) -> Path:
-    """Check the output, and make its folder.
+    """Check the output, and create its folder.
 
     Raises:
-        ValueError: If there are results already, or options do not belong together.
-        OSError: If nothing can be written there.
+        ValueError: If results exist already, or options contradict each other.
+        OSError: If the folder is not writable.
         ImportError: If matplotlib is missing.
     """
     from quad_gym.analysis.plots import require_matplotlib
@@ -93,7 +91,7 @@ def folder_of(args: Args) -> Path:
 
 
 def start_of(args: Args) -> dict[str, Any]:
-    """What the options say of the start."""
+    """Arguments for the start of the filter, from the options."""
     start: dict[str, Any] = {"course": True} if args.course else {}
     if args.heading is not None:
         start["heading"] = math.radians(args.heading)
@@ -103,7 +101,7 @@ def start_of(args: Args) -> dict[str, Any]:
 
 
 def suite_of(args: Args) -> "SensorSuite":
-    """The suite, with the sensors that options add."""
+    """Sensor suite, with sensors added by options."""
     from quad_gym.params.barometer import BarometerParams
     from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
     from quad_gym.params.suites import sensor_suite
@@ -123,7 +121,7 @@ def suite_of(args: Args) -> "SensorSuite":
 
 
 def report_of(result: "Replay") -> str:
-    """What became of each measurement, for the screen."""
+    """Format a table of measurements, rejections and NIS."""
     from quad_gym.analysis.replay_plots import sensors_of
     from quad_gym.analysis.reports import text_table
 
@@ -132,26 +130,26 @@ def report_of(result: "Replay") -> str:
         nis = measured.nis[np.isfinite(measured.nis)]
         mean = f"{nis.mean():.2f} of {measured.innovation.shape[1]}" if len(nis) else "-"
         rows.append((name, f"{len(measured.time)}", f"{int(measured.gated.sum())}", mean))
-    table = text_table({"measurements": ["of", "count", "left out", "mean NIS"]}, rows)
+    table = text_table({"measurements": ["of", "count", "rejected", "mean NIS"]}, rows)
     lines = [f"{len(result)} IMU samples from {result.time[0]:.2f} s to {result.time[-1]:.2f} s."]
     if result.too_late:
         lines.append(f"Too late for the window: {result.too_late} measurements.")
     if result.unused:
-        lines.append(f"Not used, as the suite has none: {', '.join(result.unused)}.")
+        lines.append(f"Not used, because the suite has none: {', '.join(result.unused)}.")
     if not result.heading_known[-1]:
-        lines.append("The heading is still unknown at the end: give --heading or --course.")
+        lines.append("The heading is still unknown at the end: use --heading or --course.")
     return "\n".join([table, *lines])
 
 
 def problems_in_words(result: "Replay") -> str:
-    """The problems, for the screen, and advice."""
+    """Format the problems, with advice."""
     from quad_gym.estimation.plausibility import ADVICE
 
     return "\n".join([*(f"{text[0].upper()}{text[1:]}" for text in result.problems), ADVICE])
 
 
 def innovations_of(result: "Replay") -> dict[str, list[Any]]:
-    """Columns of all innovations, in the order of sensors."""
+    """Columns of all innovations, ordered by sensor."""
     names = ("time", "received", "innovation", "sigma", "nis", "gate")
     table: dict[str, list[Any]] = {"sensor": []}
     for sensor, measured in result.measured.items():

@@ -1,4 +1,4 @@
-"""Tables of many cells that are flown one by one, in runs that may be interrupted."""
+"""Tables whose cells are flown one by one, in runs that can be resumed."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping
@@ -13,15 +13,15 @@ from quad_gym.params.sensors import SensorSuite
 
 
 class Flown(Protocol):
-    """A cell of a table."""
+    """Cell of a table."""
 
     @property
     def name(self) -> str:
-        """What it is called in files."""
+        """Name of the cell in files."""
 
     @property
     def flown(self) -> SensorSuite:
-        """The sensors that fly."""
+        """Sensor suite of the flights."""
 
 
 def run_cells(
@@ -31,18 +31,19 @@ def run_cells(
     measure: Callable[[Any], dict[str, Any]],
     table: Callable[[dict[str, Any]], str],
 ) -> dict[str, Any]:
-    """Measure all cells that a former run of the same has not.
+    """Compute the cells that an earlier run has not completed.
 
     Args:
-        cells: Each a `Flown`.
-        files: Where they are written, less the suffix: .json has the numbers and .md the table.
-            Both are written anew after each cell.
-        head: What a former run must have in common with this one, beside the code that flies.
-        measure: What is found of a cell; with "sensors".
-        table: The table of all that are found, by name.
+        cells: Cells, each a `Flown`.
+        files: Output path without extension: numbers in .json and the table in .md. Both are
+            written again after each cell.
+        head: Parameters that an earlier run must have in common with this one, in addition to the
+            code of the flights.
+        measure: Function that computes the results of a cell, including "sensors".
+        table: Function that formats the results of all cells, by name.
 
     Returns:
-        What was found of these cells, by name.
+        Results of these cells, by name.
     """
     file, chosen = files.with_suffix(".json"), list(cells)
     before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}

@@ -1,16 +1,15 @@
-"""Train a controller on a filter's estimate, on the truth, or on any other observation.
+"""Train a controller on a filter's estimate, on the true state, or on any other observation.
 
     quad-gym train QuadGym/Circle-v0
     quad-gym train QuadGym/Hover-v0 --algorithm sac --seed 3 --env observation=truth
     quad-gym train circle --engine compiled
     quad-gym train circle --resume
 
-The hyperparameters are those of baselines/recipes.py for the task and the algorithm. While
-training, the policy is evaluated on the task itself, by its true position error, and kept: last.zip
-and best.zip (.npz with --engine compiled), which quad-gym evaluate flies. Beside them are
-training.json (everything needed to repeat the run), evaluations.csv, and TensorBoard's files. A run
-that was interrupted, by Ctrl-C or otherwise, continues exactly from its last evaluation with
---resume.
+Hyperparameters for the task and the algorithm come from baselines/recipes.py. During training, the
+policy is evaluated on the task by its true position error and saved: last.zip and best.zip (.npz
+with --engine compiled), which quad-gym evaluate can fly. The folder also contains training.json
+(everything needed to repeat the run), evaluations.csv, and files for TensorBoard. An interrupted
+run continues exactly from its last evaluation with --resume.
 """
 
 import importlib.util
@@ -37,47 +36,47 @@ class Args:
 
     env_id: EnvId = "QuadGym/Circle-v0"
     algorithm: Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"] = "ppo"
-    """how to learn"""
+    """reinforcement learning algorithm"""
     engine: Literal["sb3", "compiled"] = "sb3"
-    """what trains: Stable-Baselines3, or the compiled PPO, which is several times faster
+    """training engine: Stable-Baselines3, or the compiled PPO, which is several times faster
     and needs no torch"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=rtk camera=false"""
     steps: int | None = None
-    """environment steps; if not given, the recipe's"""
+    """number of environment steps; if not given, the recipe's"""
     n_envs: int | None = None
-    """flights at a time; if not given, the recipe's"""
+    """number of parallel flights; if not given, the recipe's"""
     set: Keywords = field(default_factory=dict)
-    """parameters of the algorithm in place of the recipe's, such as gamma=0.98"""
+    """parameters of the algorithm that override the recipe's, such as gamma=0.98"""
     seed: int = 0
-    """of the networks, and of the flights in training and in its evaluations, which no other
-    seed shares and quad-gym evaluate does not fly"""
+    """seed of the networks, and of the flights in training and its evaluations; other seeds and
+    quad-gym evaluate use different flights"""
 
     output: Path | None = None
     """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; compiled_ppo is the
     ALGORITHM of the compiled engine"""
     resume: bool = False
-    """go on with the run in the folder, or begin one where there is none"""
+    """continue the run in the folder, or begin one if there is none"""
     evaluations: int = 20
-    """evaluations, and checkpoints, over the run"""
+    """number of evaluations and checkpoints during the run"""
     episodes: int = 100
-    """flown in an evaluation"""
+    """number of episodes in each evaluation"""
     threads: int | None = None
-    """threads of the flights; if not given, one per core; no result depends on them"""
+    """number of threads of the flights; if not given, one per core; it does not affect results"""
     tensorboard: bool = True
     """write files for TensorBoard, if it is installed"""
     progress: bool = True
     """show a progress bar"""
     export: Path | None = None
-    """write the best policy to this .npz too, which needs NumPy alone to fly"""
+    """also write the best policy to this .npz file, which requires only NumPy"""
 
 
 def configure(args: Args) -> tuple[Any, Path]:
-    """Check all options before anything is trained.
+    """Check all options before training.
 
     Raises:
         ValueError: If an option is invalid.
-        OSError: If nothing can be written to the folder.
+        OSError: If the folder is not writable.
         ImportError: If Stable-Baselines3 is missing.
     """
     from baselines.plans import Plan
@@ -104,7 +103,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     if args.export is not None and args.export.suffix != ".npz":
         raise ValueError(f"--export must end in .npz, got {args.export}")
     if args.export is not None and args.algorithm == "recurrent_ppo":
-        raise ValueError("--export takes no recurrent_ppo, whose policies have a memory")
+        raise ValueError("--export does not support recurrent_ppo, whose policies have a memory")
     task = IDS[args.env_id]
     name = "compiled_ppo" if args.engine == "compiled" else args.algorithm
     folder = args.output or Path("results/train") / task / f"{name}_seed_{args.seed}"
@@ -116,7 +115,7 @@ def configure(args: Args) -> tuple[Any, Path]:
 
 
 def require_model(plan: Any) -> None:
-    """Make the untrained model once, which checks what the plan says of it."""
+    """Make the untrained model once, to check the plan."""
     if plan.engine == "compiled":
         from baselines.compiled_ppo.run import make_compiled
 
@@ -138,14 +137,14 @@ def main(args: Args) -> None:
     from baselines.training import export, train
 
     if args.resume and not has_checkpoint(folder):
-        print(f"There is no run to resume in {folder}: one begins.")
+        print(f"There is no run to resume in {folder}: starting a new one.")
     print(
         f"Training {plan.recipe.algorithm} on {plan.env_id} for {plan.recipe.steps:,} steps of "
         f"{plan.recipe.n_envs} flights, seed {plan.seed}; into {folder}."
     )
     tensorboard = args.tensorboard and importlib.util.find_spec("tensorboard") is not None
     if args.tensorboard and not tensorboard:
-        print("TensorBoard is not installed: no files for it; evaluations.csv has the errors.")
+        print("TensorBoard is not installed; evaluations.csv contains the errors.")
     with usage_errors((RunError,)):
         done = train(
             plan,
@@ -157,12 +156,12 @@ def main(args: Args) -> None:
     total = time.perf_counter() - from_start
     print(
         f"{done.steps:,} steps in {done.seconds:.0f} s of training, "
-        f"{done.steps / max(done.seconds, 1e-9):,.0f} a second ({total:.0f} s in all).\n"
+        f"{done.steps / max(done.seconds, 1e-9):,.0f} per second ({total:.0f} s in total).\n"
         f"Best evaluation, after {done.best['steps']:,.0f} steps: true position error "
         f"{done.best['mean_error']:.4f} m, {done.best['crash_rate']:.1%} crashed."
     )
     if not done.finished:
-        print("Stopped. Start the same command again with --resume to go on.", file=sys.stderr)
+        print("Stopped. Run the same command with --resume to continue.", file=sys.stderr)
         raise SystemExit(130)
     if args.export is not None:
         export(done, args.export)

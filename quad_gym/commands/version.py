@@ -11,5 +11,5 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Print it."""
+    """Print the version."""
     print(quad_gym.__version__)

@@ -151,7 +151,7 @@ def test_crashes_are_counted(tmp_path, capsys):
         rows = list(csv.DictReader(stream))
     assert {row["ending"] for row in rows} <= {"out_of_bounds", "tipped_over", "below_min_height"}
     assert all(0.0 < float(row["ended_at_s"]) <= 4.0 for row in rows)
-    assert "too few flights finished" in capsys.readouterr().out
+    assert "too few flights were completed" in capsys.readouterr().out
 
 
 def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):

@@ -73,7 +73,7 @@ def test_evaluate_flies_what_there_is(tmp_path, capsys):
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "results/evaluate/trajectory/summary.json").read_text())
     assert summary["arguments"]["policy"] == ["pd"]
-    told = "PD control flies alone: no policy is included for QuadGym/Trajectory-v0"
+    told = "Only PD control is evaluated: no policy is included for QuadGym/Trajectory-v0"
     assert done.stdout.startswith(told)
     assert "pd on truth" in done.stdout
     for args, told, policies in (
@@ -106,7 +106,7 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
     [
         (["QuadGym/Square-v0"], "ENV_ID must be one of"),
         (["--policy", "nobody"], "policy must be pd"),
-        (["--policy"], "--policy must name at least one"),
+        (["--policy"], "--policy must have at least one value"),
         (["--observation", "measurements"], "name a --policy that was trained on it"),
         (["--policy", "missing.zip"], "there is no policy"),
         (["--observation", "guess"], "observation must be one of"),
@@ -121,7 +121,7 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
             "and the environment gives 13 (it lacks position_error, velocity_error, up, heading "
             "and adds position, ",
         ),
-        (["--observation"], "--observation must name at least one"),
+        (["--observation"], "--observation must have at least one value"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--policy", "pretrained", "--env", "action=motor"], "trained with action ctbr"),
         (["QuadGym/Hover-v0", "--policy", "pretrained", "--env", "wings=2"], "wings is not"),

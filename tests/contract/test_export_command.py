@@ -27,7 +27,7 @@ def test_a_policy_becomes_a_c_file_named_after_its_task(tmp_path, capsys):
     assert "int hover(const float observation[28], float action[4])" in file.read_text()
     told = capsys.readouterr().out
     assert "results/export/hover.c" in told
-    assert "hover(observation, action) 50 times a second" in told
+    assert "hover(observation, action) 50 times per second" in told
 
 
 def test_a_file_is_replaced_only_when_told(tmp_path, capsys):
@@ -35,7 +35,7 @@ def test_a_file_is_replaced_only_when_told(tmp_path, capsys):
     assert main(line.split()) == 0
     before = (tmp_path / "it.c").read_text()
     (tmp_path / "it.c").write_text("mine")
-    assert "it.c exists: give --overwrite" in refused(line, capsys)
+    assert "it.c exists: use --overwrite" in refused(line, capsys)
     assert (tmp_path / "it.c").read_text() == "mine"
     assert main([*line.split(), "--overwrite"]) == 0
     assert (tmp_path / "it.c").read_text() == before

@@ -116,7 +116,7 @@ def test_steps_are_told_of_each_algorithm():
             "--arms must name truth, whose policies",
         ),
         (["QuadGym/Circle-v0"], "ENV_ID must be one of QuadGym/LookAround-v0"),
-        (["--env", "observation=truth"], "--env must leave observation to --arms"),
+        (["--env", "observation=truth"], "--env must not contain observation: use --arms instead"),
         (["--set", "gammma=0.9"], "gammma"),
         (["--arms", "recurrent", "--set", "clip=0.1"], "clip is not a keyword of RecurrentPPO"),
         (["--arms", "truth", "--set", "critic_only=3"], "critic_only must be the number of values"),

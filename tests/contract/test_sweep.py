@@ -130,7 +130,7 @@ def test_steps_and_flights_are_options_as_those_of_train(tmp_path):
         ("n_envs = []", "n_envs must have at least one value"),
         ('engine = "compiled"\nset = {gama = 0.9}', "circle,compiled_ppo: "),
         ('engine = "compiled"\nenv = {radius = -1}', "radius must be greater than 0"),
-        ("env = {threads = 1}", "--env must leave threads to --threads"),
+        ("env = {threads = 1}", "--env must not contain threads: use --threads instead"),
     ],
 )
 def test_an_invalid_file_gets_one_clear_line(tmp_path, text, message):
@@ -149,7 +149,7 @@ def test_an_invalid_file_gets_one_clear_line(tmp_path, text, message):
         (["--retries", "-1"], "--retries must be at least 0"),
         (["--threads", "0"], "threads must be at least 1"),
         (["--options", "mem_gb=4"], "--options are of slurm and ray"),
-        (["nowhere.toml"], "there is no nowhere.toml"),
+        (["nowhere.toml"], "nowhere.toml does not exist"),
     ],
 )
 def test_wrong_options_end_the_sweep_before_it_begins(tmp_path, options, message):

@@ -220,7 +220,9 @@ def test_a_run_that_is_not_there_begins_and_says_so(tmp_path):
     few = ("--steps", 400, "--evaluations", 2, "--no-tensorboard", "--resume")
     done = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
     assert done.returncode == 0
-    assert done.stdout.startswith(f"There is no run to resume in {tmp_path / 'run'}: one begins.\n")
+    assert done.stdout.startswith(
+        f"There is no run to resume in {tmp_path / 'run'}: starting a new one.\n"
+    )
     again = console_commands.run("train", *options(tmp_path / "run", *few), where=tmp_path)
     assert again.returncode == 0
     assert "no run to resume" not in again.stdout

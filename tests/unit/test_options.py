@@ -106,7 +106,7 @@ def test_help_wraps_paragraphs_and_keeps_examples_as_they_are(capsys, monkeypatc
     assert told.startswith(f"What it does.\n\n{example}\n    it hover\n\nmany words many")
     lines = told.splitlines()
     assert max(len(line) for line in lines if line != example) <= 60
-    assert "what to fly" in told  # although an id is given
+    assert "task: hover" in told  # although an id is given
 
 
 def test_help_that_nobody_reads_to_its_end_is_no_error():
@@ -135,7 +135,7 @@ def test_what_is_no_whole_number_is_refused(word, capsys):
 def test_a_file_that_is_not_there_is_named(capsys, tmp_path):
     with pytest.raises(SystemExit), usage_errors():
         (tmp_path / "plan.toml").read_text()
-    assert capsys.readouterr().err == f"error: there is no {tmp_path / 'plan.toml'}\n"
+    assert capsys.readouterr().err == f"error: {tmp_path / 'plan.toml'} does not exist\n"
 
 
 def test_what_may_be_left_out_has_the_errors_of_what_it_is(capsys):
@@ -205,7 +205,9 @@ def test_bugs_are_not_taken_for_usage_errors():
 def test_keywords_with_an_option_of_their_own_are_refused():
     keywords = {"radius": 2.0, "sensors": "rtk"}
     assert leave(keywords, {"faults": "--fault"}) == keywords
-    with pytest.raises(ValueError, match=r"^--env must leave sensors to --sensors$"):
+    with pytest.raises(
+        ValueError, match=r"^--env must not contain sensors: use --sensors instead$"
+    ):
         leave(keywords, {"faults": "--fault", "sensors": "--sensors"})
 
 

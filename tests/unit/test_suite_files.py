@@ -148,7 +148,7 @@ def test_a_command_takes_a_suite_in_a_file(tmp_path, capsys, monkeypatch):
     header = (tmp_path / "results/export/filter_my-suite.h").read_text()
     assert "#define QUAD_GYM_FILTER_MY_SUITE_H\n" in header
     for name, message in (
-        ("none.toml", "there is no none.toml"),
+        ("none.toml", "none.toml does not exist"),
         ("wrong.toml", "wrong.toml: imus is not a field of SensorSuite; did you mean imu?"),
     ):
         (tmp_path / "wrong.toml").write_text('base = "rtk"\n[imus]\n')
