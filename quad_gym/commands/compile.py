@@ -1,7 +1,9 @@
 """Compile the kernels into the cache before their first use.
 
-Environments compile the kernels that they need at the first reset, which takes some tens of seconds
-once. A container or a CI job that compiles them in advance starts without delay:
+Environments compile the parts that they use at their first reset, each part once: about 15 s on two
+fast cores for the default environment, and further parts for other tasks, sensors and options. This
+command compiles all of them, which takes two to three times as long. A container or a CI job that
+does so beforehand starts at once:
 
     RUN quad-gym compile                     # in a Dockerfile: everything
     quad-gym compile --stages truth          # training on the true state: seconds
