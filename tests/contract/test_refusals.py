@@ -52,7 +52,7 @@ REFUSED = [
     ("benchmark --output text.toml", "cannot write to --output text.toml: File exists"),
     ("consistency --output text.toml", "cannot write to --output text.toml: File exists"),
     ("compile --jobs 0", "--jobs must be at least 1, got 0"),
-    ("replay", "LOG must be given: a table (.csv) or a log of PX4 (.ulg)"),
+    ("replay", "LOG must be given: table (.csv) or log of PX4 (.ulg)"),
     ("replay folder", "folder: Is a directory"),
     ("replay binary.npz", "binary.npz must be a table of text (.csv)"),
     (
