@@ -49,8 +49,8 @@ class Args:
     set: Keywords = field(default_factory=dict)
     """parameters of the algorithm that override the recipe's, such as gamma=0.98"""
     seed: int = 0
-    """seed of the networks, and of the flights in training and its evaluations; other seeds and
-    quad-gym evaluate use different flights"""
+    """seed of the networks, and of the flights in training and its evaluations; other seeds use
+    different flights, and so does quad-gym evaluate"""
 
     output: Path | None = None
     """folder of the run; if not given, results/train/TASK/ALGORITHM_seed_SEED; compiled_ppo is the
