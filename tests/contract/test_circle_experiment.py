@@ -171,7 +171,7 @@ def test_recorded_error_is_the_distance_from_the_recorded_reference(tmp_path):
         ("--threads 0", "--threads must be at least 1"),
         ("--gnss-rate 33", "gnss_rate must divide the IMU rate of 200 Hz"),
         ("--camera-rate 400", "camera_rate must divide the IMU rate"),
-        ("--camera-rate 50 --no-camera", "has no meaning"),
+        ("--camera-rate 50 --no-camera", "has no effect with --no-camera"),
         ("--imu-rate -1", "imu_rate must be greater than 0"),
         ("--duration 0.001", "--duration must be at least 0.01 s"),
         ("--duration nan", "--duration must be at least"),

@@ -107,7 +107,7 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
         (["QuadGym/Square-v0"], "ENV_ID must be one of"),
         (["--policy", "nobody"], "policy must be pd"),
         (["--policy"], "--policy must have at least one value"),
-        (["--observation", "measurements"], "name a --policy that was trained on it"),
+        (["--observation", "measurements"], "select a --policy that was trained on measurements"),
         (["--policy", "missing.zip"], "there is no policy"),
         (["--observation", "guess"], "observation must be one of"),
         (["--observation", "estimat"], "did you mean estimate?"),
@@ -118,7 +118,7 @@ def test_evaluate_refuses_a_policy_that_is_asked_for_and_does_not_ship(tmp_path,
         ),
         (
             ["--policy", "pretrained", "--env", "layout=absolute"],
-            "and the environment gives 13 (it lacks position_error, velocity_error, up, heading "
+            "but the environment returns 13 (it lacks position_error, velocity_error, up, heading "
             "and adds position, ",
         ),
         (["--observation"], "--observation must have at least one value"),
@@ -313,7 +313,7 @@ def test_compare_refuses_nonsense(tmp_path):
         (["QuadGym/Waypoints-v0"], "ENV_ID must be one of QuadGym/Hover-v0"),
         (["--sensors", "sonar"], "sensors must be one of"),
         (["--seeds", "0"], "--seeds must be at least 1"),
-        (["--env", "observation=truth"], "leave observation"),
+        (["--env", "observation=truth"], "must not contain observation: use --train-on"),
         (["--engine", "compiled", "--algorithm", "sac"], "engine"),
     ):
         done = run("compare", *more, "--output", tmp_path / "x", where=tmp_path)

@@ -266,7 +266,7 @@ def test_policies_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match="there is no policy"):
         load_policy(str(tmp_path / "none.zip"), env())
     (tmp_path / "broken.zip").write_bytes(b"PK nonsense")
-    with pytest.raises(ValueError, match="no policy of Stable-Baselines3"):
+    with pytest.raises(ValueError, match="is not a policy of Stable-Baselines3"):
         load_policy(str(tmp_path / "broken.zip"), env())
     (tmp_path / "broken.npz").write_bytes(b"PK nonsense")
     with pytest.raises(ValueError, match="is not a policy"):

@@ -39,7 +39,7 @@ def test_finds_gains_no_worse_than_the_start_that_fly(tmp_path):
     [
         (["--env-ids", "QuadGym/Waypoints-v0"], "--env-ids must be one of"),
         (["--candidates", "0"], "--candidates must be at least 1"),
-        (["--env", "sensors=rtk"], "leave sensors to --sensors"),
+        (["--env", "sensors=rtk"], "must not contain sensors: use --sensors instead"),
         (["--sensors", "sonar"], "sensors must be one of"),
         (["--env", "action=velocity"], 'layout="absolute"'),
         (["--output", "/dev/null/x"], "cannot write to --output"),
