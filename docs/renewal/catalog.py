@@ -307,8 +307,8 @@ CATALOG = {
             name="look_around",
             commands=[
                 "study look_around --video webp --output OUT --first-episode 100000 --arms "
-                "pd_reference pd_features pd_features_when_uncertain truth noisy certainty std "
-                "std_certainty std_certainty_privileged"
+                "pd_reference pd_features pd_features_when_uncertain truth noisy noisier certainty "
+                "std std_certainty std_certainty_privileged"
             ],
             flights=("LookAround", "LookAround, truth"),
             texts=_study(
