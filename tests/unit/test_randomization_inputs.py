@@ -22,7 +22,10 @@ SUITE = quad_gym.sensor_suite("lab")
         ({"inertia": (Uniform(1, 2), 3.0, None)}, "'inertia' must hold distributions"),
         ({"mass": Uniform(0.0, 1.0)}, "'mass' .* bounds .* got 0: .*mass must be greater than 0"),
         ({"mass": Uniform(-0.5, 0.5, relative=True)}, "'mass' .*mass must be greater than 0"),
-        ({"mass": Normal(0.8, 0.1)}, "'mass' .* bounds .* got -0.03: .*mass must be greater than 0"),
+        (
+            {"mass": Normal(0.8, 0.1)},
+            "'mass' .* bounds .* got -0.03: .*mass must be greater than 0",
+        ),
         ({"mass": Uniform(0.5, 20.0)}, "'mass' .*light enough to hover"),
         ({"mass": Uniform(1.0, 20.0, relative=True)}, "'mass' .*light enough to hover"),
         ({"max_voltage": Uniform(1.0, 12.0)}, "'max_voltage' .*light enough to hover"),
