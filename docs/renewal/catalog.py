@@ -265,7 +265,7 @@ CATALOG = {
             commands=["compare --engine compiled --sensors standard rtk --output OUT"],
             flights=("Circle, standard", "Circle, rtk", "observation truth", "observation noisy"),
             texts=_console("compare"),
-            figures={"0/learning.png": ".github/images/learning.png"},
+            figures={"0/learning_standard.png": ".github/images/learning.png"},
         ),
         Result(
             name="consistency",
