@@ -106,11 +106,33 @@ CONSISTENCY = {
 PARTS = ("state", "position", "velocity", "attitude", "accel_bias", "gyro_bias")
 
 
+def _nees(value: float) -> str:
+    return f"{value:.2f}" if value < 100.0 else f"{value:,.0f}"
+
+
+def _ablation(which: str) -> Texts:
+    """NEES by part, and root mean square errors, of each case."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        rows = []
+        for case, row in _read(folder / f"0/{which}.json")["rows"].items():
+            cells = [_nees(row[f"nees_{part}"]) for part in PARTS]
+            cells.append(f"{1e3 * row['rms_position']:.1f} mm")
+            cells.append(f"{1e3 * row['rms_attitude']:.1f} mrad")
+            cells.append(f"{1e3 * row['tracking_mean']:.0f} mm")
+            rows.append([case, *cells])
+        parts = (part.replace("_", " ") for part in PARTS)
+        errors = ("position error", "attitude error", "tracking error")
+        return {f"ablation_{which}": table(("case; NEES of", *parts, *errors), rows)}
+
+    return texts
+
+
 def _consistency(folder: Path, _: Sequence[str]) -> dict[str, str]:
     rows = []
     for number, label in enumerate(CONSISTENCY):
         overall = _read(folder / f"{number}/consistency.json")["overall"]
-        rows.append([label, *(f"{overall[part]:.4g}" for part in PARTS)])
+        rows.append([label, *(_nees(overall[part]) for part in PARTS)])
     heads = ["suite", *(part.replace("_", " ") for part in PARTS)]
     return {"consistency": table(heads, [["(consistent)", "15", *["3"] * 5], *rows])}
 
@@ -300,13 +322,13 @@ CATALOG = {
             name="ablation_filters",
             commands=["ablation filters --output OUT"],
             flights=("RandomTrajectory, rtk",),
-            texts=_console("ablation_filters"),
+            texts=_ablation("filters"),
         ),
         Result(
             name="ablation_models",
             commands=["ablation models --output OUT"],
             flights=("RandomTrajectory, rtk", "breeze"),
-            texts=_console("ablation_models"),
+            texts=_ablation("models"),
         ),
         Result(
             name="look_around",
