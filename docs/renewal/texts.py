@@ -1,0 +1,223 @@
+"""Texts of the pages, made of the files and the output of the commands of a result."""
+
+import csv
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from docs.renewal.extracts import compile_seconds, interface_speeds, study_rows
+from docs.renewal.pages import console as block
+from docs.renewal.pages import table
+
+Texts = Callable[[Path, Sequence[str]], dict[str, str]]
+TRACKING = ("Hover", "Circle", "Lemniscate", "RandomTrajectory")
+SUITES = {
+    "`standard`": "--sensors standard --episodes 4000",
+    "`rtk`": "--sensors rtk --episodes 4000",
+    "`indoor`": "--sensors indoor --episodes 4000",
+    "`consumer`": "--sensors consumer --episodes 4000",
+    "`lab`, all corrections": "--sensors lab --form corrected --episodes 1000",
+    "`lab`, no camera": "--sensors lab --no-camera --episodes 1000",
+    "`lab`": "--sensors lab --episodes 1000",
+}
+"""Options of the rows of the table of consistency, by their labels."""
+
+
+def _read(file: Path) -> Any:
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _body(printed: str) -> str:
+    """What a command printed, less the lines about the files that it wrote."""
+    return printed.partition("\nWrote ")[0]
+
+
+def compare(_: Path, printed: Sequence[str]) -> dict[str, str]:
+    """The tables and conclusions of a comparison, without its progress."""
+    return {"compare": block(_body(printed[0][printed[0].index("\nSensors ") :]))}
+
+
+def console(name: str) -> Texts:
+    return lambda _, printed: {name: block(_body(printed[0]))}
+
+
+def policies(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    rows, ids = [], (*TRACKING, "Waypoints")
+    for number, task in enumerate(ids):
+        row = [f"`QuadGym/{task}-v0`"]
+        for case in _read(folder / f"{number}/summary.json")["cases"]:
+            if task == "Waypoints":
+                row += [f"{case['gates_passed']:.2f} of 5 gates", f"{case['crash_rate']:.1%}"]
+            else:
+                row += [f"{1e3 * case['mean_error']:.1f} mm", f"{case['crash_rate']:.1%}"]
+        rows.append(row)
+    heads = ["id", "tuned PD", "crashed", "the report's PD", "crashed", "included", "crashed"]
+    return {"policies": table(heads, rows)}
+
+
+def recipes(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    rows = []
+    for group in _rows(folder / "0/groups.csv"):
+        each = [f"{1e3 * float(group[k]):.1f}" for k in ("mean_error", *_ENDS)]
+        crashed = [f"{100 * float(group[k]):.1f}" for k in ("crash_rate", *_CRASH_ENDS)]
+        rows.append(
+            [
+                f"`{group['group']}`",
+                "{} [{}, {}] mm".format(*each),
+                "{} [{}, {}] %".format(*crashed),
+            ]
+        )
+    return {"recipes": table(("trainings", "mean error", "crashed"), rows)}
+
+
+_ENDS = ("mean_error_low", "mean_error_high")
+_CRASH_ENDS = ("crash_rate_low", "crash_rate_high")
+
+
+PARTS = ("state", "position", "velocity", "attitude", "accel_bias", "gyro_bias")
+
+
+def _nees(value: float) -> str:
+    return f"{value:.2f}" if value < 100.0 else f"{value:,.0f}"
+
+
+def ablation(which: str) -> Texts:
+    """NEES by part, and root mean square errors, of each case."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        rows = []
+        for case, row in _read(folder / f"0/{which}.json")["rows"].items():
+            cells = [_nees(row[f"nees_{part}"]) for part in PARTS]
+            cells.append(f"{1e3 * row['rms_position']:.1f} mm")
+            cells.append(f"{1e3 * row['rms_attitude']:.1f} mrad")
+            cells.append(f"{1e3 * row['tracking_mean']:.0f} mm")
+            rows.append([case, *cells])
+        parts = (part.replace("_", " ") for part in PARTS)
+        errors = ("position error", "attitude error", "tracking error")
+        return {f"ablation_{which}": table(("case; NEES of", *parts, *errors), rows)}
+
+    return texts
+
+
+def consistency(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    rows = []
+    for number, label in enumerate(SUITES):
+        overall = _read(folder / f"{number}/consistency.json")["overall"]
+        rows.append([label, *(_nees(overall[part]) for part in PARTS)])
+    heads = ["suite", *(part.replace("_", " ") for part in PARTS)]
+    return {"consistency": table(heads, [["(consistent)", "15", *["3"] * 5], *rows])}
+
+
+def matrix(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    """All cells as CSV, and those that deviate, with the reason where it is known."""
+    cells = _read(folder / "0/matrix.json")["cells"]
+    names = list(dict.fromkeys(name for cell in cells.values() for name in cell["values"]))
+    with (folder / "0/matrix.csv").open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["cell", *names, "misses", "expected"])
+        for label, cell in cells.items():
+            values = [f"{cell['values'][n]:.4g}" if n in cell["values"] else "" for n in names]
+            reasons = "; ".join(cell["expected"].values())
+            writer.writerow([label, *values, " ".join(cell["misses"]), reasons])
+    rows = []
+    for label, cell in cells.items():
+        for name in cell["misses"]:
+            if "" not in cell["expected"] and name not in cell["expected"]:
+                rows.append([label, name, f"{cell['values'][name]:.2f}"])
+    inside = sum(not cell["misses"] for cell in cells.values())
+    return {
+        "matrix": table(("configuration", "quantity", "mean"), rows),
+        "matrix.count": f"{len(cells)}",
+        "matrix.inside": f"{inside}",
+    }
+
+
+def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    """All trials as CSV, and those with more than 1 % undetected failures."""
+    cells = _read(folder / "0/recovery.json")["cells"]
+    faulty = {label: cell for label, cell in cells.items() if "undetected" in cell["values"]}
+    calm = {label: cell for label, cell in cells.items() if "undetected" not in cell["values"]}
+    for name, chosen in (("faults", faulty), ("calm", calm)):
+        columns = list(next(iter(chosen.values()))["values"])
+        with (folder / f"0/{name}.csv").open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["trial", *columns, "expected"])
+            for label, cell in chosen.items():
+                values = [cell["values"][column] for column in columns]
+                shown = ["" if value is None else f"{value:.4g}" for value in values]
+                writer.writerow([label, *shown, cell["expected"]])
+    rows = [
+        [
+            label,
+            *(f"{cell['values'][n]:.1f}" for n in ("consistent", "flagged", "undetected")),
+            cell["expected"],
+        ]
+        for label, cell in faulty.items()
+        if cell["miss"]
+    ]
+    alarms = max(cell["values"]["alarms_per_hour"] for cell in calm.values())
+    return {
+        "recovery": table(
+            ("suite, fault", "consistent [%]", "flagged [%]", "undetected [%]", "reason"), rows
+        ),
+        "recovery.count": f"{len(faulty)}",
+        "recovery.alarms": f"{alarms:.1f}",
+    }
+
+
+def study(name: str, *arms: str) -> Texts:
+    """The whole table, success and crashes of some arms, and single crash rates."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        summary = _read(folder / "0/summary.json")
+        found = {
+            name: "\n" + (folder / "0/table.md").read_text(encoding="utf-8").strip() + "\n",
+            f"{name}.short": study_rows(summary, "trained on", arms, ("success", "crashed")),
+        }
+        for arm, row in summary["rows"].items():
+            percent = 100.0 * row["crashed"]["value"]
+            found[f"{name}.{arm}.crashed"] = (
+                f"{percent:.1f} %" if percent < 10 else f"{percent:.0f} %"
+            )
+        return found
+
+    return texts
+
+
+def variants(name: str, head: str, *columns: str) -> Texts:
+    """Some columns of a study's table."""
+
+    def texts(folder: Path, _: Sequence[str]) -> dict[str, str]:
+        return {f"{name}.short": study_rows(_read(folder / "0/summary.json"), head, (), columns)}
+
+    return texts
+
+
+def compiling(folder: Path, printed: Sequence[str]) -> dict[str, str]:
+    seconds = compile_seconds(_read(folder / "0/benchmark.json"))
+    return {"speed.compile": seconds, **console("speed_compile")(folder, printed)}
+
+
+def film_and_figures(study: str, figure: str) -> dict[str, str]:
+    names = ("film.webp", "learning.png", f"{figure}.png")
+    return {f"0/{name}": f"docs/images/{study}_{name}" for name in names}
+
+
+def defaults(_: Path, printed: Sequence[str]) -> dict[str, str]:
+    errors = [text.strip().splitlines()[-1].split()[4] for text in printed]
+    each = [f"{1e3 * float(error):.0f}" for error in errors]
+    return {
+        "sb3_defaults.hover": ", ".join(each[:3]) + " mm",
+        "sb3_defaults.circle": ", ".join(each[3:]) + " mm",
+    }
+
+
+def speeds(folder: Path, _: Sequence[str]) -> dict[str, str]:
+    """Steps per second of the interfaces."""
+    return interface_speeds(_read(folder / "0/benchmark.json"))
