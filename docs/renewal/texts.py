@@ -119,7 +119,7 @@ def matrix(folder: Path, _: Sequence[str]) -> dict[str, str]:
     cells = _read(folder / "0/matrix.json")["cells"]
     names = list(dict.fromkeys(name for cell in cells.values() for name in cell["values"]))
     with (folder / "0/matrix.csv").open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream)
+        writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(["cell", *names, "misses", "expected"])
         for label, cell in cells.items():
             values = [f"{cell['values'][n]:.4g}" if n in cell["values"] else "" for n in names]
@@ -146,7 +146,7 @@ def recovery(folder: Path, _: Sequence[str]) -> dict[str, str]:
     for name, chosen in (("faults", faulty), ("calm", calm)):
         columns = list(next(iter(chosen.values()))["values"])
         with (folder / f"0/{name}.csv").open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream)
+            writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(["trial", *columns, "expected"])
             for label, cell in chosen.items():
                 values = [cell["values"][column] for column in columns]
