@@ -130,8 +130,8 @@ CATALOG = {
         Result(
             name="miscalibrated",
             commands=[
-                "study look_around --arms-file baselines/arms_miscalibrated.py --output OUT "
-                "--first-episode 100000 --episodes 1000"
+                "study look_around --arms-file quad_gym/experiments/arms_miscalibrated.py "
+                "--output OUT --first-episode 100000 --episodes 1000"
             ],
             flights=("LookAround",),
             texts=texts.variants("miscalibrated", "condition", "success", "crashed", "error"),
@@ -152,8 +152,8 @@ CATALOG = {
         Result(
             name="masked",
             commands=[
-                "study stale_race --arms-file baselines/arms_masked.py --output OUT "
-                "--first-episode 100000"
+                "study stale_race --arms-file quad_gym/experiments/arms_masked.py "
+                "--output OUT --first-episode 100000"
             ],
             flights=("StaleRace",),
             texts=texts.variants("masked", "observed", "success", "crashed"),

@@ -32,15 +32,6 @@ from quad_gym import IDS
 from quad_gym.analysis import plots
 from quad_gym.analysis.reports import as_json, require_writable, versions, write_csv, write_json
 from quad_gym.batch.threads import resolve_threads
-from quad_gym.commands.compare_flights import Floats, Flown, fly
-from quad_gym.commands.compare_report import (
-    Comparison,
-    Setting,
-    conclusions,
-    matrix_text,
-    write_figures,
-    write_page,
-)
 from quad_gym.commands.options import (
     TRACKING,
     Keywords,
@@ -53,6 +44,15 @@ from quad_gym.commands.options import (
     without_idle_filter,
 )
 from quad_gym.commands.train import require_model
+from quad_gym.experiments.compare_flights import Floats, Flown, fly
+from quad_gym.experiments.compare_report import (
+    Comparison,
+    Setting,
+    conclusions,
+    matrix_text,
+    write_figures,
+    write_page,
+)
 from quad_gym.faults.presets import felt_without_sensors
 from quad_gym.params import checks as check
 from quad_gym.params.suites import sensor_suite, suite_label

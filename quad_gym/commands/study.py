@@ -7,12 +7,11 @@
     quad-gym study --quick                           # minutes: a check that it works, not a result
     quad-gym study --arms-file my_arms.py --arms truth mine
 
-Arms of baselines/arms.py (or of a file like it) are trained with the compiled PPO, or with another
-algorithm of Stable-Baselines3 where they name one, and every policy flies the same test episodes on
-the estimate. Prints a table with means over the seeds and 95 % intervals over seeds and episodes,
-says what can be concluded from them, and writes figures, numbers and a report. Each training is a
-folder: an interrupted study continues where it stopped, and a training whose folder was deleted is
-repeated, but no other.
+Arms of quad_gym/experiments/arms.py (or of a file like it) are trained with the compiled PPO, or
+with another algorithm of Stable-Baselines3 that they name, and every policy flies the same test
+episodes on the estimate. Prints a table with means over the seeds and 95 % intervals over seeds and
+episodes, and conclusions, and writes figures, numbers and a report. Each training is a folder: an
+interrupted study continues where it stopped.
 """
 
 import csv
@@ -27,7 +26,6 @@ import gymnasium
 import numpy as np
 from tyro.conf import arg
 
-from baselines.arms import Arm
 from baselines.keeping import EVALUATIONS, RunError
 from baselines.plans import Plan
 from baselines.recipes import Recipe, recipe
@@ -45,11 +43,12 @@ from quad_gym.commands.options import (
     with_full_id,
     without_idle_filter,
 )
-from quad_gym.commands.study_flights import Flown, fly
-from quad_gym.commands.study_report import table_text, write_report
-from quad_gym.commands.study_results import Study
-from quad_gym.commands.study_tasks import STUDIED, WITHIN, StudiedTask, stays
-from quad_gym.commands.study_words import conclusions
+from quad_gym.experiments.arms import Arm
+from quad_gym.experiments.study_flights import Flown, fly
+from quad_gym.experiments.study_report import table_text, write_report
+from quad_gym.experiments.study_results import Study
+from quad_gym.experiments.study_tasks import STUDIED, WITHIN, StudiedTask, stays
+from quad_gym.experiments.study_words import conclusions
 from quad_gym.params import checks as check
 
 STUDIED_IDS = tuple(env_id for env_id, task in IDS.items() if task in STUDIED)
@@ -64,7 +63,7 @@ class Args:
     arms: tuple[str, ...] = ()
     """names of arms; if not given, those that carry the conclusions, or all of --arms-file"""
     arms_file: Path | None = None
-    """a file with a tuple ARMS, as baselines/arms.py has; if not given, that one"""
+    """a file with a tuple ARMS, as quad_gym/experiments/arms.py has; if not given, that one"""
     seeds: int = 5
     """training seeds"""
     steps: int | None = None
@@ -182,7 +181,7 @@ def configure(args: Args) -> Study:
             plan.make_judge().close()
         test_flights(study, arm, 1).close()
     if args.video != "none":
-        from quad_gym.commands.study_films import require_film
+        from quad_gym.experiments.study_films import require_film
 
         require_film(study, args.video)
     require_writable("--output", study.folder)
@@ -297,7 +296,7 @@ def main(args: Args) -> None:
         print(sentence)
     film = None
     if args.video != "none":
-        from quad_gym.commands.study_films import write_film
+        from quad_gym.experiments.study_films import write_film
 
         film = write_film(results, args.video, partial(test_flights, study))
     written = write_report(results, film)

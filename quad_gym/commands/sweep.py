@@ -24,7 +24,7 @@ import tyro
 from quad_gym import IDS
 from quad_gym.commands.options import (
     Keywords,
-    full_id,
+    known_id,
     leave,
     require_at_least,
     usage_errors,
@@ -44,7 +44,7 @@ class Args:
     arms: tuple[str, ...] = ()
     """names of arms, as quad-gym study has them; if not given, the environment as --env has it"""
     arms_file: Path | None = None
-    """a file with a tuple ARMS; if not given, baselines/arms.py"""
+    """a file with a tuple ARMS; if not given, quad_gym/experiments/arms.py"""
     env: Keywords = field(default_factory=dict)
     """keywords of the environment, such as observation=truth sensors=standard,rtk"""
     algorithm: tuple[Literal["ppo", "recurrent_ppo", "sac", "td3", "tqc"], ...] = ()
@@ -92,13 +92,13 @@ def configure(args: Args) -> tuple[list[Any], Path]:
         OSError: If the file cannot be read.
         ImportError: If a package is missing.
     """
-    from quad_gym.commands.sweep_plan import expand, read
+    from quad_gym.experiments.sweep_plan import expand, read
 
     require_at_least(args, seeds=1, evaluations=1, episodes=1, jobs=1, threads=1, retries=0)
     given = _given(args, {} if args.file is None else read(args.file))
     leave(given["env"], {"threads": "--threads"})
-    name = IDS.get(full_id(given["env_ids"][0]), "") if given.get("env_ids") else "circle"
-    name = name if args.file is None else args.file.stem
+    given["env_ids"] = [known_id("env_ids", name) for name in given.get("env_ids", ["circle"])]
+    name = IDS[given["env_ids"][0]] if args.file is None else args.file.stem
     folder = args.output or Path("results/sweep") / name
     trainings = expand(given, _arms(given, args), folder, threads=args.threads)
     _check(trainings)
@@ -170,8 +170,8 @@ def main(args: Args) -> int:
         return 0
     from tqdm import tqdm
 
-    from quad_gym.commands.sweep_driver import Driver
-    from quad_gym.commands.sweep_executors import make_executor
+    from quad_gym.experiments.sweep_driver import Driver
+    from quad_gym.experiments.sweep_executors import make_executor
 
     with usage_errors():
         require_writable("--output", folder)
@@ -201,7 +201,7 @@ def _steps(trainings: list[Any]) -> int:
 
 def _report(trainings: list[Any], folder: Path) -> bool:
     """Print the table, and write it; whether that worked."""
-    from quad_gym.commands.sweep_table import row_of, table_text, write_tables
+    from quad_gym.experiments.sweep_table import row_of, table_text, write_tables
 
     rows = [row_of(training) for training in trainings]
     print(f"\n{table_text(rows)}", flush=True)

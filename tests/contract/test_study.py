@@ -5,19 +5,19 @@ import json
 import numpy as np
 import pytest
 
-from baselines.arms import ARMS, Arm
 from baselines.recipes import recipe
 from quad_gym.commands import study as command
-from quad_gym.commands import study_results
 from quad_gym.commands.main import main
-from quad_gym.commands.study_flights import Flown
-from quad_gym.commands.study_results import Study
-from quad_gym.commands.study_tasks import STUDIED, stays
-from quad_gym.commands.study_words import conclusions
+from quad_gym.experiments import study_results
+from quad_gym.experiments.arms import ARMS, Arm
+from quad_gym.experiments.study_flights import Flown
+from quad_gym.experiments.study_results import Study
+from quad_gym.experiments.study_tasks import STUDIED, stays
+from quad_gym.experiments.study_words import conclusions
 
 QUICK = ["study", "--quick", "--steps", "4096", "--env", "duration=0.6"]
 MINE = """
-from baselines.arms import Arm
+from quad_gym.experiments.arms import Arm
 ARMS = (
     Arm(name="facing", label="PD, facing the features", policy="pd:features"),
     Arm(name="truth", label="truth", training={"observation": "truth"}),

@@ -9,11 +9,11 @@ import pytest
 from baselines.recipes import recipe
 from quad_gym.commands import study as command
 from quad_gym.commands.main import main
-from quad_gym.commands.study_films import RATE, side_of
-from quad_gym.commands.study_flights import Flown
-from quad_gym.commands.study_pair import pair_of
-from quad_gym.commands.study_results import Study
-from quad_gym.commands.study_tasks import STUDIED
+from quad_gym.experiments.study_films import RATE, side_of
+from quad_gym.experiments.study_flights import Flown
+from quad_gym.experiments.study_pair import pair_of
+from quad_gym.experiments.study_results import Study
+from quad_gym.experiments.study_tasks import STUDIED
 from quad_gym.rendering.side_by_side import HOLD, SIDE
 
 pytest.importorskip("pygame")

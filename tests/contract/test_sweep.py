@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from baselines.arms import ARMS
 from baselines.locks import BusyError, holder, is_locked, locked
 from baselines.plans import description
-from quad_gym.commands.sweep_driver import Driver
-from quad_gym.commands.sweep_executors import Ended, work
-from quad_gym.commands.sweep_plan import expand, read
-from quad_gym.commands.sweep_table import FILES, groups_of, row_of, write_tables
+from quad_gym.experiments.arms import ARMS
+from quad_gym.experiments.sweep_driver import Driver
+from quad_gym.experiments.sweep_executors import Ended, work
+from quad_gym.experiments.sweep_plan import expand, read
+from quad_gym.experiments.sweep_table import FILES, groups_of, row_of, write_tables
 from tests import console_commands
 
 TRUTH = {"duration": 1.0, "observation": "truth"}

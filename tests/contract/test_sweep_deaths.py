@@ -11,8 +11,8 @@ import time
 import pytest
 
 from baselines.locks import holder, is_locked
-from quad_gym.commands import sweep_executors
-from quad_gym.commands.sweep_table import FILES
+from quad_gym.experiments import sweep_executors
+from quad_gym.experiments.sweep_table import FILES
 from tests import console_commands
 from tests.contract.test_sweep import SMALL
 

@@ -13,8 +13,8 @@ from baselines import PDPolicy
 from baselines.pd import UNSURE
 from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.commands.main import main
-from quad_gym.commands.study_flights import fly
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.experiments.study_flights import fly
 from quad_gym.tasks.look_around import LookAround
 
 ID = "QuadGym/LookAround-v0"

@@ -14,7 +14,7 @@ import numpy as np
 from baselines.keeping import EVALUATIONS
 from quad_gym.analysis.intervals import mean_interval, rate_over_trainings
 from quad_gym.analysis.reports import text_table, write_csv
-from quad_gym.commands.sweep_plan import Training
+from quad_gym.experiments.sweep_plan import Training
 
 SCORES = ("mean_error", "late_error", "crash_rate", "return", "gates_passed")
 """Of the best evaluation of a training."""

@@ -19,7 +19,7 @@ from quad_gym.analysis.comparison_plots import (
 from quad_gym.analysis.intervals import mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
 from quad_gym.analysis.reports import text_table
-from quad_gym.commands.compare_flights import Floats, Flown
+from quad_gym.experiments.compare_flights import Floats, Flown
 from quad_gym.params.suites import contents_of_suite_files, suite_label
 
 NAMES = {

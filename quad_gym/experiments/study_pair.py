@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_gym.commands.study_flights import Flown
-from quad_gym.commands.study_results import Results
+from quad_gym.experiments.study_flights import Flown
+from quad_gym.experiments.study_results import Results
 
 _TRAINING = "Of each arm it is the training with the best validation. The episode is the first one "
 CHOICES: Mapping[str, str] = {

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.arms import Arm
 from quad_gym import FlightRecorder
-from quad_gym.commands.study_pair import label_of, pair_of
-from quad_gym.commands.study_results import Results, Study
 from quad_gym.evaluation import roll_out
+from quad_gym.experiments.arms import Arm
+from quad_gym.experiments.study_pair import label_of, pair_of
+from quad_gym.experiments.study_results import Results, Study
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path

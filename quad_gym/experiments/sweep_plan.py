@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from baselines.arms import Arm
 from baselines.keeping import has_checkpoint
 from baselines.plans import Plan, description
 from baselines.recipes import Recipe, recipe
 from quad_gym import IDS
-from quad_gym.commands.options import known_id
+from quad_gym.experiments.arms import Arm
 from quad_gym.params import checks as check
 
 RECORD = "training.json"
@@ -107,6 +106,8 @@ def read(file: Path) -> dict[str, Any]:
         check.choice(f"a key of {file}", name, NAMES)
         if name in TABLES and not isinstance(value, dict):
             raise ValueError(f"{name} in {file} must be a table, got {value!r}")
+        if name in ("env_ids", "arms"):
+            _listed(name, value)
     return found
 
 
@@ -126,9 +127,9 @@ def expand(
     """
     spec = Spec(**given)
     groups = [
-        (known_id("env_ids", env_id), arm, dict(axes))
-        for env_id in _listed("env_ids", spec.env_ids)
-        for arm in _listed("arms", spec.arms) or [None]
+        (env_id, arm, dict(axes))
+        for env_id in spec.env_ids
+        for arm in tuple[str | None, ...](spec.arms) or (None,)
         for axes in _products(spec)
     ]
     found = []
@@ -143,10 +144,9 @@ def expand(
     return found
 
 
-def _listed(name: str, values: Any) -> list[Any]:
+def _listed(name: str, values: Any) -> None:
     if not (isinstance(values, list) and all(isinstance(value, str) for value in values)):
         raise ValueError(f"{name} must be a list of names, got {values!r}")
-    return values
 
 
 def _seeds(given: Any) -> Sequence[int]:

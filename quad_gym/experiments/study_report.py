@@ -18,11 +18,11 @@ from quad_gym.analysis.study_plots import (
     pace_figure,
     returns_figure,
 )
-from quad_gym.commands.study_flights import Flown
-from quad_gym.commands.study_pair import CHOICES, label_of, pair_of
-from quad_gym.commands.study_results import Results
-from quad_gym.commands.study_tasks import ALWAYS, Column
-from quad_gym.commands.study_words import conclusions, number, share
+from quad_gym.experiments.study_flights import Flown
+from quad_gym.experiments.study_pair import CHOICES, label_of, pair_of
+from quad_gym.experiments.study_results import Results
+from quad_gym.experiments.study_tasks import ALWAYS, Column
+from quad_gym.experiments.study_words import conclusions, number, share
 
 CAPTIONS = {
     "learning": "Return of the evaluations while training, each arm on what it is trained on; "

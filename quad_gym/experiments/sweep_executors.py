@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 from baselines.locks import BusyError
 from baselines.plans import Plan
 from baselines.training import train
-from quad_gym.commands.sweep_plan import Training
+from quad_gym.experiments.sweep_plan import Training
 
 EXECUTORS = ("local", "slurm", "ray")
 

@@ -8,7 +8,7 @@ arms that happens with a probability of 1 % with three trainings each, 2 % with 
 from collections.abc import Mapping
 
 from quad_gym.analysis.intervals import Estimated, difference
-from quad_gym.commands.study_results import Results
+from quad_gym.experiments.study_results import Results
 
 FEW = 5
 """Seeds below which intervals over trainings are wide."""

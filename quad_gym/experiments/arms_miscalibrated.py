@@ -1,6 +1,6 @@
 """Arms of a study of policies with a miscalibrated covariance.
 
-    quad-gym study --arms-file baselines/arms_miscalibrated.py
+    quad-gym study --arms-file quad_gym/experiments/arms_miscalibrated.py
 
 All arms fly LookAround with the pretrained policy, which was trained with a consistent filter. No
 arm is trained.
@@ -8,11 +8,11 @@ arm is trained.
 
 from typing import Any
 
-from baselines.arms import Arm
 from quad_gym import sensor_suite
+from quad_gym.experiments.arms import Arm
 
 _SUITE = sensor_suite("one_wall")
-_WITH_STD = "baselines.arm_tasks:WithStd"
+_WITH_STD = "quad_gym.experiments.arm_tasks:WithStd"
 
 
 _NOISES = (
@@ -47,7 +47,7 @@ ARMS = (
         _flown(
             f"reported_std_x{name}",
             f"reported standard deviation x {words}",
-            f"baselines.arm_tasks:REPORTED_STD_X{name}",
+            f"quad_gym.experiments.arm_tasks:REPORTED_STD_X{name}",
         )
         for name, words in _FACTORS.items()
     ),

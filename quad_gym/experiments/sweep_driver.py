@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from baselines.locks import holder, is_locked
-from quad_gym.commands.sweep_executors import Ended, Executor, Job
-from quad_gym.commands.sweep_plan import Training
-from quad_gym.commands.sweep_table import steps_done
+from quad_gym.experiments.sweep_executors import Ended, Executor, Job
+from quad_gym.experiments.sweep_plan import Training
+from quad_gym.experiments.sweep_table import steps_done
 
 REFRESH = 1.0
 """Between renewals of the progress line [s]."""

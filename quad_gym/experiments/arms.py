@@ -69,6 +69,11 @@ class Arm(Checked):
         return "compiled" if self.algorithm == "ppo" else "sb3"
 
 
+def _task(name: str, module: str = "arm_tasks") -> dict[str, str]:
+    """Keyword of an environment with a task of this package."""
+    return {"task": f"quad_gym.experiments.{module}:{name}"}
+
+
 _FAR_SIGHTED = {"gamma": 0.995}
 """Longer horizon: without a reward for certainty, looking at the markers is rewarded only seconds
 later. With the recipe's 0.99, a third of the flights crashed in preliminary trainings."""
@@ -79,7 +84,7 @@ _NOISIER = _ONE_WALL.replace(
 """Noise as large as the errors of the estimate: root mean squares of position and velocity over 300
 episodes of `pd_features_when_uncertain`, attitude in proportion. The suite's own noise, 8 mm, has
 the size of the errors of a filter that always has features in view."""
-_WITH_STD = {"task": "baselines.arm_tasks:WithStd"}
+_WITH_STD = _task("WithStd")
 
 ARMS = (
     Arm(name="pd_reference", label="PD, facing as rewarded", policy="pd"),
@@ -107,25 +112,25 @@ ARMS = (
     Arm(
         name="std_history",
         label="estimate + standard deviation + history",
-        environment={"task": "baselines.arm_tasks:WithStdHistory"},
+        environment=_task("WithStdHistory"),
         parameters=_FAR_SIGHTED,
     ),
     Arm(
         name="certainty",
         label="estimate, reward for certainty",
-        learning={"task": "baselines.arm_tasks:CertaintyReward"},
+        learning=_task("CertaintyReward"),
     ),
     Arm(
         name="std_certainty",
         label="estimate + standard deviation, reward for certainty",
         environment=_WITH_STD,
-        learning={"task": "baselines.arm_tasks:WithStdCertaintyReward"},
+        learning=_task("WithStdCertaintyReward"),
     ),
     Arm(
         name="std_certainty_privileged",
         label="estimate + standard deviation, reward for certainty, privileged critic",
         environment=_WITH_STD,
-        learning={"task": "baselines.arm_critics:WithStdCertaintyRewardForCritic"},
+        learning=_task("WithStdCertaintyRewardForCritic", "arm_critics"),
         parameters={"critic_only": 15},
     ),
     # rewarded for certainty like `certainty` and `std_certainty`, so that they differ only in the
@@ -133,7 +138,7 @@ ARMS = (
     Arm(
         name="recurrent",
         label="estimate, LSTM, reward for certainty",
-        learning={"task": "baselines.arm_tasks:CertaintyReward"},
+        learning=_task("CertaintyReward"),
         algorithm="recurrent_ppo",
     ),
 )
@@ -146,7 +151,7 @@ _COMPENSATED = {
     "sensors": _STALE.replace(estimator=_STALE.estimator.replace(delay_compensation="retrodict"))
 }
 """Sensors of the race, with a filter that uses the time stamps of their measurements."""
-_WITH_HISTORY = {"task": "baselines.arm_tasks:RaceWithHistory", **_STD}
+_WITH_HISTORY = {**_task("RaceWithHistory"), **_STD}
 
 STALE_RACE = (
     Arm(name="pd", label="PD", policy="pd"),
@@ -160,8 +165,8 @@ STALE_RACE = (
     Arm(
         name="residual",
         label="truth + residual model",
-        environment={"task": "baselines.arm_tasks:ObservedRace"},
-        training={"task": "baselines.arm_tasks:ResidualRace", **_TRUTH},
+        environment=_task("ObservedRace"),
+        training={**_task("ResidualRace"), **_TRUTH},
     ),
     Arm(
         name="truth_on_truth", label="truth, tested on the truth", flies="truth", environment=_TRUTH
@@ -181,9 +186,9 @@ STALE_RACE = (
 )
 """Arms of `QuadGym/StaleRace-v0`."""
 
-_SCALED = {"task": "baselines.arm_tasks:Scaled"}
-_WITH_UNCERTAINTY = {"task": "baselines.arm_tasks:WithUncertainty"}
-_CONSTANT_CRASH_COST = {"task": "baselines.arm_tasks:ConstantCrashCost"}
+_SCALED = _task("Scaled")
+_WITH_UNCERTAINTY = _task("WithUncertainty")
+_CONSTANT_CRASH_COST = _task("ConstantCrashCost")
 
 OUTAGE_DASH = (
     Arm(name="pd", label="PD at 4.7 m/s", policy="pd"),
@@ -206,13 +211,13 @@ OUTAGE_DASH = (
         name="std",
         label="estimate + normalized uncertainty",
         environment=_WITH_UNCERTAINTY,
-        learning={"task": "baselines.arm_tasks:ConstantCrashCostWithUncertainty"},
+        learning=_task("ConstantCrashCostWithUncertainty"),
     ),
     Arm(
         name="std_privileged",
         label="estimate + normalized uncertainty, privileged critic",
         environment=_WITH_UNCERTAINTY,
-        learning={"task": "baselines.arm_critics:ConstantCrashCostWithUncertaintyForCritic"},
+        learning=_task("ConstantCrashCostWithUncertaintyForCritic", "arm_critics"),
         parameters={"critic_only": 16},
     ),
     Arm(

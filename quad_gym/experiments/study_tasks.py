@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.arms import ARMS_OF, Arm
 from quad_gym.analysis.intervals import Score, mean, worst_tenth
-from quad_gym.commands.study_flights import Flown
+from quad_gym.experiments.arms import ARMS_OF, Arm
+from quad_gym.experiments.study_flights import Flown
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.arms import Arm
 from baselines.keeping import SUFFIXES
 from baselines.recipes import Recipe
 from quad_gym.analysis.intervals import (
@@ -22,8 +21,9 @@ from quad_gym.analysis.intervals import (
     rate_over_trainings,
 )
 from quad_gym.analysis.reports import as_json
-from quad_gym.commands.study_flights import Flown
-from quad_gym.commands.study_tasks import ALWAYS, StudiedTask
+from quad_gym.experiments.arms import Arm
+from quad_gym.experiments.study_flights import Flown
+from quad_gym.experiments.study_tasks import ALWAYS, StudiedTask
 from quad_gym.kernels.compiling.digest import flights_digest
 from quad_gym.params.suites import contents_of_suite_files
 

@@ -1,0 +1,1 @@
+"""Experiments: trainings and flights that become tables, figures and pages."""
