@@ -70,8 +70,8 @@ class Arm(Checked):
 
 
 def _task(name: str, module: str = "arm_tasks") -> dict[str, str]:
-    """Keyword of an environment with a task of this package."""
-    return {"task": f"quad_gym.experiments.{module}:{name}"}
+    """Keyword of an environment with a task of `baselines`."""
+    return {"task": f"baselines.{module}:{name}"}
 
 
 _FAR_SIGHTED = {"gamma": 0.995}

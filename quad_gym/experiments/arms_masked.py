@@ -23,7 +23,7 @@ def _flown(task: str, label: str) -> Arm:
         name=task.lower(),
         label=label,
         policy="pretrained",
-        environment={"task": f"quad_gym.experiments.arm_tasks:{task}"},
+        environment={"task": f"baselines.arm_tasks:{task}"},
     )
 
 

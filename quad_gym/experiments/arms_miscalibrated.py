@@ -12,7 +12,7 @@ from quad_gym import sensor_suite
 from quad_gym.experiments.arms import Arm
 
 _SUITE = sensor_suite("one_wall")
-_WITH_STD = "quad_gym.experiments.arm_tasks:WithStd"
+_WITH_STD = "baselines.arm_tasks:WithStd"
 
 
 _NOISES = (
@@ -47,7 +47,7 @@ ARMS = (
         _flown(
             f"reported_std_x{name}",
             f"reported standard deviation x {words}",
-            f"quad_gym.experiments.arm_tasks:REPORTED_STD_X{name}",
+            f"baselines.arm_tasks:REPORTED_STD_X{name}",
         )
         for name, words in _FACTORS.items()
     ),

@@ -89,10 +89,8 @@ def asymmetric_plan(critic_only=15, **changes):
     return small_plan(
         **{
             "env_id": "QuadGym/LookAround-v0",
-            "environment": {"duration": 1.0, "task": "quad_gym.experiments.arm_tasks:WithStd"},
-            "learning": {
-                "task": "quad_gym.experiments.arm_critics:WithStdCertaintyRewardForCritic"
-            },
+            "environment": {"duration": 1.0, "task": "baselines.arm_tasks:WithStd"},
+            "learning": {"task": "baselines.arm_critics:WithStdCertaintyRewardForCritic"},
             "recipe": plan.recipe.replace(parameters=parameters),
             **changes,
         }

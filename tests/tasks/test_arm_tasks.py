@@ -6,17 +6,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from baselines import PDPolicy
+from baselines.arm_tasks import CONSTANT_CRASH_COST, RACE_STD
 from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
 from baselines.recipes import recipe
-from quad_gym.experiments.arm_tasks import CONSTANT_CRASH_COST, RACE_STD
 from quad_gym.experiments.arms import OUTAGE_DASH
 
 ID = "QuadGym/LookAround-v0"
 
 
 def make(name, count=6, env_id=ID, **keywords):
-    own = f"quad_gym.experiments.arm_tasks:{name}"
+    own = f"baselines.arm_tasks:{name}"
     env = gymnasium.make_vec(
         env_id, num_envs=count, autoreset_mode="Disabled", task=own, **keywords
     )
@@ -167,7 +167,7 @@ def test_steady_episodes_begin_before_the_first_wall_or_between_two():
     env = gymnasium.make_vec(
         "QuadGym/OutageDash-v0",
         num_envs=300,
-        task="quad_gym.experiments.arm_tasks:ConstantCrashCost",
+        task="baselines.arm_tasks:ConstantCrashCost",
     )
     env.reset(seed=0)
     x = env.unwrapped.flights.batch.record("r")[:, 0]
@@ -252,7 +252,7 @@ def true_state(env, target):
 
 
 def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_sees():
-    task = "quad_gym.experiments.arm_tasks:WithStdCertaintyReward"
+    task = "baselines.arm_tasks:WithStdCertaintyReward"
     plain = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", task=task)
     shipped = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", privileged=True)
     both = [env.reset(seed=3)[0] for env in (plain, shipped)]
@@ -260,7 +260,7 @@ def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_
         ID,
         num_envs=6,
         autoreset_mode="Disabled",
-        task="quad_gym.experiments.arm_critics:WithStdCertaintyRewardForCritic",
+        task="baselines.arm_critics:WithStdCertaintyRewardForCritic",
     )
     observations, _ = env.reset(seed=3)
     for _ in range(20):
@@ -277,13 +277,13 @@ def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_
 
 def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails():
     task = "QuadGym/OutageDash-v0"
-    name = "quad_gym.experiments.arm_critics:ConstantCrashCostWithUncertaintyForCritic"
+    name = "baselines.arm_critics:ConstantCrashCostWithUncertaintyForCritic"
     env = gymnasium.make_vec(task, num_envs=20, autoreset_mode="Disabled", task=name)
     plain = gymnasium.make_vec(
         task,
         num_envs=20,
         autoreset_mode="Disabled",
-        task="quad_gym.experiments.arm_tasks:ConstantCrashCostWithUncertainty",
+        task="baselines.arm_tasks:ConstantCrashCostWithUncertainty",
     )
     env.reset(seed=3)
     plain.reset(seed=3)

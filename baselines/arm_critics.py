@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.experiments.arm_tasks import (
+from baselines.arm_tasks import (
     ConstantCrashCostWithUncertainty,
     Parts,
     WithStdCertaintyReward,
