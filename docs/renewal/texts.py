@@ -68,7 +68,7 @@ def recipes(folder: Path, _: Sequence[str]) -> dict[str, str]:
         crashed = [f"{100 * float(group[k]):.1f}" for k in ("crash_rate", *_CRASH_ENDS)]
         rows.append(
             [
-                f"`{group['group']}`",
+                f"`{group['group'].partition(',')[0]}`",
                 "{} [{}, {}] mm".format(*each),
                 "{} [{}, {}] %".format(*crashed),
             ]
