@@ -28,4 +28,6 @@ settings.load_profile("quad_gym")
 def pytest_sessionstart(session):
     """Compile what tests share where they run in several processes, which then only load it."""
     if getattr(session.config.option, "numprocesses", None):
-        prepare([*names_of(frozenset(SOURCES)), *FILTER_ENTRIES, *SENSORS_AND_VEHICLE])
+        prepare(
+            [*names_of([source.name for source in SOURCES]), *FILTER_ENTRIES, *SENSORS_AND_VEHICLE]
+        )

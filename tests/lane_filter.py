@@ -4,6 +4,7 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
+from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.single import FILTER_ENTRIES, FILTER_STAGES, run_stage, start_filter
 from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params.vehicle import VehicleParams
@@ -33,6 +34,7 @@ class LaneFilter:
         self.blocks = aligned_zeros(EIGHT // WIDTH, FLIGHT_BLOCK)
         self.work = aligned_zeros(1, WORK_BLOCK)
         self.settings = np.zeros(1, SETTINGS)
+        self.settings["run_filter"] = True
 
     def put(self, number, **values):
         """Set fields of one flight."""
@@ -79,7 +81,9 @@ class LaneFilter:
         self._run(Stage.PREDICT, (True,) * EIGHT)
 
     def _run(self, stage, mask):
-        table = linked_table(FILTER_STAGES, FILTER_ENTRIES)
+        needed = needed_stages(self.settings[0])
+        stages = {stage: needed[stage] for stage in FILTER_STAGES if stage in needed}
+        table = linked_table(stages, FILTER_ENTRIES)
         for block, params, settings, work in self._each(mask):
             others = (params, params, settings, work, table, self.features)
             run_stage(block.ctypes.data, 0, 1, int(stage), *others)

@@ -49,26 +49,21 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     """Names of the compiled functions of some kinds, slowest to compile first."""
     from quad_gym.envs.configuration import Flights
     from quad_gym.kernels.compiling.linked import FLY, SETTLE, names_of
-    from quad_gym.kernels.compiling.stages import Stage, needed_stages
-    from quad_gym.kernels.single import (
-        FILTER_ENTRIES,
-        FILTER_STAGES,
-        SENSORS_AND_VEHICLE,
-        SLOW_FILTER_STAGES,
-    )
+    from quad_gym.kernels.compiling.stages import SOURCES, needed_stages
+    from quad_gym.kernels.single import FILTER_ENTRIES, FILTER_STAGES, SENSORS_AND_VEHICLE
     from quad_gym.records import Autoreset
 
-    needed: frozenset[Stage] = frozenset()
+    needed: set[str] = set()
     for kind, observation in (("plain", "estimate"), ("truth", "truth")):
         if kind in kinds:
             flights = Flights("circle", 1, Autoreset.NEXT_STEP, observation=observation)
-            needed |= needed_stages(flights.batch._settings[0])
+            needed |= set(needed_stages(flights.batch._settings[0]).values())
     if "all" in kinds:
-        needed = frozenset(Stage)
-    entries = (FLY, SETTLE) if Stage.SHOW in needed else (FLY,)
+        needed = {source.name for source in SOURCES}
+    entries = (FLY, SETTLE) if "all" in kinds else (FLY,)
     names = names_of(needed, entries) if needed else []
     if {"single", "all"} & set(kinds):
-        filters = names_of(FILTER_STAGES | SLOW_FILTER_STAGES, FILTER_ENTRIES)
+        filters = names_of({s.name for s in SOURCES if s.stage in FILTER_STAGES}, FILTER_ENTRIES)
         names = [*filters, *names, *SENSORS_AND_VEHICLE]
     return list(dict.fromkeys(names))
 

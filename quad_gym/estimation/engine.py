@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from quad_gym.estimation.samples import Measurement, Sample
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.linked import linked_table
-from quad_gym.kernels.compiling.stages import Stage
+from quad_gym.kernels.compiling.stages import Stage, needed_stages
 from quad_gym.packing.aids import pack_aid_settings, slow_falls
 from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params.sensors import SensorSuite
@@ -64,8 +64,11 @@ class Engine:
         estimator = sensors.estimator.replace(kind=kind)
         self.form = form_of(estimator, innovations=True, lever_arm=lever_arm)
         self.settings = np.zeros(1, SETTINGS)
+        self.settings["run_filter"] = True
         self.settings["form"], self.settings["feature_count"] = int(self.form), self.features
         pack_aid_settings(self.settings[0], sensors, sensors)
+        needed = needed_stages(self.settings[0])
+        self._stages = {stage: needed[stage] for stage in single.FILTER_STAGES if stage in needed}
         self.slow = bool(self.settings["slow_states"] > 0)
         self._room = room_of(_PARTS)
         self._work = aligned_zeros(1, WORK_BLOCK)
@@ -134,7 +137,7 @@ class Engine:
         # for the lever arms of a velocity and of the accelerometer
         self.fill("w_before", sample.gyro_before)
         self.fill("w_meas", sample.gyro)
-        self._run(Stage.PREDICT, Stage.PREDICT_WITH_SLOW)
+        self._run(Stage.PREDICT)
 
     def update(self, measurement: Measurement) -> None:
         """Update the estimate with measurements."""
@@ -161,7 +164,7 @@ class Engine:
             blocks["pixels"][:, : self.features] = image
         self._set_dt(self.sensors.imu.dt)  # `tick` counts these
         kept = self.impose(m.noise)
-        self._run(Stage.UPDATE, Stage.UPDATE_WITH_SLOW)
+        self._run(Stage.UPDATE)
         self.restore_noise(kept)
 
     def impose(self, noise: dict[str, Any]) -> dict[str, NDArray[Any]]:
@@ -206,13 +209,10 @@ class Engine:
 
     def _table(self) -> NDArray[Any]:
         """Return the table of the stages that the filter runs."""
-        stages = single.SLOW_FILTER_STAGES if self.slow else single.FILTER_STAGES
-        own = {Stage[aid.name] for aid in self.sensors.aids}
-        return linked_table(stages | own, single.FILTER_ENTRIES)
+        return linked_table(self._stages, single.FILTER_ENTRIES)
 
-    def _run(self, stage: Stage, with_slow: Stage) -> None:
-        """Run a stage, or the stage of a filter with time-correlated errors."""
-        chosen, p = with_slow if self.slow else stage, self.params
+    def _run(self, stage: Stage) -> None:
+        p = self.params
         others = (p, p, self.settings, self._work, self._table(), self.features)
         address, count = self.blocks.ctypes.data, len(self.blocks)
-        single.run_stage(address, FLIGHT_BLOCK.itemsize, count, int(chosen), *others)
+        single.run_stage(address, FLIGHT_BLOCK.itemsize, count, int(stage), *others)

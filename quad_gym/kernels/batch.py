@@ -5,7 +5,7 @@ from numba import types
 from quad_gym.kernels.board import COMMAND, FINISHED, TICKET, comes, finished, post, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
-from quad_gym.kernels.flight import begin_episode, tick
+from quad_gym.kernels.flight import begin_episode, run, tick
 from quad_gym.kernels.simd.addresses import (
     array_at,
     lanes_at,
@@ -34,9 +34,6 @@ from quad_gym.records import (
     offset_of,
 )
 
-_IMPOSE, _MEET_ROTORS = int(Stage.IMPOSE), int(Stage.MEET_ROTORS)
-_JUDGE, _OBSERVE, _SHOW = int(Stage.JUDGE), int(Stage.OBSERVE), int(Stage.SHOW)
-_JUDGE_CONTACTS, _JUDGE_LANDING = int(Stage.JUDGE_CONTACTS), int(Stage.JUDGE_LANDING)
 _REWARD = int(Result.REWARD)
 _TERMINATED = int(Result.TERMINATED)
 _TRUNCATED = int(Result.TRUNCATED)
@@ -55,7 +52,7 @@ _TERMS, _REWARD_TERMS = len(RewardTerm), len(Result)
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
 _WORLD, _OWN, _MODEL = int(Call.WORLD), int(Call.OWN), int(Call.MODEL)
-_BELIEVED, _PLACE_FEATURES = int(Call.BELIEVED), int(Stage.PLACE_FEATURES)
+_BELIEVED = int(Call.BELIEVED)
 _SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
 _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
@@ -78,7 +75,7 @@ _wholes_at = array_at("i8")
 @kernel
 def _observe(call, flight, world, model, settings, work, stages):
     """Observe the present instant, within the space's bounds."""
-    call_stage(stages, _OBSERVE, flight, world, model, settings, work, 0)
+    call_stage(stages, Stage.OBSERVE, flight, world, model, settings, work, 0)
     size = call[_SIZE]
     low, high, row = _floats_at(call[_LOW], size), _floats_at(call[_HIGH], size), work.observation
     for k in range(size):
@@ -150,7 +147,7 @@ def _write_results(call, flight, work, index):
 @kernel
 def _show(call, index, flight, world, model, settings, work, stages):
     """Show the present instant to a user's task."""
-    call_stage(stages, _SHOW, flight, world, model, settings, work, 0)
+    call_stage(stages, Stage.SHOW, flight, world, model, settings, work, 0)
     here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
     for k in range(SHOWN_FLOATS):
         store_lanes(here + k * pitch, work.observation[k])
@@ -189,15 +186,14 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
     instant = flight.instant
     for left in range(settings.ticks_per_step - 1, -1, -1):
         _fetch_ahead(call, index, settings, left)
-        tick(flight, world, model, settings, work, stages, left == 0)
+        tick(flight, world, model, settings, work, stages, min(left, 1))
     # a step that begins an episode draws nothing before it
     flight.instant = select(resetting, instant, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)
-    call_stage(stages, _JUDGE, flight, world, model, settings, work, 0)
-    if settings.grounded:
-        call_stage(stages, _JUDGE_LANDING, flight, world, model, settings, work, 0)
-    if settings.contacts:
-        call_stage(stages, _JUDGE_CONTACTS, flight, world, model, settings, work, 0)
+    here = (flight, world, model, settings, work, stages)
+    run(Stage.JUDGE, here)
+    run(Stage.JUDGE_LANDING, here)
+    run(Stage.JUDGE_CONTACTS, here)
     done = (flight.terminated + flight.truncated) > 0.0
     flight.needs_reset = select(done, 1.0, flight.needs_reset)
     same_step = settings.autoreset == Autoreset.SAME_STEP
@@ -209,12 +205,9 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
     """Step or reset the flights of one block."""
     flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
     observing, written = call[_SIZE] > 0, False
-    if settings.randomized:
-        call_stage(stages, _IMPOSE, flight, true, nominal, settings, work, 0)
-    if settings.features_drawn:
-        call_stage(stages, _PLACE_FEATURES, flight, true, believed, settings, work, 0)
-    if settings.faults:
-        call_stage(stages, _MEET_ROTORS, flight, true, believed, settings, work, 0)
+    run(Stage.IMPOSE, (flight, true, nominal, settings, work, stages))
+    run(Stage.PLACE_FEATURES, (flight, true, believed, settings, work, stages))
+    run(Stage.MEET_ROTORS, (flight, true, believed, settings, work, stages))
     if command == Command.RESET:
         resets, plain = _bytes_at(call[_RESETS], call[_COUNT]), _plain_work_at(call[_WORK])
         for lane in range(WIDTH):

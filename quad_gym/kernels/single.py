@@ -50,12 +50,11 @@ from quad_gym.records import (
     PARAMS_BLOCK,
     SETTINGS,
     WORK_BLOCK,
+    Aid,
 )
 
-FILTER_STAGES = frozenset({Stage.UPDATE, Stage.PREDICT})
-"""The stages that a filter runs."""
-SLOW_FILTER_STAGES = frozenset({Stage.UPDATE_WITH_SLOW, Stage.PREDICT_WITH_SLOW})
-"""Those of a filter that estimates slow errors of sensors, beside its aiding sensors' own."""
+FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[aid.name] for aid in Aid))
+"""The stages that a filter runs, as far as it needs them."""
 FILTER_ENTRIES = tuple(f"{__name__}:{name}" for name in ("start_filter", "run_stage"))
 """Names of the entries that it calls, the longest to compile first."""
 SENSORS_AND_VEHICLE = tuple(
@@ -112,7 +111,7 @@ def start_filter(blocks, params, settings, work, x_I):
     types.int64,
 )
 def run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
-    """Run a stage once for every block, where `work.mask`.
+    """Run a stage that the table has once for every block, where `work.mask`.
 
     Args:
         address, pitch: Of the first block, as of `Call`; bytes from one block to the next.

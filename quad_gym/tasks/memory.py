@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from quad_gym.batch.calls import Calls
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import SETTLE
+from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.records import SHOWN, SHOWN_SIZE, WIDTH, Command
 from quad_gym.tasks.lazy import Attribute, Shown
 
@@ -61,7 +61,7 @@ class ReadableBatch(FlightBatch):
     def __init__(self, count: int, **keywords: Any) -> None:
         super().__init__(count, **keywords)
         self._settings["shown"] = True
-        self._stages |= {Stage.SHOW}
+        self._stages = needed_stages(self._settings[0])
         self._entries.append(SETTLE)
         self._fields: dict[str, NDArray[Any]] = {}
         self._handed_out: list[NDArray[Any]] = []

@@ -17,7 +17,7 @@ from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.single import run_stage
 
 SUITES = ("standard", "lab")
-FILTER = (Stage.PREDICT, Stage.UPDATE, Stage.PREDICT_WITH_SLOW, Stage.UPDATE_WITH_SLOW)
+FILTER = (Stage.PREDICT, Stage.UPDATE)
 AT_THE_START = frozenset(
     {
         Stage.DRAW,
@@ -27,7 +27,7 @@ AT_THE_START = frozenset(
         Stage.BEGIN_FAULTS,
         Stage.ALIGN,
         Stage.WARM,
-        Stage.WARM_WITH_SLOW,
+        Stage.FORGET_INNOVATIONS,
     }
 )
 """Stages of the first instant of an episode; all others are a tick's."""
@@ -55,7 +55,7 @@ class Staged:
     def __init__(self, batch: FlightBatch, stage: Stage, flag: int = 0) -> None:
         self._stage, self._flag, self._skipped = int(stage), flag, batch._room.skipped
         self._others = (batch._world, batch._model, batch._settings, batch._work[0])
-        self._table = linked_table(needed_stages(batch._settings[0]) | {stage})
+        self._table = linked_table(needed_stages(batch._settings[0]))
 
     def __call__(self, blocks: NDArray[Any]) -> None:
         """Run the stage once for every block."""
@@ -74,7 +74,7 @@ class Staged:
 
 def flag_of(stage: Stage, batch: FlightBatch) -> int:
     """What a flight calls a stage with."""
-    if stage in (Stage.UPDATE, Stage.UPDATE_WITH_SLOW):
+    if stage == Stage.UPDATE:
         return int(batch._settings["feature_count"][0])
     return int(stage in AT_THE_START)
 
@@ -115,7 +115,7 @@ def _time_suite(suite: str, count: int, effort: Effort) -> list[Row]:
 
     rows: list[Row] = []
     add("whole tick", measure(batch.step, effort, again).per(count), "whole")
-    needed = needed_stages(batch._settings[0])
+    needed = needed_stages(batch._settings[0]).keys()
     for when, kind in ((needed - AT_THE_START, "tick"), (needed & AT_THE_START, "start")):
         for stage in sorted(when):
             run = Staged(batch, stage, flag_of(stage, batch))

@@ -1,7 +1,7 @@
 """The stages of this process, compiled or loaded on demand, and a table of those a batch needs."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,45 +14,39 @@ FLY = "quad_gym.kernels.batch:fly"
 """The entry that flies a batch."""
 SETTLE = "quad_gym.kernels.task.settle:settle"
 """The entry that a user's task needs beside it."""
-_addresses: dict[Stage, int] = {}
+_addresses: dict[str, int] = {}
 _lock = threading.Lock()
 
 
-def name_of(stage: Stage) -> str:
-    """The name of a stage's compiled function, such as "quad_gym.kernels.filter.update:..."."""
-    source = SOURCES[stage]
-    return f"quad_gym.kernels.{source.module}:{source.function}"
-
-
-def names_of(needed: frozenset[Stage], entries: Sequence[str] = (FLY,)) -> list[str]:
-    """The compiled functions of these stages and of the entries that call them, the longest first.
+def names_of(needed: Collection[str], entries: Sequence[str] = (FLY,)) -> list[str]:
+    """The compiled functions of stages and of the entries that call them, the longest first.
 
     Args:
-        needed: The stages.
+        needed: Names of the stages' functions.
         entries: Names of the entries, the longest to compile first.
     """
-    ordered = [name_of(stage) for stage in SOURCES if stage in needed]
+    ordered = [name for name in dict.fromkeys(s.name for s in SOURCES) if name in needed]
     return [*ordered[:2], *entries[:1], *ordered[2:], *entries[1:]]
 
 
-def linked_table(needed: frozenset[Stage], entries: Sequence[str] = (FLY,)) -> NDArray[Any]:
+def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (FLY,)) -> NDArray[Any]:
     """The table of addresses, (1,) STAGE_TABLE, of the stages that are needed and no others.
 
-    A batch has memory for what these stages use, see `used_parts`: a stage that it calls without
-    needing it must fail rather than find what another batch has linked.
+    A batch has memory for what these stages use, see `used_parts`: other slots stay empty, whatever
+    another batch has linked.
 
     Args:
-        needed: The stages.
+        needed: The stages, and the names of their functions.
         entries: Names of the entries that call them, compiled with them.
     """
     with _lock:
-        missing = needed - _addresses.keys()
+        missing = set(needed.values()) - _addresses.keys()
         if missing:
-            prepare(names_of(needed, entries))
-            _addresses.update((stage, _address(name_of(stage))) for stage in missing)
+            prepare(names_of(set(needed.values()), entries))
+            _addresses.update((name, _address(name)) for name in missing)
     table = np.zeros(1, STAGE_TABLE)
-    for stage in needed:
-        table["address"][0, stage] = _addresses[stage]
+    for stage, name in needed.items():
+        table["address"][0, stage] = _addresses[name]
     return table
 
 

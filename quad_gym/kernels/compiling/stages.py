@@ -4,8 +4,10 @@ A stage is a compiled function of fixed arguments that other compiled code calls
 addresses. What follows from it:
 
 * What a configuration lacks - faults, late measurements, moving air, the filter - is not compiled.
-* There are no variants: a stage is the same machine code whatever it is combined with, so a flight
-  has the same bits in every configuration that does not change it.
+* A slot that a configuration does not need is empty, and skipped. Some slots have a choice: MOVE in
+  calm or in moving air, PREDICT with or without slow errors of sensors.
+* A function is the same machine code whatever it is combined with, so a flight has the same bits in
+  every configuration that does not change it.
 * Stages compile side by side, and an edit of a kernel compiles the stages again that reach it.
 
 A call costs a few nanoseconds for all flights of a block together.
@@ -36,70 +38,80 @@ from quad_gym.records import (
 
 
 class Stage(IntEnum):
-    """The stages, by their places in the table of addresses."""
+    """The slots of the table, in the order of a flight as far as it has one."""
 
-    CONTROL = 0
-    DELAY_ACTION = auto()
-    SUPPLY = auto()
-    MOVE = auto()
-    MOVE_IN_AIR = auto()
-    REST_ON_PAD = auto()
-    BEGIN_IN_AIR = auto()
-    DRIFT_BIASES = auto()
-    AVERAGE_IMU = auto()
-    SAMPLE = auto()
+    # an episode begins
+    DRAW = 0
+    IMPOSE = auto()
+    PLACE_FEATURES = auto()
+    BEGIN_LATE = auto()
+    BEGIN = auto()
     BEGIN_IMPERFECT = auto()
-    DISTURB_IMU = auto()
-    TURN_BASELINE = auto()
-    LIMIT_CAMERA = auto()
     BEGIN_FAULTS = auto()
-    ADVANCE_FAULTS = auto()
-    MEET_ROTORS = auto()
-    SATURATE_IMU = auto()
-    SUM_IMU = auto()
-    CORRUPT_GNSS = auto()
-    CORRUPT_FEATURES = auto()
-    PREDICT = auto()
-    UPDATE = auto()
+    BEGIN_IN_AIR = auto()
+    BEGIN_GROUND = auto()
+    BEGIN_CONTACTS = auto()
     ALIGN = auto()
     WARM = auto()
-    BEGIN_LATE = auto()
+    # a tick: the truth
+    DELAY_ACTION = auto()
+    CONTROL = auto()
+    SUPPLY = auto()
+    KEEP_START = auto()
+    MOVE = auto()
+    REST_ON_PAD = auto()
+    STAND = auto()
+    TOUCH = auto()
+    AVERAGE_IMU = auto()
+    # the filter
+    PREDICT = auto()
     INCREMENT = auto()
+    DRIFT_BIASES = auto()
+    FOLLOW = auto()
+    ADVANCE_FAULTS = auto()
     SET_ASIDE = auto()
+    SAMPLE = auto()
     EXCHANGE = auto()
     LATE_UPDATE = auto()
-    BEGIN = auto()
-    DRAW = auto()
-    IMPOSE = auto()
+    UPDATE = auto()
     LOOK = auto()
-    PLACE_FEATURES = auto()
+    SUM_IMU = auto()
+    # a step
+    MEET_ROTORS = auto()
     JUDGE = auto()
+    JUDGE_LANDING = auto()
+    JUDGE_CONTACTS = auto()
     OBSERVE = auto()
     SHOW = auto()
-    BEGIN_CONTACTS = auto()
-    TOUCH = auto()
-    JUDGE_CONTACTS = auto()
-    HIDE_FEATURES = auto()
-    BEGIN_GROUND = auto()
-    STAND = auto()
+    # called by other stages
     FEEL_GROUND = auto()
-    JUDGE_LANDING = auto()
-    PREDICT_WITH_SLOW = auto()
-    UPDATE_WITH_SLOW = auto()
-    LATE_UPDATE_WITH_SLOW = auto()
-    WARM_WITH_SLOW = auto()
-    FOLLOW = auto()
+    DISTURB_IMU = auto()
+    SATURATE_IMU = auto()
+    TURN_BASELINE = auto()
+    CORRUPT_GNSS = auto()
+    LIMIT_CAMERA = auto()
+    HIDE_FEATURES = auto()
+    CORRUPT_FEATURES = auto()
+    FORGET_INNOVATIONS = auto()
     _ignore_ = "aid"
     for aid in Aid:  # one for each aiding sensor, last and in their order
         vars()[aid.name] = auto()
 
 
 class Source(NamedTuple):
-    """Where a stage is, and which settings need it."""
+    """A compiled function for a slot, and the settings that need it."""
 
-    module: str
+    stage: Stage
     function: str
+    """its module in `quad_gym.kernels`, and its name"""
     needed: Callable[[Any], bool]
+    parts: tuple[str, ...] = ()
+    """parts of a flight's record that it uses beside the core, see `records.PARTS`"""
+
+    @property
+    def name(self) -> str:
+        """Name of the compiled function, such as "quad_gym.kernels.filter.update:update_stage"."""
+        return f"quad_gym.kernels.{self.function}"
 
 
 def _always(s: Any) -> bool:
@@ -119,47 +131,55 @@ def _faults(s: Any) -> bool:
 
 
 def _corrupts(s: Any) -> bool:
-    return bool(s["faults"] and s["run_filter"])
+    return _faults(s) and _filter(s)
 
 
 def _late(s: Any) -> bool:
-    return bool(s["run_filter"] and s["late"] > 0)
-
-
-def _imu_disturbed(s: Any) -> bool:
-    return bool(s["run_filter"] and s["imu_errs"] + s["imu_vibrates"] > 0)
-
-
-def _lasting(s: Any) -> bool:
-    return bool(s["run_filter"] and s["imu_errs"] + s["heading_errs"] > 0)
+    return _filter(s) and bool(s["late"])
 
 
 def _rewinds(s: Any) -> bool:
-    return bool(_late(s) and s["rewinds"] > 0)
+    return _late(s) and bool(s["rewinds"])
 
 
-def _with_slow(s: Any) -> bool:
-    return bool(s["run_filter"] and s["slow_states"] > 0)
+def _slow(s: Any) -> bool:
+    return _filter(s) and bool(s["slow_states"])
 
 
-def _without_slow(s: Any) -> bool:
-    return bool(s["run_filter"] and not s["slow_states"] > 0)
+def _warm(s: Any) -> bool:
+    return _filter(s) and bool(s["warm"])
 
 
-def _aid(aid: Aid) -> Callable[[Any], bool]:
-    return lambda s: bool(s["run_filter"] and s["aid_on"][aid] > 0)
+def _imu_averages(s: Any) -> bool:
+    return _filter(s) and bool(s["imu_averages"])
+
+
+def _imu_disturbed(s: Any) -> bool:
+    return _filter(s) and bool(s["imu_errs"] or s["imu_vibrates"])
+
+
+def _heading_errs(s: Any) -> bool:
+    return _filter(s) and bool(s["heading_errs"])
+
+
+def _lasting(s: Any) -> bool:
+    return _filter(s) and bool(s["imu_errs"] or s["heading_errs"])
+
+
+def _watches(s: Any) -> bool:
+    return _filter(s) and bool(int(s["form"]) & (FilterForm.GATE | FilterForm.INNOVATIONS))
 
 
 def _raw(s: Any) -> bool:
-    return bool(s["run_filter"] and s["layout"] == Layout.MEASUREMENTS)
-
-
-def _pad(s: Any) -> bool:
-    return bool(s["pad"] and not s["grounded"])
+    return _filter(s) and bool(s["layout"] == Layout.MEASUREMENTS)
 
 
 def _grounded(s: Any) -> bool:
     return bool(s["grounded"])
+
+
+def _pad(s: Any) -> bool:
+    return bool(s["pad"]) and not _grounded(s)
 
 
 def _contacts(s: Any) -> bool:
@@ -167,7 +187,11 @@ def _contacts(s: Any) -> bool:
 
 
 def _hides(s: Any) -> bool:
-    return bool(s["run_filter"] and s["camera_ticks"] > 0 and s["obstacle_count"] > 0)
+    return _filter(s) and bool(s["camera_ticks"] and s["obstacle_count"])
+
+
+def _limits(s: Any) -> bool:
+    return _filter(s) and bool(s["camera_limited"])
 
 
 def _follows(s: Any) -> bool:
@@ -182,113 +206,118 @@ def _drawn(s: Any) -> bool:
     return bool(s["randomized"])
 
 
-SOURCES = {
-    Stage.UPDATE_WITH_SLOW: Source("filter.update", "update_with_slow_stage", _with_slow),
-    Stage.UPDATE: Source("filter.update", "update_stage", _without_slow),
-    Stage.PREDICT_WITH_SLOW: Source("filter.predict", "predict_with_slow_stage", _with_slow),
-    Stage.PREDICT: Source("filter.predict", "predict_stage", _without_slow),
-    Stage.LATE_UPDATE_WITH_SLOW: Source(
-        "filter.late", "late_update_with_slow_stage", lambda s: _with_slow(s) and _rewinds(s)
+def _delays(s: Any) -> bool:
+    return bool(s["action_delays"] > 0)
+
+
+def _aid(aid: Aid, late: bool) -> Callable[[Any], bool]:
+    def needed(s: Any) -> bool:
+        return _filter(s) and bool(s["aid_on"][aid]) and (not late or bool(s["aid_delay"][aid]))
+
+    return needed
+
+
+def _aid_sources(aid: Aid) -> tuple[Source, Source]:
+    stage, name = Stage[aid.name], aid.name.lower()
+    function = f"measurements.{name}:{name}_stage"
+    return (
+        Source(stage, function, _aid(aid, late=True), ("aids", "late_aids")),
+        Source(stage, function, _aid(aid, late=False), ("aids",)),
+    )
+
+
+SOURCES = (
+    Source(Stage.UPDATE, "filter.update:update_with_slow_stage", _slow, ("filter", "slow")),
+    Source(Stage.UPDATE, "filter.update:update_stage", _filter, ("filter",)),
+    Source(Stage.PREDICT, "filter.predict:predict_with_slow_stage", _slow, ("filter", "slow")),
+    Source(Stage.PREDICT, "filter.predict:predict_stage", _filter, ("filter",)),
+    Source(
+        Stage.LATE_UPDATE,
+        "filter.late:late_update_with_slow_stage",
+        lambda s: _slow(s) and _rewinds(s),
+        ("late",),
     ),
-    Stage.LATE_UPDATE: Source(
-        "filter.late", "late_update_stage", lambda s: _without_slow(s) and _rewinds(s)
+    Source(Stage.LATE_UPDATE, "filter.late:late_update_stage", _rewinds, ("late",)),
+    *(source for aid in Aid for source in _aid_sources(aid)),
+    Source(Stage.SAMPLE, "sensors.sample:sample_stage", _filter, ("filter",)),
+    Source(Stage.DRAW, "task.draws:draw_stage", _drawn, ("draws",)),
+    Source(Stage.IMPOSE, "task.draws:impose_stage", _drawn, ("draws",)),
+    Source(Stage.PLACE_FEATURES, "task.places:place_features_stage", _places, ("places",)),
+    Source(Stage.BEGIN, "task.episode:begin_stage", _always),
+    Source(Stage.MOVE, "vehicle.air:move_in_air_stage", _air),
+    Source(Stage.ALIGN, "filter.align:align_stage", _filter, ("filter",)),
+    Source(Stage.OBSERVE, "task.observation:observe_stage", _always),
+    Source(Stage.SHOW, "task.show:show_stage", lambda s: bool(s["shown"])),
+    Source(Stage.ADVANCE_FAULTS, "sensors.faults:advance_faults_stage", _faults, ("faults",)),
+    Source(Stage.BEGIN_FAULTS, "sensors.faults:begin_faults_stage", _faults, ("faults",)),
+    Source(Stage.CONTROL, "vehicle.control:control_stage", _always),
+    Source(Stage.MOVE, "vehicle.dynamics:move_stage", _always),
+    Source(Stage.BEGIN_IN_AIR, "vehicle.air:begin_in_air_stage", _air),
+    Source(Stage.WARM, "filter.warm:warm_with_slow_stage", lambda s: _slow(s) and _warm(s)),
+    Source(Stage.WARM, "filter.warm:warm_stage", _warm),
+    Source(Stage.AVERAGE_IMU, "sensors.imu:average_imu_stage", _imu_averages),
+    Source(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features_stage", _corrupts),
+    Source(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss_stage", _corrupts),
+    Source(Stage.EXCHANGE, "filter.waiting:exchange_stage", _late, ("late",)),
+    Source(Stage.INCREMENT, "filter.waiting:increment_stage", _late, ("late",)),
+    Source(Stage.LOOK, "task.look:look_stage", _always),
+    Source(Stage.JUDGE, "task.reward_and_endings:judge_stage", _always),
+    Source(Stage.DRIFT_BIASES, "sensors.imu:drift_biases_stage", _filter),
+    Source(Stage.FOLLOW, "task.follow:follow_stage", _follows, ("path",)),
+    Source(Stage.REST_ON_PAD, "vehicle.pad:rest_on_pad_stage", _pad),
+    Source(
+        Stage.KEEP_START,
+        "vehicle.pad:keep_start_stage",
+        lambda s: _pad(s) or _grounded(s) or _imu_averages(s),
     ),
-    **{
-        Stage[aid.name]: Source(
-            f"measurements.{aid.name.lower()}", f"{aid.name.lower()}_stage", _aid(aid)
-        )
-        for aid in Aid
-    },
-    Stage.SAMPLE: Source("sensors.sample", "sample_stage", _filter),
-    Stage.DRAW: Source("task.draws", "draw_stage", _drawn),
-    Stage.IMPOSE: Source("task.draws", "impose_stage", _drawn),
-    Stage.PLACE_FEATURES: Source("task.places", "place_features_stage", _places),
-    Stage.BEGIN: Source("task.episode", "begin_stage", _always),
-    Stage.MOVE_IN_AIR: Source("vehicle.air", "move_in_air_stage", _air),
-    Stage.ALIGN: Source("filter.align", "align_stage", _filter),
-    Stage.OBSERVE: Source("task.observation", "observe_stage", _always),
-    Stage.SHOW: Source("task.show", "show_stage", lambda s: bool(s["shown"])),
-    Stage.ADVANCE_FAULTS: Source("sensors.faults", "advance_faults_stage", _faults),
-    Stage.BEGIN_FAULTS: Source("sensors.faults", "begin_faults_stage", _faults),
-    Stage.CONTROL: Source("vehicle.control", "control_stage", _always),
-    Stage.MOVE: Source("vehicle.dynamics", "move_stage", lambda s: not _air(s)),
-    Stage.BEGIN_IN_AIR: Source("vehicle.air", "begin_in_air_stage", _air),
-    Stage.WARM_WITH_SLOW: Source(
-        "filter.warm", "warm_with_slow_stage", lambda s: _with_slow(s) and s["warm"] > 0
+    Source(Stage.SUPPLY, "vehicle.air:supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
+    Source(Stage.BEGIN_LATE, "filter.waiting:begin_late_stage", _late, ("late",)),
+    Source(Stage.SET_ASIDE, "filter.waiting:set_aside_stage", _late),
+    Source(Stage.BEGIN_IMPERFECT, "sensors.imperfect:begin_imperfect_stage", _lasting, ("errors",)),
+    Source(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu_stage", _imu_disturbed),
+    Source(Stage.TURN_BASELINE, "sensors.imperfect:turn_baseline_stage", _heading_errs),
+    Source(Stage.LIMIT_CAMERA, "sensors.imperfect:limit_camera_stage", _limits),
+    Source(Stage.DELAY_ACTION, "vehicle.delay:delay_action_stage", _delays, ("actions",)),
+    Source(Stage.HIDE_FEATURES, "obstacles.sight:hide_features_stage", _hides),
+    Source(Stage.BEGIN_CONTACTS, "obstacles.contact:begin_contacts_stage", _contacts),
+    Source(Stage.TOUCH, "obstacles.contact:touch_stage", _contacts, ("contacts",)),
+    Source(Stage.JUDGE_CONTACTS, "obstacles.contact:judge_contacts_stage", _contacts),
+    Source(Stage.BEGIN_GROUND, "vehicle.ground:begin_ground_stage", _grounded),
+    Source(Stage.STAND, "vehicle.ground:stand_stage", _grounded, ("ground",)),
+    Source(
+        Stage.FEEL_GROUND,
+        "vehicle.ground:feel_ground_stage",
+        lambda s: _grounded(s) and _filter(s),
     ),
-    Stage.WARM: Source("filter.warm", "warm_stage", lambda s: _without_slow(s) and s["warm"] > 0),
-    Stage.AVERAGE_IMU: Source(
-        "sensors.imu", "average_imu_stage", lambda s: _filter(s) and s["imu_averages"] > 0
-    ),
-    Stage.CORRUPT_FEATURES: Source("sensors.faults", "corrupt_features_stage", _corrupts),
-    Stage.CORRUPT_GNSS: Source("sensors.faults", "corrupt_gnss_stage", _corrupts),
-    Stage.EXCHANGE: Source("filter.waiting", "exchange_stage", _late),
-    Stage.INCREMENT: Source("filter.waiting", "increment_stage", _late),
-    Stage.LOOK: Source("task.look", "look_stage", _always),
-    Stage.JUDGE: Source("task.reward_and_endings", "judge_stage", _always),
-    Stage.DRIFT_BIASES: Source("sensors.imu", "drift_biases_stage", _filter),
-    Stage.FOLLOW: Source("task.follow", "follow_stage", _follows),
-    Stage.REST_ON_PAD: Source("vehicle.pad", "rest_on_pad_stage", _pad),
-    Stage.SUPPLY: Source("vehicle.air", "supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
-    Stage.BEGIN_LATE: Source("filter.waiting", "begin_late_stage", _late),
-    Stage.SET_ASIDE: Source("filter.waiting", "set_aside_stage", _late),
-    Stage.BEGIN_IMPERFECT: Source("sensors.imperfect", "begin_imperfect_stage", _lasting),
-    Stage.DISTURB_IMU: Source("sensors.imperfect", "disturb_imu_stage", _imu_disturbed),
-    Stage.TURN_BASELINE: Source(
-        "sensors.imperfect", "turn_baseline_stage", lambda s: _filter(s) and s["heading_errs"] > 0
-    ),
-    Stage.LIMIT_CAMERA: Source(
-        "sensors.imperfect", "limit_camera_stage", lambda s: _filter(s) and s["camera_limited"] > 0
-    ),
-    Stage.DELAY_ACTION: Source(
-        "vehicle.delay", "delay_action_stage", lambda s: s["action_delays"] > 0
-    ),
-    Stage.HIDE_FEATURES: Source("obstacles.sight", "hide_features_stage", _hides),
-    Stage.BEGIN_CONTACTS: Source("obstacles.contact", "begin_contacts_stage", _contacts),
-    Stage.TOUCH: Source("obstacles.contact", "touch_stage", _contacts),
-    Stage.JUDGE_CONTACTS: Source("obstacles.contact", "judge_contacts_stage", _contacts),
-    Stage.BEGIN_GROUND: Source("vehicle.ground", "begin_ground_stage", _grounded),
-    Stage.STAND: Source("vehicle.ground", "stand_stage", _grounded),
-    Stage.FEEL_GROUND: Source(
-        "vehicle.ground", "feel_ground_stage", lambda s: _grounded(s) and _filter(s)
-    ),
-    Stage.JUDGE_LANDING: Source("vehicle.ground", "judge_landing_stage", _grounded),
-    Stage.SATURATE_IMU: Source("sensors.faults", "saturate_imu_stage", _corrupts),
-    Stage.MEET_ROTORS: Source("sensors.faults", "meet_rotors_stage", _faults),
-    Stage.SUM_IMU: Source("sensors.sample", "sum_imu_stage", _raw),
-}
-"""Every stage; those that take longest to compile come first."""
+    Source(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing_stage", _grounded),
+    Source(Stage.SATURATE_IMU, "sensors.faults:saturate_imu_stage", _corrupts),
+    Source(Stage.MEET_ROTORS, "sensors.faults:meet_rotors_stage", _faults),
+    Source(Stage.SUM_IMU, "sensors.sample:sum_imu_stage", _raw, ("raw",)),
+    Source(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations_stage", _watches, ("watch",)),
+)
+"""Every function of a stage; those that take longest to compile come first. Where a slot has
+several, it gets the first that is needed."""
 
 STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
-"""The addresses of the stages, 0 where one is not there."""
+"""The addresses of the stages, 0 where a slot is empty."""
 
 
-def needed_stages(settings: Any) -> frozenset[Stage]:
-    """The stages that a batch of these settings (a SETTINGS record) flies through."""
-    return frozenset(stage for stage, source in SOURCES.items() if source.needed(settings))
+def _chosen(settings: Any) -> dict[Stage, Source]:
+    chosen: dict[Stage, Source] = {}
+    for source in SOURCES:
+        if source.stage not in chosen and source.needed(settings):
+            chosen[source.stage] = source
+    return chosen
+
+
+def needed_stages(settings: Any) -> dict[Stage, str]:
+    """The stages that a batch of these settings (a SETTINGS record) flies through: their names."""
+    return {stage: source.name for stage, source in _chosen(settings).items()}
 
 
 def used_parts(settings: Any) -> frozenset[str]:
     """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
-    watches = FilterForm(int(settings["form"])) & (FilterForm.GATE | FilterForm.INNOVATIONS)
-    uses = {
-        "ground": _grounded(settings),
-        "contacts": _contacts(settings),
-        "path": _follows(settings),
-        "faults": _faults(settings),
-        "draws": _drawn(settings),
-        "places": _places(settings),
-        "filter": _filter(settings),
-        "actions": bool(settings["action_delays"] > 0),
-        "raw": _raw(settings),
-        "errors": _lasting(settings),
-        "watch": _filter(settings) and bool(watches),
-        "late": _late(settings),
-        "slow": _with_slow(settings),
-        "aids": bool(settings["run_filter"] and settings["aids"] > 0),
-        "late_aids": bool(settings["run_filter"] and (settings["aid_delay"] > 0).any()),
-    }
-    return frozenset(name for name, used in uses.items() if used)
+    return frozenset(part for source in _chosen(settings).values() for part in source.parts)
 
 
 _DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)
@@ -329,9 +358,8 @@ def _call(typing_context, address, flight, world, model, settings, work, stages,
 
 
 @kernel
-def call_stage(stages, number, flight, world, model, settings, work, flag):
-    """Call a stage; the records are those that it is compiled for."""
-    address = stages.address[number]
-    if address == 0:
-        raise RuntimeError("a stage that the settings need is missing from the table")
-    _call(address, flight, world, model, settings, work, stages, flag)
+def call_stage(stages, stage, flight, world, model, settings, work, flag):
+    """Call a stage unless its slot is empty; the records are those that it is compiled for."""
+    address = stages.address[stage]
+    if address != 0:
+        _call(address, flight, world, model, settings, work, stages, flag)

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.innovations import forget_innovations
 from quad_gym.kernels.filter.recovery import begin_recovery
@@ -41,9 +41,8 @@ from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import DRAW_MARK, FilterForm
+from quad_gym.records import DRAW_MARK
 
-_WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 NOTHING = (0.0, 0.0, 0.0)
 _NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
 _STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that tells no heading
@@ -180,9 +179,14 @@ def align_stage(flight, world, model, settings, work, stages, flag):
     flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
     if settings.slow_states > 0:
         begin_slow(flying, lanes_of(model), settings, mask)
-    if (settings.form & _WATCH) != 0:
-        forget_innovations(flying, settings.feature_count, mask)
+    call_stage(stages, Stage.FORGET_INNOVATIONS, flight, world, model, settings, work, 0)
     x_I = look_along_mark(flying, lanes_of(world))
     v_I, v_variance = known_velocity(flying, settings)
     tilt_variance = load3(settings.start_tilt_variance)
     initialize(flying, lanes_of(model), mask, x_I, v_I, v_variance, tilt_variance)
+
+
+@stage
+def forget_innovations_stage(flight, world, model, settings, work, stages, flag):
+    """Forget the innovations of the episode before."""
+    forget_innovations(lanes_of(flight), settings.feature_count, lanes_of(work).mask > 0.0)

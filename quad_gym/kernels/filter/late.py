@@ -62,7 +62,6 @@ from quad_gym.records import AIDS, DELAY_SLOTS, SENSORS, FilterForm, FilterStatu
 
 _PRESENT = SENSORS + AIDS
 """The turn of what is not late, after those of GNSS, camera and aiding sensors."""
-_UPDATE, _UPDATE_WITH_SLOW = int(Stage.UPDATE), int(Stage.UPDATE_WITH_SLOW)
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
@@ -260,8 +259,7 @@ def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
                 good = good & _carry(flight, p, work, leg == 0, delay, slow)
             if leg == 0:
                 work.mask = select(good, 1.0, 0.0)
-                update = _UPDATE if slow is None else _UPDATE_WITH_SLOW
-                call_stage(stages, update, flight, p, p, settings, work, 0)
+                call_stage(stages, Stage.UPDATE, flight, p, p, settings, work, 0)
         if late:
             good = good & (flight.update_failures == work.kept_failures)
             _restore_estimate(flight, work, settings, arrived, good, slow)
@@ -270,6 +268,7 @@ def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
     choose(flight, p, work, settings, slow, 0)
     if slow is not None:
         restore_valid_aids(flight, work, slow)
+    work.mask = select(mask, 1.0, 0.0)
 
 
 # ---- stages ----------------------------------------------------------------------------------

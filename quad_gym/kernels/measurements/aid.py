@@ -63,8 +63,7 @@ for _aid in Aid:  # aid number k has the stage and the fault of number k after t
 def call_aids(flight, world, model, settings, work, stages, act):
     """Call every aiding sensor that there is for an `Act`."""
     for s in range(AIDS):
-        if settings.aid_on[s] > 0:
-            call_stage(stages, _FIRST + s, flight, world, model, settings, work, act)
+        call_stage(stages, _FIRST + s, flight, world, model, settings, work, act)
 
 
 @kernel

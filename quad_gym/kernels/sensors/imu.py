@@ -4,7 +4,7 @@ Every draw has a fixed number within its instant, so that a measurement does not
 others are taken. What GNSS and camera measure is in `kernels/measurements/`.
 """
 
-from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.linalg import (
     add,
     apply,
@@ -113,3 +113,5 @@ def average_imu_stage(flight, world, model, settings, work, stages, flag):
     """Sample the means of the IMU over the tick that ends now."""
     flying, scratch = lanes_of(flight), lanes_of(work)
     measure_imu_average(flying, lanes_of(world), load_start(scratch), scratch.mask > 0.0)
+    call_stage(stages, Stage.DISTURB_IMU, flight, world, model, settings, work, 0)
+    call_stage(stages, Stage.SATURATE_IMU, flight, world, model, settings, work, 0)

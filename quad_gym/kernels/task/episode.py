@@ -17,7 +17,6 @@ from quad_gym.records import (
     DRAW_GATES,
     DRAW_PHASE,
     DRAW_SERIES,
-    FOLLOWED,
     HEADING_ALONG,
     HEADING_TOWARD,
     HEADING_VELOCITY,
@@ -25,8 +24,6 @@ from quad_gym.records import (
     MAX_HARMONICS,
     Task,
 )
-
-_FOLLOW = int(Stage.FOLLOW)
 
 
 @kernel
@@ -178,8 +175,7 @@ def begin_stage(flight, world, model, settings, work, stages, flag):
     stream, mask = stream_of(flying), lanes_of(work).mask > 0.0
     begin_clocks(flying, settings, stream, mask)
     draw_reference(flying, settings, stream, mask)
-    if settings.harmonics == FOLLOWED:
-        call_stage(stages, _FOLLOW, flight, world, model, settings, work, 0)
+    call_stage(stages, Stage.FOLLOW, flight, world, model, settings, work, 0)
     draw_start(flying, true, believed, settings, lanes_of(work), stream, mask)
     flying.charge = select(mask, true.battery_charge, flying.charge)
     begin_counters(flying, mask)

@@ -23,6 +23,7 @@ from quad_gym.records import (
     PIECE,
     TERMS,
     WIDTH,
+    Control,
 )
 
 _path_at, _piece_at = record_at(PATH), record_at(PIECE)
@@ -123,7 +124,12 @@ def _heading(flight, work, r, v):
 
 @stage
 def follow_stage(flight, world, model, settings, work, stages, flag):
-    """Set the reference of the present instant, and its preview."""
+    """Set the reference of the present instant, and its preview.
+
+    `flag`: whether the instant is within a control period, where PD control alone reads them.
+    """
+    if flag and settings.control != Control.PD:
+        return
     flying, room = lanes_of(flight), lanes_of(work)
     time = flying.tick * lanes_of(model).dt
     for i in range(2):

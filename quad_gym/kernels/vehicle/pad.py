@@ -4,7 +4,7 @@ from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import add, keep3, load3, load4, sub
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
-from quad_gym.kernels.simd.lanes import select
+from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.kernels.vehicle.dynamics import accelerations, load_start
 
 
@@ -36,6 +36,20 @@ def rest_on_pad(flight, p, start):
 
 
 @stage
+def keep_start_stage(flight, world, model, settings, work, stages, flag):
+    """Keep the true state at the start of a tick, for contact and for IMU samples that average."""
+    flying, start = lanes_of(flight), lanes_of(work).start
+    if settings.grounded or settings.imu_averages or any_of(flying.on_pad > 0.0):
+        start[0], start[1], start[2] = load3(flying.r)
+        start[3], start[4], start[5] = load3(flying.v)
+        start[6], start[7], start[8], start[9] = load4(flying.q)
+        start[10], start[11], start[12] = load3(flying.w)
+        start[13], start[14], start[15], start[16] = load4(flying.rotor_speeds)
+
+
+@stage
 def rest_on_pad_stage(flight, world, model, settings, work, stages, flag):
     """Keep the vehicles on the pad that have not lifted off."""
-    rest_on_pad(lanes_of(flight), lanes_of(world), load_start(lanes_of(work)))
+    flying = lanes_of(flight)
+    if any_of(flying.on_pad > 0.0):
+        rest_on_pad(flying, lanes_of(world), load_start(lanes_of(work)))
