@@ -65,7 +65,10 @@ def test_the_tick_section_names_every_stage_that_the_suites_fly_through(tmp_path
             assert row["seconds"] > 0.0
             assert row["share"] == pytest.approx(row["seconds"] / mine["whole tick"]["seconds"])
     parts = {row["part"] for row in rows if row["suite"] == "standard"}
-    assert parts - {row["part"] for row in rows if row["suite"] == "lab"} == {"average_imu", "keep_start"}
+    assert parts - {row["part"] for row in rows if row["suite"] == "lab"} == {
+        "average_imu",
+        "keep_start",
+    }
 
 
 def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
