@@ -2,7 +2,7 @@
 
 import sys
 
-from quad_gym.commands.main import run
+from quad_gym.commands.main import main
 
 if __name__ == "__main__":
-    sys.exit(run("circle", [word.replace("--seeds", "--episodes") for word in sys.argv[1:]]))
+    sys.exit(main(["circle", *sys.argv[1:]]))

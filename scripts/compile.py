@@ -2,7 +2,7 @@
 
 import sys
 
-from quad_gym.commands.main import run
+from quad_gym.commands.main import main
 
 if __name__ == "__main__":
-    sys.exit(run("compile"))
+    sys.exit(main(["compile", *sys.argv[1:]]))

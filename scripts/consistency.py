@@ -2,7 +2,7 @@
 
 import sys
 
-from quad_gym.commands.main import run
+from quad_gym.commands.main import main
 
 if __name__ == "__main__":
-    sys.exit(run("consistency"))
+    sys.exit(main(["consistency", *sys.argv[1:]]))

@@ -12,8 +12,6 @@ from typing import Literal
 
 import tyro
 
-from quad_gym.commands.help_texts import registry
-
 
 @dataclass(frozen=True)
 class Args:
@@ -23,10 +21,8 @@ class Args:
     """name of the shell"""
 
 
-def main(args: Args) -> None:
-    """Print one script for all commands, because shells identify it by the program's name."""
-    from quad_gym.commands.main import COMMANDS, PROGRAM, module_of
+def main(args: Args) -> int:
+    """Print the script."""
+    from quad_gym.commands import main as program
 
-    kinds = {name: module_of(name).Args for name in COMMANDS}
-    words = ["--tyro-print-completion", args.shell]
-    tyro.extras.subcommand_cli_from_dict(kinds, prog=PROGRAM, args=words, registry=registry())
+    return program.main(["--tyro-print-completion", args.shell])

@@ -1,56 +1,39 @@
-"""Filter consistency: compare errors with the covariance that the filter claims, over many flights.
-
-Flies random trajectories (or another task) by PD control and takes the normalized estimation error
-squared (NEES) of the 15 states and of each block of three, over time, and the normalized innovation
-squared (NIS) of each sensor. If the covariance is right, means over 1,000 flights lie in known
-bands at 95 % of the instants, and innovations are white. The truth is the simulator's.
-
-Prints tables and a verdict, and writes figures (PNG and SVG) and all numbers with the whole
-configuration and the seeds (consistency.json). For example:
+"""Test the consistency of the filter: compare errors with their estimated covariance.
 
   quad-gym consistency                             the suite "standard"
   quad-gym consistency circle --sensors indoor --filter-start warm
-  quad-gym consistency --sensors lab                 the report's filter
+  quad-gym consistency --sensors lab               the report's filter
   quad-gym consistency --sensors lab --form corrected   the same sensors, all corrections
   quad-gym consistency --estimator ekf             an extended Kalman filter
-  quad-gym consistency --mass-factor 1.2           a vehicle heavier than it is taken for
-  quad-gym consistency --noise-factor 1.5          sensors worse than the filter believes
+  quad-gym consistency --mass-factor 1.2           a vehicle heavier than the controller assumes
+  quad-gym consistency --noise-factor 1.5          sensors noisier than the filter assumes
 
-With --matrix it flies every suite on every task from both starts, and with faults, latencies,
-mountings, randomization, drawn starts and wind on one task, and writes one table of all means.
-With --recovery it flies every fault on every suite that can have it, and tables which filters are
-right again after 10 s, which say that they are lost, and how often they say so without cause.
-Either run, when it was interrupted, goes on where it was.
+The flights follow random trajectories (or another task) by PD control. The normalized estimation
+error squared (NEES) is computed for the 15 states and for each part of three, over time, and the
+normalized innovation squared (NIS) for each sensor. For a consistent filter, means over 1,000
+flights are inside known bands at 95 % of the instants, and innovations are white. Prints tables and
+a verdict, and writes figures (PNG and SVG) and all numbers with the configuration and the seeds
+(consistency.json).
 
-  quad-gym consistency --matrix                    everything; some 200 cells
+  quad-gym consistency --matrix                    many configurations: some 200 cells
   quad-gym consistency --matrix --cells suites     the suites on all tasks
-  quad-gym consistency --recovery                  after faults
+  quad-gym consistency --recovery                  recovery from faults
+
+With --matrix, every suite flies every task from a cold and from a warm start, and one task with
+faults, latencies, mountings, randomization, random starts and wind; the result is one table of all
+means. With --recovery, every suite flies every fault that it can have; the table shows how many
+filters are consistent 10 s later, how many flag their divergence, and the rate of false alarms. An
+interrupted run of either continues when it is started again.
 """
 
 import math
-import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from quad_gym import FilterParams, SensorSuite, sensor_suite, vehicle_params
-from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSquare
-from quad_gym.analysis.consistency_flights import Findings, endless, measure_consistency
-from quad_gym.analysis.consistency_plots import (
-    errors_figure,
-    nees_figure,
-    nis_figure,
-    whiteness_figure,
-)
-from quad_gym.analysis.plots import house_style, require_matplotlib, save_figure
-from quad_gym.analysis.reports import (
-    require_writable,
-    text_table,
-    versions,
-    write_json,
-)
-from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.analysis.plots import require_matplotlib
+from quad_gym.analysis.reports import require_writable
 from quad_gym.commands.options import (
     TRACKING,
     SuiteName,
@@ -61,7 +44,9 @@ from quad_gym.commands.options import (
     usage_errors,
 )
 from quad_gym.envs import IDS
-from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.experiments.consistency import matrix, recovery
+from quad_gym.experiments.consistency.cases import Case, Flights, run_cases
+from quad_gym.experiments.consistency.single import run_single
 from quad_gym.params.suites import FIELD_FILTER
 from quad_gym.records import Source
 
@@ -73,49 +58,48 @@ class Args:
     env_id: TrackingId = "QuadGym/RandomTrajectory-v0"
 
     episodes: int | None = None
-    """flights; if not given, 4000, or 400 in each cell of a matrix"""
+    """number of flights; if not given, 4000, or 400 in each cell of a table"""
     seed: int = 0
-    """of the first flight; the others follow it"""
+    """seed of the first flight; the others have consecutive seeds"""
     duration: float = 10.0
     """length of a flight [s]"""
     observation: Literal["estimate", "truth"] = "estimate"
-    """what the controller sees"""
+    """observation of the controller"""
     filter_start: Literal["cold", "warm", "matched"] = "cold"
-    """the filter's start: from its first fix; after some seconds of hovering; or with errors
-    drawn from its own covariance, which tests the filter apart from its start"""
+    """start of the filter: cold (from its first fix), warm (after some seconds of hovering), or
+    matched (with errors drawn from its own covariance, to test the filter without its start)"""
     every: float = 0.05
-    """time between two looks at the errors [s]"""
+    """time between two evaluations of the errors [s]"""
     settle: float = 0.0
-    """time at the start that does not count [s]"""
+    """time at the start that is left out of the means [s]"""
     output: Path | None = None
-    """folder for figures and numbers, made if it is missing; if not given, results/consistency,
-    with --matrix results/consistency_matrix, with --recovery results/consistency_recovery"""
+    """folder for figures and numbers; if not given, results/consistency, with --matrix
+    results/consistency_matrix, with --recovery results/consistency_recovery"""
     matrix: bool = False
-    """fly the matrix of configurations; of the other options only episodes, seed, duration,
-    output, cells and threads concern it"""
+    """fly the matrix of configurations; uses only the options episodes, seed, duration, output,
+    cells and threads"""
     recovery: bool = False
-    """fly faults and see how filters recover; of the other options only episodes, seed, output
-    and threads concern it"""
+    """fly faults and evaluate the recovery; uses only the options episodes, seed, output and
+    threads"""
     cells: Literal["all", "suites", "conditions"] = "all"
     """with --matrix: the suites on all tasks, other conditions on one task, or both"""
     threads: int | None = None
-    """threads; if not given, as many as there are cores; results do not depend on it"""
+    """number of threads; if not given, one per core; it does not affect results"""
 
     sensors: SuiteName = "standard"
-    form: Literal["suite", "report", "corrected", "mended"] = "suite"
-    """form of filter and IMU: as the suite has it, the report's, or with all corrections
-    (formerly mended)"""
+    form: Literal["suite", "report", "corrected"] = "suite"
+    """form of filter and IMU: the suite's, the report's, or the one with all corrections"""
     samples: Literal["instant", "average"] | None = None
-    """what an IMU sample holds, in place of the form's"""
+    """quantity in an IMU sample; if not given, the form's"""
     integration: Literal["euler", "midpoint"] | None = None
-    """how the filter integrates IMU samples, in place of the form's"""
+    """integration of IMU samples by the filter; if not given, the form's"""
     attitude_reset: bool | None = None
-    """transform the covariance when the attitude is corrected, in place of what the form does"""
+    """transform the covariance when the attitude is corrected; if not given, as the form does"""
     bearing_noise_at: Literal["measured", "predicted", "pinhole"] | None = None
-    """direction to which the filter assumes camera noise is perpendicular, in place of the
+    """direction to which the filter assumes camera noise is perpendicular; if not given, the
     form's"""
     estimator: Literal["ukf", "ekf"] | None = None
-    """the filter, in place of the suite's"""
+    """filter; if not given, the suite's"""
     camera: bool = True
     """measure with the camera, if the suite has one"""
     imu_rate: float | None = None
@@ -126,30 +110,30 @@ class Args:
     """images per second [Hz]; if not given, the suite's"""
 
     mass_factor: float = 1.0
-    """true mass, as a multiple of what the controller believes"""
+    """true mass, relative to the mass that the controller assumes"""
     motor_lag_factor: float = 1.0
-    """true lag of the motors, likewise"""
+    """true lag of the motors, relative to the assumed one"""
     world: str = "calm"
-    """what air, ground and battery do: calm, breeze or fresh_breeze"""
+    """air, ground and battery: calm, breeze or fresh_breeze"""
     faults: str | None = None
-    """what goes wrong with sensors and rotors: presets joined by +, as gnss_outage+rotor_loss"""
+    """faults of sensors and rotors: presets joined by +, as gnss_outage+rotor_loss"""
     noise_factor: float = 1.0
-    """true white noise, as a multiple of what the filter believes"""
+    """true white noise, relative to the noise that the filter assumes"""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        if self.matrix and self.recovery:
+            raise ValueError("--matrix and --recovery must not be given together")
+        table = "matrix" if self.matrix else "recovery" if self.recovery else ""
         if self.episodes is None:
-            object.__setattr__(self, "episodes", 400 if self.tables else 4000)
+            object.__setattr__(self, "episodes", 400 if table else 4000)
         if self.output is None:
-            folder = "consistency_matrix" if self.matrix else "consistency"
-            folder = "consistency_recovery" if self.recovery else folder
+            folder = f"consistency_{table}" if table else "consistency"
             object.__setattr__(self, "output", Path("results") / folder)
-        require_at_least(self, episodes=2, threads=1)
+        require_at_least(self, episodes=2, seed=0, threads=1)
         object.__setattr__(self, "env_id", known_id("ENV_ID", self.env_id, TRACKING))
         if self.cells != "all" and not self.matrix:
             raise ValueError("--cells needs --matrix")
-        if self.matrix and self.recovery:
-            raise ValueError("--matrix and --recovery must not be given together")
         for name in ("duration", "every", "mass_factor", "motor_lag_factor", "noise_factor"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -158,30 +142,20 @@ class Args:
             raise ValueError(f"--settle must be at least 0 and before the end, got {self.settle}")
 
     @property
-    def task(self) -> str:
-        """The short name of what is flown."""
-        return IDS[self.env_id]
-
-    @property
-    def tables(self) -> bool:
-        """Whether a table of many configurations is wanted."""
-        return self.matrix or self.recovery
-
-    @property
-    def count(self) -> int:
-        """How many flights."""
+    def flights(self) -> Flights:
+        """Number, seeds and length of the flights."""
         assert self.episodes is not None
-        return self.episodes
+        return Flights(self.episodes, self.seed, self.duration, self.threads)
 
     @property
     def folder(self) -> Path:
-        """Where results go."""
+        """Output folder."""
         assert self.output is not None
         return self.output
 
 
 def suite_of(args: Args) -> SensorSuite:
-    """The sensor suite that the options describe."""
+    """Sensor suite of the options."""
     suite = sensor_suite(args.sensors)
     if not args.camera:
         suite = suite.replace(camera=None)
@@ -202,171 +176,65 @@ def suite_of(args: Args) -> SensorSuite:
     return suite.with_rates(imu=args.imu_rate, gnss=args.gnss_rate, camera=camera_rate)
 
 
-def batch_of(args: Args) -> FlightBatch:
-    """Flights that nothing ends before their time."""
+def case_of(args: Args) -> Case:
+    """Configuration of the options."""
     suite, vehicle = suite_of(args), vehicle_params("lab")
-    true_vehicle = vehicle.replace(
-        mass=args.mass_factor * vehicle.mass,
-        motor_time_constant=args.motor_lag_factor * vehicle.motor_time_constant,
-    )
-    return FlightBatch(
-        args.count,
-        vehicle=vehicle,
-        sensors=suite,
-        gains="tuned",
-        task=endless(TASK_DEFAULTS[args.task]),
-        source=Source.ESTIMATE if args.observation == "estimate" else Source.TRUTH,
-        filter_start="warm" if args.filter_start == "warm" else "cold",
-        innovations=True,
-        threads=args.threads,
-        true_vehicle=true_vehicle,
-        true_sensors=suite.scaled_noise(args.noise_factor),
-        world=args.world,
-        faults=args.faults,
-    )
+    keywords: dict[str, Any] = {
+        "vehicle": vehicle,
+        "source": Source[args.observation.upper()],
+        "true_vehicle": vehicle.replace(
+            mass=args.mass_factor * vehicle.mass,
+            motor_time_constant=args.motor_lag_factor * vehicle.motor_time_constant,
+        ),
+        "true_sensors": suite.scaled_noise(args.noise_factor),
+        "world": args.world,
+        "faults": args.faults,
+    }
+    start: Literal["cold", "warm"] = "warm" if args.filter_start == "warm" else "cold"
+    return Case(title_of(suite, args), suite, IDS[args.env_id], start, keywords)
 
 
-def fly(args: Args, batch: FlightBatch) -> Findings:
-    """Fly all flights to their end, looking at the errors on the way."""
-    shown = time.monotonic()
-
-    def progress(flown: float) -> None:
-        nonlocal shown
-        if time.monotonic() > shown + 2.0:
-            shown = time.monotonic()
-            print(f"  {flown:.1f} of {args.duration:g} s flown", file=sys.stderr, flush=True)
-
-    return measure_consistency(
-        batch,
-        seeds=range(args.seed, args.seed + args.count),
-        duration=args.duration,
-        every=args.every,
-        settle=args.settle,
-        matched=args.filter_start == "matched",
-        progress=progress,
-    )
-
-
-def title_of(batch: FlightBatch, args: Args) -> str:
-    """What was flown, in a line."""
-    sensors = batch.sensors
-    choices = sensors.estimator
+def title_of(suite: SensorSuite, args: Args) -> str:
+    """Title of the report and of the figures."""
+    choices = suite.estimator
     parts = [
         f"{choices.kind.upper()}, suite {args.sensors}, {args.filter_start} start",
-        f"{sensors.imu.samples} samples",
-        f"{choices.integration}",
+        f"{suite.imu.samples} samples",
+        choices.integration,
         f"attitude reset {'on' if choices.attitude_reset else 'off'}",
     ]
-    if sensors.camera is not None:
+    if suite.camera is not None:
         parts.append(f"feature noise across the {choices.bearing_noise_at} direction")
     return ", ".join(parts)
 
 
-def table_of(quantity: str, parts: dict[str, MeanSquare]) -> str:
-    """Mean squares, for the screen."""
-    rows = [
-        (
-            part.name,
-            f"{part.overall:.2f}",
-            f"{part.mean[-1]:.2f}",
-            f"{part.low[-1]:.2f} to {part.high[-1]:.2f}",
-            f"{100 * part.share_inside:.0f}%",
-        )
-        for part in parts.values()
-    ]
-    columns = ["over time", "at the end", "tolerance", "inside"]
-    return text_table({quantity: ["of"], "mean over flights": columns}, rows)
-
-
-def report_of(findings: Findings) -> str:
-    """Tables and the verdict, for the screen."""
-    tables = [table_of("NEES", findings.nees)]
-    if findings.nis:
-        tables.append(table_of("NIS", findings.nis))
-    lines = [
-        "The filter is consistent:"
-        if findings.consistent
-        else "The filter is not consistent in everything:",
-        *(f"  {text}" for text in findings.sentences().values()),
-        f"  Filters with a numerical failure: {findings.failed}. Flights lost: "
-        f"{findings.astray.sum()}.",
-        f"Criterion: means within the tolerance, the 95 % band of a mean over at most "
-        f"{BAND_FLIGHTS:,} values, at {100 * CONSISTENT_SHARE:.0f} % of the instants or more; "
-        "white innovations; no failures.",
-    ]
-    return "\n\n".join([*tables, "\n".join(lines)])
-
-
-def fly_tables(args: Args) -> None:
-    """Fly a table of configurations, and say where it is written."""
-    from quad_gym.commands import consistency_matrix as matrix
-    from quad_gym.commands import consistency_recovery as recovery
-
-    name = "matrix" if args.matrix else "recovery"
-    with usage_errors():
-        require_writable("--output", args.folder)
-    flown: dict[str, Any] = {"flights": args.count, "first_seed": args.seed}
-    flown["threads"] = args.threads
-    if args.matrix:
-        chosen = matrix.cells_of(args.cells)
-        found = matrix.run_matrix(chosen, args.folder, duration=args.duration, **flown)
-        wrong = matrix.unexpected(found)
-    else:
-        found = recovery.run_recovery(list(recovery.trials()), args.folder, **flown)
-        wrong = recovery.unexpected(found)
-    print(f"{len(found)} cells, {wrong} unexpected misses; see {args.folder / name}.md.")
-
-
 def main(args: Args) -> None:
-    """Fly, measure, judge, draw and write."""
-    if args.tables:
-        fly_tables(args)
+    """Run the experiment."""
+    if args.matrix or args.recovery:
+        fly_table(args)
         return
     with usage_errors():
         require_matplotlib()
-        batch = batch_of(args)
+        case = case_of(args)
+        case.batch(8, 1)  # rejects an invalid configuration
         require_writable("--output", args.folder)
-    began, title = time.monotonic(), title_of(batch, args)
-    print(f"{title}; {args.count:,} flights of {args.duration:g} s, {args.task}.\n")
-    whole = fly(args, batch)
-    findings = whole.since(args.settle)
-    print(report_of(findings))
+    run_single(
+        case,
+        args.flights,
+        args.folder,
+        every=args.every,
+        settle=args.settle,
+        matched=args.filter_start == "matched",
+        configuration=args,
+    )
 
-    files = []
-    with house_style():
-        figures = {
-            "nees": nees_figure(whole.nees, title, args.settle),
-            "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
-        }
-        if whole.nis:
-            figures["nis"] = nis_figure(whole.nis, title, args.settle)
-        if findings.whiteness:
-            figures["whiteness"] = whiteness_figure(findings.whiteness, title)
-        for name, figure in figures.items():
-            files += save_figure(figure, args.folder / name)
-    squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
-    found = {
-        "consistent": findings.consistent,
-        "consistent_share": CONSISTENT_SHARE,
-        "verdicts": findings.sentences(),
-        "share_inside": {name: part.share_inside for name, part in squares.items()},
-        "overall": {name: part.overall for name, part in squares.items()},
-        "filters_failed": findings.failed,
-        "flights_astray": int(findings.astray.sum()),
-        "mean_tracking_error": float(findings.tracking.mean.mean()),
-        "configuration": args,
-        "sensors": batch.sensors,
-        "vehicle": batch.vehicle,
-        "world": batch.world,
-        "faults": batch.faults,
-        "seeds": [args.seed, args.seed + args.count - 1],
-        "versions": versions("numpy", "numba", "scipy"),
-        "nees": whole.nees,
-        "nis": whole.nis,
-        "whiteness": findings.whiteness,
-        "rms_errors": whole.errors,
-        "rms_claimed": whole.claimed,
-    }
-    files.append(write_json(args.folder / "consistency.json", found))
-    seconds = time.monotonic() - began
-    print(f"\nWrote {len(files)} files to {args.folder} after {seconds:.1f} s.")
+
+def fly_table(args: Args) -> None:
+    """Fly the cases of a table, and print where it is."""
+    with usage_errors():
+        require_writable("--output", args.folder)
+    table, name = (matrix, "matrix") if args.matrix else (recovery, "recovery")
+    files, duration = args.folder / name, {"duration": args.duration} if args.matrix else {}
+    cases = matrix.cases_of(args.cells) if args.matrix else recovery.cases()
+    found = run_cases(cases, files, args.flights, table.measure, table.table_of, **duration)
+    print(f"{len(found)} cells, {table.unexpected(found)} unexpected misses; see {files}.md.")

@@ -33,6 +33,7 @@ from quad_gym.commands.options import (
     Keywords,
     OwnSuite,
     leave,
+    require_at_least,
     sensors_of,
     usage_errors,
     with_full_id,
@@ -132,6 +133,7 @@ def check_options(args: Args) -> None:
         ImportError: If a library for drawing or writing is not installed.
     """
     args = with_full_id(args)
+    require_at_least(args, seed=0)
     for name in ("speed", "fps"):
         value = getattr(args, name)
         if not (math.isfinite(value) and value > 0.0):

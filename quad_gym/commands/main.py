@@ -1,13 +1,13 @@
-"""`quad-gym COMMAND`: imports and runs the module of the command."""
+"""`quad-gym COMMAND`: subcommands of tyro, of which only the one that runs is imported."""
 
 import importlib
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any, Union
+
+from tyro.conf import subcommand
 
 from quad_gym.commands.options import parse
-from quad_gym.commands.refusals import INTERRUPTED, USAGE_ERROR
-from quad_gym.params.checks import did_you_mean
 
 COMMANDS = {
     "circle": "reproduce the report's experiment over many seeds: tables and figures",
@@ -30,22 +30,12 @@ COMMANDS = {
 }
 """Commands, of one or two words, and their descriptions."""
 
-PROGRAM = "quad-gym"
-
-
-def usage(group: str = "") -> str:
-    """Help text of `quad-gym` itself, or of the commands that begin with a word."""
-    width = max(map(len, COMMANDS))
-    shown = {name: text for name, text in COMMANDS.items() if name.startswith(group)}
-    lines = "\n".join(f"  {name:{width}}   {text}" for name, text in shown.items())
-    return (
-        f"usage: {PROGRAM} COMMAND [options]\n\ncommands:\n{lines}\n\n"
-        f"{PROGRAM} COMMAND --help explains a command.\n"
-    )
+INTERRUPTED = 130
+"""Exit code of a program that Ctrl-C has stopped."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command; Ctrl-C ends it with a message.
 
     Args:
         argv: Command and its options; None: the arguments of the process.
@@ -54,39 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    groups = {name.split()[0] for name in COMMANDS if " " in name}
-    group = [words.pop(0)] if words[:1] and words[0] in groups else []
-    if words[:1] in (["-h"], ["--help"]):
-        print(usage(*group), end="")
-        return 0
-    command = " ".join(group + words[:1])
-    if command not in COMMANDS:
-        got = f"got {command!r}" if command else "none given"
-        meant = did_you_mean(command, COMMANDS)
-        print(
-            f"{PROGRAM}: error: the command must be one of {', '.join(COMMANDS)}, {got}{meant} "
-            "(--help explains them)",
-            file=sys.stderr,
-        )
-        return USAGE_ERROR
-    return run(command, words[1:], program=f"{PROGRAM} {command}")
-
-
-def run(command: str, argv: Sequence[str] | None = None, *, program: str | None = None) -> int:
-    """Parse the options of a command and run it; Ctrl-C ends it with a message and exit code 130.
-
-    Args:
-        command: One of `COMMANDS`.
-        argv: Options of the command; None: the arguments of the process.
-        program: Name of the program in messages; None: the name of the process.
-
-    Returns:
-        Exit code.
-    """
     try:
-        module = module_of(command)
-        args = parse(module.Args, argv, description=module.__doc__, program=program)
-        return module.main(args) or 0
+        args = parse(subcommands(words), words, prog="quad-gym", description="")
+        return sys.modules[type(args).__module__].main(args) or 0
     except (KeyboardInterrupt, Exception) as error:
         if not _interrupted(error):
             raise
@@ -97,10 +57,33 @@ def run(command: str, argv: Sequence[str] | None = None, *, program: str | None 
             reports.remove_unused_folders()
 
 
+def subcommands(words: Sequence[str]) -> Any:
+    """Union of all commands for tyro, with the options of the one that `words` call.
+
+    Scripts for completion (`--tyro-print-completion`) need the options of every command.
+    """
+    everything = any(word.startswith("--tyro-") for word in words)
+    unions: dict[str, list[Any]] = {}
+    for command, text in COMMANDS.items():
+        kind: Any = _not_called
+        name = command.split()
+        if everything or list(words[: len(name)]) == name:
+            module = module_of(command)
+            kind, text = module.Args, module.__doc__
+        chosen = subcommand(name[-1], constructor=kind, description=text)
+        unions.setdefault(name[0], []).append(Annotated[Any, chosen])
+    export = subcommand("export", description="export a policy or a filter to an autopilot")
+    unions["export"] = [Annotated[Union[tuple(unions["export"])], export]]  # noqa: UP007
+    return Union[tuple(kind for union in unions.values() for kind in union)]  # noqa: UP007
+
+
+def _not_called() -> None:
+    """Stand-in for the options of the other commands."""
+
+
 def module_of(command: str) -> Any:
     """Import the module of one of `COMMANDS`, with its `Args` and its `main`."""
-    name = "benchmark.main" if command == "benchmark" else command.replace(" ", "_")
-    return importlib.import_module(f"quad_gym.commands.{name}")
+    return importlib.import_module(f"quad_gym.commands.{command.replace(' ', '_')}")
 
 
 def _interrupted(error: BaseException | None) -> bool:

@@ -1,25 +1,22 @@
-"""Command lines: parsers made by tyro from frozen dataclasses of options.
+"""Command lines: frozen dataclasses of options, parsed by tyro.
 
 A command declares each option once, with its type, its default and, in the docstring below it, its
-help text. Invalid options end the program with a message on stderr and exit code 2, as is usual on
-Unix.
+help text. Types that several commands share are at the end of this file.
 """
 
 import ast
 import dataclasses
-import os
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from quad_gym.commands.help_texts import registry, wrapped
-from quad_gym.commands.refusals import refuse, told_in_one_line
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
@@ -30,54 +27,55 @@ from quad_gym.params.suites import ALL_SUITES, SUITES
 
 _Args = TypeVar("_Args")
 
+USAGE_ERROR = 2
+"""Exit code of a program that was called with invalid options."""
 
-def parse(
-    kind: type[_Args],
-    argv: Sequence[str] | None = None,
-    *,
-    description: str | None = None,
-    program: str | None = None,
-) -> _Args:
-    """Parse the command line to an instance of a dataclass.
+_REGISTRY = ConstructorRegistry()
 
-    A ValueError of the dataclass's own checks ends the program like an invalid option.
+
+def parse(kind: Any, argv: Sequence[str] | None = None, **options: Any) -> Any:
+    """Parse the command line; invalid options end the program with exit code 2.
 
     Args:
-        kind: Dataclass whose fields are the options.
+        kind: Dataclass whose fields are the options, or a union of subcommands.
         argv: Arguments without the program's name; None: the arguments of the process.
-        description: Text above the options in the help.
-        program: Name of the program in its messages; None: the name of the process.
+        **options: Further options of `tyro.cli`.
+
+    Returns:
+        Instance of the dataclass.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    program = program or Path(sys.argv[0]).name
-    asked = bool({"-h", "--help"} & set(words))
-    try:
-        if asked:
-            words = ["--help"]  # tyro would hide the help of options that are given
-            if description:  # tyro would join its lines without wrapping
-                print(wrapped(description))
-                description = ""
-        if any(word.startswith("--tyro-") for word in words):
-            raise refuse("use quad-gym completion for all commands", program)
-        with nullcontext() if asked else told_in_one_line(program):
-            args = tyro.cli(
-                kind, args=words, description=description, prog=program, registry=registry()
-            )
-    except BrokenPipeError:  # the reader has closed the pipe, as in `--help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(1) from None
-    _require_sound(args, words, program)
+    with usage_errors((ValueError,)):
+        args = tyro.cli(kind, args=words, registry=_REGISTRY, **options)
+        for field in dataclasses.fields(args):
+            name = option_name(field.name)
+            if name in words and getattr(args, field.name) in ((), {}):
+                raise ValueError(f"{name} must have at least one value, got none")
     return args
 
 
-def _require_sound(args: Any, words: Sequence[str], program: str) -> None:
-    """End the program if an option has no value, or is a negative seed."""
-    for option in dataclasses.fields(args):
-        name, value = option_name(option.name), getattr(args, option.name)
-        if name in words and value in ((), {}):
-            raise refuse(f"{name} must have at least one value, got none", program)
-        if name == "--seed" and value < 0:
-            raise refuse(f"{name} must be at least 0, got {value}", program)
+@_REGISTRY.primitive_rule
+def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+    """Rule of tyro for whole numbers, which may be written as 1e6."""
+
+    def read(words: list[str]) -> int:
+        try:
+            return int(words[0])
+        except ValueError:
+            pass
+        if not float(words[0]).is_integer():
+            raise ValueError(f"must be a whole number, got {words[0]!r}")
+        return int(float(words[0]))
+
+    if info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 def option_name(field: str) -> str:
@@ -86,15 +84,7 @@ def option_name(field: str) -> str:
 
 
 def require_at_least(args: Any, **least: int) -> None:
-    """Reject numbers that are too small; options that were not given (None) are accepted.
-
-    Args:
-        args: Dataclass of options.
-        least: Smallest valid number of each field, by name.
-
-    Raises:
-        ValueError: If a number is too small.
-    """
+    """Reject numbers that are too small; options that were not given (None) are accepted."""
     for field, limit in least.items():
         value = getattr(args, field)
         if value is not None and value < limit:
@@ -105,32 +95,21 @@ def require_at_least(args: Any, **least: int) -> None:
 def usage_errors(
     kinds: tuple[type[Exception], ...] = (ValueError, OSError, ImportError),
 ) -> Iterator[None]:
-    """Context that turns errors of checks into one line on stderr and exit code 2.
-
-    Args:
-        kinds: Types of errors that the user can correct.
-    """
+    """Context that turns errors of checks into one line on stderr and exit code 2."""
     try:
         yield
     except kinds as error:
-        told = str(error)
+        message = str(error)
         if isinstance(error, OSError) and error.filename is not None:
-            told = f"{error.filename}: {error.strerror}"
+            message = f"{error.filename}: {error.strerror}"
             if isinstance(error, FileNotFoundError):
-                told = f"{error.filename} does not exist"
-        raise refuse(told) from None
+                message = f"{error.filename} does not exist"
+        print(f"error: {message}", file=sys.stderr)
+        raise SystemExit(USAGE_ERROR) from None
 
 
 def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[str, Any]:
-    """Check that `--env` contains no keyword for which there is a separate option.
-
-    Args:
-        keywords: Keywords given by `--env`.
-        options: Options by name of the keyword that they replace.
-
-    Raises:
-        ValueError: If one of these keywords was given.
-    """
+    """Check that `--env` contains no keyword for which there is a separate option."""
     for name, instead in options.items():
         if name in keywords:
             raise ValueError(f"--env must not contain {name}: use {instead} instead")
@@ -138,32 +117,13 @@ def leave(keywords: Mapping[str, Any], options: Mapping[str, str]) -> Mapping[st
 
 
 def refuse_overwriting(file: Path, overwrite: bool) -> None:
-    """Reject replacing the results of an earlier run without `--overwrite`.
-
-    Args:
-        file: One of the results.
-        overwrite: True to allow replacing it (`--overwrite`).
-
-    Raises:
-        ValueError: If the file exists and `overwrite` is False.
-    """
+    """Reject replacing the results of an earlier run without `--overwrite`."""
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists: use --overwrite to replace it, or another --output")
 
 
 def writable_file(output: Path | None, name: str, suffix: str, overwrite: bool) -> Path:
-    """File that an export writes, in a writable folder.
-
-    Args:
-        output: File given by `--output`; None: a file in results/export.
-        name: Name of the file if `output` is None.
-        suffix: Required extension.
-        overwrite: True to allow replacing the file.
-
-    Raises:
-        ValueError: If the extension differs, or the file exists and `overwrite` is False.
-        OSError: If the folder is not writable.
-    """
+    """File that an export writes, in a writable folder."""
     from quad_gym.analysis.reports import require_writable
 
     file = output or Path("results/export") / (name + suffix)
@@ -191,12 +151,7 @@ def without_idle_filter(keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def free_folder(folder: Path, result: str) -> Path:
-    """Folder without results: this one, or else FOLDER_2, FOLDER_3, ...
-
-    Args:
-        folder: First folder to try.
-        result: Name of a file that exists in folders with results.
-    """
+    """Folder without results: this one, or else FOLDER_2, FOLDER_3, ..."""
     number, found = 1, folder
     while (found / result).exists():
         number += 1
@@ -225,11 +180,7 @@ def value_of(word: str) -> Any:
 
 
 def _pairs(words: Sequence[str]) -> dict[str, Any]:
-    """Parse `key=value` pairs, with values as in `value_of`.
-
-    Raises:
-        ValueError: If a word is not a pair.
-    """
+    """Parse `key=value` pairs, with values as in `value_of`."""
     found = {}
     for word in words:
         key, equals, value = word.partition("=")
@@ -241,7 +192,7 @@ def _pairs(words: Sequence[str]) -> dict[str, Any]:
 
 Keywords = Annotated[
     dict[str, Any],
-    tyro.constructors.PrimitiveConstructorSpec(
+    PrimitiveConstructorSpec(
         nargs="*",
         metavar="KEY=VALUE ...",
         instance_from_str=_pairs,
@@ -271,16 +222,7 @@ def one_of(ids: Iterable[str]) -> str:
 
 
 def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
-    """Convert an id or a short name to an id.
-
-    Args:
-        name: Name of the argument, for the message.
-        given: Value of the argument.
-        ids: Valid ids.
-
-    Raises:
-        ValueError: If the value is not valid.
-    """
+    """Convert an id or a short name to an id."""
     found, ids = full_id(given), tuple(ids)
     if found not in ids:
         # a task for other commands is not misspelled
@@ -292,15 +234,7 @@ def known_id(name: str, given: str, ids: Iterable[str] = IDS) -> str:
 
 
 def with_full_id(args: _Args, ids: Iterable[str] = IDS) -> _Args:
-    """Replace a short name in the field `env_id` of options by its id.
-
-    Args:
-        args: Dataclass with the field `env_id`.
-        ids: Valid ids.
-
-    Raises:
-        ValueError: If the id is not valid.
-    """
+    """Replace a short name in the field `env_id` of options by its id."""
     found = known_id("ENV_ID", args.env_id, ids)  # type: ignore[attr-defined]
     return replace(args, env_id=found)  # type: ignore[type-var]
 
@@ -308,7 +242,7 @@ def with_full_id(args: _Args, ids: Iterable[str] = IDS) -> _Args:
 EnvId = tyro.conf.Positional[
     Annotated[
         str,
-        tyro.constructors.PrimitiveConstructorSpec(
+        PrimitiveConstructorSpec(
             nargs=1,
             metavar="ENV_ID",
             instance_from_str=lambda words: full_id(words[0]),

@@ -4,11 +4,11 @@
     quad-gym tune --env-ids circle --sensors consumer
     quad-gym evaluate QuadGym/Circle-v0 --policy pd pd:results/tune/gains.json
 
-Differential evolution (scipy.optimize) searches gains between a third and three times those it
-starts from, for the smallest true position error: for each task relative to the gains at the start,
-geometric mean over the tasks, where a crash counts as a large error. Every candidate flies the
-same episodes; at the end the best flies fresh ones, beside the gains at the start. Prints both,
-and writes gains.json and search.csv.
+Differential evolution (scipy.optimize) searches gains between a third of the initial gains and
+three times these, for the smallest true position error: for each task relative to the initial
+gains, then the geometric mean over the tasks, where a crash counts as a large error. Every
+candidate flies the same episodes. At the end, the best gains and the initial gains fly new
+episodes. Prints both, and writes gains.json and search.csv.
 """
 
 import math
@@ -62,7 +62,7 @@ class Args:
         arg(help=f"{one_of(TRACKING)}; if not given, all of them", help_behavior_hint=""),
     ] = TRACKING
     observation: Literal["estimate", "truth", "noisy"] = "estimate"
-    """what control sees"""
+    """observation of the controller"""
     sensors: SuiteName = "standard"
     env: Keywords = field(default_factory=dict)
     """further keywords of the environment, such as action=wrench control_rate=200"""
@@ -86,15 +86,15 @@ class Args:
 
 @dataclass(frozen=True)
 class Knobs:
-    """Which gains are searched, as the logarithms of factors on those at the start."""
+    """Gains to search, as logarithms of factors on the initial gains."""
 
     start: PDGains
     torques: bool
-    """whether Kd matters by itself; with rates or tilt commanded, only K / Kd does"""
+    """True if Kd has a separate effect; with commands of rates or tilt, only K / Kd has one"""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is turned."""
+        """Names of the searched gains."""
         names = ("position", "velocity", "attitude, tilt", "attitude, yaw")
         return (*names, "body rates, tilt", "body rates, yaw") if self.torques else names
 
@@ -112,7 +112,7 @@ class Knobs:
 
 @dataclass
 class Search:
-    """Flies candidates, and remembers what came of them."""
+    """Evaluation of candidates, and its history."""
 
     envs: dict[str, Any]
     knobs: Knobs

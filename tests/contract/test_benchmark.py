@@ -2,22 +2,19 @@
 
 import functools
 import json
-from pathlib import Path
 
 import gymnasium
 import pytest
 
 import quad_gym
-from quad_gym.commands.benchmark import against, interfaces, learning, rendering, stages
-from quad_gym.commands.benchmark import main as script
-from quad_gym.commands.benchmark.timing import Timing, by_turns
+from quad_gym.commands import benchmark as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.experiments.benchmark import interfaces, learning, rendering, stages
+from quad_gym.experiments.benchmark.timing import Effort, Timing, by_turns
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.records import WIDTH
 from tests.console import plain
-
-ROOT = Path(__file__).parents[2]
 
 
 def run(folder, *options):
@@ -84,8 +81,8 @@ def test_blocks_over_a_period_measure_as_often_as_the_sensors_do():
 def test_what_takes_turns_is_timed_by_turns():
     order, slow, fast = [], iter([4.0, 2.0, 3.0]), iter([1.0, 1.0, 1.5])
     jobs = [lambda: order.append("slow") or next(slow), lambda: order.append("fast") or next(fast)]
-    timings = by_turns(jobs, 3, order.append)
-    assert order == [0, "slow", "fast", 1, "slow", "fast", 2, "slow", "fast"]
+    timings = by_turns(jobs, 3)
+    assert order == ["slow", "fast"] * 3
     assert timings == [Timing(2.0, 0.5), Timing(1.0, 0.0)]
 
 
@@ -113,57 +110,11 @@ def test_the_options_section_compares_each_with_everything_off(tmp_path):
 
 
 def test_the_interfaces_name_the_suite_they_time(monkeypatch):
-    effort = script.Effort(1, 0.001)
+    effort = Effort(1, 0.001)
     for options, suite in (({}, "standard"), ({"sensors": "lab"}, "lab")):
         row = interfaces.time_batch("vector", 8, effort, 1, control_rate=50, **options)
         assert row["suite"] == suite
         assert row["name"] == f"vector, estimate, 50 Hz, {suite}"
-
-
-def test_another_checkout_is_timed_by_turns_and_compared(tmp_path, capsys, monkeypatch):
-    every = against.rows_to_compare
-    without_torch = lambda *of: [row for row in every(*of) if row["interface"] != "sb3"]  # noqa: E731
-    monkeypatch.setattr(against, "rows_to_compare", without_torch)
-    found = run(tmp_path, "--against", str(ROOT), "--n-envs", "8", "--threads", "1")
-    assert list(found["sections"]) == ["against"]
-    rows = found["sections"]["against"]
-    assert {"vector", "single"} <= {row["interface"] for row in rows}
-    for row in rows:
-        assert row["suite"] == "standard"
-        assert row["ratio"] == pytest.approx(row["seconds"] / row["other"])
-        assert row["seconds"] > 0.0
-    assert "here / there" in capsys.readouterr().out
-
-
-def test_a_checkout_without_the_default_suite_is_compared_with_the_laboratorys():
-
-    class Other:
-        folder = ROOT
-
-        def __init__(self, *suites):
-            self.suites = suites
-
-        def ask(self, suite):
-            if suite not in self.suites:
-                raise against.RefusedError(f"no suite {suite}")
-            return str(ROOT / "quad_gym" / "__init__.py")
-
-    new, old = Other("lab", "standard"), Other("lab")
-    assert against.common_suite((new, new)) == "standard"
-    assert against.common_suite((new, old)) == against.common_suite((old, new)) == "lab"
-    new.folder = ROOT / "elsewhere"
-    with pytest.raises(RuntimeError, match="elsewhere is not used"):
-        against.common_suite((new, old))
-
-
-def test_a_row_that_the_other_checkout_refuses_is_left_out(monkeypatch, capsys):
-    rows = [row for row in against.rows_to_compare(4, 1, "lab") if row["interface"] == "single"][:2]
-    rows[0] = {**rows[0], "options": {"observation": "guess"}}
-    monkeypatch.setattr(against, "rows_to_compare", lambda envs, threads, suite: rows)
-    found = against.time_against(ROOT, 4, 1, script.Effort(1, 0.001))
-    assert [row["name"] for row in found] == [rows[1]["name"]]
-    said = capsys.readouterr().err
-    assert f"{rows[0]['name']}: left out: ValueError: observation must be" in said
 
 
 @pytest.mark.slow
@@ -211,7 +162,6 @@ def test_all_sections_are_those_that_take_no_minutes():
         ["--seconds", "nan"],
         ["--threads", "0"],
         ["--only", "speed"],
-        ["--against", "/nowhere"],
     ],
     ids=" ".join,
 )

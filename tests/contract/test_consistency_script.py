@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import quad_gym
 from quad_gym.analysis.consistency import MeanSquare
 from quad_gym.analysis.consistency_flights import Findings
-from quad_gym.commands import consistency as script
-from quad_gym.commands.options import parse
+from quad_gym.experiments.consistency import single
 from tests import console_commands
 
 
@@ -50,7 +48,7 @@ def test_it_writes_figures_and_numbers_with_configuration_and_seeds(tmp_path):
 
 
 def test_it_finds_sensors_that_are_worse_than_the_filter_believes(tmp_path, monkeypatch):
-    monkeypatch.setattr(script, "save_figure", lambda figure, stem: [])
+    monkeypatch.setattr(single, "save_figure", lambda figure, stem: [])
     assert run(tmp_path, "--noise-factor", "1.5").returncode == 0
     found = json.loads((tmp_path / "consistency.json").read_text())
     assert not found["consistent"]
@@ -65,14 +63,6 @@ def test_wrong_options_are_refused_in_a_line(tmp_path):
         done = run(tmp_path, *options)
         assert done.returncode == 2
         assert "Traceback" not in done.stderr
-
-
-def test_the_former_name_of_the_corrected_form_is_accepted():
-    forms = [
-        script.suite_of(parse(script.Args, ["--sensors", "lab", "--form", form]))
-        for form in ("corrected", "mended")
-    ]
-    assert forms[0] == forms[1] != quad_gym.sensor_suite("lab")
 
 
 def test_small_innovations_of_a_constant_error_that_counts_as_noise_are_expected(tmp_path):

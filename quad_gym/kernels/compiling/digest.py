@@ -61,7 +61,7 @@ def flights_digest() -> str:
     Results on disk are kept beside it: with other code they are measured anew. What commands and
     pictures look like does not count.
     """
-    apart = {"commands", "rendering", "compiling"}
+    apart = {"commands", "experiments", "rendering", "compiling"}
     names = sorted(name for name in _sources_of(_BASE / PACKAGE) if not apart & {*name.split("/")})
     files = [_BASE / name for name in names]
     digests = [_read(file, file.stat().st_mtime_ns)[0] for file in files]

@@ -1,6 +1,6 @@
-"""The compiler's part of the benchmark: how long the first flight waits.
+"""Compilation before the first flight.
 
-It measures a copy of the package in a temporary folder, with the cache beside the kernels: each
+A copy of the package in a temporary folder is measured, with the cache in that folder: each
 configuration begins with an empty cache, and sources can be edited.
 """
 
@@ -13,8 +13,7 @@ import tempfile
 from pathlib import Path
 
 import quad_gym
-from quad_gym.analysis.reports import text_table
-from quad_gym.commands.benchmark.timing import Row
+from quad_gym.experiments.benchmark.timing import NAME, Row, column, table
 
 PACKAGE = Path(quad_gym.__file__).resolve().parent
 ENVS = 1024
@@ -42,14 +41,14 @@ CONFIGURATIONS = {
     "truth": (None, "", ', observation="truth"'),
     "default": ("standard", "", ""),
 }
-"""Suite, what comes before the environment, and its keywords; edits are made with the last one."""
+"""Suite, code before the environment, and its keywords; edits are measured with the last one."""
 
 EDITED = ("kernels/task/reward_and_endings.py", "kernels/filter/predict.py")
-"""Sources that get one more constant, each after the other."""
+"""Sources to which a constant is added, one after the other."""
 
 
 def seconds_of(folder: Path, before: str, options: str, after: str = "") -> float:
-    """Seconds that a new process takes with the copy of the package in a folder."""
+    """Duration of a new process with the copy of the package in a folder [s]."""
     code = CIRCLE.format(before=before, envs=ENVS, options=options, after=after)
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     environment.pop("NUMBA_CACHE_DIR", None)  # the cache is beside the kernels
@@ -66,16 +65,16 @@ def seconds_of(folder: Path, before: str, options: str, after: str = "") -> floa
 
 
 def empty_cache(package: Path) -> None:
-    """Delete all compiled code of a copy of the package."""
+    """Delete all compiled code."""
     for file in package.rglob("*.code"):
         file.unlink()
 
 
 def time_compile(quick: bool) -> list[Row]:
-    """Imports included: the first reset with an empty and a full cache, a step after an edit.
+    """Time the first reset with an empty and a full cache, and a step after an edit.
 
     Args:
-        quick: Only what compiles fast.
+        quick: True for the fastest configuration only.
     """
     rows: list[Row] = []
 
@@ -109,7 +108,11 @@ def time_compile(quick: bool) -> list[Row]:
 
 
 def compile_table(rows: list[Row]) -> str:
-    """The compiler's figures."""
-    cells = [(r["name"], r["suite"] or "-", r["cache"], f"{r['seconds']:.1f}") for r in rows]
-    heading = f"A new process with {ENVS:,} flights of the circle"
-    return text_table({heading: ["up to the first reset", "suite", "cache", "s"]}, cells)
+    """Format the section."""
+    columns = {
+        "up to the first reset": NAME,
+        "suite": lambda row: row["suite"] or "-",
+        "cache": column("cache"),
+        "s": column("seconds", ".1f"),
+    }
+    return table(f"A new process with {ENVS:,} flights of the circle", rows, columns)

@@ -1,6 +1,7 @@
-"""What the filter in lanes is compared with: alone, in plain NumPy by the tests, and filterpy's."""
+"""Filters to compare with: for one vehicle, the plain NumPy filter of the tests, and filterpy's."""
 
 import importlib.util
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -13,11 +14,11 @@ from quad_gym import SensorSuite
 from quad_gym.estimation import UnscentedKalmanFilter
 
 REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "reference_ukf.py"
-"""The plain filter; where it is missing, nothing is compared with it."""
+"""The plain filter, present in a checkout only."""
 
 
 class Measured(NamedTuple):
-    """What one flight measures at one instant."""
+    """Measurements of one flight at one instant."""
 
     gyro: NDArray[np.float64]
     accel: NDArray[np.float64]
@@ -27,7 +28,7 @@ class Measured(NamedTuple):
 
 
 def load_reference() -> ModuleType | None:
-    """The module with `PlainUKF`, or None where the tests are not at hand."""
+    """The module with `PlainUKF`; None outside a checkout."""
     spec = importlib.util.spec_from_file_location("reference_ukf", REFERENCE)
     if spec is None or spec.loader is None or not REFERENCE.exists():
         return None
@@ -36,15 +37,21 @@ def load_reference() -> ModuleType | None:
     return module
 
 
-def alone_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None]:
-    """Cycles of the package's filter for one vehicle over a flight, from its first fix on."""
-    return _cycles(UnscentedKalmanFilter, sensors, flight)
-
-
-def plain_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None] | None:
-    """Cycles of the plain augmented filter, likewise; None where the tests are not at hand."""
+def peers(sensors: SensorSuite, flight: list[Measured]) -> dict[str, Callable[[], None]]:
+    """Functions that run the filters over a flight, by name, as far as they are available."""
+    found = {"UnscentedKalmanFilter": _cycles(UnscentedKalmanFilter, sensors, flight)}
     module = load_reference()
-    return None if module is None else _cycles(module.PlainUKF, sensors, flight)
+    if module is None:
+        print(f"  plain NumPy and filterpy: {REFERENCE} is missing", file=sys.stderr)
+        return found
+    found["plain NumPy"] = _cycles(module.PlainUKF, sensors, flight)
+    try:
+        from filterpy import kalman
+    except ImportError as error:
+        print(f"  filterpy: {error}", file=sys.stderr)
+        return found
+    found["filterpy"] = _filterpy_cycles(kalman, module, sensors, flight)
+    return found
 
 
 def _cycles(kind: Any, sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None]:
@@ -58,20 +65,15 @@ def _cycles(kind: Any, sensors: SensorSuite, flight: list[Measured]) -> Callable
     return run
 
 
-def filterpy_cycles(sensors: SensorSuite, flight: list[Measured]) -> Callable[[], None] | None:
-    """Cycles of filterpy's filter over a flight; None where it is not installed.
+def _filterpy_cycles(
+    kalman: Any, module: Any, sensors: SensorSuite, flight: list[Measured]
+) -> Callable[[], None]:
+    """Cycles of filterpy's filter over a flight.
 
-    It has the same models and the state dimension 15, but noise that is added to the covariance
-    instead of augmenting the state, and so fewer sigma points: 31 in place of 55 and 43 (55 with
-    two features). The attitude error is moved into the reference attitude after each half.
+    It has the same models and the state dimension 15, but adds the noise to the covariance instead
+    of augmenting the state, and so has fewer sigma points: 31 instead of 55 and 43 (55 with two
+    features). The attitude error is moved into the reference attitude after each half.
     """
-    try:
-        from filterpy import kalman
-    except ImportError:
-        return None
-    module = load_reference()
-    if module is None:
-        return None
     plain: Any = module.PlainUKF(sensors)
     rotation, rates, unit = module.rotation_312, module.euler_rate_matrix, module.unit
     dt, features = plain.dt, len(plain.features)

@@ -1,7 +1,7 @@
-"""How soon the compiled PPO flies better than tuned PD control, over training seeds.
+"""Time until the compiled PPO is better than tuned PD control, over training seeds.
 
-Each training is that of `quad-gym train QuadGym/Circle-v0 --engine compiled`. Time is that of
-training alone: compiling and evaluations are left out.
+Each training equals `quad-gym train circle --engine compiled`. The time excludes compilation and
+evaluations.
 """
 
 import csv
@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.analysis.reports import text_table
-from quad_gym.commands.benchmark.timing import Row
+from quad_gym.experiments.benchmark.timing import Row
 
 ENV_ID = "QuadGym/Circle-v0"
 
 
 def time_learning(seeds: int, steps: int | None, threads: int, quick: bool) -> list[Row]:
-    """Train with every seed.
+    """Train with each seed.
 
     Args:
         seeds: Number of training seeds, from 0 on.
-        steps: Environment steps of a training; None: the recipe's.
+        steps: Environment steps of a training; None: as in the recipe.
         threads: Threads of each training.
-        quick: Only to see that it runs.
+        quick: True for one short training.
     """
     from baselines.plans import Plan
     from baselines.recipes import recipe
@@ -53,7 +53,7 @@ def time_learning(seeds: int, steps: int | None, threads: int, quick: bool) -> l
 
 
 def pd_error(plan: Any) -> float:
-    """Mean error [m] of tuned PD control in the episodes that the training's evaluations fly."""
+    """Mean error of tuned PD control in the episodes of the training's evaluations [m]."""
     from baselines.pd import PDPolicy
     from baselines.seeds import first_seed
     from quad_gym.evaluation import roll_out
@@ -68,7 +68,7 @@ def pd_error(plan: Any) -> float:
 
 
 def summary(evaluations: list[dict[str, float]], pd: float) -> Row:
-    """When the policy first was better than PD without a crash, and how it ended."""
+    """First evaluation better than PD without a crash, and the last evaluation."""
     better = [r for r in evaluations if r["mean_error"] < pd and r["crash_rate"] == 0.0]
     last = evaluations[-1]
     return {
@@ -81,16 +81,17 @@ def summary(evaluations: list[dict[str, float]], pd: float) -> Row:
 
 
 def learning_table(rows: list[Row]) -> str:
-    """A line per seed, and the latest of all."""
+    """Format the section: a line per seed, and the latest of all."""
 
-    def soon(row: Row) -> tuple[str, str]:
-        if row["steps_to_pd"] is None:
-            return "-", "-"
-        return f"{row['steps_to_pd']:,.0f}", f"{row['seconds_to_pd']:.1f}"
+    def format_or_dash(value: float | None, form: str) -> str:
+        return "-" if value is None else format(value, form)
 
     cells = [
         (
-            *(f"{row['seed']}", *soon(row), f"{1e3 * row['pd_error']:.1f}"),
+            f"{row['seed']}",
+            format_or_dash(row["steps_to_pd"], ",.0f"),
+            format_or_dash(row["seconds_to_pd"], ".1f"),
+            f"{1e3 * row['pd_error']:.1f}",
             *(f"{row['steps']:,}", f"{row['seconds']:.1f}", f"{1e3 * row['error']:.1f}"),
             f"{row['crash_rate']:.1%}",
         )

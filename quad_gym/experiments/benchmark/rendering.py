@@ -1,4 +1,4 @@
-"""Frames a second of the renderer, on one core."""
+"""Frames per second of the renderer, on one core."""
 
 import itertools
 from collections.abc import Iterator
@@ -8,8 +8,17 @@ import numpy as np
 
 from baselines import PDPolicy
 from quad_gym import IDS, Flight
-from quad_gym.analysis.reports import text_table
-from quad_gym.commands.benchmark.timing import Effort, Row, measure, percent, report
+from quad_gym.experiments.benchmark.timing import (
+    NAME,
+    SPREAD,
+    Effort,
+    Row,
+    column,
+    measure,
+    per_second,
+    report,
+    table,
+)
 from quad_gym.rendering import VIEWS, Renderer, flight_of
 
 SIZE = (640, 480)
@@ -17,7 +26,7 @@ INSTANTS = 40
 
 
 def time_rendering(effort: Effort) -> list[Row]:
-    """Frames of every task from both views, at instants spread over a flight."""
+    """Time frames of every task from both views, at instants distributed over a flight."""
     rows: list[Row] = []
     for env_id, task in IDS.items():
         env = gymnasium.make_vec(env_id, 1, autoreset_mode="Disabled", threads=1)
@@ -37,10 +46,7 @@ def time_rendering(effort: Effort) -> list[Row]:
 
 
 def rendering_table(rows: list[Row]) -> str:
-    """The renderer's figures."""
-    cells = [
-        (r["name"], f"{1e3 * r['seconds']:.2f}", f"{1.0 / r['seconds']:,.0f}", percent(r["spread"]))
-        for r in rows
-    ]
-    heading = f"Frames of {SIZE[0]} x {SIZE[1]}, one core"
-    return text_table({heading: ["task", "ms", "frames/s", "spread"]}, cells)
+    """Format the section."""
+    times = column("seconds", ".2f", 1e3)
+    columns = {"task": NAME, "ms": times, "frames/s": per_second, "spread": SPREAD}
+    return table(f"Frames of {SIZE[0]} x {SIZE[1]}, one core", rows, columns)

@@ -1,27 +1,30 @@
-"""The filter's part of the benchmark: a cycle in lanes, alone, in plain NumPy and in filterpy."""
+"""Cycles of the filter: in lanes, for one vehicle, in plain NumPy, and in filterpy."""
 
-import sys
 from typing import Any
 
 import numpy as np
 
 import quad_gym
-from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.benchmark.peers import (
-    Measured,
-    alone_cycles,
-    filterpy_cycles,
-    plain_cycles,
+from quad_gym.experiments.benchmark.peers import Measured, peers
+from quad_gym.experiments.benchmark.stages import Staged, hovering
+from quad_gym.experiments.benchmark.timing import (
+    NAME,
+    SPREAD,
+    Effort,
+    Row,
+    Timing,
+    column,
+    measure,
+    report,
+    table,
 )
-from quad_gym.commands.benchmark.stages import Staged, hovering
-from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 from quad_gym.kernels.compiling import Stage
 from quad_gym.records import FLIGHT_BLOCK, WIDTH, aligned_zeros
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
-    """What one flight measures in the coming ticks."""
+    """Measurements of one flight in the next ticks."""
     recorded = []
     for _ in range(ticks):
         names = ("gyro", "accel", "gnss_position", "gnss_baseline", "pixels")
@@ -33,12 +36,12 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
 
 
 def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
-    """Cycles of update and prediction on one core, in lanes, alone and elsewhere.
+    """Time cycles of update and prediction on one core.
 
     Args:
-        count: Flights in a batch.
-        effort: How long to measure.
-        recorded_ticks: Length of the flight that a filter alone and those elsewhere estimate.
+        count: Number of flights in a batch.
+        effort: Number and length of the repeats.
+        recorded_ticks: Length of the flight of the filters for one vehicle.
     """
     rows: list[Row] = []
     with_camera = quad_gym.sensor_suite("lab")
@@ -47,11 +50,11 @@ def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
         batch = hovering(count, sensors=sensors)
         seeing = np.flatnonzero(batch.record("feature_valid").sum(axis=1) == features)
         blocks = aligned_zeros(count // WIDTH, FLIGHT_BLOCK)
-        for name in FLIGHT_BLOCK.names or ():  # the flights that see all features, over and over
+        for name in FLIGHT_BLOCK.names or ():  # repeats flights that see all features
             values = batch.record(name)[np.resize(seeing, count)]
             lanes = values.reshape(-1, WIDTH, *values.shape[1:])
             blocks[name] = np.moveaxis(lanes, 1, -1)
-        update, predict = Staged(batch, Stage.UPDATE, features), Staged(batch, Stage.PREDICT)
+        update, predict = Staged(batch, Stage.UPDATE), Staged(batch, Stage.PREDICT)
 
         def in_lanes(blocks: Any = blocks, update: Any = update, predict: Any = predict) -> None:
             update(blocks)
@@ -69,28 +72,16 @@ def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
         add("lanes", measure(in_lanes, effort, again).per(count))
         recorded = record_one(batch, int(seeing[0]), recorded_ticks)
         recorded = [now for now in recorded if len(now.pixels) == features]
-        for name, make in (
-            ("UnscentedKalmanFilter", alone_cycles),
-            ("plain NumPy", plain_cycles),
-            ("filterpy", filterpy_cycles),
-        ):
-            run = make(sensors, recorded)
-            if run is None:
-                print(f"  {name}: not installed", file=sys.stderr)
-            else:
-                add(name, measure(run, effort).per(len(recorded)))
+        for name, run in peers(sensors, recorded).items():
+            add(name, measure(run, effort).per(len(recorded)))
+    of_lanes = {row["measurements"]: row["seconds"] for row in rows if row["kind"] == "lanes"}
     for row in rows:
-        lanes_row = next(
-            r for r in rows if r["kind"] == "lanes" and r["measurements"] == row["measurements"]
-        )
-        row["times_lanes"] = row["seconds"] / lanes_row["seconds"]
+        row["times_lanes"] = row["seconds"] / of_lanes[row["measurements"]]
     return rows
 
 
 def filter_table(rows: list[Row]) -> str:
-    """The filter's figures."""
-    cells = [
-        (r["name"], f"{1e6 * r['seconds']:,.2f}", percent(r["spread"]), f"{r['times_lanes']:,.1f}")
-        for r in rows
-    ]
-    return text_table({"UKF cycle, one core": ["filter", "us", "spread", "x lanes"]}, cells)
+    """Format the section."""
+    times, ratio = column("seconds", ",.2f", 1e6), column("times_lanes", ",.1f")
+    columns = {"filter": NAME, "us": times, "spread": SPREAD, "x lanes": ratio}
+    return table("UKF cycle, one core", rows, columns)

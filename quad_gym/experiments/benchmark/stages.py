@@ -1,4 +1,4 @@
-"""The tick's part of the benchmark: the stages that a configuration flies through, one by one."""
+"""Stages of a tick, one by one."""
 
 import math
 from typing import Any
@@ -6,11 +6,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.reports import text_table
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands.benchmark.timing import Effort, Row, Timing, measure, percent, report
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
+from quad_gym.experiments.benchmark.timing import (
+    SPREAD,
+    Effort,
+    Row,
+    Timing,
+    column,
+    measure,
+    percent,
+    report,
+    table,
+)
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
@@ -30,11 +39,11 @@ AT_THE_START = frozenset(
         Stage.FORGET_INNOVATIONS,
     }
 )
-"""Stages of the first instant of an episode; all others are a tick's."""
+"""Stages of the first instant of an episode; all others belong to a tick."""
 
 
 def hovering(count: int, **options: Any) -> FlightBatch:
-    """A batch that hovers by the PD controller on the estimate, half a second after its start."""
+    """Batch that hovers by PD control on the estimate, half a second after its start."""
     task = TASK_DEFAULTS["hover"].replace(duration=0.0)
     batch = FlightBatch(count, task=task, gains="tuned", threads=1, **options)
     batch.reset(seeds=range(count))
@@ -44,16 +53,18 @@ def hovering(count: int, **options: Any) -> FlightBatch:
 
 
 class Staged:
-    """One stage of a batch, which can be run on blocks.
+    """Stage that runs on blocks of flights.
 
     Args:
-        batch: The batch whose parameters and settings count; in a calm world, without draws.
-        stage: Which stage.
-        flag: What the stage is called with.
+        batch: Batch with the parameters and settings; in a calm world, without draws.
+        stage: The stage.
     """
 
-    def __init__(self, batch: FlightBatch, stage: Stage, flag: int = 0) -> None:
-        self._stage, self._flag, self._skipped = int(stage), flag, batch._room.skipped
+    def __init__(self, batch: FlightBatch, stage: Stage) -> None:
+        self._stage, self._skipped = int(stage), batch._room.skipped
+        self._flag = int(stage in AT_THE_START)
+        if stage == Stage.UPDATE:
+            self._flag = int(batch._settings["feature_count"][0])
         self._others = (batch._world, batch._model, batch._settings, batch._work[0])
         self._table = linked_table(needed_stages(batch._settings[0]))
 
@@ -72,17 +83,10 @@ class Staged:
         )
 
 
-def flag_of(stage: Stage, batch: FlightBatch) -> int:
-    """What a flight calls a stage with."""
-    if stage == Stage.UPDATE:
-        return int(batch._settings["feature_count"][0])
-    return int(stage in AT_THE_START)
-
-
 def over_a_period(batch: FlightBatch) -> NDArray[Any]:
-    """The blocks of a batch at different instants, which cover a period of its sensors.
+    """Blocks of a batch at different instants, which cover a period of its sensors.
 
-    So a stage has its mean cost where sensors do not measure in every tick.
+    Stages then have their mean cost, even if sensors do not measure in every tick.
     """
     clocks = [int(batch._settings[f"{sensor}_ticks"][0]) for sensor in ("gnss", "camera")]
     period = math.lcm(*(clock for clock in clocks if clock > 0))
@@ -94,12 +98,7 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
 
 
 def time_tick(count: int, effort: Effort) -> list[Row]:
-    """A whole tick on one core, and its stages, per flight, with the suites of SUITES.
-
-    Args:
-        count: Flights in a batch.
-        effort: How long to measure.
-    """
+    """Time a whole tick on one core, and its stages, per flight, with the suites of `SUITES`."""
     return [row for suite in SUITES for row in _time_suite(suite, count, effort)]
 
 
@@ -118,7 +117,7 @@ def _time_suite(suite: str, count: int, effort: Effort) -> list[Row]:
     needed = needed_stages(batch._settings[0]).keys()
     for when, kind in ((needed - AT_THE_START, "tick"), (needed & AT_THE_START, "start")):
         for stage in sorted(when):
-            run = Staged(batch, stage, flag_of(stage, batch))
+            run = Staged(batch, stage)
 
             def once(run: Staged = run) -> None:
                 run(blocks)
@@ -135,16 +134,12 @@ def _time_suite(suite: str, count: int, effort: Effort) -> list[Row]:
 
 
 def tick_table(rows: list[Row]) -> str:
-    """The tick's figures."""
-    cells = [
-        (
-            r["suite"],
-            r["part"] + (" (at the start)" if r["kind"] == "start" else ""),
-            f"{1e6 * r['seconds']:.3f}",
-            percent(r["spread"]),
-            percent(r["share"]),
-        )
-        for r in rows
-    ]
-    heading = "One flight's tick, one core"
-    return text_table({heading: ["suite", "stage", "us", "spread", "of the whole"]}, cells)
+    """Format the section."""
+    columns = {
+        "suite": column("suite"),
+        "stage": lambda row: row["part"] + (" (at the start)" if row["kind"] == "start" else ""),
+        "us": column("seconds", ".3f", 1e6),
+        "spread": SPREAD,
+        "of the whole": percent("share"),
+    }
+    return table("One flight's tick, one core", rows, columns)

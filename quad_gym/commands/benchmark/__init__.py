@@ -1,1 +1,0 @@
-"""The benchmark, a module for each section; `main` runs them."""

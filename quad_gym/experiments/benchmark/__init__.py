@@ -1,0 +1,1 @@
+"""Benchmark of all parts, a module for each section."""

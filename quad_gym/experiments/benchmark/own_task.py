@@ -1,0 +1,100 @@
+"""Speed of a task written in NumPy, compared with the compiled task."""
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_gym import rewards
+from quad_gym.experiments.benchmark.interfaces import random_actions
+from quad_gym.experiments.benchmark.timing import (
+    NAME,
+    SPREAD,
+    Effort,
+    Row,
+    by_turns,
+    column,
+    lasting,
+    per_second,
+    report,
+    table,
+)
+from quad_gym.tasks.task import Task
+
+if TYPE_CHECKING:
+    from quad_gym.tasks.view import View
+
+COUNTS = (8, 1024)
+"""Numbers of flights in the batches."""
+TIPPED = math.cos(math.radians(100.0))
+
+
+class OwnCircle(Task):
+    """Reward, endings and observation of the circle in NumPy."""
+
+    replaces_observation = True
+
+    def reward(self, view: "View") -> NDArray[np.float64]:
+        """(n,) the built-in reward per second."""
+        return rewards.TRACKING(view)
+
+    def terminated(self, view: "View") -> NDArray[np.bool_]:
+        """(n,) too far from the reference, tipped over, or on the ground."""
+        away, grounded = view.position_error > 3.0, view.position[:, 2] < -0.5
+        return away | grounded | (view.truth.up[:, 2] < TIPPED)
+
+    def truncated(self, view: "View") -> NDArray[np.bool_]:
+        """(n,) time limit reached, or filter failed."""
+        return np.logical_or(view.step >= 500, view.estimate.status)
+
+    def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
+        """Errors, directions, rates, reference and action, in the body frame."""
+        seen = view.observed
+        return {
+            "position_error": seen.position_error,
+            "velocity_error": seen.velocity_error,
+            "up": seen.up,
+            "heading": seen.heading,
+            "body_rates": seen.body_rates,
+            "reference_acceleration": seen.reference_acceleration,
+            "preview": seen.preview.reshape(-1, 6),
+            "last_action": view.action,
+        }
+
+
+def time_own_task(effort: Effort, threads: int) -> list[Row]:
+    """Time steps of both tasks in alternation, at 50 Hz on the estimate."""
+    rows: list[Row] = []
+    for count in COUNTS:
+        envs, steps = [], []
+        options: dict[str, Any] = {"control_rate": 50.0, "threads": threads}
+        for task in (None, OwnCircle()):
+            own: dict[str, Any] = {} if task is None else {"task": task}
+            env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **options, **own)
+            env.reset(seed=0)
+            envs.append(env)
+            steps.append(partial(_step, env, random_actions(count)))
+        first = by_turns([partial(lasting, step, 1) for step in steps], 3)  # also warms up
+        calls = max(1, round(effort.seconds / 4.0 / first[0].best))
+        found = by_turns([partial(lasting, step, calls) for step in steps], 4 * effort.repeats)
+        for env in envs:
+            env.close()
+        for name, timing in zip(("shipped", "own, in NumPy"), found, strict=True):
+            share = found[0].best / timing.best
+            label = f"circle {name}, {count} flights"
+            rows.append(report(label, timing.per(count), envs=count, share=share))
+    return rows
+
+
+def _step(env: Any, actions: Any) -> None:
+    env.step(next(actions))
+
+
+def own_task_table(rows: list[Row]) -> str:
+    """Format the section."""
+    ratio = column("share", ".2f")
+    columns = {"task": NAME, "steps/s": per_second, "spread": SPREAD, "of shipped": ratio}
+    return table("The circle, shipped and as a task of one's own, 50 Hz, estimate", rows, columns)

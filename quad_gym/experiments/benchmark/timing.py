@@ -1,0 +1,117 @@
+"""Timing by the best of several repeats, and tables of the results."""
+
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from quad_gym.analysis.reports import text_table
+
+
+class Effort(NamedTuple):
+    """Number and length of the repeats."""
+
+    repeats: int
+    seconds: float
+    """length of a repeat [s]"""
+
+
+class Timing(NamedTuple):
+    """Duration of a piece of work."""
+
+    best: float
+    """fastest repeat [s]"""
+    spread: float
+    """ratio of the median of the repeats to the best, minus one"""
+
+    def per(self, count: int) -> "Timing":
+        """Duration of one of `count` equal parts."""
+        return Timing(self.best / count, self.spread)
+
+
+Row = dict[str, Any]
+"""Result of a section, for the table and the file."""
+
+
+def measure(
+    work: Callable[[], Any], effort: Effort, before: Callable[[], Any] = lambda: None
+) -> Timing:
+    """Time a call: the best of some repeats, each of as many calls as fit in its length.
+
+    Args:
+        work: Function to time.
+        effort: Repeats and their length.
+        before: Function called before every repeat, not timed.
+    """
+    before()
+    work()
+    began = time.perf_counter()
+    work()
+    calls = max(1, round(effort.seconds / (time.perf_counter() - began)))
+    times = []
+    for _ in range(effort.repeats):
+        before()
+        times.append(lasting(work, calls))
+    return _timing(times)
+
+
+def by_turns(
+    jobs: Iterable[Callable[[], float]],
+    turns: int,
+) -> list[Timing]:
+    """Time several jobs in alternation, so that other load on the machine affects all of them.
+
+    Args:
+        jobs: Functions that do their work and return its duration [s].
+        turns: Number of turns of each job.
+    """
+    jobs = list(jobs)
+    times = [[job() for job in jobs] for _ in range(turns)]
+    return [_timing(own) for own in zip(*times, strict=True)]
+
+
+def lasting(work: Callable[[], Any], calls: int) -> float:
+    """Mean duration of several calls [s]."""
+    began = time.perf_counter()
+    for _ in range(calls):
+        work()
+    return (time.perf_counter() - began) / calls
+
+
+def _timing(times: Sequence[float]) -> Timing:
+    best = min(times)
+    return Timing(best, statistics.median(times) / best - 1.0)
+
+
+def report(name: str, timing: Timing, **more: Any) -> Row:
+    """Make a row, and print it to stderr."""
+    print(f"  {name}: {1e6 * timing.best:,.2f} us", file=sys.stderr, flush=True)
+    return {"name": name, "seconds": timing.best, "spread": timing.spread, **more}
+
+
+Column = Callable[[Row], str]
+
+
+def column(key: str, form: str = "", scale: float = 1) -> Column:
+    """Column of a table: a text, or a number multiplied by a scale."""
+    return lambda row: format(scale * row[key] if form else row[key], form)
+
+
+def percent(key: str) -> Column:
+    """Column of shares, in percent; a dash for None."""
+    return lambda row: "-" if row[key] is None else f"{100.0 * row[key]:.1f} %"
+
+
+def per_second(row: Row) -> str:
+    """Number of repetitions per second."""
+    return f"{1.0 / row['seconds']:,.0f}"
+
+
+NAME, SPREAD = column("name"), percent("spread")
+
+
+def table(heading: str, rows: Sequence[Row], columns: Mapping[str, Column]) -> str:
+    """Format rows for the screen."""
+    cells = [[text(row) for text in columns.values()] for row in rows]
+    return text_table({heading: list(columns)}, cells)

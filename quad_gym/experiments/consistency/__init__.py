@@ -1,0 +1,1 @@
+"""Consistency of filters: one configuration, and tables of many."""

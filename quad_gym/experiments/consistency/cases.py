@@ -1,0 +1,121 @@
+"""Cases of an experiment on consistency, and tables of them that can be resumed."""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from tqdm import tqdm
+
+from quad_gym.analysis.consistency_flights import Findings, endless, measure_consistency
+from quad_gym.analysis.reports import as_json, versions, write_json
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.kernels.compiling.digest import flights_digest
+from quad_gym.params.sensors import SensorSuite
+
+Results = dict[str, dict[str, Any]]
+"""Results of cases, by name."""
+
+
+@dataclass(frozen=True)
+class Flights:
+    """Flights of each case."""
+
+    count: int
+    first_seed: int = 0
+    duration: float = 10.0
+    """length [s]"""
+    threads: int | None = None
+
+    @property
+    def seeds(self) -> range:
+        """Consecutive seeds of the flights."""
+        return range(self.first_seed, self.first_seed + self.count)
+
+    @property
+    def seed_limits(self) -> list[int]:
+        """First and last seed."""
+        return [self.seeds[0], self.seeds[-1]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Configuration of flights by PD control."""
+
+    name: str
+    sensors: SensorSuite
+    task: str = "random_trajectory"
+    start: Literal["cold", "warm"] = "cold"
+    """start of the filter"""
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    """further keywords of `FlightBatch`"""
+    expected: Mapping[str, str] = field(default_factory=dict)
+    """reasons for misses, by column; "" stands for all columns"""
+
+    def batch(self, count: int, threads: int | None = None) -> FlightBatch:
+        """Flights without early endings."""
+        return FlightBatch(
+            count,
+            sensors=self.sensors,
+            task=endless(TASK_DEFAULTS[self.task]),
+            gains="tuned",
+            filter_start=self.start,
+            innovations=True,
+            threads=threads,
+            **self.keywords,
+        )
+
+
+def fly(batch: FlightBatch, flights: Flights, **options: Any) -> Findings:
+    """Fly, and compare errors with covariances; for options, see `measure_consistency`."""
+    return measure_consistency(batch, seeds=flights.seeds, duration=flights.duration, **options)
+
+
+def run_cases(
+    cases: Iterable[Case],
+    files: Path,
+    flights: Flights,
+    measure: Callable[[Case, Flights], dict[str, Any]],
+    table: Callable[[Results, Flights], str],
+    **head: Any,
+) -> Results:
+    """Compute the cases that an earlier run has not completed.
+
+    Args:
+        cases: Cases of the table.
+        files: Output path without extension: numbers in .json and the table in .md. Both are
+            written again after each case.
+        flights: Flights of each case.
+        measure: Function that computes the results of a case, including "sensors".
+        table: Function that formats the results of all cases.
+        **head: Further parameters that an earlier run must have in common with this one.
+
+    Returns:
+        Results of these cases.
+    """
+    file, chosen = files.with_suffix(".json"), list(cases)
+    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    head = {"flights": flights.count, **head, "seeds": flights.seed_limits}
+    head |= {"versions": versions("numpy", "numba"), "sources": flights_digest()}
+    same = {key: before.get(key) for key in head} == as_json(head)
+    done: Results = before["cells"] if same else {}
+    for case in tqdm(chosen, desc=files.name, unit=" cells"):
+        if done.get(case.name, {}).get("sensors") != as_json(case.sensors):
+            done[case.name] = as_json(measure(case, flights))
+            write_json(file, {**head, "cells": done})
+            files.with_suffix(".md").write_text(table(done, flights), encoding="utf-8")
+    return {case.name: done[case.name] for case in chosen}
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown, with texts in its first and last column."""
+    head, *body = (f"| {' | '.join(row)} |" for row in rows)
+    return [head, "|---|" + "---:|" * (len(rows[0]) - 2) + "---|", *body]
+
+
+def remark(reasons: Iterable[str], filters_failed: int) -> str:
+    """Reasons for misses, and the number of filters with a numerical failure."""
+    failed = [f"**{filters_failed} filters failed**"] if filters_failed else []
+    return "; ".join([*reasons, *failed])

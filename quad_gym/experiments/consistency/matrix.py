@@ -1,0 +1,223 @@
+"""Means of NEES and NIS in many configurations.
+
+Every suite flies every task, from a cold and from a warm start. On one task, every suite also flies
+with temporary faults, other latencies and mountings, randomization with and without the drawn
+values in the filter, random starts, and wind. A value is the mean over all flights and instants. It
+is a miss if it is outside the 95 % band of the mean at one instant, which is conservative: the mean
+over instants varies less. Misses are expected if the filter's model differs from the simulation.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+from quad_gym.analysis.consistency import PARTS, SENSOR_BLOCKS, mean_band
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.experiments.consistency.cases import (
+    Case,
+    Flights,
+    Results,
+    fly,
+    markdown,
+    remark,
+)
+from quad_gym.faults.presets import PRESETS, faults_of
+from quad_gym.params.distributions import Uniform
+from quad_gym.params.randomization import Randomization
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import SUITES, sensor_suite
+
+STARTS: tuple[Literal["cold", "warm"], ...] = ("cold", "warm")
+CONDITIONS_TASK = "random_trajectory"
+FREEDOMS = {name: part.stop - part.start for name, part in PARTS.items()} | {
+    "nis_position": 3,
+    "nis_baseline": 2,
+    "nis_velocity": 3,
+    "nis_feature": 2,
+    "nis_barometer": 1,
+    "nis_magnetometer": 3,
+}
+"""Degrees of freedom, by column: the means of a consistent filter."""
+
+_LEVER_ARM = (0.05, 0.02, 0.03)
+_DISPLACED = Uniform(-0.01, 0.01)
+
+
+def case_of(
+    suite: str,
+    task: str,
+    start: Literal["cold", "warm"],
+    condition: str = "nominal",
+    wrong: str = "",
+    sensors: SensorSuite | None = None,
+    **keywords: Any,
+) -> Case:
+    """One configuration.
+
+    Args:
+        suite: Name of the sensor suite.
+        task: Name of the task.
+        start: Start of the filter.
+        condition: Name of the difference from the suite and the task.
+        wrong: Difference between the filter's model and the simulation; empty: none.
+        sensors: Sensor suite that flies; None: the one named `suite`.
+        **keywords: Further keywords of `FlightBatch`.
+    """
+    flown = sensors or sensor_suite(suite)
+    expected = {}
+    if suite == "lab":
+        expected = {"": "the report's filter"}
+    elif wrong:
+        expected = {"": wrong}
+    else:
+        if flown.gnss is not None and flown.gnss.heading_errs:
+            expected["nis_baseline"] = "counts constant heading errors as noise"
+        if flown.imu.believed_accel_error > 0.0 and (task == "waypoints" or "world" in keywords):
+            reason = "counts errors of scale as noise"
+            expected |= {"velocity": reason, "accel_bias": reason}
+    return Case(f"{suite}, {task}, {start}, {condition}", flown, task, start, keywords, expected)
+
+
+def _late(suite: SensorSuite, periods: int) -> SensorSuite:
+    """Suite with latencies of some periods of each sensor."""
+    aids = {aid.name.lower(): params for aid, params in suite.aids.items()}
+    sensors = {"gnss": suite.gnss, "camera": suite.camera, **aids}
+    return suite.replace(
+        **{
+            name: params.replace(latency=periods / params.rate)
+            for name, params in sensors.items()
+            if params is not None
+        }
+    )
+
+
+def _draws(suite: SensorSuite) -> dict[str, Any]:
+    """Random noise of the sensors and random mass."""
+    names = {"accel_noise_density", "gyro_noise_density"}
+    if suite.gnss is not None:
+        names |= {"position_sigma_I"} | ({"baseline_sigma"} if suite.gnss.has_baseline else set())
+    names |= {"pixel_sigma"} if suite.camera is not None else set()
+    return {name: Uniform(1.0, 2.0, relative=True) for name in sorted(names)} | {
+        "mass": Uniform(0.8, 1.2, relative=True)
+    }
+
+
+def _mounting(suite: SensorSuite) -> dict[str, Any]:
+    """Random errors of the mounting of the sensors."""
+    found: dict[str, Any] = {"lever_arm_B": _DISPLACED}
+    if suite.gnss is not None:
+        found["primary_antenna_B"] = Uniform(-0.01, 0.01, offset=True)
+    if suite.camera is not None:
+        found["camera_rotation"] = _DISPLACED
+    return found
+
+
+def _conditions(name: str) -> Iterator[dict[str, Any]]:
+    """Arguments of `case_of` for the conditions of a suite."""
+    suite = sensor_suite(name)
+    for fault, parts in PRESETS.items():
+        if not parts or any(getattr(part, "duration", math.inf) == math.inf for part in parts):
+            continue  # it does not end
+        try:
+            faults_of(fault, suite)
+        except ValueError:  # the suite lacks its sensor
+            continue
+        corrupted = "corrupted measurements" if fault == "gnss_jump" else ""
+        yield {"condition": fault, "wrong": corrupted, "faults": fault}
+    for periods, text in enumerate(("no latency", "one period late", "two periods late")):
+        yield {"condition": text, "sensors": _late(suite, periods)}
+    arm = suite.replace(imu=suite.imu.replace(lever_arm_B=_LEVER_ARM))
+    yield {"condition": "lever arm", "sensors": arm}
+    for drawn, draws in (("mounting", _mounting(suite)), ("noise and mass", _draws(suite))):
+        known, unknown = Randomization(draws, known=True), Randomization(draws)
+        yield {"condition": f"{drawn} drawn, known", "randomization": known}
+        yield {
+            "condition": f"{drawn} drawn, unknown",
+            "wrong": f"unknown {drawn}",
+            "randomization": unknown,
+        }
+    starts = {name: Uniform(-0.1, 0.1) for name in ("start_roll", "start_pitch", "start_yaw")}
+    starts["start_velocity_I"] = Uniform(-0.5, 0.5)
+    yield {"condition": "start drawn", "randomization": Randomization(starts)}
+    yield {"condition": "fresh breeze", "world": "fresh_breeze"}
+
+
+def cases_of(kind: str) -> list[Case]:
+    """Cases: "suites" on all tasks, "conditions" on one task, or "all" of these."""
+    suites = [case_of(s, task, start) for s in SUITES for task in TASK_DEFAULTS for start in STARTS]
+    conditions = [
+        case_of(suite, CONDITIONS_TASK, start, **fields)
+        for suite in SUITES
+        for start in STARTS
+        for fields in _conditions(suite)
+    ]
+    return {"suites": suites, "conditions": conditions, "all": suites + conditions}[kind]
+
+
+def measure(case: Case, flights: Flights) -> dict[str, Any]:
+    """Fly a case: values by column, misses, and the configuration."""
+    batch = case.batch(flights.count, flights.threads)
+    found = fly(batch, flights, every=0.1)
+    values = {name: part.overall for name, part in found.nees.items()}
+    values |= {f"nis_{name}": part.overall for name, part in found.nis.items()}
+    bands = {name: mean_band(FREEDOMS[name], [flights.count]) for name in values}
+    misses = [k for k, v in values.items() if not bands[k][0][0] <= v <= bands[k][1][0]]
+    return {
+        "values": values,
+        "misses": misses,
+        "expected": case.expected,
+        "filters_failed": found.failed,
+        "flights_astray": int(found.astray.sum()),
+        "sensors": batch.sensors,
+        "task": batch.task,
+        "world": batch.world,
+        "faults": batch.faults,
+        "randomization": batch.randomization,
+    }
+
+
+def table_of(cells: Results, flights: Flights) -> str:
+    """Format the matrix in Markdown: misses bold, or in italics if they are expected."""
+    names = [*PARTS, *(f"nis_{name}" for name in SENSOR_BLOCKS)]
+    bands = [mean_band(FREEDOMS[name], [flights.count]) for name in names]
+    rows = [
+        [
+            "suite, task, start, condition",
+            *(name.removeprefix("nis_") for name in names),
+            "expected misses",
+        ],
+        ["95 % band", *(f"{low[0]:.2f} to {high[0]:.2f}" for low, high in bands), ""],
+    ]
+    for label, cell in cells.items():
+        expected = cell["expected"]
+        reasons = [f"{k.removeprefix('nis_')}: {v}" if k else v for k, v in expected.items()]
+        texts = [_text(name, cell) for name in names]
+        rows.append([label, *texts, remark(reasons, cell["filters_failed"])])
+    lines = [
+        f"Mean of NEES, then NIS, over {flights.count} flights. In a consistent filter:",
+        "",
+        *markdown(rows),
+        "",
+        "**Bold**: a miss. *Italics*: a miss that is expected, for the reason given.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _text(name: str, cell: Mapping[str, Any]) -> str:
+    """Format the value of a column, with the mark of a miss."""
+    value = cell["values"].get(name)
+    if value is None:
+        return ""
+    text = f"{value:.3g}" if value >= 100 else f"{value:.2f}"
+    if name not in cell["misses"]:
+        return text
+    return f"*{text}*" if {"", name} & cell["expected"].keys() else f"**{text}**"
+
+
+def unexpected(cells: Results) -> int:
+    """Number of misses without a known reason."""
+    return sum(
+        not {"", name} & cell["expected"].keys()
+        for cell in cells.values()
+        for name in cell["misses"]
+    )

@@ -1,0 +1,179 @@
+"""Recovery of filters after faults, and their false alarms.
+
+Every suite flies each preset fault that it can have. A fault starts at `FAULT_START` and, unless it
+is instantaneous, ends after `FAULT_DURATION`; flights are evaluated `RECOVERY_TIME` later. See
+`quad_gym.analysis.recovery` for the definitions. For the rate of false alarms, every suite also
+flies without a fault.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from quad_gym.analysis.recovery import REQUIRED, Recovery, follow_recovery
+from quad_gym.experiments.consistency.cases import (
+    Case,
+    Flights,
+    Results,
+    markdown,
+    remark,
+)
+from quad_gym.faults import AccelBiasStep, Fault, GnssOutage, GyroBiasStep, PositionJump
+from quad_gym.faults.presets import PRESETS, faults_of
+from quad_gym.params.sensors import SensorSuite
+from quad_gym.params.suites import SUITES, sensor_suite
+
+FAULT_START, FAULT_DURATION, RECOVERY_TIME = 3.0, 5.0, 10.0
+"""Start and duration of faults, and time that filters have to recover [s]."""
+CALM_TASKS = ("hover", "random_trajectory", "waypoints")
+CALM_DURATION = 60.0
+"""Length of flights without a fault [s]."""
+INSTANTANEOUS = (AccelBiasStep, GyroBiasStep, PositionJump)
+"""Faults that end at once."""
+
+COLUMNS = {
+    "consistent_at_end": "consistent at its end [%]",
+    "consistent": "consistent 10 s later [%]",
+    "flagged": "inconsistent, flagged [%]",
+    "undetected": "undetected failures [%]",
+    "settling_time": "99 % consistent or flagged after [s]",
+    "large_error": "large error for 2 s [%]",
+    "missed": "never flagged in that time [%]",
+}
+CALM_COLUMNS = {
+    "alarms_per_hour": "alarms per hour",
+    "flagged": "time flagged [%]",
+    "hours": "flown [h]",
+}
+
+
+def end_of(faults: tuple[Fault, ...]) -> float:
+    """End of the last of some faults [s]."""
+    return max(
+        float(fault.start) + (0.0 if isinstance(fault, INSTANTANEOUS) else float(fault.duration))  # type: ignore[arg-type]
+        for fault in faults
+    )
+
+
+def _timed(fault: Fault) -> Fault:
+    """Preset fault with the times of this experiment."""
+    times = {} if isinstance(fault, INSTANTANEOUS) else {"duration": FAULT_DURATION}
+    return fault.replace(rate=0.0, start=FAULT_START, **times)  # type: ignore[no-any-return]
+
+
+def cases() -> Iterator[Case]:
+    """Every suite with every fault that it can have, and without faults."""
+    catalog = {name: tuple(map(_timed, parts)) for name, parts in PRESETS.items() if parts}
+    middle = FAULT_START + 0.5 * FAULT_DURATION
+    catalog |= {
+        "gyro step of 1 deg/s": (GyroBiasStep(start=FAULT_START, size=math.radians(1.0)),),
+        "gnss_outage with imu_bias_step": (
+            GnssOutage(start=FAULT_START, duration=FAULT_DURATION),
+            AccelBiasStep(start=middle),
+            GyroBiasStep(start=middle),
+        ),
+    }
+    for name in SUITES:
+        suite = sensor_suite(name)
+        gated = suite.estimator.false_alarm_probability > 0.0
+        expected = {} if gated else {"": "no gate, so it cannot correct itself"}
+        for fault, parts in catalog.items():
+            if _possible(parts, suite):
+                yield Case(
+                    f"{name}, {fault}",
+                    suite,
+                    start="warm",
+                    keywords={"faults": parts},
+                    expected=expected,
+                )
+    for name in SUITES:
+        for task in CALM_TASKS:
+            yield Case(f"{name}, {task}", sensor_suite(name), task, "warm")
+
+
+def _possible(faults: tuple[Fault, ...], suite: SensorSuite) -> bool:
+    try:
+        faults_of(faults, suite)
+    except ValueError:
+        return False
+    return True
+
+
+def measure(case: Case, flights: Flights) -> dict[str, Any]:
+    """Fly a case: values by column, and the configuration."""
+    faults = case.keywords.get("faults")
+    batch = case.batch(flights.count, flights.threads)
+    duration = end_of(faults) + RECOVERY_TIME if faults else CALM_DURATION
+    found = follow_recovery(batch, seeds=flights.seeds, duration=duration)
+    values = _after_faults(found, end_of(faults), duration) if faults else _without_faults(found)
+    return {
+        "values": values,
+        "miss": values.get("undetected", 0.0) > 100.0 * (1.0 - REQUIRED) + 1e-9,
+        "expected": case.expected.get("", ""),
+        "filters_failed": int((batch.record("filter_status") != 0).sum()),
+        "sensors": batch.sensors,
+        "task": batch.task,
+        "faults": batch.faults,
+    }
+
+
+def _after_faults(found: Recovery, fault_end: float, end: float) -> dict[str, float]:
+    """Values of `COLUMNS`."""
+    flagged = found.flagged & ~found.consistent
+    return {
+        "consistent_at_end": 100.0 * found.share(found.consistent, fault_end),
+        "consistent": 100.0 * found.share(found.consistent, end),
+        "flagged": 100.0 * found.share(flagged, end),
+        "undetected": 100.0 * found.share(found.undetected, end),
+        "settling_time": found.time_to(~found.undetected, fault_end),
+        "large_error": 100.0 * float(found.long_large_error().mean()),
+        "missed": 100.0 * float(found.missed_alarms().mean()),
+    }
+
+
+def _without_faults(found: Recovery) -> dict[str, float]:
+    """Values of `CALM_COLUMNS`."""
+    return {
+        "alarms_per_hour": found.alarms() / found.hours,
+        "flagged": 100.0 * found.flagged.mean(),
+        "hours": found.hours,
+    }
+
+
+def table_of(cells: Results, flights: Flights) -> str:
+    """Format two tables in Markdown: after faults, and without faults."""
+    calm = f"Without a fault, {flights.count} flights of {CALM_DURATION:g} s each."
+    parts = []
+    for heads, first, title in (
+        (
+            COLUMNS,
+            "suite, fault",
+            f"{flights.count} flights each, on random trajectories, warm start.",
+        ),
+        (CALM_COLUMNS, "suite, task", calm),
+    ):
+        rows = [[first, *heads.values(), "remarks"]]
+        for label, cell in cells.items():
+            if cell["values"].keys() != heads.keys():
+                continue
+            texts = {name: _text(cell["values"][name]) for name in heads}
+            reasons = []
+            if cell["miss"]:
+                reasons = [cell["expected"]] if cell["expected"] else []
+                mark = "*" if reasons else "**"
+                texts["undetected"] = f"{mark}{texts['undetected']}{mark}"
+            rows.append([label, *texts.values(), remark(reasons, cell["filters_failed"])])
+        if len(rows) > 1:
+            parts.append("\n".join([title, "", *markdown(rows)]))
+    end = "**Bold**: more than 1 % undetected failures. *Italics*: the same, expected."
+    return "\n\n".join([*parts, end]) + "\n"
+
+
+def _text(value: float | None) -> str:
+    """Format a number; a dash for infinity, which JSON lacks."""
+    return "-" if value is None or math.isinf(value) else f"{value:.1f}"
+
+
+def unexpected(cells: Results) -> int:
+    """Number of cases with undetected failures without a known reason."""
+    return sum(cell["miss"] and not cell["expected"] for cell in cells.values())

@@ -1,0 +1,135 @@
+"""Consistency of a filter in one configuration: report, figures and numbers."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from quad_gym.analysis.consistency import BAND_FLIGHTS, CONSISTENT_SHARE, MeanSquare
+from quad_gym.analysis.consistency_flights import Findings
+from quad_gym.analysis.consistency_plots import (
+    errors_figure,
+    nees_figure,
+    nis_figure,
+    whiteness_figure,
+)
+from quad_gym.analysis.plots import house_style, save_figure
+from quad_gym.analysis.reports import text_table, versions, write_json
+from quad_gym.experiments.consistency.cases import Case, Flights, fly
+
+
+def run_single(
+    case: Case,
+    flights: Flights,
+    output: Path,
+    *,
+    every: float,
+    settle: float,
+    matched: bool,
+    configuration: Any,
+) -> None:
+    """Fly a case, print the report, and write figures and numbers.
+
+    Args:
+        case: The configuration; its name is the title of the figures.
+        flights: Number, seeds and length of the flights.
+        output: Folder.
+        every: Time between two evaluations of the errors [s].
+        settle: Time at the start that is left out of the means [s].
+        matched: True to start the filters with errors drawn from their own covariance.
+        configuration: Options of the experiment, for the file.
+    """
+    began, batch = time.monotonic(), case.batch(flights.count, flights.threads)
+    print(f"{case.name}; {flights.count:,} flights of {flights.duration:g} s, {case.task}.\n")
+    shown = began
+
+    def progress(flown: float) -> None:
+        nonlocal shown
+        if time.monotonic() > shown + 2.0:
+            shown = time.monotonic()
+            print(f"  {flown:.1f} of {flights.duration:g} s flown", file=sys.stderr, flush=True)
+
+    whole = fly(batch, flights, every=every, settle=settle, matched=matched, progress=progress)
+    findings = whole.since(settle)
+    print(report_of(findings))
+    files = _draw(case.name, whole, findings, settle, output)
+    squares = findings.nees | {f"nis_{name}": part for name, part in findings.nis.items()}
+    found = {
+        "consistent": findings.consistent,
+        "consistent_share": CONSISTENT_SHARE,
+        "verdicts": findings.sentences(),
+        "share_inside": {name: part.share_inside for name, part in squares.items()},
+        "overall": {name: part.overall for name, part in squares.items()},
+        "filters_failed": findings.failed,
+        "flights_astray": int(findings.astray.sum()),
+        "mean_tracking_error": float(findings.tracking.mean.mean()),
+        "configuration": configuration,
+        "sensors": batch.sensors,
+        "vehicle": batch.vehicle,
+        "world": batch.world,
+        "faults": batch.faults,
+        "seeds": flights.seed_limits,
+        "versions": versions("numpy", "numba", "scipy"),
+        "nees": whole.nees,
+        "nis": whole.nis,
+        "whiteness": findings.whiteness,
+        "rms_errors": whole.errors,
+        "rms_claimed": whole.claimed,
+    }
+    files.append(write_json(output / "consistency.json", found))
+    seconds = time.monotonic() - began
+    print(f"\nWrote {len(files)} files to {output} after {seconds:.1f} s.")
+
+
+def _draw(
+    title: str, whole: Findings, findings: Findings, settle: float, output: Path
+) -> list[Path]:
+    """Draw and save the figures; return their files."""
+    files: list[Path] = []
+    with house_style():
+        figures = {
+            "nees": nees_figure(whole.nees, title, settle),
+            "errors": errors_figure(whole.nees["state"].time, whole.errors, whole.claimed, title),
+        }
+        if whole.nis:
+            figures["nis"] = nis_figure(whole.nis, title, settle)
+        if findings.whiteness:
+            figures["whiteness"] = whiteness_figure(findings.whiteness, title)
+        for name, figure in figures.items():
+            files += save_figure(figure, output / name)
+    return files
+
+
+def _table(quantity: str, parts: dict[str, MeanSquare]) -> str:
+    """Format mean squares for the screen."""
+    rows = [
+        (
+            part.name,
+            f"{part.overall:.2f}",
+            f"{part.mean[-1]:.2f}",
+            f"{part.low[-1]:.2f} to {part.high[-1]:.2f}",
+            f"{100 * part.share_inside:.0f}%",
+        )
+        for part in parts.values()
+    ]
+    columns = ["over time", "at the end", "tolerance", "inside"]
+    return text_table({quantity: ["of"], "mean over flights": columns}, rows)
+
+
+def report_of(findings: Findings) -> str:
+    """Format tables and the verdict for the screen."""
+    tables = [_table("NEES", findings.nees)]
+    if findings.nis:
+        tables.append(_table("NIS", findings.nis))
+    lines = [
+        "The filter is consistent:"
+        if findings.consistent
+        else "The filter is not consistent in everything:",
+        *(f"  {text}" for text in findings.sentences().values()),
+        f"  Filters with a numerical failure: {findings.failed}. Flights lost: "
+        f"{findings.astray.sum()}.",
+        f"Criterion: means within the tolerance, the 95 % band of a mean over at most "
+        f"{BAND_FLIGHTS:,} values, at {100 * CONSISTENT_SHARE:.0f} % of the instants or more; "
+        "white innovations; no failures.",
+    ]
+    return "\n\n".join([*tables, "\n".join(lines)])
