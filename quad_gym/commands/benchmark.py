@@ -15,6 +15,7 @@ configuration, the versions and the processor. Run it on an idle machine.
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -95,47 +96,36 @@ class Args:
         return available_cores() if self.threads is None else self.threads
 
 
-TABLES = {
-    "filter": filter.filter_table,
-    "tick": stages.tick_table,
-    "options": options.options_table,
-    "interfaces": interfaces.interfaces_table,
-    "tasks": own_task.own_task_table,
-    "memory": machine.memory_table,
-    "rendering": rendering.rendering_table,
-    "compile": compiling.compile_table,
-    "learning": learning.learning_table,
+SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str]]] = {
+    "filter": (
+        lambda args: filter.time_filter(args.batch, args.effort, 5 if args.quick else 40),
+        filter.filter_table,
+    ),
+    "tick": (lambda args: stages.time_tick(args.batch, args.effort), stages.tick_table),
+    "options": (lambda args: options.time_options(args.batch, args.effort), options.options_table),
+    "interfaces": (
+        lambda args: interfaces.time_interfaces(args.n_envs, args.most_threads, args.effort),
+        interfaces.interfaces_table,
+    ),
+    "tasks": (
+        lambda args: own_task.time_own_task(args.effort, args.most_threads),
+        own_task.own_task_table,
+    ),
+    "memory": (lambda args: machine.measure_memory(args.quick), machine.memory_table),
+    "rendering": (lambda args: rendering.time_rendering(args.effort), rendering.rendering_table),
+    "compile": (lambda args: compiling.time_compile(args.quick), compiling.compile_table),
+    "learning": (
+        lambda args: learning.time_learning(args.seeds, args.steps, args.most_threads, args.quick),
+        learning.learning_table,
+    ),
 }
-"""Functions that format the rows of each section."""
+"""Functions that measure the rows of each section and format them."""
 
 
 def chosen_sections(args: Args) -> list[str]:
     """Names of the sections to run."""
-    whole = [name for name in TABLES if name not in ALONE]
+    whole = [name for name in SECTIONS if name not in ALONE]
     return whole if args.only == "all" else [args.only]
-
-
-def run_section(name: str, args: Args) -> list[Row]:
-    """Measure a section."""
-    effort, threads = args.effort, args.most_threads
-    match name:
-        case "filter":
-            return filter.time_filter(args.batch, effort, 5 if args.quick else 40)
-        case "tick":
-            return stages.time_tick(args.batch, effort)
-        case "options":
-            return options.time_options(args.batch, effort)
-        case "interfaces":
-            return interfaces.time_interfaces(args.n_envs, threads, effort)
-        case "tasks":
-            return own_task.time_own_task(effort, threads)
-        case "memory":
-            return machine.measure_memory(args.quick)
-        case "rendering":
-            return rendering.time_rendering(effort)
-        case "compile":
-            return compiling.time_compile(args.quick)
-    return learning.time_learning(args.seeds, args.steps, threads, args.quick)
 
 
 def main(args: Args) -> None:
@@ -147,8 +137,9 @@ def main(args: Args) -> None:
     sections: dict[str, list[Row]] = {}
     for name in chosen_sections(args):
         print(f"{name}:", file=sys.stderr, flush=True)
-        sections[name] = run_section(name, args)
-        print(TABLES[name](sections[name]), end="\n\n", flush=True)
+        time_section, table = SECTIONS[name]
+        sections[name] = time_section(args)
+        print(table(sections[name]), end="\n\n", flush=True)
     found = {
         "sections": sections,
         "configuration": dataclasses.asdict(args),

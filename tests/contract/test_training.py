@@ -185,7 +185,7 @@ def train_again(folder, steps, where):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--algorithm", "alphago"], "must be one of"),
+        (["--algorithm", "alphago"], "alphago"),
         (["--env", "radius=-1"], "radius must be greater than 0"),
         (["--env", "height=4"], "out_of_bounds must be at least 4 m"),  # half start on the pad
         (["--env", "colour=red"], "colour is not a keyword"),

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 import quad_gym
-from quad_gym.experiments.benchmark.timing import NAME, Row, column, table
+from quad_gym.experiments.benchmark import timing
 
 PACKAGE = Path(quad_gym.__file__).resolve().parent
 ENVS = 1024
@@ -70,13 +70,13 @@ def empty_cache(package: Path) -> None:
         file.unlink()
 
 
-def time_compile(quick: bool) -> list[Row]:
+def time_compile(quick: bool) -> list[timing.Row]:
     """Time the first reset with an empty and a full cache, and a step after an edit.
 
     Args:
         quick: True for the fastest configuration only.
     """
-    rows: list[Row] = []
+    rows: list[timing.Row] = []
 
     def add(name: str, cache: str, suite: str | None, seconds: float) -> None:
         print(f"  {name}, {cache}: {seconds:.1f} s", file=sys.stderr, flush=True)
@@ -107,12 +107,12 @@ def time_compile(quick: bool) -> list[Row]:
     return rows
 
 
-def compile_table(rows: list[Row]) -> str:
+def compile_table(rows: list[timing.Row]) -> str:
     """Format the section."""
     columns = {
-        "up to the first reset": NAME,
+        "up to the first reset": timing.NAME,
         "suite": lambda row: row["suite"] or "-",
-        "cache": column("cache"),
-        "s": column("seconds", ".1f"),
+        "cache": timing.column("cache"),
+        "s": timing.column("seconds", ".1f"),
     }
-    return table(f"A new process with {ENVS:,} flights of the circle", rows, columns)
+    return timing.table(f"A new process with {ENVS:,} flights of the circle", rows, columns)

@@ -6,19 +6,9 @@ import numpy as np
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.peers import Measured, peers
 from quad_gym.experiments.benchmark.stages import Staged, hovering
-from quad_gym.experiments.benchmark.timing import (
-    NAME,
-    SPREAD,
-    Effort,
-    Row,
-    Timing,
-    column,
-    measure,
-    report,
-    table,
-)
 from quad_gym.kernels.compiling import Stage
 from quad_gym.records import FLIGHT_BLOCK, WIDTH, aligned_zeros
 
@@ -35,7 +25,7 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
     return recorded
 
 
-def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
+def time_filter(count: int, effort: timing.Effort, recorded_ticks: int) -> list[timing.Row]:
     """Time cycles of update and prediction on one core.
 
     Args:
@@ -43,7 +33,7 @@ def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
         effort: Number and length of the repeats.
         recorded_ticks: Length of the flight of the filters for one vehicle.
     """
-    rows: list[Row] = []
+    rows: list[timing.Row] = []
     with_camera = quad_gym.sensor_suite("lab")
     for measurements, sensors in ((6, with_camera.replace(camera=None)), (12, with_camera)):
         features = (measurements - 6) // 3
@@ -60,28 +50,28 @@ def time_filter(count: int, effort: Effort, recorded_ticks: int) -> list[Row]:
             update(blocks)
             predict(blocks)
 
-        def add(name: str, timing: Timing, n: int = measurements) -> None:
+        def add(name: str, timed: timing.Timing, n: int = measurements) -> None:
             what = {"kind": name, "measurements": n, "suite": "lab"}
-            rows.append(report(f"{name}, {n} measurements, lab", timing, **what))
+            rows.append(timing.report(f"{name}, {n} measurements, lab", timed, **what))
 
         start = blocks.copy()
 
         def again(blocks: Any = blocks, start: Any = start) -> None:
             blocks[:] = start
 
-        add("lanes", measure(in_lanes, effort, again).per(count))
+        add("lanes", timing.measure(in_lanes, effort, again).per(count))
         recorded = record_one(batch, int(seeing[0]), recorded_ticks)
         recorded = [now for now in recorded if len(now.pixels) == features]
         for name, run in peers(sensors, recorded).items():
-            add(name, measure(run, effort).per(len(recorded)))
+            add(name, timing.measure(run, effort).per(len(recorded)))
     of_lanes = {row["measurements"]: row["seconds"] for row in rows if row["kind"] == "lanes"}
     for row in rows:
         row["times_lanes"] = row["seconds"] / of_lanes[row["measurements"]]
     return rows
 
 
-def filter_table(rows: list[Row]) -> str:
+def filter_table(rows: list[timing.Row]) -> str:
     """Format the section."""
-    times, ratio = column("seconds", ",.2f", 1e6), column("times_lanes", ",.1f")
-    columns = {"filter": NAME, "us": times, "spread": SPREAD, "x lanes": ratio}
-    return table("UKF cycle, one core", rows, columns)
+    times, ratio = timing.column("seconds", ",.2f", 1e6), timing.column("times_lanes", ",.1f")
+    columns = {"filter": timing.NAME, "us": times, "spread": timing.SPREAD, "x lanes": ratio}
+    return timing.table("UKF cycle, one core", rows, columns)

@@ -3,6 +3,7 @@
 import itertools
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -11,19 +12,7 @@ from numpy.typing import NDArray
 
 import quad_gym
 from quad_gym import sensor_suite
-from quad_gym.experiments.benchmark.timing import (
-    NAME,
-    SPREAD,
-    Effort,
-    Row,
-    Timing,
-    column,
-    measure,
-    per_second,
-    percent,
-    report,
-    table,
-)
+from quad_gym.experiments.benchmark import timing
 
 SLOW = sensor_suite("standard").with_rates(gnss=10.0, camera=25.0)
 """Sensors at low rates; 30 Hz does not divide 200 Hz."""
@@ -36,7 +25,9 @@ def random_actions(count: int) -> Iterator[NDArray[np.float32]]:
     return itertools.cycle(list(draws))
 
 
-def time_batch(interface: str, count: int, effort: Effort, threads: int, **options: Any) -> Row:
+def time_batch(
+    interface: str, count: int, effort: timing.Effort, threads: int, **options: Any
+) -> timing.Row:
     """Time steps of many flights with the interface "vector" (Gymnasium) or "sb3"."""
     options.update(threads=threads)
     env: Any
@@ -56,20 +47,22 @@ def time_batch(interface: str, count: int, effort: Effort, threads: int, **optio
         env.step(next(actions))
         steps += count
 
-    timing = measure(step, effort).per(count)
+    timed = timing.measure(step, effort).per(count)
     resets = float((batch.record("episode").sum() - began) / steps)
     env.close()
-    return _row(interface, count, threads, timing, resets, options)
+    return _row(interface, count, threads, timed, resets, options)
 
 
-def time_single(effort: Effort, **options: Any) -> Row:
+def time_single(effort: timing.Effort, **options: Any) -> timing.Row:
     """Time steps of one flight made by `gymnasium.make`, including its wrappers."""
     env = gymnasium.make("QuadGym/Hover-v0", **options)
-    actions = (action[0] for action in random_actions(1))
-    return _row("single", 1, 1, *time_env(env, actions, effort), options)
+    actions = [action[0] for action in itertools.islice(random_actions(1), 16)]
+    return _row("single", 1, 1, *time_env(env, itertools.cycle(actions), effort), options)
 
 
-def time_env(env: Any, actions: Iterator[Any], effort: Effort) -> tuple[Timing, float]:
+def time_env(
+    env: Any, actions: Iterator[Any], effort: timing.Effort
+) -> tuple[timing.Timing, float]:
     """Time steps of a single environment, and count the share of steps that end an episode."""
     steps, resets = 0, 0
 
@@ -83,21 +76,26 @@ def time_env(env: Any, actions: Iterator[Any], effort: Effort) -> tuple[Timing, 
                 env.reset()
 
     env.reset(seed=0)
-    timing = measure(some_steps, effort).per(50)
+    timed = timing.measure(some_steps, effort).per(50)
     env.close()
-    return timing, resets / steps
+    return timed, resets / steps
 
 
 def _row(
-    interface: str, count: int, threads: int, timing: Timing, resets: float, options: dict[str, Any]
-) -> Row:
+    interface: str,
+    count: int,
+    threads: int,
+    timed: timing.Timing,
+    resets: float,
+    options: dict[str, Any],
+) -> timing.Row:
     """Row of an interface of this package."""
     observation, rate = options.get("observation", "estimate"), options.get("control_rate", 50)
     suite = options.get("sensors", "standard")
     suite = "standard, GNSS 10 Hz, camera 25 Hz" if suite is SLOW else suite
-    return report(
+    return timing.report(
         f"{interface}, {observation}, {rate} Hz, {suite}",
-        timing,
+        timed,
         interface=interface,
         envs=count,
         threads=threads,
@@ -107,27 +105,27 @@ def _row(
     )
 
 
-def time_others(envs: int, effort: Effort) -> list[Row]:
+def time_others(envs: int, effort: timing.Effort) -> list[timing.Row]:
     """Time Gymnasium's pendulum and cart-pole, which have neither sensors nor a filter."""
     alike: dict[str, Any] = {"threads": 1, "suite": None, "options": {}}
     rest = itertools.repeat(np.zeros(1, np.float32))
-    timing, resets = time_env(gymnasium.make("Pendulum-v1"), rest, effort)
+    timed, resets = time_env(gymnasium.make("Pendulum-v1"), rest, effort)
     what = {"interface": "single", "envs": 1, "reset_share": resets}
-    rows = [report("Pendulum-v1", timing, **what, **alike)]
+    rows = [timing.report("Pendulum-v1", timed, **what, **alike)]
     for env_id, mode, actions in (
         ("Pendulum-v1", "sync", np.zeros((envs, 1), np.float32)),
         ("CartPole-v1", "vector_entry_point", np.zeros(envs, np.int64)),
     ):
         many: Any = gymnasium.make_vec(env_id, envs, vectorization_mode=mode)
         many.reset(seed=0)
-        timing = measure(lambda many=many, actions=actions: many.step(actions), effort).per(envs)  # type: ignore[misc]
+        timed = timing.measure(partial(many.step, actions), effort).per(envs)
         what = {"interface": mode, "envs": envs, "reset_share": None}
-        rows.append(report(f"{env_id}, {mode}", timing, **what, **alike))
+        rows.append(timing.report(f"{env_id}, {mode}", timed, **what, **alike))
         many.close()
     return rows
 
 
-def time_interfaces(envs: int, cores: int, effort: Effort) -> list[Row]:
+def time_interfaces(envs: int, cores: int, effort: timing.Effort) -> list[timing.Row]:
     """Time steps of all interfaces with random actions.
 
     Args:
@@ -135,7 +133,7 @@ def time_interfaces(envs: int, cores: int, effort: Effort) -> list[Row]:
         cores: Largest number of threads.
         effort: Number and length of the repeats.
     """
-    rows: list[Row] = []
+    rows: list[timing.Row] = []
     for rate in (200, 50):
         for observation in ("estimate", "truth", "noisy", "measurements"):
             what = {"observation": observation, "control_rate": rate}
@@ -155,14 +153,14 @@ def time_interfaces(envs: int, cores: int, effort: Effort) -> list[Row]:
     return rows + time_others(envs, effort)
 
 
-def interfaces_table(rows: list[Row]) -> str:
+def interfaces_table(rows: list[timing.Row]) -> str:
     """Format the section."""
     columns = {
-        "interface, observation, control, suite": NAME,
-        "envs": column("envs", ","),
-        "threads": column("threads"),
-        "steps/s": per_second,
-        "spread": SPREAD,
-        "resets": percent("reset_share"),
+        "interface, observation, control, suite": timing.NAME,
+        "envs": timing.column("envs", ","),
+        "threads": timing.column("threads"),
+        "steps/s": timing.per_second,
+        "spread": timing.SPREAD,
+        "resets": timing.percent("reset_share"),
     }
-    return table("Random actions around hover", rows, columns)
+    return timing.table("Random actions around hover", rows, columns)

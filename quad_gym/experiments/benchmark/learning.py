@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from quad_gym.analysis.reports import text_table
-from quad_gym.experiments.benchmark.timing import Row
+from quad_gym.experiments.benchmark import timing
 
 ENV_ID = "QuadGym/Circle-v0"
 
 
-def time_learning(seeds: int, steps: int | None, threads: int, quick: bool) -> list[Row]:
+def time_learning(seeds: int, steps: int | None, threads: int, quick: bool) -> list[timing.Row]:
     """Train with each seed.
 
     Args:
@@ -31,7 +31,7 @@ def time_learning(seeds: int, steps: int | None, threads: int, quick: bool) -> l
 
     chosen = recipe(ENV_ID)
     chosen = chosen.replace(steps=(2 * 8_192 if quick else steps) or chosen.steps)
-    rows: list[Row] = []
+    rows: list[timing.Row] = []
     for seed in range(1 if quick else seeds):
         plan = Plan(
             env_id=ENV_ID,
@@ -67,7 +67,7 @@ def pd_error(plan: Any) -> float:
     return error
 
 
-def summary(evaluations: list[dict[str, float]], pd: float) -> Row:
+def summary(evaluations: list[dict[str, float]], pd: float) -> timing.Row:
     """First evaluation better than PD without a crash, and the last evaluation."""
     better = [r for r in evaluations if r["mean_error"] < pd and r["crash_rate"] == 0.0]
     last = evaluations[-1]
@@ -80,7 +80,7 @@ def summary(evaluations: list[dict[str, float]], pd: float) -> Row:
     }
 
 
-def learning_table(rows: list[Row]) -> str:
+def learning_table(rows: list[timing.Row]) -> str:
     """Format the section: a line per seed, and the latest of all."""
 
     def format_or_dash(value: float | None, form: str) -> str:

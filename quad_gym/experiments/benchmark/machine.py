@@ -9,7 +9,7 @@ from typing import Any
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.spaces import layout_bounds, observation_layout
-from quad_gym.experiments.benchmark.timing import NAME, Row, column, table
+from quad_gym.experiments.benchmark import timing
 from quad_gym.kernels.compiling.cores import available_cores
 
 FIRST_USE = """
@@ -28,7 +28,7 @@ def start_times() -> list[float]:
     return list(map(float, done.stdout.split()))
 
 
-def measure_memory(quick: bool) -> list[Row]:
+def measure_memory(quick: bool) -> list[timing.Row]:
     """Measure the memory of 4,096 flights, and the first step of a new process."""
     count = 4096
     tracemalloc.start()
@@ -52,13 +52,17 @@ def measure_memory(quick: bool) -> list[Row]:
     return [{"name": name, "value": v, "unit": unit} for name, (v, unit) in values.items()]
 
 
-def memory_table(rows: list[Row]) -> str:
+def memory_table(rows: list[timing.Row]) -> str:
     """Format the section."""
 
-    def value(row: Row) -> str:
+    def value(row: timing.Row) -> str:
         return format(row["value"], ",.0f" if row["unit"] == "bytes" else ".2f")
 
-    return table("Memory and start", rows, {"what": NAME, "value": value, "unit": column("unit")})
+    return timing.table(
+        "Memory and start",
+        rows,
+        {"what": timing.NAME, "value": value, "unit": timing.column("unit")},
+    )
 
 
 def processor() -> dict[str, Any]:

@@ -8,16 +8,7 @@ from typing import Any
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.experiments.benchmark.timing import (
-    NAME,
-    SPREAD,
-    Effort,
-    Row,
-    by_turns,
-    column,
-    report,
-    table,
-)
+from quad_gym.experiments.benchmark import timing
 from quad_gym.params.suites import SUITES
 from quad_gym.records import Control
 
@@ -99,7 +90,7 @@ TICKS = 10
 that some turns are undisturbed."""
 
 
-def time_options(count: int, effort: Effort) -> list[Row]:
+def time_options(count: int, effort: timing.Effort) -> list[timing.Row]:
     """Time a tick of a flight with each option, and a reset with each start, on one core."""
     task = TASK_DEFAULTS["hover"].replace(duration=0.0)
     turns: dict[str, Callable[[], float]] = {}
@@ -114,11 +105,11 @@ def time_options(count: int, effort: Effort) -> list[Row]:
         turns[name] = _turn_of(batch, batch.step if name in OPTIONS else batch.reset)
     number = max(2, round(effort.repeats * effort.seconds / (TICKS * count * turns[OFF]())))
     print(f"  {number} turns", file=sys.stderr, flush=True)
-    timings = dict(zip(turns, by_turns(turns.values(), number), strict=True))
+    timings = dict(zip(turns, timing.by_turns(turns.values(), number), strict=True))
     off = timings[OFF].best
     return [
-        report(name, timing, times_off=timing.best / off, suite=_suite_of(name))
-        for name, timing in timings.items()
+        timing.report(name, timed, times_off=timed.best / off, suite=_suite_of(name))
+        for name, timed in timings.items()
     ]
 
 
@@ -141,13 +132,13 @@ def _turn_of(batch: FlightBatch, job: Callable[[], Any]) -> Callable[[], float]:
     return turn
 
 
-def options_table(rows: list[Row]) -> str:
+def options_table(rows: list[timing.Row]) -> str:
     """Format the section."""
     columns = {
-        "option": NAME,
-        "suite": column("suite"),
-        "us": column("seconds", ".3f", 1e6),
-        "spread": SPREAD,
-        "x off": column("times_off", ".2f"),
+        "option": timing.NAME,
+        "suite": timing.column("suite"),
+        "us": timing.column("seconds", ".3f", 1e6),
+        "spread": timing.SPREAD,
+        "x off": timing.column("times_off", ".2f"),
     }
-    return table("One flight's tick with one option on, one core", rows, columns)
+    return timing.table("One flight's tick with one option on, one core", rows, columns)

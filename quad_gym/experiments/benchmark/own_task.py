@@ -9,19 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym import rewards
+from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.interfaces import random_actions
-from quad_gym.experiments.benchmark.timing import (
-    NAME,
-    SPREAD,
-    Effort,
-    Row,
-    by_turns,
-    column,
-    lasting,
-    per_second,
-    report,
-    table,
-)
 from quad_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -65,9 +54,9 @@ class OwnCircle(Task):
         }
 
 
-def time_own_task(effort: Effort, threads: int) -> list[Row]:
+def time_own_task(effort: timing.Effort, threads: int) -> list[timing.Row]:
     """Time steps of both tasks in alternation, at 50 Hz on the estimate."""
-    rows: list[Row] = []
+    rows: list[timing.Row] = []
     for count in COUNTS:
         envs, steps = [], []
         options: dict[str, Any] = {"control_rate": 50.0, "threads": threads}
@@ -77,15 +66,19 @@ def time_own_task(effort: Effort, threads: int) -> list[Row]:
             env.reset(seed=0)
             envs.append(env)
             steps.append(partial(_step, env, random_actions(count)))
-        first = by_turns([partial(lasting, step, 1) for step in steps], 3)  # also warms up
+        first = timing.by_turns(
+            [partial(timing.lasting, step, 1) for step in steps], 3
+        )  # also warms up
         calls = max(1, round(effort.seconds / 4.0 / first[0].best))
-        found = by_turns([partial(lasting, step, calls) for step in steps], 4 * effort.repeats)
+        found = timing.by_turns(
+            [partial(timing.lasting, step, calls) for step in steps], 4 * effort.repeats
+        )
         for env in envs:
             env.close()
-        for name, timing in zip(("shipped", "own, in NumPy"), found, strict=True):
-            share = found[0].best / timing.best
+        for name, timed in zip(("shipped", "own, in NumPy"), found, strict=True):
+            share = found[0].best / timed.best
             label = f"circle {name}, {count} flights"
-            rows.append(report(label, timing.per(count), envs=count, share=share))
+            rows.append(timing.report(label, timed.per(count), envs=count, share=share))
     return rows
 
 
@@ -93,8 +86,15 @@ def _step(env: Any, actions: Any) -> None:
     env.step(next(actions))
 
 
-def own_task_table(rows: list[Row]) -> str:
+def own_task_table(rows: list[timing.Row]) -> str:
     """Format the section."""
-    ratio = column("share", ".2f")
-    columns = {"task": NAME, "steps/s": per_second, "spread": SPREAD, "of shipped": ratio}
-    return table("The circle, shipped and as a task of one's own, 50 Hz, estimate", rows, columns)
+    ratio = timing.column("share", ".2f")
+    columns = {
+        "task": timing.NAME,
+        "steps/s": timing.per_second,
+        "spread": timing.SPREAD,
+        "of shipped": ratio,
+    }
+    return timing.table(
+        "The circle, shipped and as a task of one's own, 50 Hz, estimate", rows, columns
+    )

@@ -8,26 +8,16 @@ import numpy as np
 
 from baselines import PDPolicy
 from quad_gym import IDS, Flight
-from quad_gym.experiments.benchmark.timing import (
-    NAME,
-    SPREAD,
-    Effort,
-    Row,
-    column,
-    measure,
-    per_second,
-    report,
-    table,
-)
+from quad_gym.experiments.benchmark import timing
 from quad_gym.rendering import VIEWS, Renderer, flight_of
 
 SIZE = (640, 480)
 INSTANTS = 40
 
 
-def time_rendering(effort: Effort) -> list[Row]:
+def time_rendering(effort: timing.Effort) -> list[timing.Row]:
     """Time frames of every task from both views, at instants distributed over a flight."""
-    rows: list[Row] = []
+    rows: list[timing.Row] = []
     for env_id, task in IDS.items():
         env = gymnasium.make_vec(env_id, 1, autoreset_mode="Disabled", threads=1)
         flight = flight_of(PDPolicy(env), env)
@@ -40,13 +30,20 @@ def time_rendering(effort: Effort) -> list[Row]:
                 for _ in range(INSTANTS):
                     renderer.draw(next(moments))
 
-            timing = measure(frames, effort).per(INSTANTS)
-            rows.append(report(f"{task}, {view} view", timing, task=task, view=view, size=SIZE))
+            timed = timing.measure(frames, effort).per(INSTANTS)
+            rows.append(
+                timing.report(f"{task}, {view} view", timed, task=task, view=view, size=SIZE)
+            )
     return rows
 
 
-def rendering_table(rows: list[Row]) -> str:
+def rendering_table(rows: list[timing.Row]) -> str:
     """Format the section."""
-    times = column("seconds", ".2f", 1e3)
-    columns = {"task": NAME, "ms": times, "frames/s": per_second, "spread": SPREAD}
-    return table(f"Frames of {SIZE[0]} x {SIZE[1]}, one core", rows, columns)
+    times = timing.column("seconds", ".2f", 1e3)
+    columns = {
+        "task": timing.NAME,
+        "ms": times,
+        "frames/s": timing.per_second,
+        "spread": timing.SPREAD,
+    }
+    return timing.table(f"Frames of {SIZE[0]} x {SIZE[1]}, one core", rows, columns)

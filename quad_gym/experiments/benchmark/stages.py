@@ -9,17 +9,7 @@ from numpy.typing import NDArray
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.envs.spaces import layout_bounds, observation_layout
-from quad_gym.experiments.benchmark.timing import (
-    SPREAD,
-    Effort,
-    Row,
-    Timing,
-    column,
-    measure,
-    percent,
-    report,
-    table,
-)
+from quad_gym.experiments.benchmark import timing
 from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
@@ -97,23 +87,23 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
     return blocks
 
 
-def time_tick(count: int, effort: Effort) -> list[Row]:
+def time_tick(count: int, effort: timing.Effort) -> list[timing.Row]:
     """Time a whole tick on one core, and its stages, per flight, with the suites of `SUITES`."""
     return [row for suite in SUITES for row in _time_suite(suite, count, effort)]
 
 
-def _time_suite(suite: str, count: int, effort: Effort) -> list[Row]:
+def _time_suite(suite: str, count: int, effort: timing.Effort) -> list[timing.Row]:
     batch = hovering(count, sensors=suite, bounds=layout_bounds(observation_layout()))
     start, blocks = over_a_period(batch), batch._blocks
 
     def again() -> None:
         batch.restore(start)
 
-    def add(name: str, timing: Timing, kind: str) -> None:
-        rows.append(report(f"{name}, {suite}", timing, part=name, kind=kind, suite=suite))
+    def add(name: str, timed: timing.Timing, kind: str) -> None:
+        rows.append(timing.report(f"{name}, {suite}", timed, part=name, kind=kind, suite=suite))
 
-    rows: list[Row] = []
-    add("whole tick", measure(batch.step, effort, again).per(count), "whole")
+    rows: list[timing.Row] = []
+    add("whole tick", timing.measure(batch.step, effort, again).per(count), "whole")
     needed = needed_stages(batch._settings[0]).keys()
     for when, kind in ((needed - AT_THE_START, "tick"), (needed & AT_THE_START, "start")):
         for stage in sorted(when):
@@ -122,24 +112,24 @@ def _time_suite(suite: str, count: int, effort: Effort) -> list[Row]:
             def once(run: Staged = run) -> None:
                 run(blocks)
 
-            add(stage.name.lower(), measure(once, effort, again).per(count), kind)
+            add(stage.name.lower(), timing.measure(once, effort, again).per(count), kind)
     for name, parts in (
         ("filter", [row for row in rows if row["part"] in {s.name.lower() for s in FILTER}]),
         ("sum of the tick's stages", [row for row in rows if row["kind"] == "tick"]),
     ):
-        add(name, Timing(float(np.sum([row["seconds"] for row in parts])), 0.0), "sum")
+        add(name, timing.Timing(float(np.sum([row["seconds"] for row in parts])), 0.0), "sum")
     for row in rows:
         row["share"] = row["seconds"] / rows[0]["seconds"]
     return rows
 
 
-def tick_table(rows: list[Row]) -> str:
+def tick_table(rows: list[timing.Row]) -> str:
     """Format the section."""
     columns = {
-        "suite": column("suite"),
+        "suite": timing.column("suite"),
         "stage": lambda row: row["part"] + (" (at the start)" if row["kind"] == "start" else ""),
-        "us": column("seconds", ".3f", 1e6),
-        "spread": SPREAD,
-        "of the whole": percent("share"),
+        "us": timing.column("seconds", ".3f", 1e6),
+        "spread": timing.SPREAD,
+        "of the whole": timing.percent("share"),
     }
-    return table("One flight's tick, one core", rows, columns)
+    return timing.table("One flight's tick, one core", rows, columns)
