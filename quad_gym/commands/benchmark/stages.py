@@ -15,6 +15,7 @@ from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.single import run_stage
+from quad_gym.records import Act, Sensor
 
 SUITES = ("standard", "lab")
 FILTER = (Stage.PREDICT, Stage.UPDATE)
@@ -76,6 +77,8 @@ def flag_of(stage: Stage, batch: FlightBatch) -> int:
     """What a flight calls a stage with."""
     if stage == Stage.UPDATE:
         return int(batch._settings["feature_count"][0])
+    if stage.name in Sensor.__members__:
+        return int(Act.SAMPLE)
     return int(stage in AT_THE_START)
 
 
@@ -84,8 +87,8 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
 
     So a stage has its mean cost where sensors do not measure in every tick.
     """
-    clocks = [int(batch._settings[f"{sensor}_ticks"][0]) for sensor in ("gnss", "camera")]
-    period = math.lcm(*(clock for clock in clocks if clock > 0))
+    clocks = batch._settings["sensor_ticks"][0][[Sensor.GNSS, Sensor.CAMERA]]
+    period = math.lcm(*(int(clock) for clock in clocks if clock > 0))
     blocks = batch.snapshot()
     for instant in range(period):
         blocks[instant::period] = batch.snapshot()[instant::period]
