@@ -14,7 +14,7 @@ from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.records import FLIGHT
+from quad_gym.records import FEATURE_SLICE, FLIGHT
 from quad_gym.rotations import dcm_to_quaternion
 from quad_gym.vehicle import State, checked_state
 
@@ -129,7 +129,7 @@ class Camera(_Sensor):
         if self._limited:
             limits = (self._blurs, self._hides, self._features)
             single.limit_features(self._flight, self._params, *limits)
-        seen = self._flight["feature_valid"][0, : self._features] > 0.0
+        seen = self._flight["block_valid"][0, FEATURE_SLICE][: self._features] > 0.0
         return np.where(seen[:, np.newaxis], self._flight["pixels"][0, : self._features], np.nan)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.records import Control
+from quad_gym.records import AID_BLOCKS, Control
 
 
 def fly(sensors, count=200, *, task="random_trajectory", seed=0, start=None, **keywords):
@@ -72,5 +72,4 @@ def nees(batch, block=slice(0, 15)):
 
 def measured_now(batch):
     """(n, blocks): which blocks were measured at the present instant."""
-    flags = [batch.record(f"{name}_valid") for name in ("position", "baseline", "velocity")]
-    return np.column_stack([*flags, batch.record("feature_valid")]) > 0.0
+    return batch.record("block_valid")[:, :AID_BLOCKS] > 0.0

@@ -6,11 +6,15 @@ from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.single import FILTER_ENTRIES, FILTER_STAGES, run_stage, start_filter
+from quad_gym.packing.aids import pack_aid_settings
 from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
+    BASELINE_BLOCK,
+    FEATURE_BLOCKS,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
+    POSITION_BLOCK,
     SETTINGS,
     WIDTH,
     WORK_BLOCK,
@@ -35,6 +39,7 @@ class LaneFilter:
         self.work = aligned_zeros(1, WORK_BLOCK)
         self.settings = np.zeros(1, SETTINGS)
         self.settings["run_filter"] = True
+        pack_aid_settings(self.settings[0], sensors, sensors)
 
     def put(self, number, **values):
         """Set fields of one flight."""
@@ -48,6 +53,11 @@ class LaneFilter:
         for name, value in values.items():
             self.params[name][block, ..., lane] = value
 
+    def set_valid(self, number, measured, valid):
+        """Flag blocks of the measurement of one flight."""
+        block, lane = divmod(number, WIDTH)
+        self.blocks["block_valid"][block, measured, lane] = valid
+
     def get(self, name):
         """A field of all flights, (EIGHT, ...)."""
         return field_of_flights(self.blocks, name, EIGHT)
@@ -60,13 +70,13 @@ class LaneFilter:
             number,
             gnss_position=recording.gnss_position[k] if position else np.nan,
             gnss_baseline=recording.gnss_baseline[k] if baseline else np.nan,
-            position_valid=float(position),
-            baseline_valid=float(baseline),
             gyro=recording.gyro[k],
             accel=recording.accel[k],
         )
         block, lane = divmod(number, WIDTH)
-        self.blocks["feature_valid"][block, : self.features, lane] = seen
+        self.set_valid(number, POSITION_BLOCK, position)
+        self.set_valid(number, BASELINE_BLOCK, baseline)
+        self.set_valid(number, slice(FEATURE_BLOCKS, FEATURE_BLOCKS + self.features), seen)
         shown = np.where(seen[:, None], pixels, np.nan)
         self.blocks["pixels"][block, : self.features, :, lane] = shown
 
@@ -90,7 +100,7 @@ class LaneFilter:
 
     def _each(self, mask):
         """Blocks and what they need, one by one, the part of a mask that is theirs in force."""
-        self.settings["form"], self.settings["feature_count"] = self.form, self.features
+        self.settings["form"] = self.form
         for k, chosen in enumerate(np.reshape(mask, (-1, WIDTH))):
             self.work["mask"][0] = chosen
             yield self.blocks[k : k + 1], self.params[k : k + 1], self.settings, self.work

@@ -14,6 +14,7 @@ from baselines import PDPolicy
 from quad_gym import FlightRecorder
 from quad_gym.envs.single import QuadEnv
 from quad_gym.frames import ecef_to_enu, ecef_to_geodetic
+from quad_gym.records import AID_BLOCKS
 from quad_gym.rotations import quaternion_to_dcm
 
 RTK = quad_gym.sensor_suite("rtk")
@@ -40,7 +41,7 @@ def flown(suite=RTK, seconds=10.0, seed=5, task="circle"):
 
     def keep_aids():
         batch = env.flights.batch
-        fresh = (batch.record("aid_fresh") + batch.record("aid_valid"))[0] > 0.0
+        fresh = (batch.record("block_fresh") + batch.record("block_valid"))[0, AID_BLOCKS:] > 0.0
         aids.append(np.where(fresh[:, np.newaxis], batch.record("aid_measurement")[0], np.nan))
 
     keep_aids()

@@ -302,8 +302,7 @@ class InnovationRecorder:
 
     def add(self, batch: FlightBatch, time: float) -> None:
         """Record the measurements of the present instant, `time` after the start [s]."""
-        names = ("position", "baseline", "velocity", "feature", "aid")
-        valid = np.column_stack([batch.record(f"{name}_valid") for name in names]) > 0.0
+        valid = batch.record("block_valid") > 0.0
         if not valid.any():
             return
         valid &= batch.record("gate") != GateDecision.UNSURE  # the filter does not use these

@@ -24,12 +24,8 @@ def innovations_of(batch: "FlightBatch") -> dict[str, NDArray[Any]]:
         episode. NaN: not measured yet.
     """
     blocks = list(blocks_of(batch.sensors))
-    position, baseline = batch.record("position_fresh"), batch.record("baseline_fresh")
-    has_velocity = batch.sensors.gnss is not None and batch.sensors.gnss.velocity_sigma is not None
-    others = batch.record("feature_fresh"), batch.record("aid_fresh")
-    measured = np.column_stack([position, baseline, position * has_velocity, *others])
     return {
-        "measured": measured[:, blocks] > 0.0,
+        "measured": batch.record("block_fresh")[:, blocks] > 0.0,
         "innovation": batch.record("innovation")[:, blocks],
         "sigma": batch.record("innovation_sigma")[:, blocks],
         "nis": batch.record("block_nis")[:, blocks],

@@ -18,6 +18,7 @@ from quad_gym.records import (
     FLIGHT_BLOCK,
     WIDTH,
     Room,
+    Sensor,
     aligned_zeros,
     field_of_flights,
 )
@@ -230,12 +231,10 @@ class FlightMemory:
         Raises:
             ValueError: If an aiding sensor is unknown, or the suite lacks it.
         """
-        there = {aid.name.lower(): aid for aid in self.sensors.aids}
-        for name, measures in aids.items():
-            check.choice("switch_sensors", name, tuple(there))
-            self._switch(self._blocks["aid_wait"][:, there[name]], name, measures)
-        for sensor, measures in (("gnss", gnss), ("camera", camera)):
-            self._switch(self._blocks[f"{sensor}_wait"], sensor, measures)
+        for name in aids:
+            check.choice("switch_sensors", name, tuple(a.name.lower() for a in self.sensors.aids))
+        for name, measures in {"gnss": gnss, "camera": camera, **aids}.items():
+            self._switch(self._blocks["wait"][:, Sensor[name.upper()]], name, measures)
 
     @staticmethod
     def _switch(waits: NDArray[Any], sensor: str, measures: bool | None) -> None:

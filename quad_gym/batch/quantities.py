@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
-from quad_gym.records import HEADING_ALONG, HEADING_VELOCITY, Aid
+from quad_gym.records import (
+    AID_BLOCKS,
+    BASELINE_BLOCK,
+    FEATURE_SLICE,
+    HEADING_ALONG,
+    HEADING_VELOCITY,
+    POSITION_BLOCK,
+    VELOCITY_BLOCK,
+    Aid,
+)
 from quad_gym.rotations import dcm_to_quaternion, quaternion_to_dcm
 
 if TYPE_CHECKING:
@@ -140,28 +149,25 @@ def _series(batch: "FlightBatch", flights: Flights) -> tuple[Floats, Floats, Flo
     return r_ref, v_ref, a_ref, x_ref
 
 
-def _measured(batch: "FlightBatch", flights: Flights, flag: str) -> NDArray[np.bool_]:
-    """A mask of measurements since the last step, or at the start of the episode."""
-    fresh = batch.record(f"{flag}_fresh", flights) + batch.record(f"{flag}_valid", flights)
+def _measured(batch: "FlightBatch", flights: Flights) -> NDArray[np.bool_]:
+    """A mask of blocks measured since the last step, or at the start of the episode."""
+    fresh = batch.record("block_fresh", flights) + batch.record("block_valid", flights)
     return np.asarray(fresh > 0.0)
 
 
-def _gnss(field: str, flag: str) -> Computed:
+def _gnss(field: str, block: int) -> Computed:
     """A vector that GNSS measures, turned from G to I."""
 
     def of(batch: "FlightBatch", flights: Flights) -> Floats:
-        measured, gnss = _measured(batch, flights, flag), batch.sensors.gnss
-        if field == "gnss_velocity" and (gnss is None or gnss.velocity_sigma is None):
-            measured[:] = False
-        turned = batch.record(field, flights) @ batch.R_IG.T
-        return np.where(measured[:, np.newaxis], turned, np.nan)
+        measured = _measured(batch, flights)[:, block, np.newaxis]
+        return np.where(measured, batch.record(field, flights) @ batch.R_IG.T, np.nan)
 
     return of
 
 
 def _pixels(batch: "FlightBatch", flights: Flights) -> Floats:
     count = 0 if batch.sensors.camera is None else len(batch.sensors.camera.features_I)
-    measured = _measured(batch, flights, "feature")[:, :count, np.newaxis]
+    measured = _measured(batch, flights)[:, FEATURE_SLICE][:, :count, np.newaxis]
     return np.where(measured, batch.record("pixels", flights)[:, :count], np.nan)
 
 
@@ -169,7 +175,7 @@ def _aid(aid: Aid) -> Computed:
     """The measurement of an aiding sensor."""
 
     def of(batch: "FlightBatch", flights: Flights) -> Floats:
-        measured = _measured(batch, flights, "aid")[:, aid, np.newaxis]
+        measured = _measured(batch, flights)[:, AID_BLOCKS + aid, np.newaxis]
         found = np.where(measured, batch.record("aid_measurement", flights)[:, aid], np.nan)
         return found[:, 0] if aid == Aid.BAROMETER else found
 
@@ -215,9 +221,9 @@ QUANTITIES = {
     # the last measurements since the last step, NaN where there was none
     "gyro": Quantity("gyro", (3,), "rad/s", "B", "angular rate", filtered=True),
     "accel": Quantity("accel", (3,), "m/s^2", "B", "specific force", filtered=True),
-    "gnss_position": Quantity(_gnss("gnss_position", "position"), (3,), "m", "I", "primary antenna", filtered=True),
-    "gnss_baseline": Quantity(_gnss("gnss_baseline", "baseline"), (3,), "m", "I", "primary to secondary antenna", filtered=True),
-    "gnss_velocity": Quantity(_gnss("gnss_velocity", "position"), (3,), "m/s", "I", "of the primary antenna, where the receiver gives it", filtered=True),
+    "gnss_position": Quantity(_gnss("gnss_position", POSITION_BLOCK), (3,), "m", "I", "primary antenna", filtered=True),
+    "gnss_baseline": Quantity(_gnss("gnss_baseline", BASELINE_BLOCK), (3,), "m", "I", "primary to secondary antenna", filtered=True),
+    "gnss_velocity": Quantity(_gnss("gnss_velocity", VELOCITY_BLOCK), (3,), "m/s", "I", "of the primary antenna, where the receiver gives it", filtered=True),
     "pixels": Quantity(_pixels, ("features", 2), "pixels", "C", "features, from the image's center", filtered=True),
     "barometer": Quantity(_aid(Aid.BAROMETER), (), "m", "-", "altitude", filtered=True),
     "magnetometer": Quantity(_aid(Aid.MAGNETOMETER), (3,), "T", "B", "magnetic field", filtered=True),

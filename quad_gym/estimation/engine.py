@@ -19,8 +19,13 @@ from quad_gym.packing.flight import form_of, params_block, params_record
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
+    AID_BLOCKS,
+    BASELINE_BLOCK,
+    FEATURE_SLICE,
     FLIGHT_BLOCK,
+    POSITION_BLOCK,
     SETTINGS,
+    VELOCITY_BLOCK,
     WIDTH,
     WORK_BLOCK,
     FilterForm,
@@ -65,7 +70,7 @@ class Engine:
         self.form = form_of(estimator, innovations=True, lever_arm=lever_arm)
         self.settings = np.zeros(1, SETTINGS)
         self.settings["run_filter"] = True
-        self.settings["form"], self.settings["feature_count"] = int(self.form), self.features
+        self.settings["form"] = int(self.form)
         pack_aid_settings(self.settings[0], sensors, sensors)
         needed = needed_stages(self.settings[0])
         self._stages = {stage: needed[stage] for stage in single.FILTER_STAGES if stage in needed}
@@ -142,12 +147,13 @@ class Engine:
     def update(self, measurement: Measurement) -> None:
         """Update the estimate with measurements."""
         m, blocks = measurement, self.blocks
-        blocks["position_valid"] = m.position_G is not None
-        blocks["baseline_valid"] = m.baseline_G is not None
-        blocks["velocity_valid"] = m.velocity_G is not None
-        blocks["feature_valid"], blocks["aid_valid"] = 0.0, 0.0
+        valid = blocks["block_valid"]
+        valid[:] = 0.0
+        valid[:, POSITION_BLOCK] = m.position_G is not None
+        valid[:, BASELINE_BLOCK] = m.baseline_G is not None
+        valid[:, VELOCITY_BLOCK] = m.velocity_G is not None
         for aid, value in m.aids.items():
-            blocks["aid_valid"][:, aid] = 1.0
+            valid[:, AID_BLOCKS + aid] = 1.0
             blocks["aid_measurement"][:, aid, : len(value)] = value[:, np.newaxis]
         given = {
             "gnss_position": m.position_G,
@@ -159,7 +165,7 @@ class Engine:
                 self.fill(name, numbers)
         if m.pixels is not None:
             seen = np.asarray(~np.isnan(m.pixels).any(axis=1))[:, np.newaxis]
-            blocks["feature_valid"][:, : self.features] = seen
+            valid[:, FEATURE_SLICE][:, : self.features] = seen
             image = np.where(seen, m.pixels, 0.0)[..., np.newaxis]
             blocks["pixels"][:, : self.features] = image
         self._set_dt(self.sensors.imu.dt)  # `tick` counts these

@@ -17,9 +17,10 @@ from quad_gym.kernels.simd.addresses import (
 from quad_gym.kernels.simd.atomics import add_shared, read_shared
 from quad_gym.kernels.simd.lanes import all_of, any_of, select
 from quad_gym.records import (
-    AIDS,
+    FIRST_BLOCK,
     FLIGHT_BLOCK,
     PARAMS_BLOCK,
+    SENSORS,
     SETTINGS,
     SHOWN,
     SHOWN_FLOATS,
@@ -173,13 +174,9 @@ def _fetch_ahead(call, index, settings, left):
 def _fly_step(call, index, flight, world, model, settings, work, stages):
     """Fly a control period and judge it; return which lanes begin and which ended an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
-    flight.position_fresh = 0.0
-    flight.baseline_fresh = 0.0
-    for i in range(settings.feature_count):
-        flight.feature_fresh[i] = 0.0
-    if settings.run_filter and settings.aids > 0:
-        for s in range(AIDS):
-            flight.aid_fresh[s] = 0.0
+    for sensor in range(SENSORS):
+        for k in range(settings.sensor_blocks[sensor]):
+            flight.block_fresh[FIRST_BLOCK[sensor] + k] = 0.0
     if settings.run_filter and settings.layout == Layout.MEASUREMENTS:
         for i in range(3):
             flight.gyro_sum[i] = flight.accel_sum[i] = 0.0

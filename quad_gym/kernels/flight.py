@@ -11,13 +11,12 @@ decided by the settings, see `SOURCES` in `kernels/compiling/stages.py`.
 import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.measurements import call_sensor, call_sensors
 from quad_gym.kernels.maths.linalg import load3, norm, sub
-from quad_gym.kernels.measurements.aid import ACTS, align_by_aid, call_aids
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
 from quad_gym.records import Act
 
-_BEGIN_AID, _SAMPLE_AID = int(Act.BEGIN), int(Act.SAMPLE)
 _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
 
 
@@ -59,10 +58,8 @@ def tick(flight, world, model, settings, work, stages, within):
     flight.tick = flight.tick + 1.0
     run(Stage.FOLLOW, here, within)
     run(Stage.ADVANCE_FAULTS, here)
-    run(Stage.SET_ASIDE, here)
     run(Stage.SAMPLE, here)
-    call_aids(flight, world, model, settings, work, stages, _SAMPLE_AID)
-    run(Stage.EXCHANGE, here)
+    call_sensors(flight, world, model, settings, work, stages, Act.SAMPLE, 0)
     if settings.late and settings.rewinds:
         run(Stage.LATE_UPDATE, here)
     else:
@@ -91,19 +88,18 @@ def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     run(Stage.BEGIN_LATE, here)
     run(Stage.BEGIN, here)
     run(Stage.BEGIN_IMPERFECT, here)
-    call_aids(flight, world, model, settings, work, stages, _BEGIN_AID)
+    call_sensors(flight, world, model, settings, work, stages, Act.BEGIN, 0)
     run(Stage.BEGIN_FAULTS, here)
     run(Stage.BEGIN_IN_AIR, here)  # after the faults, which restore a rotor lost before
     run(Stage.BEGIN_GROUND, here)
     run(Stage.BEGIN_CONTACTS, here)
-    run(Stage.SET_ASIDE, here)
     run(Stage.SAMPLE, here, 1)
-    call_aids(flight, world, model, settings, work, stages, _SAMPLE_AID + ACTS)
+    call_sensors(flight, world, model, settings, work, stages, Act.SAMPLE, 1)
     run(Stage.ALIGN, here)
     run(Stage.WARM, here)
-    if not settings.warm and settings.heading_aid >= 0:
-        align_by_aid(flight, model, settings, work, stages)
-    run(Stage.EXCHANGE, here, 1)
+    if not settings.warm and settings.heading_sensor >= 0:
+        sensor = settings.heading_sensor
+        call_sensor(flight, world, model, settings, work, stages, sensor, Act.ALIGN, 0)
     run(Stage.UPDATE, here)
     run(Stage.LOOK, here)
     r_ref, _, _, _ = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)

@@ -27,8 +27,9 @@ from quad_gym.kernels.maths.linalg import (
     store3,
     store33,
 )
-from quad_gym.kernels.measurements import features
-from quad_gym.kernels.measurements.position import drift_gnss
+from quad_gym.kernels.sensors import camera
+from quad_gym.kernels.sensors.gnss import measure_gnss
+from quad_gym.kernels.sensors.gnss_position import drift_gnss
 from quad_gym.kernels.sensors.imperfect import (
     draw_heading_error,
     draw_imu_errors,
@@ -38,7 +39,6 @@ from quad_gym.kernels.sensors.imperfect import (
     vibrate_imu,
 )
 from quad_gym.kernels.sensors.imu import drift_biases, measure_imu, measure_imu_average
-from quad_gym.kernels.sensors.sample import measure_gnss
 from quad_gym.kernels.simd.addresses import lanes_at
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.vehicle.air import accelerations_in_air
@@ -50,10 +50,10 @@ from quad_gym.records import (
     PARAMS_BLOCK,
     SETTINGS,
     WORK_BLOCK,
-    Aid,
+    Sensor,
 )
 
-FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[aid.name] for aid in Aid))
+FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
 """The stages that a filter runs, as far as it needs them."""
 FILTER_ENTRIES = tuple(f"{__name__}:{name}" for name in ("start_filter", "run_stage"))
 """Names of the entries that it calls, the longest to compile first."""
@@ -182,7 +182,7 @@ def step_gnss_drift(flights, params):
 @_entry(_FLIGHT, _PARAMS, types.int64)
 def sense_features(flights, params, feature_count):
     """Measure the features that the camera of flights[0] sees."""
-    features.measure(flights[0], params[0], feature_count, True)
+    camera.measure(flights[0], params[0], feature_count, True)
 
 
 @_entry(_FLIGHT, _PARAMS)

@@ -11,7 +11,15 @@ from quad_gym.params import checks as check
 from quad_gym.params.aids import SlowError
 from quad_gym.params.gnss import LEAST_DRIFT
 from quad_gym.params.sensors import SensorSuite, delay_ticks
-from quad_gym.records import AID_BLOCKS, AID_FREEDOMS, AIDS, FEATURE_BLOCKS, MAX_SLOW
+from quad_gym.records import (
+    AID_BLOCKS,
+    AID_FREEDOMS,
+    AIDS,
+    FEATURE_BLOCKS,
+    FIRST_AID,
+    MAX_SLOW,
+    Sensor,
+)
 
 
 class SlowStates(NamedTuple):
@@ -99,7 +107,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
 
 
 def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuite) -> None:
-    """Write which aiding sensors and slow errors there are, and their clocks.
+    """Write which sensors and slow errors there are, and the clocks of all but GNSS and camera.
 
     Args:
         settings: One SETTINGS record.
@@ -114,15 +122,19 @@ def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuit
     settings["slow_states"], settings["slow_errors"] = len(states.errors), states.estimated
     settings["estimates_drift"] = states.drifts
     settings["aid_vector"], settings["aid_scalar"] = states.vectors, states.scalars
-    settings["aids"] = len(believes.aids)
-    settings["heading_aid"] = -1 if believes.heading_aid is None else believes.heading_aid
+    heading = believes.heading_aid
+    settings["heading_sensor"] = -1 if heading is None else FIRST_AID + heading
+    features = 0 if measures.camera is None else len(measures.camera.features_I)
+    settings["sensor_blocks"][: Sensor.CAMERA + 1] = FEATURE_BLOCKS, features
+    settings["feature_count"] = features
     for aid, params in measures.aids.items():
+        sensor = FIRST_AID + aid
         ticks = check.ticks(f"{type(params).__name__}.rate", params.rate, measures.imu.rate)
         label = f"{type(params).__name__}.latency"
-        settings["aid_on"][aid], settings["aid_ticks"][aid] = True, ticks
-        settings["aid_phase"][aid] = phase_ticks(params.phase, ticks)
+        settings["sensor_blocks"][sensor], settings["sensor_ticks"][sensor] = 1, ticks
+        settings["sensor_phase"][sensor] = phase_ticks(params.phase, ticks)
         delay = delay_ticks(label, params.latency, params.rate, measures.imu.rate)
-        settings["aid_delay"][aid] = delay
+        settings["sensor_delay"][sensor] = delay
 
 
 def phase_ticks(phase: float | None, period: int) -> int:

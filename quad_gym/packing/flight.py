@@ -33,6 +33,7 @@ from quad_gym.records import (
     FilterForm,
     Layout,
     RewardTerm,
+    Sensor,
     Source,
     Start,
     Task,
@@ -196,7 +197,7 @@ _HARMONICS = {
 def pack_latency(
     settings: Any, measures: SensorSuite, clocks: Clocks, believes: SensorSuite
 ) -> None:
-    """Fill the settings' fields of aiding sensors, and of late measurements.
+    """Fill the settings' fields of which sensors there are, and of delayed measurements.
 
     Args:
         settings: One SETTINGS record.
@@ -213,9 +214,9 @@ def pack_latency(
         if sensor is not None:
             label = f"{type(sensor).__name__}.latency"
             rate = getattr(clocks, f"{name}_rate")
-            settings[f"{name}_delay"] = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
-    latest = max(settings["gnss_delay"], settings["camera_delay"], *settings["aid_delay"])
-    settings["late"] = latest > 0
+            delay = delay_ticks(label, sensor.latency, rate, clocks.imu_rate)
+            settings["sensor_delay"][Sensor[name.upper()]] = delay
+    settings["late"] = settings["sensor_delay"].max() > 0
     settings["rewinds"] = believes.estimator.delay_compensation == "retrodict"
 
 
@@ -261,16 +262,17 @@ def settings_record(
     s["form"] = form_of(sensors.estimator, innovations, lever_form(sensors.imu, lever_drawn))
     s["imu_averages"] = sensors.imu.samples == "average"
     if sensors.gnss is not None:
-        s["gnss_ticks"] = clocks.ticks_between("gnss")
+        ticks = clocks.ticks_between("gnss")
+        s["sensor_ticks"][Sensor.GNSS] = ticks
+        s["sensor_phase"][Sensor.GNSS] = phase_ticks(sensors.gnss.phase, ticks)
         s["gnss_velocity"] = sensors.gnss.velocity_sigma is not None
-        s["gnss_phase"] = phase_ticks(sensors.gnss.phase, s["gnss_ticks"])
     s["gnss_baseline"] = sensors.gnss is None or sensors.gnss.has_baseline
     s["gnss_drifts"] = gnss_drifts
     s["reuse_first_fix"] = sensors.estimator.reuse_first_fix
     if sensors.camera is not None:
-        s["camera_ticks"] = clocks.ticks_between("camera")
-        s["camera_phase"] = phase_ticks(sensors.camera.phase, s["camera_ticks"])
-        s["feature_count"] = len(sensors.camera.features_I)
+        ticks = clocks.ticks_between("camera")
+        s["sensor_ticks"][Sensor.CAMERA] = ticks
+        s["sensor_phase"][Sensor.CAMERA] = phase_ticks(sensors.camera.phase, ticks)
     s["source"], s["control"], s["layout"] = source, control, layout
     s["include_std"], s["privileged"] = include_std, privileged
     s["autoreset"], s["run_filter"] = autoreset, run_filter

@@ -79,14 +79,19 @@ class Control(IntEnum):
 
 
 class Sensor(IntEnum):
-    """The sensors whose measurements of one instant are one joint update; each has one clock."""
+    """Sensors other than the IMU, each a stage with a clock and a latency.
+
+    This is the order of their rows in the stacked measurement, and of delayed updates.
+    """
 
     GNSS = 0
     CAMERA = 1
+    BAROMETER = 2
+    MAGNETOMETER = 3
 
 
 class Block(IntEnum):
-    """What these measure; each a file in `kernels/measurements/`, and a group of the gate.
+    """Measurements of GNSS and camera, each a file in `kernels/sensors/` and a group of the gate.
 
     The features of an image are as many blocks of the measurement and come last.
     """
@@ -102,11 +107,10 @@ BLOCK_FREEDOMS = (3, 2, 3, 2)
 
 
 class Aid(IntEnum):
-    """Aiding sensors: those beside IMU, GNSS and camera, each a file in `kernels/measurements/`.
+    """Sensors with parameters in the fields `aid_...`: the last of `Sensor`, in the same order.
 
-    The name in lower case is that of the field of `SensorSuite`. This is their only list: the fault
-    that silences one (`FaultKind`), its stage (`kernels.compiling.stages`), its block of the
-    measurement and its part of a raw observation follow from it.
+    The name in lower case is the field of `SensorSuite`. The fault that silences a sensor
+    (`FaultKind`), its stage, its block of the measurement and its part of a raw observation follow.
     """
 
     BAROMETER = 0
@@ -114,24 +118,24 @@ class Aid(IntEnum):
 
 
 AID_FREEDOMS = (1, 3)
-"""Numbers that an aiding sensor measures, in the order of `Aid`."""
+"""Numbers that each of them measures, in the order of `Aid`."""
 
 
 class Act(IntEnum):
-    """What the stage of an aiding sensor is called for."""
+    """Tasks of a sensor's stage."""
 
     BEGIN = 0
-    """begin an episode: draw errors that last, set clocks"""
+    """begin an episode: draw constant errors, set the clock"""
     SAMPLE = 1
-    """measure where it is due, let what is late wait, and what has waited arrive"""
+    """measure when due, hold back delayed measurements, and deliver those that arrive"""
     EXPECT = 2
     """predict the measurement: its center, noise and columns"""
-    JUDGE = 3
-    """keep the innovation and mask it beyond the gate"""
-    DOUBT = 4
-    """raise the variances of the states that may be wrong"""
+    GATE = 3
+    """store the innovation, and mask it beyond the gate"""
+    INFLATE = 4
+    """inflate the variances of states that may be wrong after an alarm"""
     ALIGN = 5
-    """give the filter's start its heading, where `heading_aid` of the settings says so"""
+    """initialize the heading, if the sensor is `heading_sensor` of the settings"""
 
 
 class Task(IntEnum):
@@ -256,7 +260,7 @@ class FaultKind(IntEnum):
     ROTOR_LOSS = 11
 
     _ignore_ = "aid"
-    for aid in Aid:  # an aiding sensor is silent: BAROMETER_LOSS and so on
+    for aid in Aid:  # the sensor is silent: BAROMETER_LOSS and so on
         vars()[f"{aid.name}_LOSS"] = 12 + aid
 
 

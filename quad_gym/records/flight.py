@@ -5,7 +5,6 @@ from quad_gym.records.sizes import (
     AIDS,
     DELAY_SLOTS,
     FAULT_KINDS,
-    FEATURE_BLOCKS,
     MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
@@ -115,8 +114,7 @@ _CORE_FIELDS = (
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
     Field("diverged", (), "0 or 1", "whether the covariance does not explain the last innovations"),
     Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
-    Field("position_fresh", (), "0 or 1", "whether gnss_position was measured since the last step"),
-    Field("baseline_fresh", (), "0 or 1", "whether gnss_baseline was measured since the last step"),
+    Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
     # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
     Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
     Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
@@ -139,9 +137,7 @@ _CORE_FIELDS = (
     Field("b_a", (3,), "m/s^2", "accelerometer bias"),
     Field("b_g", (3,), "rad/s", "gyro bias"),
     Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
-    Field("gnss_wait", (), "ticks", "until GNSS measures next"),
-    Field("camera_wait", (), "ticks", "until the camera measures next"),
-    Field("feature_fresh", (MAX_FEATURES,), "0 or 1", "whether a feature was seen since the last step"),
+    Field("wait", (SENSORS,), "ticks", "until each sensor measures next"),
     # to which batches a snapshot belongs
     Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
 )
@@ -151,14 +147,11 @@ _FILTER_FIELDS = (
     Field("w_before", (3,), "rad/s", "w_meas one sample before"),
     Field("gyro", (3,), "rad/s", "the filter's sample of them: w_meas, or the mean over the last tick"),
     Field("accel", (3,), "m/s^2", "specific force f_meas in B: at the present instant, or likewise"),
-    Field("position_valid", (), "0 or 1", "whether gnss_position was measured at the present instant"),
-    Field("baseline_valid", (), "0 or 1", "whether gnss_baseline was measured at the present instant"),
-    Field("velocity_valid", (), "0 or 1", "whether gnss_velocity was measured at the present instant"),
+    Field("block_valid", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement reaches the filter at the present instant"),
     Field("gnss_position", (3,), "m", "primary antenna relative to the reference antenna, in G"),
     Field("gnss_baseline", (3,), "m", "primary to secondary antenna, in G"),
     Field("gnss_velocity", (3,), "m/s", "of the primary antenna, in G"),
     Field("pixels", (MAX_FEATURES, 2), "pixels", "feature projections"),
-    Field("feature_valid", (MAX_FEATURES,), "0 or 1", "whether the camera saw a feature at the present instant"),
     # the filter
     Field("r_hat", (3,), "m", "estimated position in I"),
     Field("v_hat", (3,), "m/s", "estimated velocity in I"),
@@ -169,7 +162,7 @@ _FILTER_FIELDS = (
     Field("update_failures", (), "-", "updates that failed since the filter's start"),
     Field("nis", (), "-", "normalized innovation squared of the last update; NaN: it was done in steps"),
     Field("nis_dimension", (), "-", "measurements in the last update"),
-    Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, aiding sensors, since the last accepted one"),
+    Field("rejected_in_row", (SENSOR_GROUPS,), "-", "positions, baselines, velocities, images wholly rejected, other sensors, since the last accepted one"),
     Field("reopened", (SENSOR_GROUPS,), "-", "times that the gate of each of these was reopened in this episode"),
     Field("accepted_tick", (SENSOR_GROUPS,), "ticks", "when one of each of these was last accepted"),
     Field("innovation_drift", (SENSOR_GROUPS, 3), "-", "mean of the last innovations of each, in deviations"),
@@ -177,7 +170,7 @@ _FILTER_FIELDS = (
     Field("corrected_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
     Field("corrected_tick", (), "ticks", "when the last of them was"),
     Field("fit_tick", (), "ticks", "when an image last fitted the estimate"),
-    Field("doubt_tick", (), "ticks", "when the filter last doubted itself; of one without a gate, later by the time that its biases take to be corrected"),
+    Field("alarm_tick", (), "ticks", "of the last inconsistency alarm; without a gate, later by the time that biases take to be corrected"),
     Field("nis_ratio", (), "-", "mean of the last NIS over their degrees of freedom, rejected ones included"),
     Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
 )
@@ -188,7 +181,7 @@ _ERROR_FIELDS = (
     Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
 )
 _WATCH_FIELDS = (
-    # the innovations of the last measurements, one by one: position, baseline, velocity, features, aiding sensors
+    # the innovations of the last measurements, one by one: position, baseline, velocity, features, other sensors
     Field("innovation", (MAX_BLOCKS, 3), "mixed", "of position and velocity in I; of a direction across the predicted one, horizontal and up, in I (features: in B), then NaN"),
     Field("innovation_sigma", (MAX_BLOCKS, 3), "mixed", "standard deviations that the filter expected of them"),
     Field("block_nis", (MAX_BLOCKS,), "-", "normalized innovation squared of each block, with FREEDOMS; NaN: none yet"),
@@ -203,15 +196,11 @@ _LATE_FIELDS = (
     Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
     Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
     Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
-    # the same when the measurements in transit were taken, the latest first; of GNSS and camera
+    # the same when the measurements in transit were taken, the latest first
     Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),
     # the measurements in transit
-    Field("late_position", (DELAY_SLOTS, 3), "m", "gnss_position"),
-    Field("late_baseline", (DELAY_SLOTS, 3), "m", "gnss_baseline"),
-    Field("late_velocity", (DELAY_SLOTS, 3), "m/s", "gnss_velocity"),
-    Field("late_valid", (DELAY_SLOTS, FEATURE_BLOCKS), "0 or 1", "whether these were measured"),
-    Field("late_pixels", (DELAY_SLOTS, MAX_FEATURES, 2), "pixels", "feature projections"),
-    Field("late_seen", (DELAY_SLOTS, MAX_FEATURES), "0 or 1", "whether the camera saw a feature"),
+    Field("waiting", (MAX_BLOCKS, DELAY_SLOTS, 3), "mixed", "measurements, block by block"),
+    Field("waiting_valid", (MAX_BLOCKS, DELAY_SLOTS), "0 or 1", "whether these were measured"),
 )
 _SLOW_FIELDS = (
     # the slow errors of sensors, where the filter estimates them
@@ -221,19 +210,11 @@ _SLOW_FIELDS = (
     Field("L_slow", (MAX_SLOW, MAX_STATES), "mixed", "rows of d below L in the factor of the joint covariance"),
 )
 _AID_FIELDS = (
-    # aiding sensors, in the order of Aid
-    Field("aid_wait", (AIDS,), "ticks", "until it measures next"),
-    Field("aid_valid", (AIDS,), "0 or 1", "whether a measurement reaches the filter at the present instant"),
-    Field("aid_fresh", (AIDS,), "0 or 1", "whether one has done so since the last step"),
+    # sensors other than GNSS and camera, in the order of Aid
     Field("aid_measurement", (AIDS, 3), "m; T", "altitude, then zeros; magnetic field in B"),
     Field("aid_vector", (AIDS, 3), "T", "true slow error in B, if it has one of three numbers: hard iron"),
     Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination less the believed one"),
     Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),
-)
-_LATE_AID_FIELDS = (
-    # the measurements of aiding sensors in transit, the latest first
-    Field("aid_stamps", (AIDS, DELAY_SLOTS, STAMP), "mixed", "when they were taken: the tick (NaN: none), C, V, X, B, w_meas"),
-    Field("aid_waiting", (AIDS, DELAY_SLOTS, 3), "m; T", "aid_measurement"),
 )
 # fmt: on
 PARTS = (
@@ -252,7 +233,6 @@ PARTS = (
     ("late", _LATE_FIELDS),
     ("slow", _SLOW_FIELDS),
     ("aids", _AID_FIELDS),
-    ("late_aids", _LATE_AID_FIELDS),
 )
 """The parts of a record, in the order in which they lie in memory. All flights have the core; what
 a batch uses beside it is best close to it, as the memory of a flight has no gaps: see `Room`."""

@@ -27,25 +27,37 @@ DELAY_SLOTS = MAX_UNDER_WAY + 1
 """Measurements that wait: at a latency of MAX_UNDER_WAY periods one is taken as another arrives."""
 MAX_ACTION_DELAY = 10
 """Longest delay of an action, in control steps."""
-AIDS = len(Aid)
-"""Number of kinds of aiding sensors."""
 SENSORS = len(Sensor)
-"""Number of sensors beside the IMU and these."""
+"""Sensors other than the IMU."""
+AIDS = len(Aid)
+"""Those with parameters in the fields `aid_...`, which come last."""
+FIRST_AID = SENSORS - AIDS
+"""The first of them."""
 POSITION_BLOCK = int(Block.POSITION)
 BASELINE_BLOCK = int(Block.BASELINE)
 VELOCITY_BLOCK = int(Block.VELOCITY)
 FEATURE_BLOCKS = int(Block.FEATURES)
 """Where the blocks stand in a flight's fields of innovations; feature i is FEATURE_BLOCKS + i."""
 AID_BLOCKS = FEATURE_BLOCKS + MAX_FEATURES
-"""Where their blocks begin in a flight's fields of innovations; that of aid i is AID_BLOCKS + i."""
+"""Blocks of the other sensors begin here; that of aid i is AID_BLOCKS + i."""
 MAX_BLOCKS = AID_BLOCKS + AIDS
-"""Blocks of the measurement: antenna position, baseline, velocity, features, aiding sensors."""
+"""Blocks of the measurement: antenna position, baseline, velocity, features, other sensors."""
+FIRST_BLOCK = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_BLOCKS, MAX_BLOCKS))
+"""First block of each sensor."""
+FEATURE_SLICE = slice(FEATURE_BLOCKS, AID_BLOCKS)
+"""Blocks of the features."""
 MAX_MEASUREMENTS = 3 * MAX_BLOCKS
 """Length of the stacked measurement; a direction has three numbers."""
 AID_GROUPS = len(Block)
-"""Where aiding sensors begin among the kinds of measurements."""
+"""Groups of the other sensors begin here."""
 SENSOR_GROUPS = AID_GROUPS + AIDS
-"""Kinds of measurements: positions, baselines, velocities, images, and aiding sensors."""
+"""Groups of the gate: positions, baselines, velocities, images, and the other sensors."""
+FIRST_GROUP = (POSITION_BLOCK, FEATURE_BLOCKS, *range(AID_GROUPS, SENSOR_GROUPS))
+"""First group of each sensor."""
+GROUP_COUNT = (FEATURE_BLOCKS, *[1] * (SENSORS - 1))
+"""Groups of each sensor."""
+BLOCK_NUMBERS = (3, 3, *AID_FREEDOMS)
+"""Numbers in a block of each sensor: a direction is a unit vector."""
 FREEDOMS = (*BLOCK_FREEDOMS, *BLOCK_FREEDOMS[-1:] * (MAX_FEATURES - 1), *AID_FREEDOMS)
 """Degrees of freedom of the blocks: a direction has two."""
 MAX_OBSERVATION = 512
@@ -54,7 +66,7 @@ WARM_DRAWS = 21
 """Standard normals that make the errors of a warm start: fifteen, and those of the true biases."""
 MAX_SLOW = 9
 """Slow errors of sensors that a filter can have among its states, a multiple of three: the drift of
-GNSS positions, the hard iron of a magnetometer, and one number of each aiding sensor."""
+GNSS positions, the hard iron of a magnetometer, and one number of each other sensor."""
 MAX_STATES = 15 + MAX_SLOW
 """States of a filter with all of them."""
 WARM_SLOW_DRAWS = 2 * MAX_SLOW
@@ -73,3 +85,7 @@ class Field(NamedTuple):
     unit: str
     meaning: str
     kind: str = "f8"
+
+
+for _aid in Aid:
+    assert Sensor[_aid.name] == FIRST_AID + _aid

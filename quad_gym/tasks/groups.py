@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.metrics import nees, state_error
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle
+from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK
 from quad_gym.rotations import dcm_to_quaternion
 from quad_gym.tasks.lazy import Attribute, Group, Lazy, Shown
 
@@ -326,20 +327,20 @@ class Measured(Group):
     def gnss_valid(self) -> Truths:
         """True where a position was measured in this step, (n,)."""
         self._need_sensors()
-        return self._flights.columns("position_fresh") > 0.0
+        return self._flights.rows("block_fresh")[:, POSITION_BLOCK] > 0.0
 
     @Lazy
     def baseline_valid(self) -> Truths:
         """True where a baseline was measured in this step, (n,)."""
         self._need_sensors()
-        return self._flights.columns("baseline_fresh") > 0.0
+        return self._flights.rows("block_fresh")[:, BASELINE_BLOCK] > 0.0
 
     @Lazy
     def features_seen(self) -> Truths:
         """True for features in an image of this step, (n, m)."""
         self._need_sensors()
         count = self._flights.feature_places().shape[1]
-        return self._flights.rows("feature_fresh")[:, :count] > 0.0
+        return self._flights.rows("block_fresh")[:, FEATURE_SLICE][:, :count] > 0.0
 
     def _in_I(self, name: str, valid: Truths) -> Floats:
         """Vector in G rotated to I; NaN where it was not measured."""

@@ -27,8 +27,7 @@ DRAWN = {
 }
 STALE = frozenset(
     (
-        *("pixels", "aid_measurement", "stamps", "aid_stamps", "aid_waiting", "late_position"),
-        *("late_baseline", "late_velocity", "late_valid", "late_pixels", "late_seen"),
+        *("pixels", "aid_measurement", "stamps", "waiting", "waiting_valid"),
         *("fault_size", "fault_vector", "fault_pick", "feature_hidden", "delayed_action"),
         *("gyro_sum", "accel_sum", "fault_news"),
     )

@@ -21,7 +21,7 @@ COMBINATIONS = [(task, action) for task in quad_gym.IDS.values() for action in A
 NOT_MEASURED = (
     *("start_given", "innovation", "innovation_sigma", "block_nis", "obstacle_distance"),
     "nis",  # of an update in steps
-    *("stamps", "aid_stamps"),  # of measurements that do not wait
+    "stamps",  # of measurements that do not wait
     "drawn",  # of a sensor that the suite lacks
 )
 """Fields that hold NaN where nothing was given or measured."""

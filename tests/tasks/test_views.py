@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym.records import FEATURE_SLICE
 from quad_gym.tasks.fields import VIEW_FIELDS
 from quad_gym.tasks.lazy import Shown
 
@@ -188,7 +189,7 @@ def test_the_features_in_view_are_those_that_the_camera_has_seen():
         flying = ~view.is_first
         np.testing.assert_array_equal(
             view.truth.features_in_view[flying],
-            env.flights.batch.record("feature_valid")[flying, :2],
+            env.flights.batch.record("block_valid")[:, FEATURE_SLICE][flying, :2],
         )
         seen += np.bincount(view.truth.features_in_view[flying].ravel(), minlength=2)
     assert (seen > 20).all()  # both cases came

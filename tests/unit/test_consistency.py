@@ -18,7 +18,7 @@ from quad_gym.analysis.consistency import (
     verdict,
 )
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.records import AID_BLOCKS, FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, GateDecision
+from quad_gym.records import FEATURE_BLOCKS, MAX_BLOCKS, POSITION_BLOCK, GateDecision
 from tests.unit.alarms import assert_normal
 
 
@@ -123,11 +123,7 @@ class Measured:
     def __init__(self, innovations, nis, seen):
         blocks = (self.count, MAX_BLOCKS)
         self.fields = {
-            "position_valid": seen[:, POSITION_BLOCK],
-            "baseline_valid": np.zeros(self.count),
-            "velocity_valid": np.zeros(self.count),
-            "feature_valid": seen[:, FEATURE_BLOCKS:AID_BLOCKS],
-            "aid_valid": seen[:, AID_BLOCKS:],
+            "block_valid": seen,
             "innovation": np.repeat(innovations[:, np.newaxis], MAX_BLOCKS, axis=1),
             "innovation_sigma": np.full((*blocks, 3), 2.0),
             "block_nis": np.repeat(nis[:, np.newaxis], MAX_BLOCKS, axis=1),

@@ -9,6 +9,7 @@ import quad_gym
 from quad_gym import Cylinder, FlightBatch, Randomization, TaskParams, Uniform, Wall, WorldParams
 from quad_gym.batch.surroundings import hidden_points
 from quad_gym.flights.record import FlightRecorder
+from quad_gym.records import FEATURE_SLICE
 from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import nees
 from tests.unit.alarms import alarm_score
@@ -93,7 +94,7 @@ def test_an_error_of_the_map_turns_with_it():
     flights = batch(6, true_sensors=INDOOR.replace(camera=camera))
     for _ in range(10):
         flights.step()
-    seen = flights.record("feature_valid")[:, : len(NOMINAL)] > 0.0
+    seen = flights.record("block_valid")[:, FEATURE_SLICE][:, : len(NOMINAL)] > 0.0
     assert seen.any()
     true = places(flights.drawn(), wrong)
     R_BI = quaternion_to_dcm(flights.record("q"))
@@ -147,7 +148,7 @@ def test_obstacles_hide_features_where_they_are():
         eyes = r + np.einsum("nji,j->ni", R_BI, np.array(INDOOR.camera.position_B))
         centers = flights.record("obstacle_center")[:, :2]
         hidden = hidden_points(world.obstacles, centers, eyes, flights.feature_places())
-        seen = flights.record("feature_valid")[:, : len(NOMINAL)] > 0.0
+        seen = flights.record("block_valid")[:, FEATURE_SLICE][:, : len(NOMINAL)] > 0.0
         assert not (seen & hidden).any()
         hid, saw = hid + int(hidden.sum()), saw + int(seen.sum())
     assert hid > 100

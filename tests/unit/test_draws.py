@@ -6,7 +6,7 @@ import pytest
 import quad_gym
 from quad_gym.kernels.single import sense_features, sense_gnss, sense_imu, step_biases
 from quad_gym.packing.flight import params_record
-from quad_gym.records import FLIGHT
+from quad_gym.records import FEATURE_SLICE, FLIGHT
 from tests.unit.alarms import alarm_score
 
 COUNT = 10_000
@@ -30,7 +30,7 @@ def readings():
         step_biases(flight, params)
         names = ("accel", "gyro", "gnss_position", "gnss_baseline", "b_a", "b_g", "pixels")
         rows.append(np.concatenate([flight[name][0].ravel() for name in names]))
-    assert flight["feature_valid"].sum() == len(features)
+    assert flight["block_valid"][:, FEATURE_SLICE].sum() == len(features)
     noise = np.array(rows)
     return (noise - noise.mean(axis=0)) / noise.std(axis=0)
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.records import FEATURE_SLICE
 from quad_gym.rotations import dcm_to_euler, euler_to_dcm
 from tests.reference_ukf import PlainEKF
 from tests.unit.test_ukf import LAB, assert_equal, compare, estimator
@@ -199,7 +200,7 @@ def test_a_batch_flies_the_filter_of_the_friendly_class():
     ekf = ExtendedKalmanFilter(sensors)
     ekf.initialize(read("gnss_position"), read("gnss_baseline"))
     for _ in range(50):
-        seen = read("feature_valid")[:2, np.newaxis] > 0.0
+        seen = read("block_valid")[FEATURE_SLICE][:2, np.newaxis] > 0.0
         pixels = np.where(seen, read("pixels")[:2], np.nan)
         ekf.update(read("gnss_position"), read("gnss_baseline"), pixels)
         np.testing.assert_allclose(ekf.position, read("r_hat"), rtol=0.0, atol=1e-11)

@@ -59,7 +59,8 @@ def filters_with(blocks, sensors, form):
         names = ("position", "baseline")
         chosen = {name: name in blocks for name in names} | {"camera": "features" in blocks}
         filters.measure(lane, RECORDING, TICK, **chosen)
-        filters.put(lane, velocity_valid=float("velocity" in blocks), gnss_velocity=np.zeros(3))
+        filters.put(lane, gnss_velocity=np.zeros(3))
+        filters.set_valid(lane, VELOCITY_BLOCK, "velocity" in blocks)
     return filters
 
 

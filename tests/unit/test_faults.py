@@ -27,7 +27,7 @@ from quad_gym.faults import (
 )
 from quad_gym.faults.presets import ALL, faults_of
 from quad_gym.frames import ecef_to_enu
-from quad_gym.records import POSITION_BLOCK, FaultKind, Source
+from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK, FaultKind, Source
 from quad_gym.rotations import quaternion_to_dcm
 from tests.field_flights import fly
 from tests.unit.alarms import ALARM, alarm_score
@@ -141,10 +141,10 @@ def test_an_outage_takes_the_fixes_away_and_changes_nothing_else():
         calm.step()
         faulty.step()
         heard, paired = not 20 <= tick < 40, not 20 <= tick < 50
-        assert (faulty.record("position_valid") == heard).all()
-        assert (faulty.record("baseline_valid") == paired).all()
-        assert (faulty.record("position_fresh") == heard).all()
-        assert (faulty.record("baseline_fresh") == paired).all()
+        assert (faulty.record("block_valid")[:, POSITION_BLOCK] == heard).all()
+        assert (faulty.record("block_valid")[:, BASELINE_BLOCK] == paired).all()
+        assert (faulty.record("block_fresh")[:, POSITION_BLOCK] == heard).all()
+        assert (faulty.record("block_fresh")[:, BASELINE_BLOCK] == paired).all()
         np.testing.assert_array_equal(calm.record("r"), faulty.record("r"))
         if heard:
             np.testing.assert_array_equal(
@@ -208,7 +208,7 @@ def test_an_occlusion_hides_the_same_share_of_features_as_long_as_it_stays():
     for tick in range(1, 51):
         calm.step()
         faulty.step()
-        seen, left = calm.record("feature_valid"), faulty.record("feature_valid")
+        seen, left = (b.record("block_valid")[:, FEATURE_SLICE] for b in (calm, faulty))
         hidden = faulty.record("feature_hidden") * (20 <= tick < 40)
         np.testing.assert_array_equal(left, seen * (1.0 - hidden))
         if tick == 20:
@@ -227,8 +227,8 @@ def test_wrong_associations_take_one_seen_feature_for_another(how):
     for _ in range(50):
         calm.step()
         faulty.step()
-        seen = faulty.record("feature_valid") > 0.0
-        np.testing.assert_array_equal(seen, calm.record("feature_valid") > 0.0)
+        seen = faulty.record("block_valid")[:, FEATURE_SLICE] > 0.0
+        np.testing.assert_array_equal(seen, calm.record("block_valid")[:, FEATURE_SLICE] > 0.0)
         right, wrong = calm.record("pixels"), faulty.record("pixels")
         mistaken = faulty.record("feature_mistaken") > 0.0
         for i in np.flatnonzero(seen.sum(axis=1) >= 2):
@@ -358,7 +358,7 @@ def test_the_gate_rejects_most_outliers_and_says_so():
         batch.step()
         if tick < 400:
             continue
-        now = batch.record("position_valid") > 0.0
+        now = batch.record("block_valid")[:, POSITION_BLOCK] > 0.0
         wild = batch.record("outlier") > 0.0
         rejected = batch.record("gate")[:, POSITION_BLOCK] == 2.0
         outliers, fixes = outliers + (now & wild).sum(), fixes + (now & ~wild).sum()

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import quad_gym
 from quad_gym.frames import ecef_to_enu
 from quad_gym.kernels.maths.linalg import load3, store3
-from quad_gym.kernels.measurements.baseline import noisy_baseline
+from quad_gym.kernels.sensors.gnss_baseline import noisy_baseline
 from quad_gym.sensors import GnssReceiver
 from tests.unit.alarms import assert_normal
 from tests.unit.compiled import Compiled

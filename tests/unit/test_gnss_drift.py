@@ -10,6 +10,7 @@ import pytest
 import quad_gym
 from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
 from quad_gym.faults import GnssJump, GnssOutliers
+from quad_gym.records import POSITION_BLOCK
 from tests.circle_flight import record_circle
 from tests.field_flights import fly, nees, state_errors, steps
 from tests.reference_late import Rewinding
@@ -204,7 +205,7 @@ def test_late_fixes_leave_what_filtering_all_over_again_does():
     for tick in range(1, 601):
         batch.step()
         reference.predict(batch.record("gyro")[0], batch.record("accel")[0])
-        if batch.record("position_valid")[0]:
+        if batch.record("block_valid")[:, POSITION_BLOCK][0]:
             reference.update(
                 tick - 20,
                 gnss_position_G=batch.record("gnss_position")[0],
@@ -241,7 +242,8 @@ def test_a_gross_outlier_is_rejected():
     struck = rejected = 0
     for _ in range(1000):
         batch.step()
-        hit = (batch.record("position_valid") > 0.0) & (batch.record("outlier") > 0.0)
+        measured = batch.record("block_valid")[:, POSITION_BLOCK] > 0.0
+        hit = measured & (batch.record("outlier") > 0.0)
         struck += hit.sum()
         rejected += (hit & (batch.record("gate")[:, 0] == 2.0)).sum()
     assert struck > 1000
@@ -257,7 +259,7 @@ def test_a_jump_of_the_fixes_shows_in_the_innovations_and_moves_the_slow_error()
     assert (batch.record("block_nis")[:, 0] > 100.0).mean() > 0.9
     assert (batch.record("gate")[:, 0] == 2.0).all()
     steps(batch, 3.0)  # the filter doubts its position meanwhile
-    assert (batch.record("doubt_tick") > 3.0 * CONSUMER.imu.rate).all()
+    assert (batch.record("alarm_tick") > 3.0 * CONSUMER.imu.rate).all()
     assert (batch.record("gate")[:, 0] == 1.0).all()
     assert nees(batch, slice(0, 3)).mean() < 30.0
 

@@ -16,7 +16,7 @@ from quad_gym.packing.flight import params_record
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.params.world import WorldParams
-from quad_gym.records import Autoreset, Control, Source
+from quad_gym.records import FEATURE_SLICE, Autoreset, Control, Source
 from quad_gym.rotations import euler_to_dcm, quaternion_to_dcm
 from quad_gym.vehicle import state_derivative
 from tests.filter_states import set_at_rest
@@ -262,7 +262,7 @@ def seen_by_projection(flights, camera, ground=None):
 def test_features_beyond_the_range_are_not_seen():
     suite = with_camera(max_range=5.5)
     flights = batch(suite, 200, randomization={"start_yaw": quad_gym.Uniform(-3.0, 3.0)})
-    found = flights.record("feature_valid")[:, :12] > 0.0
+    found = flights.record("block_valid")[:, FEATURE_SLICE][:, :12] > 0.0
     np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera))
     unlimited = seen_by_projection(flights, suite.camera.replace(max_range=math.inf))
     assert 0.1 < found.sum() / unlimited.sum() < 0.9
@@ -273,7 +273,7 @@ def test_the_ground_hides_what_is_below_it_and_everything_from_below(ground):
     """Features are at 0 and 1 m, cameras about 1 m high."""
     suite = with_camera(ground_hides=True)
     flights = batch(suite, 200, world=WorldParams(ground_height=ground))
-    found = flights.record("feature_valid")[:, :12] > 0.0
+    found = flights.record("block_valid")[:, FEATURE_SLICE][:, :12] > 0.0
     np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera, ground))
     above = seen_by_projection(flights, suite.camera)
     assert found.any() == (ground < 1.0)
@@ -283,7 +283,7 @@ def test_the_ground_hides_what_is_below_it_and_everything_from_below(ground):
 def test_a_feature_on_the_ground_is_seen():
     suite = with_camera(ground_hides=True)
     flights = batch(suite, 50, world=WorldParams(ground_height=0.0))
-    found = flights.record("feature_valid")[:, :12] > 0.0
+    found = flights.record("block_valid")[:, FEATURE_SLICE][:, :12] > 0.0
     np.testing.assert_array_equal(found, seen_by_projection(flights, suite.camera))
 
 
@@ -293,8 +293,8 @@ def test_blur_grows_with_the_body_rate(rate):
     spin = {"start_body_rates": [None, None, quad_gym.Uniform(rate, rate)]}
     sharp, blurred = with_camera(), with_camera(exposure=0.004)
     plain, found = (batch(s, 400, randomization=spin) for s in (sharp, blurred))
-    seen = found.record("feature_valid") > 0.0
-    np.testing.assert_array_equal(seen, plain.record("feature_valid") > 0.0)
+    seen = found.record("block_valid")[:, FEATURE_SLICE] > 0.0
+    np.testing.assert_array_equal(seen, plain.record("block_valid")[:, FEATURE_SLICE] > 0.0)
     shift = (found.record("pixels") - plain.record("pixels"))[seen].ravel()
     smear = sharp.camera.focal_length * rate * 0.004
     if rate == 0.0:

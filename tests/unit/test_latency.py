@@ -6,7 +6,7 @@ import pytest
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.records import WIDTH, FilterStatus, Source
+from quad_gym.records import POSITION_BLOCK, WIDTH, FilterStatus, Source
 from tests.field_flights import fly, measured_now, nees, steps
 from tests.reference_late import Rewinding
 from tests.reference_ukf import PlainEKF, PlainUKF
@@ -262,9 +262,9 @@ def test_a_late_measurement_that_fails_leaves_the_estimate_bit_for_bit():
     batch = fly(suite, 10, task="hover")
     steps(batch, 6 * DT)  # one fix is under way, until tick 15
     bad, none = batch.snapshot(), batch.snapshot()
-    assert (bad["late_valid"][:, 0, 0] == 1.0).any()
-    bad["late_position"][0, 0, 1, ::2] = np.nan
-    none["late_valid"][0, 0, :, ::2] = 0.0
+    assert (bad["waiting_valid"][:, POSITION_BLOCK, 0] == 1.0).any()
+    bad["waiting"][0, POSITION_BLOCK, 0, 1, ::2] = np.nan
+    none["waiting_valid"][0, :3, 0, ::2] = 0.0
     after = []
     for start in (bad, none):
         batch.restore(start)
@@ -284,7 +284,7 @@ def test_an_undone_update_leaves_no_corrections_behind():
     batch = fly(suite, 10, task="hover")
     steps(batch, 6 * DT)
     flights = batch.snapshot()
-    flights["late_position"][0, 0, 1, ::2] = np.nan
+    flights["waiting"][0, POSITION_BLOCK, 0, 1, ::2] = np.nan
     flights["corrected"], flights["corrected_variance"] = 1.0, 1e9
     batch.restore(flights)
     steps(batch, 9 * DT)
@@ -354,9 +354,9 @@ def test_an_episode_begins_with_nothing_under_way():
     for _ in range(2):
         for _ in range(24):
             batch.step()
-            assert not batch.record("position_valid").any()
+            assert not batch.record("block_valid")[:, POSITION_BLOCK].any()
         batch.step()
-        assert batch.record("position_valid").all()
+        assert batch.record("block_valid")[:, POSITION_BLOCK].all()
         steps(batch, 0.7)
         batch.reset()
 

@@ -8,7 +8,7 @@ import quad_gym
 from quad_gym import Cylinder, Wall, WorldParams
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.batch.surroundings import hidden_points, nearest_obstacle, require_room
-from quad_gym.records import MAX_OBSTACLES, Ending, Source
+from quad_gym.records import FEATURE_SLICE, MAX_OBSTACLES, Ending, Source
 
 WALL = Wall(center_I=(0.5, -0.2, 1.0), size=(3.0, 0.6, 2.0), yaw=0.7)
 MAST = Cylinder(center_I=(-0.4, 0.3, 0.8), radius=0.5, height=1.8)
@@ -221,7 +221,10 @@ def test_obstacles_hide_features_and_change_nothing_else():
         np.testing.assert_array_equal(free.record("r"), hidden.record("r"))
         if step % 8:
             continue
-        seen, kept = (b.record("feature_valid")[:, : len(features)] > 0.0 for b in (free, hidden))
+        seen, kept = (
+            b.record("block_valid")[:, FEATURE_SLICE][:, : len(features)] > 0.0
+            for b in (free, hidden)
+        )
         R_BI = quad_gym.rotations.quaternion_to_dcm(free.record("q"))
         eyes = free.record("r") + np.einsum("nij,i->nj", R_BI, free.sensors.camera.position_B)
         for k, point in enumerate(features):
@@ -244,8 +247,8 @@ def test_late_images_lack_what_was_hidden_when_they_were_taken():
     for _ in range(400):
         now.step()
         then.step()
-        taken.append(now.record("feature_valid"))
-        arrived.append(then.record("feature_valid"))
+        taken.append(now.record("block_valid")[:, FEATURE_SLICE])
+        arrived.append(then.record("block_valid")[:, FEATURE_SLICE])
     np.testing.assert_array_equal(arrived[7:], taken[:-7])
     assert 0.2 < np.mean(np.array(taken)[4::5, :, 0] > 0.0) < 0.9
 

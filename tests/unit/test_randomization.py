@@ -14,7 +14,7 @@ from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.task.draws import normal_quantile
 from quad_gym.params.distributions import Distribution
 from quad_gym.params.randomization import nominal_values
-from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, Control, Source
+from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, FEATURE_SLICE, Control, Source
 from quad_gym.rotations import euler_to_dcm
 from tests.unit.alarms import ALARM, alarm_score
 from tests.unit.compiled import Compiled
@@ -302,7 +302,7 @@ def test_a_camera_turned_in_its_mount_sees_what_a_turned_camera_sees():
     camera = SUITE.camera
     R_BI = quad_gym.rotations.quaternion_to_dcm(batch.record("q"))[0]
     for i, X in enumerate(camera.features_I):
-        if batch.record("feature_valid")[0, i] == 0.0:
+        if batch.record("block_valid")[:, FEATURE_SLICE][0, i] == 0.0:
             continue
         in_B = R_BI @ (np.array(X) - batch.record("r")[0]) - camera.position_B
         in_C = turn @ euler_to_dcm(camera.attitude) @ in_B

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import quad_gym
-from quad_gym.records import GateDecision
+from quad_gym.records import FEATURE_SLICE, GateDecision
 from quad_gym.sensors import Camera
 from tests.field_flights import fly, state_errors
 from tests.filter_states import set_at_rest
@@ -73,7 +73,7 @@ def test_a_rough_start_is_consistent_after_the_first_image_in_steps_only(kind):
         errors, L = state_errors(batch), batch.record("L")
         white = np.linalg.solve(L, errors[..., np.newaxis])[..., 0]
         sums[above] = (white**2).sum()
-        assert (batch.record("feature_valid").sum(axis=1) > 0).mean() > 0.99
+        assert (batch.record("block_valid")[:, FEATURE_SLICE].sum(axis=1) > 0).mean() > 0.99
     expected = stats.chi2(15 * 2000)
     assert expected.cdf(sums[0.01]) < 1.0 - ALARM
     assert expected.cdf(sums[0.01]) > ALARM

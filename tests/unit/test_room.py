@@ -104,5 +104,5 @@ def test_fields_without_room_read_as_nothing():
     assert batch.record("L").shape == (11, 15, 15)
     assert (batch.record("L") == 0.0).all()
     assert np.isnan(batch.record("block_nis")).all()
-    assert batch.record("filter_status").dtype == batch.record("late_valid").astype("u8").dtype
+    assert batch.record("filter_status").dtype == batch.record("waiting_valid").astype("u8").dtype
     assert batch.record("r_hat", np.array([3, 5])).shape == (2, 3)

@@ -7,7 +7,7 @@ from scipy import stats
 import quad_gym
 from quad_gym.params.sensors import InitialPoseParams
 from quad_gym.params.suites import SUITES
-from quad_gym.records import VELOCITY_BLOCK
+from quad_gym.records import BASELINE_BLOCK, FEATURE_SLICE, POSITION_BLOCK, VELOCITY_BLOCK
 from quad_gym.sensors import GnssReceiver
 from tests.field_flights import attitudes, fly, state_errors, steps
 from tests.filter_states import set_at_rest
@@ -71,7 +71,7 @@ def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
     squares = []
     for _ in range(40):
         batch.step()
-        measured = batch.record("velocity_valid") > 0.0
+        measured = batch.record("block_valid")[:, VELOCITY_BLOCK] > 0.0
         squares.append(batch.record("block_nis")[measured, VELOCITY_BLOCK])
     nis = np.concatenate(squares)
     assert len(nis) > 3000
@@ -83,10 +83,10 @@ def test_the_lever_arm_of_a_velocity_turns_with_the_present_rate():
 
 def ticks_of_fixes(suite, count, ticks):
     batch = fly(suite, count, task="hover")
-    rows = [batch.record("position_valid")]
+    rows = [batch.record("block_valid")[:, POSITION_BLOCK]]
     for _ in range(ticks):
         batch.step()
-        rows.append(batch.record("position_valid"))
+        rows.append(batch.record("block_valid")[:, POSITION_BLOCK])
     return np.array(rows) > 0.0
 
 
@@ -98,9 +98,9 @@ def test_sensors_measure_at_their_phase_and_rate():
     fixes, images = [], []
     for tick in range(1, 101):
         batch.step()
-        if batch.record("position_valid").all():
+        if batch.record("block_valid")[:, POSITION_BLOCK].all():
             fixes.append(tick)
-        if batch.record("feature_valid").any():
+        if batch.record("block_valid")[:, FEATURE_SLICE].any():
             images.append(tick)
     assert fixes == list(range(5, 101, 20))
     assert images == list(range(2, 101, 4))
@@ -180,10 +180,10 @@ def test_gnss_velocity_is_that_of_the_antenna_with_its_noise():
 
 
 def test_velocity_is_measured_by_suites_that_have_it_only():
-    assert fly("rtk", 2, task="hover").record("velocity_valid").shape == (2,)
+    assert fly("rtk", 2, task="hover").record("block_valid")[:, VELOCITY_BLOCK].shape == (2,)
     lab = fly("lab", 2, task="hover")
     steps(lab, 0.1)
-    assert not lab.record("velocity_valid").any()
+    assert not lab.record("block_valid")[:, VELOCITY_BLOCK].any()
     ukf = quad_gym.UnscentedKalmanFilter(quad_gym.sensor_suite("lab"))
     ukf.initialize((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="velocity"):
@@ -216,8 +216,8 @@ def test_indoors_the_filter_starts_from_its_mark_and_never_has_a_fix():
     assert_normal(off, np.zeros(3), np.eye(3) * 0.05**2)
     for _ in range(50):
         batch.step()
-        assert not batch.record("position_valid").any()
-        assert not batch.record("baseline_valid").any()
+        assert not batch.record("block_valid")[:, POSITION_BLOCK].any()
+        assert not batch.record("block_valid")[:, BASELINE_BLOCK].any()
 
 
 def test_the_friendly_filter_takes_no_fix_without_gnss():

@@ -100,7 +100,7 @@ def test_a_filter_that_mends_nothing_is_lost_for_about_as_long_as_it_is_wrong(ta
         steps(batch, 1.0)
         lost.append(batch.record("diverged") > 0.0)
         wrong.append(nees(batch, slice(0, 9)) > RIGHT)
-        held = (batch.record("doubt_tick") - batch.record("tick")) * imu.dt
+        held = (batch.record("alarm_tick") - batch.record("tick")) * imu.dt
         assert held.max() < 60.0  # not P/Q of biases that hardly change, 1e5 s
     assert np.mean(lost[1:4]) == 1.0
     assert np.mean(np.array(wrong) & ~np.array(lost)) <= 0.02

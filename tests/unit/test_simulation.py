@@ -9,7 +9,15 @@ import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.faults import AccelBiasStep, GnssOutage
 from quad_gym.params.task import TaskParams
-from quad_gym.records import FLIGHT, RESULTS, Autoreset, Control, Source
+from quad_gym.records import (
+    FEATURE_SLICE,
+    FLIGHT,
+    POSITION_BLOCK,
+    RESULTS,
+    Autoreset,
+    Control,
+    Source,
+)
 
 ENDLESS = TaskParams(duration=0)
 SEEDS = np.random.default_rng(5).permutation(1000)[:100].tolist()
@@ -301,16 +309,16 @@ def test_sensors_that_are_switched_off_measure_nothing_until_they_are_back():
         return batch
 
     batch = flown((None, None))
-    assert batch.record("position_valid").all()
-    assert batch.record("feature_valid")[:, :2].any()
+    assert batch.record("block_valid")[:, POSITION_BLOCK].all()
+    assert batch.record("block_valid")[:, FEATURE_SLICE][:, :2].any()
     batch = flown((False, None), (None, False))
-    assert not batch.record("position_valid").any()
-    assert not batch.record("feature_valid").any()
+    assert not batch.record("block_valid")[:, POSITION_BLOCK].any()
+    assert not batch.record("block_valid")[:, FEATURE_SLICE].any()
     batch = flown((False, False), (True, None))
-    assert batch.record("position_valid").all()
-    assert not batch.record("feature_valid").any()
+    assert batch.record("block_valid")[:, POSITION_BLOCK].all()
+    assert not batch.record("block_valid")[:, FEATURE_SLICE].any()
     batch.reset(seeds=[0, 1])
-    assert batch.record("feature_valid")[:, :2].any()
+    assert batch.record("block_valid")[:, FEATURE_SLICE][:, :2].any()
     same = flown((True, True), (True, None), (None, None))
     assert same.snapshot().tobytes() == flown(*[(None, None)] * 3).snapshot().tobytes()
     with pytest.raises(ValueError, match="gnss"):

@@ -106,7 +106,7 @@ def draws_of_call(name, function, call):
     if "_draw_of(k)" in source:
         values["k"] = FAULTS
         assert len(values) == 1  # so that the places of kinds are told apart
-    elif name.endswith("measurements.aid"):  # of sensor s, or of the slow state k
+    elif name.endswith("sensors.aid"):  # of sensor s, or of the slow state k
         names = {node.id for node in ast.walk(call.args[1]) if isinstance(node, ast.Name)}
         values |= {"s": range(AIDS)} if "s" in names else {}
         values |= {"k": range(0, MAX_SLOW, 3)} if "k" in names else {}
@@ -209,9 +209,7 @@ def quantities_of(batch, task):
         "outage and jump begin": batch.record("fault_from")[:, [OUTAGE, JUMP]],
         "outage lasts": (batch.record("fault_until") - batch.record("fault_from"))[:, [OUTAGE]],
         "jump": batch.record("fault_vector")[:, JUMP],
-        "first measurements": np.stack(
-            [batch.record("gnss_wait"), batch.record("camera_wait")], axis=1
-        ),
+        "first measurements": batch.record("wait"),
     }
     for name, values in vectors.items():
         drawn |= {f"{name} {i}": values[:, i] for i in range(values.shape[1])}

@@ -5,13 +5,14 @@ import pytest
 
 import quad_gym
 from quad_gym.estimation import UnscentedKalmanFilter
-from quad_gym.records import FLIGHT, FilterStatus
+from quad_gym.records import FEATURE_BLOCKS, FLIGHT, MAX_BLOCKS, FilterStatus
 from tests.circle_flight import record_circle
 from tests.lane_filter import EIGHT, STATE, LaneFilter
 
 LAB = quad_gym.sensor_suite("lab")
 TICKS = 200
 RECORDINGS = [record_circle(LAB, TICKS, seed=100 + lane) for lane in range(EIGHT)]
+ALL_VALID = (np.arange(MAX_BLOCKS) < FEATURE_BLOCKS + len(LAB.camera.features_I)).astype(float)
 PRESENT = np.random.default_rng(0).random((TICKS, EIGHT, 3)) < 0.7
 
 
@@ -123,7 +124,7 @@ def test_missing_measurements_of_neighbors_do_not_move_a_lane(calm):
 def test_wild_measurements_of_a_neighbor_do_not_move_a_lane(calm, name, value):
     def wild(filters, k):
         if k == 7:
-            filters.put(5, **{name: value}, position_valid=1, baseline_valid=1, feature_valid=1)
+            filters.put(5, **{name: value}, block_valid=ALL_VALID)
 
     moved = fly(LaneFilter(LAB), upset=wild)
     for lane in (0, 1, 2, 3, 4, 6, 7):
@@ -158,7 +159,7 @@ def started():
 @pytest.mark.parametrize("name", ["gnss_position", "gnss_baseline", "pixels"])
 def test_a_measurement_that_is_not_finite_fails_the_update_of_its_lane_alone(name, value):
     filters = started()
-    filters.put(4, **{name: value}, feature_valid=1.0)
+    filters.put(4, **{name: value}, block_valid=ALL_VALID)
     before = {field: filters.get(field) for field in (*STATE, "nis", "nis_dimension")}
     filters.update()
     for field, values in before.items():

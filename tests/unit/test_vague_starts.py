@@ -162,6 +162,6 @@ def test_a_flight_in_few_steps_does_not_notice_one_in_many_beside_it():
 
 
 def test_information_of_the_steps_of_an_image_adds_up_to_one():
-    few = (update._FIRST_OF_FEW, *update._DOUBTS[update._FEW + 1 :])
-    for doubts in (update._DOUBTS, few):
-        assert sum(1.0 / doubt for doubt in doubts) == pytest.approx(1.0, rel=1e-12)
+    few = (update._FIRST_OF_FEW, *update._FACTORS[update._FEW + 1 :])
+    for factors in (update._FACTORS, few):
+        assert sum(1.0 / factor for factor in factors) == pytest.approx(1.0, rel=1e-12)

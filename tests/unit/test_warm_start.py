@@ -10,7 +10,7 @@ from quad_gym.batch.warm_start import WARM_UP
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.params.suites import SUITES
-from quad_gym.records import FLIGHT_FIELDS
+from quad_gym.records import FLIGHT_FIELDS, POSITION_BLOCK
 from tests.field_flights import attitudes, fly, nees, state_errors, steps
 from tests.unit.alarms import assert_normal
 
@@ -144,10 +144,10 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
         "diverged",
         "accepted_tick",
         "fit_tick",
-        "doubt_tick",
+        "alarm_tick",
     }
     seen = {"r_seen", "v_seen", "R_seen", "w_seen", "estimation_error", "gate"}
-    fixes = {"position_valid", "baseline_valid", "velocity_valid", "configuration"}
+    fixes = {"block_valid", "configuration"}
     for field in FLIGHT_FIELDS:
         if field.name not in estimates | seen | fixes:
             np.testing.assert_array_equal(
@@ -159,9 +159,9 @@ def test_cold_is_the_default_and_the_truth_is_the_same_either_way():
 def test_a_first_fix_is_a_measurement_of_a_filter_that_it_did_not_start():
     rtk = quad_gym.sensor_suite("rtk").simplified()
     suite = rtk.replace(gnss=rtk.gnss.replace(phase=0.0), camera=None)
-    assert not fly(suite, 3).record("position_valid").any()
+    assert not fly(suite, 3).record("block_valid")[:, POSITION_BLOCK].any()
     warm = fly(suite, 3, filter_start="warm")
-    assert warm.record("position_valid").all()
+    assert warm.record("block_valid")[:, POSITION_BLOCK].all()
     assert (warm.record("nis_dimension") == 9.0).all()
 
 

@@ -10,7 +10,7 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.peers import Measured, peers
 from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.kernels.compiling import Stage
-from quad_gym.records import FLIGHT_BLOCK, WIDTH, aligned_zeros
+from quad_gym.records import FEATURE_SLICE, FLIGHT_BLOCK, WIDTH, aligned_zeros
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
@@ -19,7 +19,7 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
     for _ in range(ticks):
         names = ("gyro", "accel", "gnss_position", "gnss_baseline", "pixels")
         gyro, accel, position, baseline, pixels = (batch.record(name)[flight] for name in names)
-        features = int(batch.record("feature_valid")[flight].sum())
+        features = int(batch.record("block_valid")[flight, FEATURE_SLICE].sum())
         recorded.append(Measured(gyro, accel, position, baseline, pixels[:features]))
         batch.step()
     return recorded
@@ -38,7 +38,8 @@ def time_filter(count: int, effort: timing.Effort, recorded_ticks: int) -> list[
     for measurements, sensors in ((6, with_camera.replace(camera=None)), (12, with_camera)):
         features = (measurements - 6) // 3
         batch = hovering(count, sensors=sensors)
-        seeing = np.flatnonzero(batch.record("feature_valid").sum(axis=1) == features)
+        seen = batch.record("block_valid")[:, FEATURE_SLICE].sum(axis=1)
+        seeing = np.flatnonzero(seen == features)
         blocks = aligned_zeros(count // WIDTH, FLIGHT_BLOCK)
         for name in FLIGHT_BLOCK.names or ():  # repeats flights that see all features
             values = batch.record(name)[np.resize(seeing, count)]

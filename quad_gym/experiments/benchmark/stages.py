@@ -14,6 +14,7 @@ from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.kernels.single import run_stage
+from quad_gym.records import Act, Sensor
 
 SUITES = ("standard", "lab")
 FILTER = (Stage.PREDICT, Stage.UPDATE)
@@ -55,6 +56,8 @@ class Staged:
         self._flag = int(stage in AT_THE_START)
         if stage == Stage.UPDATE:
             self._flag = int(batch._settings["feature_count"][0])
+        elif stage.name in Sensor.__members__:
+            self._flag = int(Act.SAMPLE)
         self._others = (batch._world, batch._model, batch._settings, batch._work[0])
         self._table = linked_table(needed_stages(batch._settings[0]))
 
@@ -78,8 +81,8 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
 
     Stages then have their mean cost, even if sensors do not measure in every tick.
     """
-    clocks = [int(batch._settings[f"{sensor}_ticks"][0]) for sensor in ("gnss", "camera")]
-    period = math.lcm(*(clock for clock in clocks if clock > 0))
+    clocks = batch._settings["sensor_ticks"][0][[Sensor.GNSS, Sensor.CAMERA]]
+    period = math.lcm(*(int(clock) for clock in clocks if clock > 0))
     blocks = batch.snapshot()
     for instant in range(period):
         blocks[instant::period] = batch.snapshot()[instant::period]

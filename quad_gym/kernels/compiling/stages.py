@@ -25,14 +25,15 @@ from numba.np.numpy_support import from_dtype
 
 from quad_gym.kernels.compiling.decorators import entry, kernel
 from quad_gym.records import (
+    FIRST_AID,
     FLIGHT_BLOCK,
     FOLLOWED,
     PARAMS_BLOCK,
     SETTINGS,
     WORK_BLOCK,
-    Aid,
     FilterForm,
     Layout,
+    Sensor,
     Supply,
 )
 
@@ -69,9 +70,7 @@ class Stage(IntEnum):
     DRIFT_BIASES = auto()
     FOLLOW = auto()
     ADVANCE_FAULTS = auto()
-    SET_ASIDE = auto()
     SAMPLE = auto()
-    EXCHANGE = auto()
     LATE_UPDATE = auto()
     UPDATE = auto()
     LOOK = auto()
@@ -93,9 +92,9 @@ class Stage(IntEnum):
     HIDE_FEATURES = auto()
     CORRUPT_FEATURES = auto()
     FORGET_INNOVATIONS = auto()
-    _ignore_ = "aid"
-    for aid in Aid:  # one for each aiding sensor, last and in their order
-        vars()[aid.name] = auto()
+    _ignore_ = "sensor"
+    for sensor in Sensor:  # last, in their order
+        vars()[sensor.name] = auto()
 
 
 class Source(NamedTuple):
@@ -187,7 +186,7 @@ def _contacts(s: Any) -> bool:
 
 
 def _hides(s: Any) -> bool:
-    return _filter(s) and bool(s["camera_ticks"] and s["obstacle_count"])
+    return _sensor(Sensor.CAMERA)(s) and bool(s["obstacle_count"])
 
 
 def _limits(s: Any) -> bool:
@@ -210,20 +209,13 @@ def _delays(s: Any) -> bool:
     return bool(s["action_delays"] > 0)
 
 
-def _aid(aid: Aid, late: bool) -> Callable[[Any], bool]:
-    def needed(s: Any) -> bool:
-        return _filter(s) and bool(s["aid_on"][aid]) and (not late or bool(s["aid_delay"][aid]))
-
-    return needed
+def _sensor(sensor: Sensor) -> Callable[[Any], bool]:
+    return lambda s: _filter(s) and bool(s["sensor_blocks"][sensor])
 
 
-def _aid_sources(aid: Aid) -> tuple[Source, Source]:
-    stage, name = Stage[aid.name], aid.name.lower()
-    function = f"measurements.{name}:{name}_stage"
-    return (
-        Source(stage, function, _aid(aid, late=True), ("aids", "late_aids")),
-        Source(stage, function, _aid(aid, late=False), ("aids",)),
-    )
+def _sensor_source(sensor: Sensor) -> Source:
+    name, parts = sensor.name.lower(), () if sensor < FIRST_AID else ("aids",)
+    return Source(Stage[sensor.name], f"sensors.{name}:{name}_stage", _sensor(sensor), parts)
 
 
 SOURCES = (
@@ -233,13 +225,13 @@ SOURCES = (
     Source(Stage.PREDICT, "filter.predict:predict_stage", _filter, ("filter",)),
     Source(
         Stage.LATE_UPDATE,
-        "filter.late:late_update_with_slow_stage",
+        "filter.delayed:late_update_with_slow_stage",
         lambda s: _slow(s) and _rewinds(s),
         ("late",),
     ),
-    Source(Stage.LATE_UPDATE, "filter.late:late_update_stage", _rewinds, ("late",)),
-    *(source for aid in Aid for source in _aid_sources(aid)),
-    Source(Stage.SAMPLE, "sensors.sample:sample_stage", _filter, ("filter",)),
+    Source(Stage.LATE_UPDATE, "filter.delayed:late_update_stage", _rewinds, ("late",)),
+    *map(_sensor_source, Sensor),
+    Source(Stage.SAMPLE, "sensors.imu:sample_stage", _filter, ("filter",)),
     Source(Stage.DRAW, "task.draws:draw_stage", _drawn, ("draws",)),
     Source(Stage.IMPOSE, "task.draws:impose_stage", _drawn, ("draws",)),
     Source(Stage.PLACE_FEATURES, "task.places:place_features_stage", _places, ("places",)),
@@ -258,8 +250,7 @@ SOURCES = (
     Source(Stage.AVERAGE_IMU, "sensors.imu:average_imu_stage", _imu_averages),
     Source(Stage.CORRUPT_FEATURES, "sensors.faults:corrupt_features_stage", _corrupts),
     Source(Stage.CORRUPT_GNSS, "sensors.faults:corrupt_gnss_stage", _corrupts),
-    Source(Stage.EXCHANGE, "filter.waiting:exchange_stage", _late, ("late",)),
-    Source(Stage.INCREMENT, "filter.waiting:increment_stage", _late, ("late",)),
+    Source(Stage.INCREMENT, "filter.preintegration:increment_stage", _late, ("late",)),
     Source(Stage.LOOK, "task.look:look_stage", _always),
     Source(Stage.JUDGE, "task.reward_and_endings:judge_stage", _always),
     Source(Stage.DRIFT_BIASES, "sensors.imu:drift_biases_stage", _filter),
@@ -271,8 +262,7 @@ SOURCES = (
         lambda s: _pad(s) or _grounded(s) or _imu_averages(s),
     ),
     Source(Stage.SUPPLY, "vehicle.air:supply_stage", lambda s: s["supply"] != Supply.NOMINAL),
-    Source(Stage.BEGIN_LATE, "filter.waiting:begin_late_stage", _late, ("late",)),
-    Source(Stage.SET_ASIDE, "filter.waiting:set_aside_stage", _late),
+    Source(Stage.BEGIN_LATE, "filter.preintegration:begin_late_stage", _late, ("late",)),
     Source(Stage.BEGIN_IMPERFECT, "sensors.imperfect:begin_imperfect_stage", _lasting, ("errors",)),
     Source(Stage.DISTURB_IMU, "sensors.imperfect:disturb_imu_stage", _imu_disturbed),
     Source(Stage.TURN_BASELINE, "sensors.imperfect:turn_baseline_stage", _heading_errs),
@@ -292,7 +282,7 @@ SOURCES = (
     Source(Stage.JUDGE_LANDING, "vehicle.ground:judge_landing_stage", _grounded),
     Source(Stage.SATURATE_IMU, "sensors.faults:saturate_imu_stage", _corrupts),
     Source(Stage.MEET_ROTORS, "sensors.faults:meet_rotors_stage", _faults),
-    Source(Stage.SUM_IMU, "sensors.sample:sum_imu_stage", _raw, ("raw",)),
+    Source(Stage.SUM_IMU, "sensors.imu:sum_imu_stage", _raw, ("raw",)),
     Source(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations_stage", _watches, ("watch",)),
 )
 """Every function of a stage; those that take longest to compile come first. Where a slot has

@@ -8,7 +8,7 @@ the second order, are zero. With `R(e) = I - [e x] + ...`:
 * `a = R_hat^T R(e)^T (f - b_a) - g e3`:  da = R_hat^T (de x f - db_a)
 * `e+ = e + dt S(e) (w - b_g)`:  de+ = de + dt ((de_th w_z, -de_phi w_z, -de_th w_x) - db_g)
 
-The derivatives of measurements are in the files of these, in `kernels/measurements/`.
+The derivatives of measurements are in the files of these, in `kernels/sensors/`.
 """
 
 from quad_gym.kernels.compiling import kernel

@@ -1,60 +1,47 @@
-"""Innovations of all blocks of a measurement: the gate of each, and the statistics of all of them.
+"""Innovations of all blocks of a measurement: gate and statistics.
 
-See `measurements/gate.py` for one block. Where one kind of measurement has been rejected
-`max_rejections` times in a row, the filter is more likely wrong than the sensor, see `recovery.py`.
+See `gate.py` for one block. Where one group of measurements has been rejected `max_rejections`
+times in a row, the filter is more likely wrong than the sensor, see `recovery.py`.
 """
 
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.measurements import call_measured
 from quad_gym.kernels.filter.recovery import follow_ratio, forget_corrections
-from quad_gym.kernels.measurements.aid import judge_aids, mark_failed_aids
-from quad_gym.kernels.measurements.blocks import judge
-from quad_gym.kernels.measurements.blocks import mark_failed as mark_failed_blocks
 from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, SENSOR_GROUPS
+from quad_gym.records import AID_BLOCKS, AIDS, FEATURE_BLOCKS, SENSOR_GROUPS, Act
+
+_GATE = int(Act.GATE)
 
 
 @kernel
-def judge_innovations(flight, p, work, settings, slow, stages, first_of_aids, mask, again):
-    """Keep the innovations of the present measurements and mask those beyond the gate.
+def gate_innovations(flight, p, work, settings, stages, mask, again):
+    """Store the innovations of the present measurements and mask those beyond the gate.
 
-    Where measurements are processed in steps, the first decides for all.
+    Where measurements are processed in steps, the first step decides for all.
 
     Args:
         flight: Record; keeps innovations, NIS, decisions and counters.
-        p: Parameters as the filter believes them.
-        work: Workspace, with `z` the innovation and `Rz` the measurement noise alone; afterwards
-            `left_out` says how many numbers were masked in each lane.
-        settings: What the batch does.
-        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
-        stages: The table of stages, which has those of aiding sensors; None without slow errors.
-        first_of_aids: Row at which aiding sensors begin.
-        mask: Which lanes.
-        again: Which lanes take a later step of measurements that they have met before.
+        p: Parameters assumed by the filter.
+        work: Workspace, with `nu` the innovation and `Rz` the measurement noise; on return,
+            `left_out` is how many numbers were masked in each lane.
+        settings: Configuration of the batch.
+        stages: Table of stages, with those of the sensors.
+        mask: Lanes to be updated.
+        again: Lanes in a later step of the same measurements.
     """
     zero = 0.0 * p.sigma_beta
     work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)
     work.judged_nis, work.judged_freedoms, work.left_out = zero, zero, zero
-    if slow is not None:
-        judge_aids(flight, p, work, slow, stages, first_of_aids)
-    judge(flight, p, work, settings, slow, 0)
+    call_measured(flight, p, work, settings, stages, _GATE)
     first = mask & (work.measured > 0.0) & logical_not(again)
     follow_ratio(flight, p, work.judged_nis, work.judged_freedoms, first)
 
 
 @kernel
-def mark_failed(flight, p, work, settings, slow, failed):
-    """Say of the blocks of an update that failed as a whole that none was taken."""
-    work.taking = select(failed, 1.0, 0.0)
-    mark_failed_blocks(flight, p, work, settings, slow, 0)
-    if slow is not None:
-        mark_failed_aids(flight, work, slow)
-
-
-@kernel
 def forget_innovations(flight, feature_count, mask):
-    """Begin an episode without innovations, where `mask`."""
+    """Reset the innovations at the start of an episode, in the lanes `mask`."""
     blocks = FEATURE_BLOCKS + feature_count
     for k in range(blocks + AIDS):
         s = k if k < blocks else k - blocks + AID_BLOCKS

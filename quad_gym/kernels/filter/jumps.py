@@ -1,13 +1,12 @@
-"""A jump of the vehicle that the filter takes for drift of GNSS.
+"""Detection of a jump of the vehicle that the filter attributes to the drift of GNSS positions.
 
-Where GNSS positions drift (`slow.py`), the filter knows better how the vehicle has moved than where
-GNSS has drifted, so that it takes any fix that is off for drift, however suddenly it comes: once
-the drift has followed, no innovation is left. But corrections of the drift are white in a right
-filter, each with the variance that its update takes away, as those of biases are (`recovery.py`).
-Their sum over about a second has the deviation by which GNSS drifts meanwhile, 0.1 m with
-`consumer`, and shows what drift does not do. Then the position is doubted as much as the drift. The
-same happens when a barometer is rejected `max_rejections` times in a row, as it sees the vertical
-part of a jump.
+Where GNSS positions drift (`slow.py`), the filter predicts the motion better than the drift, so it
+attributes any offset of a fix to the drift, however sudden: once the drift has followed, no
+innovation is left. But corrections of the drift are white in a consistent filter, each with the
+variance that its update removes, like those of biases (`recovery.py`). Their sum over about a
+second has the standard deviation of the drift in that time, 0.1 m with `consumer`, and shows jumps.
+Then position and drift are inflated alike. The same happens when a barometer is rejected
+`max_rejections` times in a row, as it observes the vertical part of a jump.
 
 Source: ours.
 """
@@ -19,12 +18,12 @@ from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.simd.lanes import select
 
 _TIME = 1.5
-"""How long corrections of the drift are added up [s]; it follows fixes within 0.6 s, or as long as
-a gate rejects some."""
+"""Time over which corrections of the drift are summed [s]; the drift follows fixes within 0.6 s, or
+later while the gate rejects some."""
 _SUDDEN, _LIKELY = 24.0, 12.0
-"""Normalized square of their sum, chi-square of three numbers, beyond which it is no drift. That of
-a right filter exceeds it with a probability of 2e-5. Less, 0.7 %, where the filter is lost anyway:
-a barometer may have seen the vertical share of the jump."""
+"""Normalized square of their sum, chi-square with three degrees of freedom, beyond which it is a
+jump: exceeded with a probability of 2e-5 in a consistent filter. Less, 0.7 %, where the filter is
+flagged as diverged: a barometer may have seen the vertical part of the jump."""
 
 
 @kernel
@@ -54,7 +53,7 @@ def follow_drift_corrections(flight, p, L9, dx, columns, ok):
 
 @kernel
 def drifts_suddenly(flight):
-    """Where corrections of the drift are more than drift, and than the position's deviation.
+    """Lanes whose corrections exceed the drift and the standard deviation of the position.
 
     Less than the latter does no harm.
     """
@@ -67,10 +66,10 @@ def drifts_suddenly(flight):
 
 
 @kernel
-def doubt_position_and_drift(flight, P, doubted):
-    """Raise the variances of position and drift to what a jump may have been.
+def inflate_position_and_drift(flight, P, moved):
+    """Inflate position and drift to the square of the likely jump.
 
-    Some axes follow it later than others, so that none is raised by less than the mean.
+    Some axes follow it later than others, so none is inflated by less than the mean.
     """
     mean = 0.0 * flight.tick
     for i in range(3):
@@ -78,14 +77,14 @@ def doubt_position_and_drift(flight, P, doubted):
     for i in range(3):
         total = flight.drift_corrected[i]
         square = maximum(total * total, mean)
-        wanted = select(doubted, enlarge(square, MOST_POSITION), 0.0)
+        wanted = select(moved, enlarge(square, MOST_POSITION), 0.0)
         P[R + i, R + i] = maximum(P[R + i, R + i], wanted)
         P[D + i, D + i] = maximum(P[D + i, D + i], wanted)
 
 
 @kernel
 def forget_drift_corrections(flight, mask):
-    """Begin to add up corrections of the drift anew, where `mask`."""
+    """Reset the sum of corrections of the drift, in the lanes `mask`."""
     for i in range(3):
         flight.drift_corrected[i] = select(mask, 0.0, flight.drift_corrected[i])
         before = flight.drift_corrected_variance[i]

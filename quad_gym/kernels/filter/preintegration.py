@@ -24,7 +24,7 @@ Dellaert and D. Scaramuzza, IEEE Trans. Robotics 33(1), 2017.
 
 import math
 
-from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V
 from quad_gym.kernels.filter.lever_arm import LEVER_ARM, lever_force
 from quad_gym.kernels.maths.elementary import maximum
@@ -49,6 +49,7 @@ from quad_gym.kernels.maths.linalg import (
     transpose,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm, vector_to_dcm
+from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm
 
@@ -219,3 +220,18 @@ def take_columns(work, R_s, dR, dv, dr, back):
             M[R + i, j] = r[i]
             M[V + i, j] = v[i]
             M[E + i, j] = e[i]
+
+
+# ---- stages ----------------------------------------------------------------------------------
+
+
+@stage
+def begin_late_stage(flight, world, model, settings, work, stages, flag):
+    """Reset the sums of the IMU at the start of an episode."""
+    begin_increments(lanes_of(flight), lanes_of(work).mask > 0.0)
+
+
+@stage
+def increment_stage(flight, world, model, settings, work, stages, flag):
+    """Add the tick's IMU sample to the sums with which delayed measurements are retrodicted."""
+    add_increment(lanes_of(flight), lanes_of(model), settings.form)

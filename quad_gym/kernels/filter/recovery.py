@@ -1,19 +1,19 @@
-"""A filter that notices that it is wrong: what tells it, and when it counts as lost.
+"""Consistency monitoring: alarms, and when the filter counts as diverged.
 
-Four things tell a filter that its covariance does not explain what is measured; three are here.
+Four things show that the covariance does not explain the measurements; three are here.
 
-* **Rejections.** A kind of measurement was rejected `max_rejections` times in a row. The filter is
-  then more likely wrong than the sensor - unless GNSS is rejected while the camera's features fit,
-  which then speak for the estimate: GNSS stays out as long as they do.
-* **Drifts.** Innovations of a right filter are white. Their mean over the last 50 or so, in
-  deviations, exceeds `DRIFT_ALARM` in a right filter about once in a million times.
-* **Corrections that go one way.** Corrections of the IMU biases are white in a right filter, too,
-  each with the variance that its update takes away, P- less P+. That is no more than the biases'
-  driving noise puts in, so that their sum over some seconds shows a bias that has changed long
-  before innovations do, in which attitude and position may make up for each other.
+* **Rejections.** A group of measurements was rejected `max_rejections` times in a row. Then the
+  filter is more likely wrong than the sensor - unless GNSS is rejected while the camera's features
+  fit, which supports the estimate: GNSS stays out as long as they do.
+* **Drifts.** Innovations of a consistent filter are white. Their mean over the last 50 or so, in
+  standard deviations, exceeds `DRIFT_ALARM` in a consistent filter about once in a million times.
+* **Corrections that go one way.** Corrections of the IMU biases are white in a consistent filter,
+  too, each with the variance that its update removes, P- less P+. That is no more than the biases'
+  driving noise adds, so their sum over some seconds shows a bias that has changed long before
+  innovations do, in which attitude and position may compensate each other.
 * **Jumps of the drift** of GNSS positions, see `jumps.py`.
 
-What a filter doubts then is in `doubts.py`.
+`inflation.py` then inflates the covariance.
 
 Source: for the drift of innovations R. K. Mehra and J. Peschon, Automatica 7, 1971. That
 corrections are white with these variances follows from the whiteness of innovations.
@@ -46,22 +46,22 @@ _HARMLESS = 1.0 / _ONE_WAY**2
 """So that this sum is more than the bias's own deviation."""
 LARGEST = 3.0
 """Innovations count as no more deviations than that in the mean, for the sake of outliers."""
-LOST_RATIO, FOUND_RATIO = 2.1, 1.5
-"""Mean NIS over its degrees of freedom at which a filter counts as lost, and as found again."""
+DIVERGED_RATIO, CONVERGED_RATIO = 2.1, 1.5
+"""Mean NIS over degrees of freedom at which a filter counts as diverged, and no longer does."""
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
-DOUBT_TIME = 1.0
-"""How long a filter counts as lost after a doubt, at least [s]."""
+ALARM_TIME = 1.0
+"""Shortest time that a filter counts as diverged after an alarm [s]."""
 _LONGEST_MEMORY = 60.0
 """How long it does at most where nothing is mended [s]: what a bias that hardly any measurement
 tells of does by then shows again."""
 FITTING_FEATURES = 3
-"""Features of an image that speak for the estimate against GNSS."""
+"""Fitting features of an image that support the estimate against GNSS."""
 _FIT_TIME = 1.0
-"""How long they do [s]."""
+"""How long they support it [s]."""
 MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
-"""Largest deviations that a doubt raises to [m/s^2], [rad/s], [rad]."""
+"""Largest standard deviations after an inflation [m/s^2], [rad/s], [rad]."""
 MOST_POSITION, MOST_VELOCITY = 100.0, 20.0
-"""Likewise [m], [m/s]. A rejected position counts in full, even beyond."""
+"""Largest standard deviations after an inflation [m], [m/s]. A rejected position counts in full."""
 _REMAINING = 9.0
 """Square of how many times as large an error may be as what shows of it: corrections or drift of
 GNSS may have followed in part."""
@@ -70,14 +70,14 @@ MOST_ANGLE = math.pi / math.sqrt(3.0)
 
 
 @kernel
-def follow_drift(flight, group, has, first, second, third):
-    """Follow the mean innovation of a group, in deviations, where a lane `has` one."""
+def follow_drift(flight, group, valid, first, second, third):
+    """Average the innovation of a group, in standard deviations, in the lanes `valid`."""
     values = (first, second, third)
     for i in range(3):
         value = clip(values[i], -LARGEST, LARGEST)
         mean = flight.innovation_drift[group, i]
         mean = mean + _MEMORY * (value - mean)
-        flight.innovation_drift[group, i] = select(has, mean, flight.innovation_drift[group, i])
+        flight.innovation_drift[group, i] = select(valid, mean, flight.innovation_drift[group, i])
 
 
 @kernel
@@ -145,26 +145,26 @@ def one_way(flight, first):
 
 @kernel
 def follow_ratio(flight, p, nis, freedoms, mask):
-    """Follow NIS over its degrees of freedom, and say whether the filter is lost, where `mask`."""
+    """Average NIS over its degrees of freedom, and flag divergence, in the lanes `mask`."""
     ratio = minimum(nis / maximum(freedoms, 1.0), _LARGEST_RATIO)
     measured = mask & (freedoms > 0.0)
     mean = flight.nis_ratio + _RATIO_MEMORY * (ratio - flight.nis_ratio)
     flight.nis_ratio = select(measured, mean, flight.nis_ratio)
-    limit = select(flight.diverged > 0.0, FOUND_RATIO, LOST_RATIO)
-    in_doubt = (flight.tick - flight.doubt_tick) * p.dt < DOUBT_TIME
-    lost = (flight.nis_ratio > limit) | in_doubt
-    flight.diverged = select(mask, select(lost, 1.0, 0.0), flight.diverged)
+    limit = select(flight.diverged > 0.0, CONVERGED_RATIO, DIVERGED_RATIO)
+    alarmed = (flight.tick - flight.alarm_tick) * p.dt < ALARM_TIME
+    diverged = (flight.nis_ratio > limit) | alarmed
+    flight.diverged = select(mask, select(diverged, 1.0, 0.0), flight.diverged)
 
 
 @kernel
 def camera_fits(flight, p):
-    """Where features have fitted lately, so that they speak for the estimate against GNSS."""
+    """Lanes whose features have fitted lately, which supports the estimate against GNSS."""
     return (flight.tick - flight.fit_tick) * p.dt <= _FIT_TIME
 
 
 @kernel
 def forget_corrections(flight, mask):
-    """Begin to add up corrections anew, where `mask`."""
+    """Reset the sums of corrections, in the lanes `mask`."""
     for i in range(6):
         flight.corrected[i] = select(mask, 0.0, flight.corrected[i])
         flight.corrected_variance[i] = select(mask, 0.0, flight.corrected_variance[i])
@@ -176,7 +176,7 @@ def forget_corrections(flight, mask):
 
 @kernel
 def begin_recovery(flight, mask):
-    """Forget all doubts at the start of an episode, where `mask`."""
+    """Reset the monitoring at the start of an episode, in the lanes `mask`."""
     for group in range(SENSOR_GROUPS):
         flight.accepted_tick[group] = select(mask, 0.0, flight.accepted_tick[group])
         for i in range(3):
@@ -184,13 +184,13 @@ def begin_recovery(flight, mask):
             flight.innovation_drift[group, i] = select(mask, 0.0, drift)
     flight.nis_ratio = select(mask, 1.0, flight.nis_ratio)
     flight.diverged = select(mask, 0.0, flight.diverged)
-    flight.doubt_tick = select(mask, -1e9, flight.doubt_tick)
+    flight.alarm_tick = select(mask, -1e9, flight.alarm_tick)
     flight.fit_tick = select(mask, -1e9, flight.fit_tick)
 
 
 @kernel
 def drifts(flight, group):
-    """Where the innovations of a group of measurements drift."""
+    """Lanes in which the innovations of a group of measurements drift."""
     largest = abs(flight.innovation_drift[group, 0])
     largest = maximum(largest, abs(flight.innovation_drift[group, 1]))
     largest = maximum(largest, abs(flight.innovation_drift[group, 2]))
@@ -198,12 +198,11 @@ def drifts(flight, group):
 
 
 @kernel
-def suspect_group(flight, p, work, group, free):
-    """Note whether a group of measurements makes the filter doubt itself, where it is `free` to."""
-    may = (work.taking > 0.0) & free
-    doubted = may & (flight.rejected_in_row[group] >= p.max_rejections)
-    work.doubted[group] = select(doubted, 1.0, 0.0)
-    work.drifting = select(may & drifts(flight, group), 1.0, work.drifting)
+def raise_alarm(flight, p, work, group, free):
+    """Set work.alarm of a group of measurements, and work.drifting, in the lanes `free`."""
+    alarm = free & (flight.rejected_in_row[group] >= p.max_rejections)
+    work.alarm[group] = select(alarm, 1.0, 0.0)
+    work.drifting = select(free & drifts(flight, group), 1.0, work.drifting)
 
 
 @kernel
@@ -226,27 +225,27 @@ def raise_diagonal(P, first, least):
 
 
 @kernel
-def doubt_acceleration(p, P, acceleration, doubted):
-    """Raise the deviations of accelerometer biases, and of the tilt to what g makes of it."""
+def inflate_accel_bias(p, P, acceleration, alarm):
+    """Raise the standard deviations of accelerometer biases, and 1/g of it of the tilt."""
     bounded = minimum(acceleration, MOST_ACCEL_BIAS)
-    raise_diagonal(P, BA, select(doubted > 0.0, bounded * bounded, 0.0))
+    raise_diagonal(P, BA, select(alarm > 0.0, bounded * bounded, 0.0))
     tilt = minimum(acceleration / p.gravity, MOST_TILT)
-    raise_diagonal(P, E, select(doubted > 0.0, tilt * tilt, 0.0))
+    raise_diagonal(P, E, select(alarm > 0.0, tilt * tilt, 0.0))
 
 
 @kernel
-def doubt_rate(P, rate, doubted):
-    """Raise the deviations of gyro biases."""
+def inflate_gyro_bias(P, rate, alarm):
+    """Raise the standard deviations of gyro biases."""
     bounded = minimum(rate, MOST_GYRO_BIAS)
-    raise_diagonal(P, BG, select(doubted > 0.0, bounded * bounded, 0.0))
+    raise_diagonal(P, BG, select(alarm > 0.0, bounded * bounded, 0.0))
 
 
 @kernel
-def doubt_heading(P, vertical, square, doubted):
+def inflate_heading(P, vertical, square, alarm):
     """Raise the variance of the heading, the angle about the `vertical` in B."""
     P_ee = load_block(P, E, E)
     heading = dot(vertical, apply(P_ee, vertical))
-    wanted = select(doubted, minimum(square, MOST_ANGLE * MOST_ANGLE), 0.0)
+    wanted = select(alarm, minimum(square, MOST_ANGLE * MOST_ANGLE), 0.0)
     more = maximum(wanted - heading, 0.0)
     store_block(P, E, E, add_outer(P_ee, scale(more, vertical), vertical))
 
@@ -267,23 +266,23 @@ def _memory(flight, p, i, drive):
 
 
 @kernel
-def tell_drifts(flight, p, mask):
-    """Count a filter that only watches its innovations as lost while they drift, where `mask`.
+def flag_drifts(flight, p, mask):
+    """Flag a filter without a gate as diverged while innovations drift, in the lanes `mask`.
 
-    The mean of a sensor that no longer measures stays what it was, and tells nothing of now. As
-    nothing is mended, the filter stays lost for as long as its biases remember.
+    The mean of a sensor that no longer measures is outdated and does not count. As nothing is
+    inflated, the flag stays for as long as the biases take to be corrected.
     """
-    drifting = flight.nis_ratio > LOST_RATIO
+    drifting = flight.nis_ratio > DIVERGED_RATIO
     for group in range(SENSOR_GROUPS):
-        recent = (flight.tick - flight.accepted_tick[group]) * p.dt <= DOUBT_TIME
+        recent = (flight.tick - flight.accepted_tick[group]) * p.dt <= ALARM_TIME
         drifting = drifting | (recent & drifts(flight, group))
     accel, _ = one_way(flight, 0)
     gyro, _ = one_way(flight, 3)
     drifting = mask & (drifting | accel | gyro)
     if any_of(drifting):
-        memory = DOUBT_TIME + 0.0 * p.dt
+        memory = ALARM_TIME + 0.0 * p.dt
         for i in range(3):
             memory = maximum(memory, _memory(flight, p, i, p.accel_bias_drive))
             memory = maximum(memory, _memory(flight, p, 3 + i, p.gyro_bias_drive))
-        held = maximum(flight.doubt_tick, flight.tick + (memory - DOUBT_TIME) / p.dt)
-        flight.doubt_tick = select(drifting, held, flight.doubt_tick)
+        held = maximum(flight.alarm_tick, flight.tick + (memory - ALARM_TIME) / p.dt)
+        flight.alarm_tick = select(drifting, held, flight.alarm_tick)

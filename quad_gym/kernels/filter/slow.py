@@ -11,8 +11,8 @@ far as it is better than that. White noise in its place would have to be so stro
 counted for nothing. (R. G. Brown and P. Y. C. Hwang, Introduction to Random Signals and Applied
 Kalman Filtering, section on colored measurement noise.)
 
-There can be the drift of GNSS positions (three states in I, the first three of d), and what aiding
-sensors have (`kernels/measurements/`): three numbers each, then one number each. As blocks are 3 x
+There can be the drift of GNSS positions (three states in I, the first three of d), and what other
+sensors have (`kernels/sensors/`): three numbers each, then one number each. As blocks are 3 x
 3, their number is a multiple of three; the states that fill it up are constant, of variance one,
 and never measured.
 
@@ -203,7 +203,7 @@ def shift_slow(flight, slow, columns, ok, shift):
             flight.L_slow[i, j] = select(ok, columns[D + i, last - j], flight.L_slow[i, j])
 
 
-# ---- doubts ----------------------------------------------------------------------------------
+# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel
@@ -218,7 +218,7 @@ def fill_slow(flight, slow, P):
         store_block(P, D + i, D + i, sum_of_squares(M, i, D + i + 3))
 
 
-# ---- late measurements -----------------------------------------------------------------------
+# ---- delayed measurements --------------------------------------------------------------------
 
 
 @kernel

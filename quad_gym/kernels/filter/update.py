@@ -1,11 +1,11 @@
-"""The filter's update: by all blocks of a measurement at once.
+"""The measurement update of the filter, with all blocks of a measurement at once.
 
-See `predict.py` for the form of the unscented transform. What a block measures, and what the filter
-expects of it, is in its file in `kernels/measurements/`; each has three rows of the stacked
-measurement. A block that a lane lacks is masked: its deviations and innovation are zero and its
-noise is one, which gives exactly the update without it. Blocks that every lane lacks are left out.
+See `predict.py` for the form of the unscented transform. Sensors (`kernels/sensors/`) fill three
+rows of the stacked measurement for each block. A block that a lane lacks is masked: its deviations
+and innovation are zero and its noise is one, which gives exactly the update without it. Blocks that
+no lane has are left out.
 
-The EKF shares everything with the UKF: where this one puts the half-differences of a pair of sigma
+The EKF shares everything with the UKF: where the UKF puts the half-differences of a pair of sigma
 points into a column, the EKF puts the derivative of the model times the column of L; the half-sums
 less the center, which carry the second order, are zero.
 """
@@ -15,11 +15,13 @@ import math
 import numpy as np
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.filter.doubts import raise_doubts
 from quad_gym.kernels.filter.error_state import BA, BG, E, R, V, reset_matrix, turn_factor
-from quad_gym.kernels.filter.innovations import judge_innovations, mark_failed
+from quad_gym.kernels.filter.inflation import inflate
+from quad_gym.kernels.filter.innovations import gate_innovations
 from quad_gym.kernels.filter.jumps import follow_drift_corrections
-from quad_gym.kernels.filter.recovery import follow_corrections, tell_drifts
+from quad_gym.kernels.filter.measurements import call_measured, count_measured, mark_failed
+from quad_gym.kernels.filter.recovery import flag_drifts, follow_corrections
+from quad_gym.kernels.filter.rows import columns_of
 from quad_gym.kernels.filter.slow import load_slow, shift_slow, turn_iron
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
@@ -45,23 +47,21 @@ from quad_gym.kernels.maths.linalg import (
     sum_of_squares,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm, split_rotation
-from quad_gym.kernels.measurements.aid import count_aids, expect_aids
-from quad_gym.kernels.measurements.blocks import count, expect
-from quad_gym.kernels.measurements.rows import columns_of
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import FEATURE_BLOCKS, FilterForm, FilterStatus, GateDecision
+from quad_gym.records import FEATURE_BLOCKS, Act, FilterForm, FilterStatus, GateDecision
 
 _EKF, _TURN = int(FilterForm.EKF), int(FilterForm.TURN)
 _GATE, _WATCH = int(FilterForm.GATE), int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _GRADUAL = int(FilterForm.GRADUAL)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _UNSURE = float(GateDecision.UNSURE)
+_EXPECT = int(Act.EXPECT)
 
 
 @kernel
 def _store_rows(a, m):
-    """Write a matrix some of whose elements are constants."""
+    """Write a matrix with constant elements."""
     store3(a[0], m[0])
     store3(a[1], m[1])
     store3(a[2], m[2])
@@ -69,7 +69,7 @@ def _store_rows(a, m):
 
 @kernel
 def _split_turns(flight, work, c):
-    """Fill work.odd and work.even with the turns of the sigma points."""
+    """Fill work.odd and work.even with the rotations of the sigma points."""
     for j in range(9):
         even, odd, _ = split_rotation(scale(c, load_column3(flight.L, E, j)))
         _store_rows(work.odd[j], odd)
@@ -78,19 +78,19 @@ def _split_turns(flight, work, c):
 
 @kernel
 def _innovate(work, n, c):
-    """Turn work.z into the innovation: what was measured less what the sigma points expect."""
+    """Fill work.nu, the innovation: the measurement less the mean of the sigma points."""
     S, mu = work.E, work.mu
     for k in range(n):
         total = S[0, k]
         for j in range(1, 9):
             total = total + S[j, k]
         mu[k] = total / c
-        work.z[k] = work.z[k] - work.h[k] - mu[k]
+        work.nu[k] = work.z[k] - work.z_hat[k] - mu[k]
 
 
 @kernel
-def _sum_noise(p, work, n, doubt):
-    """Multiply the measurement noise in work.Rz by `doubt` and add the even parts' share."""
+def _sum_noise(p, work, n, factor):
+    """Multiply the measurement noise in work.Rz by `factor` and add the even parts' share."""
     S, mu = work.E, work.mu
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
     for i in range(0, n, 3):
@@ -99,14 +99,14 @@ def _sum_noise(p, work, n, doubt):
             block = sum_of_outers_of_rows(S, S, i, j, 9)
             block = add_outer(block, mu_i, (mu[j], mu[j + 1], mu[j + 2]))
             if i == j:
-                noise = scale33(doubt, load_block(work.Rz, i, i))
+                noise = scale33(factor, load_block(work.Rz, i, i))
                 block = (add(block[0], noise[0]), add(block[1], noise[1]), add(block[2], noise[2]))
             store_block(work.Rz, i, j, block)
 
 
-_DOUBTS = (1e6, 1e6 / 9.0, 1e5 / 9.0, 1e4 / 9.0, 1e3 / 9.0, 100.0 / 9.0, 10.0 / 9.0)
+_FACTORS = (1e6, 1e6 / 9.0, 1e5 / 9.0, 1e4 / 9.0, 1e3 / 9.0, 100.0 / 9.0, 10.0 / 9.0)
 """Factors on the noise of the steps of a measurement; the sum of their inverses is one."""
-_LAST = len(_DOUBTS) - 1
+_LAST = len(_FACTORS) - 1
 _FEW, _FIRST_OF_FEW = _LAST - 2, 100.0
 """The first of the last three steps, and its factor where these are enough."""
 _VAGUE = 0.2
@@ -114,8 +114,8 @@ _VAGUE = 0.2
 
 
 @kernel
-def update(flight, p, work, settings, mask, slow=None, stages=None):
-    """Condition the estimate on the valid measurements of the present instant, where `mask`.
+def update(flight, p, work, settings, stages, mask, slow=None):
+    """Update the estimate with the valid measurements of the present instant, in the lanes `mask`.
 
     A lane whose result is not finite keeps its state bit for bit, sets UPDATE_FAILED and counts it.
     The gate masks after the spread c of the sigma points was chosen for all measurements; c enters
@@ -124,20 +124,20 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
     With GRADUAL, lanes whose attitude is uncertain process images in steps: three updates by the
     same measurements with more noise, or seven where a direction is uncertain by `_VAGUE`, each
     about the estimate that the one before has left. Their information adds up to that of the
-    measurements, so that a linear model would see no difference; the derivatives of this one are
+    measurements, so it makes no difference for a linear model; the derivatives of this one are
     taken where they matter. (R. Zanetti, "Recursive Update Filtering for Nonlinear Estimation",
     IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
-        p: Parameters as the filter believes them.
+        p: Parameters assumed by the filter.
         work: Workspace.
-        settings: The filter's form and the features in use.
-        mask: Which lanes.
+        settings: The filter's form and its sensors.
+        stages: Table of stages, with those of the sensors.
+        mask: Lanes to work on.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
-        stages: The table of stages, which has those of aiding sensors; None without slow errors.
     """
-    loose, first, form = mask & (p.sigma_spread < 0.0), _LAST, settings.form  # nowhere
+    loose, first, form = mask & (p.sigma_spread < 0.0), _LAST, settings.form  # all false
     hidden, vague = loose, loose
     if (form & _GRADUAL) != 0 and settings.feature_count > 0:
         loose, vague = _are_loose(flight, p, work, settings.feature_count)
@@ -148,12 +148,12 @@ def update(flight, p, work, settings, mask, slow=None, stages=None):
                 hidden = _hide_unsure(flight, work, settings.feature_count, loose)
     failures = flight.update_failures
     for part in range(first, _LAST + 1):
-        few = _FIRST_OF_FEW if part == _FEW else _DOUBTS[part]
-        doubt = select(vague, _DOUBTS[part], select(loose, few, 1.0))
+        few = _FIRST_OF_FEW if part == _FEW else _FACTORS[part]
+        factor = select(vague, _FACTORS[part], select(loose, few, 1.0))
         well = flight.update_failures == failures  # a step that fails is the last
         taking = mask & well & (vague | (loose & (part >= _FEW)) | (part == _LAST))
         again = (vague & (part > 0)) | (loose & (part > _FEW))
-        _update_by(flight, p, work, settings, taking, doubt, again, slow, stages)
+        _update_by(flight, p, work, settings, stages, taking, factor, again, slow)
     if any_of(hidden):
         _show_hidden(flight, work, settings, hidden)
     if (form & _GRADUAL) != 0:
@@ -172,11 +172,11 @@ def _are_loose(flight, p, work, feature_count):
     position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
     attitude = P_ee[0][0] + P_ee[1][1] + P_ee[2][2]
     too_much, r = p.recursive_update_threshold * p.recursive_update_threshold, load3(flight.r_hat)
-    loose = attitude < 0.0  # nowhere
+    loose = attitude < 0.0  # all false
     vague = loose
     for i in range(feature_count):
         offset = sub(load3(p.features[i]), r)
-        square, seen = dot(offset, offset), flight.feature_valid[i] > 0.0
+        square, seen = dot(offset, offset), flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         loose = loose | (seen & (position > (too_much - attitude) * square))
         unsure = seen & (position > (p.gate_uncertainty - attitude) * square)
         work.hidden[i] = select(unsure, 1.0, 0.0)
@@ -191,23 +191,23 @@ def _hide_unsure(flight, work, feature_count, mask):
 
     Each step would infer a wrong distance from a wrong direction and make the filter overconfident.
     """
-    some = work.hidden[0] < 0.0  # nowhere
+    some = work.hidden[0] < 0.0  # all false
     for i in range(feature_count):
         hidden = mask & (work.hidden[i] > 0.0)
         some = some | hidden
         work.hidden[i] = select(hidden, 1.0, 0.0)
-        flight.feature_valid[i] = select(hidden, 0.0, flight.feature_valid[i])
+        valid = flight.block_valid[FEATURE_BLOCKS + i]
+        flight.block_valid[FEATURE_BLOCKS + i] = select(hidden, 0.0, valid)
     return some
 
 
 @kernel
 def _show_hidden(flight, work, settings, mask):
-    """Undo that, and say of these features that they were left out: they have no innovation."""
+    """Restore hidden features, and mark them as left out: they have no innovation."""
     for i in range(settings.feature_count):
-        hidden = mask & (work.hidden[i] > 0.0)
-        flight.feature_valid[i] = select(hidden, 1.0, flight.feature_valid[i])
+        hidden, block = mask & (work.hidden[i] > 0.0), FEATURE_BLOCKS + i
+        flight.block_valid[block] = select(hidden, 1.0, flight.block_valid[block])
         if (settings.form & _WATCH) != 0:
-            block = FEATURE_BLOCKS + i
             flight.gate[block] = select(hidden, _UNSURE, flight.gate[block])
             flight.block_nis[block] = select(hidden, np.nan, flight.block_nis[block])
             for axis in range(3):
@@ -217,87 +217,64 @@ def _show_hidden(flight, work, settings, mask):
 
 
 @kernel
-def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
-    """Condition the estimate on the measurements with `doubt` times their noise, where `mask`.
+def _whiten(work, n, columns):
+    """Solve the update: NIS, and where the noise is positive definite.
 
-    `again`: where these measurements were met before, with another doubt.
+    On return, work.M is the factor K of I + C C^T = K K^T with C = A^T Rz^(-T/2), and work.t is
+    K^-1 C Rz^(-1/2) nu.
     """
-    work.measured, form = 0.0 * flight.tick, settings.form
-    first_of_aids = count(flight, p, work, settings, slow, 0)
-    n = first_of_aids
-    if slow is not None:
-        n = count_aids(flight, work, slow, first_of_aids)
-    if n == 0:
-        return
-    states, estimated = 15, 15  # those that fill up the slow ones are not estimated
-    if slow is not None:
-        states, estimated = 15 + slow.slow_states, 15 + slow.slow_errors
-    columns = columns_of(slow)
-    last, measured = columns - 1, work.measured
-    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
-    work.spread, work.inverse_spread = c, 1.0 / c
-    if (form & _EKF) == 0:
-        _split_turns(flight, work, c)
-    expect(flight, p, work, settings, slow, 0)
-    if slow is not None:
-        expect_aids(flight, p, work, slow, stages, first_of_aids)
-    _innovate(work, n, c)
-    if (form & _WATCH) != 0:
-        judge_innovations(flight, p, work, settings, slow, stages, first_of_aids, mask, again)
-        measured = measured - work.left_out
-    _sum_noise(p, work, n, doubt)
-
-    # C = A^T Rz^(-T/2), kept as rows of work.A; y = Rz^(-1/2) innovation
-    A, z, N, t, L9 = work.A, work.z, work.N, work.t, work.L9
+    A, nu, M, t = work.A, work.nu, work.M, work.t
     pivot = cholesky(work.Rz, n, work.inverse_diagonal)
-    solve_right(A, columns, work.Rz, n, work.inverse_diagonal, 0)
-    solve_left_vector(work.Rz, z, n, work.inverse_diagonal)
-    nis = z[0] * z[0]
+    solve_right(A, columns, work.Rz, n, work.inverse_diagonal, 0)  # rows of C
+    solve_left_vector(work.Rz, nu, n, work.inverse_diagonal)
+    nis = nu[0] * nu[0]
     for k in range(1, n):
-        nis = nis + z[k] * z[k]
-
-    # N = I + C C^T = K K^T, t = K^-1 C y
+        nis = nis + nu[k] * nu[k]
     for j in range(columns):
-        total = A[j, 0] * z[0]
+        total = A[j, 0] * nu[0]
         for k in range(1, n):
-            total = total + A[j, k] * z[k]
+            total = total + A[j, k] * nu[k]
         t[j] = total
     for i in range(0, columns, 3):
         for j in range(0, i + 3, 3):
             if i == j:
-                store_block(N, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
+                store_block(M, i, i, add_to_diagonal(sum_of_squares(A, i, n), 1.0))
             else:
-                store_block(N, i, j, sum_of_outers(A, i, A, j, n))
-    cholesky(N, columns, work.inverse_diagonal)
-    solve_left_vector(N, t, columns, work.inverse_diagonal)
+                store_block(M, i, j, sum_of_outers(A, i, A, j, n))
+    cholesky(M, columns, work.inverse_diagonal)
+    solve_left_vector(M, t, columns, work.inverse_diagonal)
     for j in range(columns):
         nis = nis - t[j] * t[j]
+    return nis, pivot > 0.0
 
-    # L9 K^-T: with the columns last first it is the updated factor's, last first again
-    L = flight.L
+
+@kernel
+def _correct(flight, work, states, columns, slow):
+    """Fill work.L9 with L9 K^-T, the updated factor, and work.dx; return the sum of dx.
+
+    With the columns last first, L9 K^-T is the updated factor's, last first again.
+    """
+    L, L9, t, dx, last = flight.L, work.L9, work.t, work.dx, columns - 1
     for i in range(15):
         for j in range(min(columns, 15)):
             L9[i, last - j] = L[i, j]
     if slow is not None:
         load_slow(flight, slow, L9)
-    solve_right(L9, states, N, columns, work.inverse_diagonal, columns - 3)
-
-    dx = work.h  # no longer needed
-    total = 0.0 * nis
+    solve_right(L9, states, work.M, columns, work.inverse_diagonal, columns - 3)
+    total = 0.0 * work.spread
     for i in range(states):
         shift = L9[i, 0] * t[0]
         for j in range(1, columns):
             shift = shift + L9[i, j] * t[j]
         dx[i] = shift
         total = total + shift
-    if (form & _TURN) != 0:
-        correction = (dx[E], dx[E + 1], dx[E + 2])
-        T = reset_matrix(correction)
-        if slow is not None:
-            turn_iron(flight, slow, p, L9, T, correction, columns)
-        turn_factor(L9, T, states, columns)
-    wanted = mask & (measured > 0.0)
-    ok = wanted & (pivot > 0.0) & is_finite(total)
+    return total
+
+
+@kernel
+def _keep(flight, p, work, form, columns, ok, slow):
+    """Keep the updated estimate and factor, in the lanes `ok`."""
+    L, L9, dx, last = flight.L, work.L9, work.dx, columns - 1
     keep3(flight.r_hat, ok, add(load3(flight.r_hat), (dx[R], dx[R + 1], dx[R + 2])))
     keep3(flight.v_hat, ok, add(load3(flight.v_hat), (dx[V], dx[V + 1], dx[V + 2])))
     if (form & _WATCH) != 0:
@@ -314,30 +291,67 @@ def _update_by(flight, p, work, settings, mask, doubt, again, slow, stages):
             L[i, j] = select(ok, L9[i, last - j], L[i, j])
     if slow is not None:
         shift_slow(flight, slow, L9, ok, dx)
+
+
+@kernel
+def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
+    """Update with the measurements, their noise multiplied by `factor`, in the lanes `mask`.
+
+    `again`: lanes in a later step of the same measurements.
+    """
+    n, form = count_measured(flight, work, settings), settings.form
+    if n == 0:
+        return
+    columns, states, estimated = 9, 15, 15
+    if slow is not None:
+        columns, states = columns_of(slow), 15 + slow.slow_states
+        estimated = 15 + slow.slow_errors  # the others only fill up a block
+    measured = work.measured
+    c = p.sigma_spread * math.sqrt(p.sigma_kappa + 1.0 * estimated + measured)
+    work.spread, work.inverse_spread = c, 1.0 / c
+    if (form & _EKF) == 0:
+        _split_turns(flight, work, c)
+    call_measured(flight, p, work, settings, stages, _EXPECT)
+    _innovate(work, n, c)
+    if (form & _WATCH) != 0:
+        gate_innovations(flight, p, work, settings, stages, mask, again)
+        measured = measured - work.left_out
+    _sum_noise(p, work, n, factor)
+    nis, definite = _whiten(work, n, columns)
+    total = _correct(flight, work, states, columns, slow)
+    if (form & _TURN) != 0:
+        correction = (work.dx[E], work.dx[E + 1], work.dx[E + 2])
+        T = reset_matrix(correction)
+        if slow is not None:
+            turn_iron(flight, slow, p, work.L9, T, correction, columns)
+        turn_factor(work.L9, T, states, columns)
+    wanted = mask & (measured > 0.0)
+    ok = wanted & definite & is_finite(total) & is_finite(nis)
+    _keep(flight, p, work, form, columns, ok, slow)
     flight.nis = select(ok, nis, flight.nis)
     flight.nis_dimension = select(ok, measured, flight.nis_dimension)
-    failed = wanted & logical_not(ok)
-    flight.filter_status = select(
-        failed, flight.filter_status | _UPDATE_FAILED, flight.filter_status
-    )
+    failed, status = wanted & logical_not(ok), flight.filter_status
+    flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
     if (form & _WATCH) != 0 and any_of(failed):
-        mark_failed(flight, p, work, settings, slow, failed)
+        mark_failed(flight, settings, failed)
     if (form & _GATE) != 0:
-        raise_doubts(flight, p, work, settings, mask & logical_not(failed), slow, stages)
+        inflate(flight, p, work, settings, mask & logical_not(failed), slow, stages)
     elif (form & _WATCH) != 0:
-        tell_drifts(flight, p, mask)
+        flag_drifts(flight, p, mask)
 
 
 @stage
 def update_stage(flight, world, model, settings, work, stages, flag):
     """Update the estimate with the valid measurements."""
     scratch = lanes_of(work)
-    update(lanes_of(flight), lanes_of(model), scratch, settings, scratch.mask > 0.0)
+    mask = scratch.mask > 0.0
+    update(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask)
 
 
 @stage
 def update_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """The same by a filter that estimates slow errors of sensors."""
-    flying, scratch = lanes_of(flight), lanes_of(work)
-    update(flying, lanes_of(model), scratch, settings, scratch.mask > 0.0, settings, stages)
+    """Update the estimate of a filter with slow errors of sensors among its states."""
+    scratch = lanes_of(work)
+    mask = scratch.mask > 0.0
+    update(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask, settings)

@@ -51,11 +51,11 @@ def _heading(R_BI):
 
 @kernel
 def _draw_errors(settings, stream, work, slow, T):
-    """Fill work.h with the errors W u of a vehicle that looks east; return the normals of d."""
+    """Fill work.dx with the errors W u of a vehicle that looks east; return the normals of d."""
     states, draws = 15, WARM_DRAWS
     if slow is not None:
         states, draws = 15 + slow.slow_states, WARM_DRAWS + 2 * slow.slow_states
-    u, errors = work.z, work.h
+    u, errors = work.z, work.dx
     for k in range(8):
         u[2 * k], u[2 * k + 1] = normal_pair(stream, DRAW_WARM + k)
     n_a, n_g = six_normals(stream, DRAW_FIRST_BIASES)
@@ -131,7 +131,7 @@ def start_warm(flight, settings, stream, work, mask, slow=None):
     R_BI = quaternion_to_dcm(load4(flight.q))
     T = _heading(R_BI)
     n_d = _draw_errors(settings, stream, work, slow, T)
-    d = work.h
+    d = work.dx
     keep3(flight.r_hat, mask, sub(load3(flight.r), apply(T, load3(d[R : R + 3]))))
     keep3(flight.v_hat, mask, sub(load3(flight.v), apply(T, load3(d[V : V + 3]))))
     R_error = euler_to_dcm(load3(d[E : E + 3]))
@@ -163,8 +163,7 @@ def start_warm(flight, settings, stream, work, mask, slow=None):
             true = apply(T, (s[0] * n_d[0], s[1] * n_d[1], s[2] * n_d[2]))
             keep3(flight.gnss_drift, mask, true)
             keep3(flight.slow_hat, mask, sub(true, apply(T, load3(d[D : D + 3]))))
-        if slow.aids > 0:
-            _start_aids(flight, slow, T, d, mask)
+        _start_aids(flight, slow, T, d, mask)
 
 
 @stage

@@ -6,6 +6,7 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.obstacles.shapes import crosses
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import FEATURE_BLOCKS
 
 
 @kernel
@@ -18,7 +19,8 @@ def hide_features(flight, p, settings, mask):
         for k in range(settings.obstacle_count):
             center_I = load3(flight.obstacle_center[k])
             hidden = hidden | crosses(camera_I, X_I, center_I, settings, k)
-        flight.feature_valid[i] = select(mask & hidden, 0.0, flight.feature_valid[i])
+        valid = flight.block_valid[FEATURE_BLOCKS + i]
+        flight.block_valid[FEATURE_BLOCKS + i] = select(mask & hidden, 0.0, valid)
 
 
 @stage

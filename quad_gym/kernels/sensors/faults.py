@@ -25,7 +25,14 @@ from quad_gym.kernels.maths.linalg import (
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import DRAW_FAULTS, DRAW_HIDDEN, DRAWS_OF_FAULT, FAULT_KINDS, FaultKind
+from quad_gym.records import (
+    DRAW_FAULTS,
+    DRAW_HIDDEN,
+    DRAWS_OF_FAULT,
+    FAULT_KINDS,
+    FEATURE_BLOCKS,
+    FaultKind,
+)
 
 _FIRST, _FIRST_HIDDEN = np.uint64(DRAW_FAULTS), np.uint64(DRAW_HIDDEN)
 _DRAWS = np.uint64(DRAWS_OF_FAULT)
@@ -304,7 +311,7 @@ def _mistake_features(flight, settings, mask):
     stream = stream_of(flight)
     seen = 0.0 * flight.tick
     for i in range(settings.feature_count):
-        seen = seen + flight.feature_valid[i]
+        seen = seen + flight.block_valid[FEATURE_BLOCKS + i]
     chance, u = uniform_pair(stream, _draw_of(k) + _FOUR)
     w, _ = uniform_pair(stream, _draw_of(k) + _FIVE)
     struck = mask & (flight.fault_active[k] > 0.0) & (chance < settings.fault_share[k])
@@ -321,17 +328,17 @@ def _mistake_features(flight, settings, mask):
     zero = 0.0 * u
     x_first, y_first, x_second, y_second = zero, zero, zero, zero
     for i in range(settings.feature_count):
-        valid = flight.feature_valid[i] > 0.0
+        valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
         here, there = valid & (rank == first), valid & (rank == second)
         x, y = flight.pixels[i, 0], flight.pixels[i, 1]
         x_first, y_first = select(here, x, x_first), select(here, y, y_first)
         x_second, y_second = select(there, x, x_second), select(there, y, y_second)
-        rank = rank + flight.feature_valid[i]
+        rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
 
     swaps = settings.fault_swaps > 0
     rank = zero
     for i in range(settings.feature_count):
-        valid = struck & (flight.feature_valid[i] > 0.0)
+        valid = struck & (flight.block_valid[FEATURE_BLOCKS + i] > 0.0)
         here, there = valid & (rank == first) & swaps, valid & (rank == second)
         x, y = flight.pixels[i, 0], flight.pixels[i, 1]
         x, y = select(here, x_second, x), select(here, y_second, y)
@@ -339,7 +346,7 @@ def _mistake_features(flight, settings, mask):
         flight.pixels[i, 1] = select(there, y_first, y)
         mistaken = select(here | there, 1.0, 0.0)
         flight.feature_mistaken[i] = select(mask, mistaken, flight.feature_mistaken[i])
-        rank = rank + flight.feature_valid[i]
+        rank = rank + flight.block_valid[FEATURE_BLOCKS + i]
 
 
 @kernel
@@ -351,9 +358,9 @@ def corrupt_features(flight, settings, mask):
     if settings.fault_on[_OCCLUSION]:
         covered = mask & (flight.fault_active[_OCCLUSION] > 0.0)
         for i in range(settings.feature_count):
-            hidden = covered & (flight.feature_hidden[i] > 0.0)
-            flight.feature_valid[i] = select(hidden, 0.0, flight.feature_valid[i])
-            flight.feature_fresh[i] = select(hidden, 0.0, flight.feature_fresh[i])
+            hidden, block = covered & (flight.feature_hidden[i] > 0.0), FEATURE_BLOCKS + i
+            flight.block_valid[block] = select(hidden, 0.0, flight.block_valid[block])
+            flight.block_fresh[block] = select(hidden, 0.0, flight.block_fresh[block])
     if settings.fault_on[_ASSOCIATIONS]:
         _mistake_features(flight, settings, mask)
 

@@ -27,7 +27,13 @@ from quad_gym.kernels.maths.random import normal_pair, six_normals, stream_of, u
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import logical_not, select
-from quad_gym.records import DRAW_BLUR, DRAW_HEADING, DRAW_IMU_ERRORS, DRAW_VIBRATION
+from quad_gym.records import (
+    DRAW_BLUR,
+    DRAW_HEADING,
+    DRAW_IMU_ERRORS,
+    DRAW_VIBRATION,
+    FEATURE_BLOCKS,
+)
 
 HIDDEN_BELOW = 1e-3
 """A feature on the ground is not below it [m]."""
@@ -124,8 +130,9 @@ def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
         lost = norm(sub(X_I, camera_I)) > p.max_range
         if ground_hides:
             lost = lost | logical_not(above) | (X_I[2] < p.ground_height - HIDDEN_BELOW)
-        kept = select(lost, 0.0, flight.feature_valid[i])
-        flight.feature_valid[i] = select(mask, kept, flight.feature_valid[i])
+        valid = flight.block_valid[FEATURE_BLOCKS + i]
+        kept = select(lost, 0.0, valid)
+        flight.block_valid[FEATURE_BLOCKS + i] = select(mask, kept, valid)
         if blurs:
             u, v = uniform_pair(stream, DRAW_BLUR + i)
             seen = mask & (kept > 0.0)

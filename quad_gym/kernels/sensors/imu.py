@@ -1,7 +1,7 @@
-"""The IMU: what it measures at the present instant, and how its biases drift.
+"""The IMU: its measurements, and the drift of its biases.
 
 Every draw has a fixed number within its instant, so that a measurement does not depend on which
-others are taken. What GNSS and camera measure is in `kernels/measurements/`.
+others are taken.
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
@@ -14,6 +14,7 @@ from quad_gym.kernels.maths.linalg import (
     load33,
     scale,
     select3,
+    store3,
     sub,
 )
 from quad_gym.kernels.maths.random import six_normals, stream_of
@@ -25,10 +26,7 @@ from quad_gym.kernels.vehicle.dynamics import (
     imu_point_acceleration,
     load_start,
 )
-from quad_gym.records import (
-    DRAW_BIAS,
-    DRAW_IMU,
-)
+from quad_gym.records import DRAW_BIAS, DRAW_IMU
 
 
 @kernel
@@ -102,6 +100,24 @@ def measure_imu_average(flight, p, start, mask):
     _sample_imu(flight, p, scale(rate, rotation_between(q_start, q_end)), f_B, mask)
 
 
+# ---- stages ----------------------------------------------------------------------------------
+
+
+@stage
+def sample_stage(flight, world, model, settings, work, stages, flag):
+    """Sample the IMU at the present instant; `flag`: 1 at the start of an episode."""
+    if flag == 0 and settings.imu_averages:  # at the start there is nothing to average
+        return
+    flying, scratch = lanes_of(flight), lanes_of(work)
+    mask = scratch.mask > 0.0
+    measure_imu(flying, lanes_of(world), mask)
+    call_stage(stages, Stage.FEEL_GROUND, flight, world, world, settings, work, 0)
+    call_stage(stages, Stage.DISTURB_IMU, flight, world, world, settings, work, 0)
+    if flag > 0:
+        keep3(flying.w_before, mask, load3(flying.w_meas))
+    call_stage(stages, Stage.SATURATE_IMU, flight, world, world, settings, work, 0)
+
+
 @stage
 def drift_biases_stage(flight, world, model, settings, work, stages, flag):
     """Let the true IMU biases drift over a tick."""
@@ -115,3 +131,11 @@ def average_imu_stage(flight, world, model, settings, work, stages, flag):
     measure_imu_average(flying, lanes_of(world), load_start(scratch), scratch.mask > 0.0)
     call_stage(stages, Stage.DISTURB_IMU, flight, world, model, settings, work, 0)
     call_stage(stages, Stage.SATURATE_IMU, flight, world, model, settings, work, 0)
+
+
+@stage
+def sum_imu_stage(flight, world, model, settings, work, stages, flag):
+    """Add the newest IMU sample to the sum since the last step."""
+    here = lanes_of(flight)
+    store3(here.gyro_sum, add(load3(here.gyro_sum), load3(here.gyro)))
+    store3(here.accel_sum, add(load3(here.accel_sum), load3(here.accel)))

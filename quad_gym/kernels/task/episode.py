@@ -1,4 +1,4 @@
-"""How an episode begins: its reference, its gates, its clocks and counters."""
+"""The start of an episode: its reference, gates and counters."""
 
 import math
 
@@ -6,7 +6,6 @@ from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.maths.elementary import minimum, sin_cos
 from quad_gym.kernels.maths.linalg import keep3, load3
 from quad_gym.kernels.maths.random import six_normals, stream_of, uniform_pair
-from quad_gym.kernels.measurements.clock import first_wait
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.follow import draw_path
@@ -15,7 +14,6 @@ from quad_gym.kernels.task.start import draw_start
 from quad_gym.records import (
     DRAW_COURSE,
     DRAW_GATES,
-    DRAW_PHASE,
     DRAW_SERIES,
     HEADING_ALONG,
     HEADING_TOWARD,
@@ -139,21 +137,6 @@ def draw_reference(flight, settings, stream, mask):
 
 
 @kernel
-def begin_clocks(flight, settings, stream, mask):
-    """Set when GNSS and camera measure first, where `mask`; nothing has been measured yet."""
-    gnss_share, camera_share = uniform_pair(stream, DRAW_PHASE)
-    wait = first_wait(settings.gnss_phase, settings.gnss_ticks, gnss_share)
-    flight.gnss_wait = select(mask, wait, flight.gnss_wait)
-    wait = first_wait(settings.camera_phase, settings.camera_ticks, camera_share)
-    flight.camera_wait = select(mask, wait, flight.camera_wait)
-    keep3(flight.gnss_drift, mask, (0.0, 0.0, 0.0))
-    flight.position_fresh = select(mask, 0.0, flight.position_fresh)
-    flight.baseline_fresh = select(mask, 0.0, flight.baseline_fresh)
-    for i in range(settings.feature_count):
-        flight.feature_fresh[i] = select(mask, 0.0, flight.feature_fresh[i])
-
-
-@kernel
 def begin_counters(flight, mask):
     """Set what counts steps, rewards and errors of an episode to its start, where `mask`."""
     flight.step = select(mask, 0.0, flight.step)
@@ -170,10 +153,9 @@ def begin_counters(flight, mask):
 
 @stage
 def begin_stage(flight, world, model, settings, work, stages, flag):
-    """Set clocks, reference and true state at the start of an episode, and its counters."""
+    """Set reference, true state and counters at the start of an episode."""
     flying, true, believed = lanes_of(flight), lanes_of(world), lanes_of(model)
     stream, mask = stream_of(flying), lanes_of(work).mask > 0.0
-    begin_clocks(flying, settings, stream, mask)
     draw_reference(flying, settings, stream, mask)
     call_stage(stages, Stage.FOLLOW, flight, world, model, settings, work, 0)
     draw_start(flying, true, believed, settings, lanes_of(work), stream, mask)

@@ -9,12 +9,18 @@ from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference, position_on_reference
 from quad_gym.records import (
+    AID_BLOCKS,
     AID_FREEDOMS,
     AIDS,
+    BASELINE_BLOCK,
     DRAWN_SIZE,
+    FEATURE_BLOCKS,
+    FIRST_AID,
     FIXED,
     FOLLOWED,
     MAX_GATES,
+    POSITION_BLOCK,
+    VELOCITY_BLOCK,
     Layout,
     Source,
     Task,
@@ -103,10 +109,11 @@ def _put_absolute(flight, p, settings, row):
 
 @kernel
 def _put_aids(flight, p, settings, row, k):
-    """What aiding sensors have measured since the last step, else zeros."""
+    """Measurements of sensors other than GNSS and camera since the last step, else zeros."""
     for s in range(AIDS):
-        if settings.aid_on[s] > 0:
-            fresh, scaled = flight.aid_fresh[s], flight.aid_fresh[s] / p.aid_scale[s]
+        if settings.sensor_blocks[FIRST_AID + s] > 0:
+            fresh = flight.block_fresh[AID_BLOCKS + s]
+            scaled = fresh / p.aid_scale[s]
             for i in range(AID_FREEDOMS[s]):
                 row[k + i] = scaled * flight.aid_measurement[s, i]
             row[k + AID_FREEDOMS[s]] = fresh
@@ -128,27 +135,27 @@ def _put_sensors(flight, p, settings, row):
     starts, share = flight.tick == 0.0, 1.0 / settings.ticks_per_step
     k = _put3(row, k, select3(starts, gyro, scale(share, load3(flight.gyro_sum))))
     k = _put3(row, k, select3(starts, accel, scale(share, load3(flight.accel_sum))))
-    fresh = flight.position_fresh
+    fresh = flight.block_fresh[POSITION_BLOCK]
     k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_position))))
     row[k] = fresh
     baseline = apply(R_IG, load3(flight.gnss_baseline))
-    fresh = flight.baseline_fresh / p.baseline_length
+    measured = flight.block_fresh[BASELINE_BLOCK]
+    fresh = measured / p.baseline_length
     k = _put3(row, k + 1, scale(fresh, baseline))
-    row[k] = flight.baseline_fresh
+    row[k] = measured
     k += 1
     if settings.gnss_velocity > 0:  # measured with every position
-        fresh = flight.position_fresh
+        fresh = flight.block_fresh[VELOCITY_BLOCK]
         k = _put3(row, k, scale(fresh, apply(R_IG, load3(flight.gnss_velocity))))
         row[k] = fresh
         k += 1
     for i in range(settings.feature_count):
-        fresh = flight.feature_fresh[i]
+        fresh = flight.block_fresh[FEATURE_BLOCKS + i]
         row[k] = fresh * flight.pixels[i, 0] / p.half_image[0]
         row[k + 1] = fresh * flight.pixels[i, 1] / p.half_image[1]
         row[k + 2] = fresh
         k += 3
-    if settings.aids > 0:
-        k = _put_aids(flight, p, settings, row, k)
+    k = _put_aids(flight, p, settings, row, k)
     return _put_reference(flight, p, settings, row, k)
 
 

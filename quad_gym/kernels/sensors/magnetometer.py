@@ -27,9 +27,9 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, D, E, R, V
 from quad_gym.kernels.filter.recovery import (
     MOST_ANGLE,
-    doubt_heading,
-    doubt_rate,
     drifts,
+    inflate_gyro_bias,
+    inflate_heading,
     raise_diagonal,
 )
 from quad_gym.kernels.maths.elementary import maximum, minimum, sin_cos
@@ -62,18 +62,20 @@ from quad_gym.kernels.maths.linalg import (
 )
 from quad_gym.kernels.maths.random import normal_pair, stream_of
 from quad_gym.kernels.maths.rotation import level_attitude, quaternion_to_dcm
-from quad_gym.kernels.measurements.aid import (
+from quad_gym.kernels.sensors.aid import (
     aid_due,
     begin_aid,
     deliver,
     deliver_first,
     draw_matrix,
+    gate_aid,
 )
-from quad_gym.kernels.measurements.aid_stage import aid_stage
+from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import select
-from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm
+from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm, Sensor
 
-_S = int(Aid.MAGNETOMETER)
+_S, _SENSOR = int(Aid.MAGNETOMETER), int(Sensor.MAGNETOMETER)
+_BLOCK = AID_BLOCKS + _S
 _EKF = int(FilterForm.EKF)
 _DRIFT_TIME = 0.5
 """Within such a time the magnetometer pulls the heading back [s]: less than it takes, so that the
@@ -81,15 +83,14 @@ bias may be more than a drift says."""
 
 
 @kernel
-def _begin(flight, p, settings, s, mask):
-    """Begin an episode, where `mask`."""
-    begin_aid(flight, p, settings, s, mask)
-    draw_matrix(flight, p, s, mask)
+def _begin(flight, p, settings, mask):
+    begin_aid(flight, p, settings, _S, mask)
+    draw_matrix(flight, p, _S, mask)
 
 
 @kernel
-def _measure(flight, p, settings, mask, starting):
-    """Measure where it is due."""
+def _sample(flight, p, settings, work, stages, mask, starting):
+    """Measure when due."""
     due = aid_due(flight, p, settings, _S, mask, starting)
     stream = stream_of(flight)
     a, b = normal_pair(stream, DRAW_AID + 2 * _S)
@@ -100,15 +101,15 @@ def _measure(flight, p, settings, mask, starting):
     field_B = add(field_B, apply(load33(flight.aid_matrix[_S]), field_B))
     noise = scale(p.aid_sigma[_S], (a, b, c))
     values = add(add(field_B, load3(flight.aid_vector[_S])), noise)
-    if starting and settings.heading_aid == _S and settings.warm == 0:
+    if starting and settings.heading_sensor == _SENSOR and settings.warm == 0:
         deliver_first(flight, _S, mask, values)
     else:
-        deliver(flight, settings, _S, mask, due, values)
+        deliver(flight, work, settings, _S, mask, due, values)
 
 
 @kernel
 def _align(flight, p, work, settings, mask):
-    """Give the filter's start the heading of the field, and the covariance that comes with it."""
+    """Initialize the heading with the direction of the field, and the covariance to match."""
     P, L, R_BI = work.P, flight.L, load33(flight.R_hat)
     m, z = load3(p.aid_numbers[_S]), load3(flight.aid_measurement[_S])
     R_BI = multiply(R_BI, level_attitude(apply_transposed(R_BI, z), m))
@@ -202,27 +203,27 @@ def _expected_field(flight, p, settings):
 
 
 @kernel
-def _put_center(flight, p, work, settings, k, has, f_B):
+def _put_center(flight, p, work, settings, k, valid, f_B):
     """Fill rows k to k + 2 of center, measured and noise."""
     first = settings.aid_vector[_S]
     center = add(f_B, load3(flight.slow_hat[first : first + 3]))
     variance = p.aid_sigma[_S] * p.aid_sigma[_S]
     for i in range(3):
-        work.h[k + i] = select(has, center[i], 0.0)
-        work.z[k + i] = select(has, flight.aid_measurement[_S, i], 0.0)
+        work.z_hat[k + i] = select(valid, center[i], 0.0)
+        work.z[k + i] = select(valid, flight.aid_measurement[_S, i], 0.0)
         for j in range(3):
             work.Rz[k + i, k + j] = 0.0 * variance
-        work.Rz[k + i, k + i] = select(has, variance, 1.0)
+        work.Rz[k + i, k + i] = select(valid, variance, 1.0)
 
 
 @kernel
 def _expect(flight, p, work, settings, k):
     """Fill rows k to k + 2."""
     L, M, inverse_c = flight.L, flight.L_slow, work.inverse_spread
-    has, last = flight.aid_valid[_S] > 0.0, D + settings.slow_states - 1
+    valid, last = flight.block_valid[_BLOCK] > 0.0, D + settings.slow_states - 1
     first, delta = settings.aid_vector[_S], settings.aid_scalar[_S]
     f_B, g_B = _expected_field(flight, p, settings)
-    _put_center(flight, p, work, settings, k, has, f_B)
+    _put_center(flight, p, work, settings, k, valid, f_B)
     zero = 0.0 * f_B[0]
     nothing = (zero, zero, zero)
     for j in range(last + 1):
@@ -237,34 +238,41 @@ def _expect(flight, p, work, settings, k):
                 bent = add_scaled(apply(even, turned), inverse_c, apply(odd, f_B))
                 straight = add(straight, bent)
                 half_sum = add_scaled(apply(odd, turned), inverse_c, apply(even, f_B))
-            store3(work.E[8 - j][k : k + 3], select3(has, half_sum, nothing))
-        store3(work.A[last - j][k : k + 3], select3(has, straight, nothing))
+            store3(work.E[8 - j][k : k + 3], select3(valid, half_sum, nothing))
+        store3(work.A[last - j][k : k + 3], select3(valid, straight, nothing))
 
 
 @kernel
-def _doubt(flight, p, work, settings, mask):
-    """What the filter doubts where the field is not where it expects it.
+def _gate(flight, p, work, settings, k):
+    gate_aid(flight, p, work, settings, _S, k, 3.0)
+
+
+@kernel
+def _inflate(flight, p, work, settings):
+    """Inflate hard iron, attitude and gyro biases.
 
     The variances of hard iron and of the heading are raised to the square of a rejected innovation.
-    Where innovations drift, a gyro turns the attitude while the magnetometer pulls it back: the
-    variances of the attitude are raised to the square of their mean, as an angle, and those of the
-    gyro's biases to that of the turn in `_DRIFT_TIME`.
+    Where innovations drift, a gyro bias rotates the attitude while the magnetometer pulls it back:
+    the variances of the attitude are raised to the square of the mean innovation, as an angle, and
+    those of the gyro biases to the square of the rate that rotates as far in `_DRIFT_TIME`.
     """
-    doubted = mask & (flight.rejected_in_row[AID_GROUPS + _S] >= p.max_rejections)
-    nu, k = load3(flight.innovation[AID_BLOCKS + _S]), D + settings.aid_vector[_S]
+    alarm, mask = work.alarm[AID_GROUPS + _S] > 0.0, work.taking > 0.0
+    nu, k = load3(flight.innovation[_BLOCK]), D + settings.aid_vector[_S]
     m, R_BI, P = load3(p.aid_numbers[_S]), load33(flight.R_hat), work.P
     square = nu[0] * nu[0] + nu[1] * nu[1] + nu[2] * nu[2]
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    doubt_heading(P, vertical, square / (m[0] * m[0] + m[1] * m[1]), doubted)
+    inflate_heading(P, vertical, square / (m[0] * m[0] + m[1] * m[1]), alarm)
     mean = load3(flight.innovation_drift[AID_GROUPS + _S])
-    sigma = load3(flight.innovation_sigma[AID_BLOCKS + _S])
+    sigma = load3(flight.innovation_sigma[_BLOCK])
     off = (mean[0] * sigma[0], mean[1] * sigma[1], mean[2] * sigma[2])
     turned = dot(off, off) / (m[0] * m[0] + m[1] * m[1])
     drifting = select(mask & drifts(flight, AID_GROUPS + _S), 1.0, 0.0)
     raise_diagonal(P, E, drifting * minimum(turned, MOST_ANGLE * MOST_ANGLE))
-    doubt_rate(P, math.sqrt(turned) / _DRIFT_TIME, drifting)
+    inflate_gyro_bias(P, math.sqrt(turned) / _DRIFT_TIME, drifting)
     for i in range(3):
-        P[k + i, k + i] = maximum(P[k + i, k + i], select(doubted, nu[i] * nu[i], 0.0))
+        P[k + i, k + i] = maximum(P[k + i, k + i], select(alarm, nu[i] * nu[i], 0.0))
 
 
-magnetometer_stage = aid_stage(Aid.MAGNETOMETER, _begin, _measure, _expect, _doubt, _align)
+magnetometer_stage = sensor_stage(
+    Sensor.MAGNETOMETER, _begin, _sample, _expect, _gate, _inflate, _align
+)

@@ -17,13 +17,19 @@ import numpy as np
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.directions import direction_noise
 from quad_gym.kernels.filter.error_state import E
+from quad_gym.kernels.filter.gate import add_nis, gate_direction, mask_rejected
 from quad_gym.kernels.filter.recovery import (
     camera_fits,
-    doubt_heading,
-    doubt_rate,
     follow_drift,
-    suspect_group,
+    inflate_gyro_bias,
+    inflate_heading,
     time_of,
+)
+from quad_gym.kernels.filter.rows import (
+    clear_slow_columns,
+    columns_of,
+    put_noise,
+    put_three,
 )
 from quad_gym.kernels.maths.elementary import maximum
 from quad_gym.kernels.maths.linalg import (
@@ -43,25 +49,12 @@ from quad_gym.kernels.maths.linalg import (
     scale,
     store_block,
 )
-from quad_gym.kernels.measurements.gate import judge_direction, leave_out
-from quad_gym.kernels.measurements.rows import (
-    clear_slow_columns,
-    columns_of,
-    put_noise,
-    put_three,
-)
-from quad_gym.kernels.measurements.triples import triple_functions
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import BASELINE_BLOCK, FilterForm, Sensor
+from quad_gym.records import BASELINE_BLOCK, FilterForm
 
-SENSOR = Sensor.GNSS
 _EKF = int(FilterForm.EKF)
 _COARSE = 0.05
 """Noise up to which that is left out [rad], as of the laboratory: it makes no difference."""
-
-count, mark_failed, set_aside, exchange, keep_valid, choose = triple_functions(
-    "baseline", BASELINE_BLOCK
-)
 
 # ---- simulation ------------------------------------------------------------------------------
 
@@ -84,7 +77,7 @@ def noisy_baseline(r_b, normals, sigma_b, floor, length):
 
 @kernel
 def measure(flight, p, R_BI, normals, mask):
-    """Measure the baseline in G, where `mask`."""
+    """Measure the baseline in G, in the lanes `mask`."""
     baseline_G = apply_transposed(load33(p.R_IG), apply_transposed(R_BI, load3(p.baseline)))
     measured = noisy_baseline(
         baseline_G, normals, p.baseline_sigma, p.direction_floor, p.baseline_length
@@ -96,90 +89,80 @@ def measure(flight, p, R_BI, normals, mask):
 
 
 @kernel
-def _center(flight, p, work, k, has, R_BI, unit_baseline):
-    """Fill the rows of what is expected, of what was measured, and of the noise."""
+def _center(flight, p, work, k, valid, R_BI, unit_baseline):
+    """Fill the rows of predicted measurement, measurement and noise."""
     u_I = apply_transposed(R_BI, unit_baseline)
-    put_three(work.h, k, has, u_I)
+    put_three(work.z_hat, k, valid, u_I)
     measured = apply(load33(p.R_IG), load3(flight.gnss_baseline))
-    put_three(work.z, k, has, scale(1.0 / norm(measured), measured))
+    put_three(work.z, k, valid, scale(1.0 / norm(measured), measured))
     variance = p.baseline_noise * p.baseline_noise
     noise = direction_noise(u_I, variance, p.direction_floor)
     white = p.baseline_sigma * p.baseline_sigma
     along = select(p.baseline_sigma > _COARSE, 2.0 * white * white, 0.0)
-    put_noise(work, k, has, add_outer(noise, scale(along, u_I), u_I))
+    put_noise(work, k, valid, add_outer(noise, scale(along, u_I), u_I))
 
 
 @kernel
-def expect(flight, p, work, settings, slow, k):
-    """Fill the rows from k on, if any lane has a baseline; return the row behind them."""
-    if not any_of(flight.baseline_valid > 0.0):
+def expect(flight, p, work, settings, k):
+    """Fill the rows from k on, if any lane has a baseline; return the next row."""
+    valid = flight.block_valid[BASELINE_BLOCK] > 0.0
+    if not any_of(valid):
         return k
-    L, last, has = flight.L, columns_of(slow) - 1, flight.baseline_valid > 0.0
+    L, last = flight.L, columns_of(settings) - 1
     R_BI, inverse_c = load33(flight.R_hat), work.inverse_spread
     unit_baseline = scale(1.0 / p.baseline_length, load3(p.baseline))
-    _center(flight, p, work, k, has, R_BI, unit_baseline)
-    clear_slow_columns(work, k, slow)
+    _center(flight, p, work, k, valid, R_BI, unit_baseline)
+    clear_slow_columns(work, k, settings)
     for j in range(9):
         A, S = work.A[last - j], work.E[8 - j]
         if (settings.form & _EKF) != 0:
             turned = cross(load_column3(L, E, j), unit_baseline)
-            put_three(A, k, has, apply_transposed(R_BI, turned))
-            put_three(S, k, has, scale(0.0, turned))
+            put_three(A, k, valid, apply_transposed(R_BI, turned))
+            put_three(S, k, valid, scale(0.0, turned))
         else:
             baseline_odd = scale(inverse_c, apply_transposed(load33(work.odd[j]), unit_baseline))
             baseline_even = scale(inverse_c, apply_transposed(load33(work.even[j]), unit_baseline))
-            put_three(A, k, has, apply_transposed(R_BI, baseline_odd))
-            put_three(S, k, has, apply_transposed(R_BI, baseline_even))
+            put_three(A, k, valid, apply_transposed(R_BI, baseline_odd))
+            put_three(S, k, valid, apply_transposed(R_BI, baseline_even))
     return k + 3
 
 
 @kernel
-def judge(flight, p, work, settings, slow, k):
-    """Keep the innovation in the rows from k on, and mask it beyond the gate."""
-    if not any_of(flight.baseline_valid > 0.0):
+def gate(flight, p, work, settings, k):
+    """Store the innovation in the rows from k on, and mask it beyond the gate."""
+    if not any_of(flight.block_valid[BASELINE_BLOCK] > 0.0):
         return k
-    has, columns = (work.taking > 0.0) & (flight.baseline_valid > 0.0), columns_of(slow)
-    rejected, _, scaled, nis = judge_direction(
-        flight, p, work, settings, k, BASELINE_BLOCK, has, columns, np.inf
+    valid = (work.taking > 0.0) & (flight.block_valid[BASELINE_BLOCK] > 0.0)
+    rejected, _, scaled, nis = gate_direction(
+        flight, p, work, settings, k, BASELINE_BLOCK, valid, np.inf
     )
-    first = has & logical_not(work.again > 0.0)
+    first = valid & logical_not(work.again > 0.0)
     follow_drift(flight, BASELINE_BLOCK, first, scaled[0], scaled[1], 0.0 * p.sigma_beta)
     # as for positions, see there
-    counts = select(has & logical_not(rejected & camera_fits(flight, p)), 1.0, 0.0)
-    work.judged_nis = work.judged_nis + counts * nis
-    work.judged_freedoms = work.judged_freedoms + 2.0 * counts
-    leave_out(flight, work, settings, k, BASELINE_BLOCK, has, rejected, columns, 3.0)
+    add_nis(work, first & logical_not(rejected & camera_fits(flight, p)), nis, 2.0)
+    mask_rejected(flight, work, settings, k, BASELINE_BLOCK, valid, rejected, 3.0)
     return k + 3
 
 
-# ---- doubts ----------------------------------------------------------------------------------
+# ---- inflation -------------------------------------------------------------------------------
 
 
 @kernel
-def suspect(flight, p, work, settings, slow, k):
-    """Note whether baselines make the filter doubt itself; not against a camera that fits."""
-    suspect_group(flight, p, work, BASELINE_BLOCK, logical_not(camera_fits(flight, p)))
-    return k
+def inflate(flight, p, work, settings):
+    """Inflate the attitude and the gyro biases.
 
-
-@kernel
-def doubt(flight, p, work, settings, slow, k):
-    """Raise the variances of what may be wrong, where baselines are doubted.
-
-    That is the heading by the innovation to the side, and roll and pitch by that up; the gyro may
-    have led there.
+    The heading is inflated by the innovation to the side, roll and pitch by the one up.
     """
-    R_BI, P, doubted = load33(flight.R_hat), work.P, work.doubted[BASELINE_BLOCK]
+    R_BI, P, alarm = load33(flight.R_hat), work.P, work.alarm[BASELINE_BLOCK]
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
-    side = select(doubted > 0.0, flight.innovation[BASELINE_BLOCK, 0], 0.0)
-    up = select(doubted > 0.0, flight.innovation[BASELINE_BLOCK, 1], 0.0)
+    side = select(alarm > 0.0, flight.innovation[BASELINE_BLOCK, 0], 0.0)
+    up = select(alarm > 0.0, flight.innovation[BASELINE_BLOCK, 1], 0.0)
     P_ee = load_block(P, E, E)
     heading = dot(vertical, apply(P_ee, vertical))
     tilt = 0.5 * (P_ee[0][0] + P_ee[1][1] + P_ee[2][2] - heading)
     more = maximum(up * up - tilt, 0.0)
     P_ee = add_outer(add_to_diagonal(P_ee, more), scale(-more, vertical), vertical)
     store_block(P, E, E, P_ee)
-    doubt_heading(P, vertical, side * side, doubted > 0.0)
+    inflate_heading(P, vertical, side * side, alarm > 0.0)
     turned = maximum(abs(side), abs(up))
-    doubt_rate(P, turned / time_of(flight, p, BASELINE_BLOCK), doubted)
-    return k
+    inflate_gyro_bias(P, turned / time_of(flight, p, BASELINE_BLOCK), alarm)

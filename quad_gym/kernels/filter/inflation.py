@@ -1,26 +1,26 @@
-"""What a filter doubts that notices that it is wrong: what becomes of its covariance.
+"""Covariance inflation after the filter detects that it is inconsistent.
 
-What may be wrong is not only what the sensor measures. An innovation that has grown for a time T
-since the last acceptance may come from biases, so their deviations become: nu / T of an angle
+The error need not be in what the sensor measures. An innovation that has grown for a time T since
+the last acceptance may come from biases, so their standard deviations become: nu / T of an angle
 for the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g of
-that for the tilt. What each measurement doubts is in its file in `kernels/measurements/`. Variances
-are raised to the square of these, not increased by it, so that doubts that repeat do not add up.
-Where GNSS positions drift, position and drift are raised to the square of three times an innovation
-or a sum of corrections, as the drift may have followed the error in part.
+that for the tilt. Each sensor inflates the states that it may have misled (`kernels/sensors/`).
+Variances are raised to the square of these numbers, not increased by it, so repeated alarms do not
+add up. Where GNSS positions drift, position and drift are raised to the square of three times an
+innovation or a sum of corrections, as the drift may have followed the error in part.
 
 Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
-states is multiplied by `_FACTOR`: what went wrong with the biases is in attitude, velocity and
-position, too, and correlations say how. So is the variance of the drift of GNSS positions, for
-which an error of the position may have been taken; to no more than drift can be. Slow errors of
-aiding sensors keep theirs: a constant one that has become uncertain may stay so, such as hard iron,
-and the heading with it. The biases get more than that: sixteen times their deviation for a drift,
-three times the corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
+states is multiplied by `_FACTOR`: the error of the biases has reached attitude, velocity and
+position, too, and correlations say how. So is the variance of the drift of GNSS positions, which
+may have absorbed an error of the position, up to its stationary value. Slow errors of other sensors
+keep theirs: a constant one that has become uncertain may stay so, such as hard iron, and with it
+the heading. The biases get more: sixteen times their standard deviation for a drift, three times
+the corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
 
-No alarm inflates a deviation beyond `MOST_POSITION` and its like. What nothing measures for a
-time, such as the heading in hover without a baseline, or the position in an outage of GNSS, would
-otherwise grow fourfold with each alarm, until sigma points mean nothing. The bounds act as a
-congruence P -> M P M with M diagonal in the position, velocity and biases, and in tilt and heading,
-so that P stays positive definite.
+No alarm inflates a standard deviation beyond `MOST_POSITION` and its like. States that are not
+observed for a time, such as the heading in hover without a baseline, or the position in an outage
+of GNSS, would otherwise grow fourfold with each alarm, until sigma points mean nothing. The bounds
+act as a congruence P -> M P M with M diagonal in the position, velocity and biases, and in tilt and
+heading, so that P stays positive definite.
 
 Source: ours.
 """
@@ -29,13 +29,14 @@ import math
 
 import numpy as np
 
-from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E, R, V
 from quad_gym.kernels.filter.jumps import (
-    doubt_position_and_drift,
     drifts_suddenly,
     forget_drift_corrections,
+    inflate_position_and_drift,
 )
+from quad_gym.kernels.filter.measurements import call_sensors
 from quad_gym.kernels.filter.recovery import (
     MOST_ACCEL_BIAS,
     MOST_ANGLE,
@@ -47,7 +48,7 @@ from quad_gym.kernels.filter.recovery import (
     enlarge,
     forget_corrections,
     one_way,
-    suspect_group,
+    raise_alarm,
     variance_of,
 )
 from quad_gym.kernels.filter.slow import fill_slow, keep_slow_factor
@@ -65,14 +66,24 @@ from quad_gym.kernels.maths.linalg import (
     store_block,
     sum_of_outers,
 )
-from quad_gym.kernels.measurements.blocks import doubt, suspect
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import AID_GROUPS, AIDS, SENSOR_GROUPS, Act, Aid, FilterStatus
+from quad_gym.records import (
+    AID_GROUPS,
+    BASELINE_BLOCK,
+    FIRST_GROUP,
+    GROUP_COUNT,
+    POSITION_BLOCK,
+    SENSOR_GROUPS,
+    SENSORS,
+    Act,
+    Aid,
+    FilterStatus,
+)
 
-_FIRST_AID, _DOUBT = int(Stage[Aid(0).name]), int(Act.DOUBT)
+_INFLATE = int(Act.INFLATE)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 _FACTOR, _BIAS_FACTOR = 16.0, 240.0
-"""Of the covariance, and what is added of the biases' variances, where innovations drift."""
+"""Factor on the covariance, and the share of the biases' variances that is added, after a drift."""
 _BAROMETER_GROUP = AID_GROUPS + int(Aid.BAROMETER)
 
 
@@ -84,7 +95,7 @@ def _mean_variance(flight, row):
 
 
 @kernel
-def _doubt_biases(flight, P, row, drifting, going, square, most):
+def _inflate_biases(flight, P, row, drifting, going, square, most):
     """Add to the variances of three biases from a row on, up to `most`."""
     more = select(drifting, minimum(_BIAS_FACTOR * _mean_variance(flight, row), most * most), 0.0)
     more = more + select(going, enlarge(square, most), 0.0)
@@ -123,8 +134,8 @@ def _inflate_drift(p, P, inflated):
     """Inflate the drift of GNSS positions, to no more than its stationary deviation.
 
     Its covariances with the other states stay as they are, so that correlations become weaker:
-    with the same ones, the fix that tells the sum of position and drift would tell unequally
-    inflated ones apart.
+    with the same ones, a fix, which observes the sum of position and drift, would separate them
+    where they are inflated unequally.
     """
     for i in range(3):
         a, s = p.slow_decay[i], p.slow_drive[i]
@@ -162,40 +173,51 @@ def bound_inflation(flight, P, inflated, states):
 
 
 @kernel
-def raise_doubts(flight, p, work, settings, mask, slow, stages):
-    """Inflate the covariance of what may be wrong, where the filter is, and `mask`.
+def _raise_alarms(flight, p, work, settings, mask):
+    """Fill work.alarm and work.drifting, in the lanes `mask`.
+
+    Positions and baselines raise no alarm while the camera fits.
+    """
+    work.taking, work.drifting = select(mask, 1.0, 0.0), 0.0 * flight.tick
+    contradicted = camera_fits(flight, p)
+    for sensor in range(SENSORS):
+        first = FIRST_GROUP[sensor]
+        for group in range(first, first + GROUP_COUNT[sensor]):
+            free = mask
+            if group in (POSITION_BLOCK, BASELINE_BLOCK):
+                free = mask & logical_not(contradicted)
+            work.alarm[group] = 0.0 * flight.tick
+            if settings.sensor_blocks[sensor] > 0:
+                raise_alarm(flight, p, work, group, free)
+
+
+@kernel
+def inflate(flight, p, work, settings, mask, slow, stages):
+    """Raise alarms and inflate the covariance of states that may be wrong, in the lanes `mask`.
 
     Args:
         flight: Record; reads innovations, rejections and drifts, changes the covariance.
-        p: Parameters as the filter believes them.
+        p: Parameters assumed by the filter.
         work: Workspace.
-        settings: What the batch does.
-        mask: Which lanes.
+        settings: Configuration of the batch.
+        mask: Lanes to work on.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
-        stages: The table of stages, which has those of aiding sensors; None without slow errors.
+        stages: Table of stages.
     """
-    work.taking, work.drifting = select(mask, 1.0, 0.0), 0.0 * flight.tick
-    for group in range(SENSOR_GROUPS):
-        work.doubted[group] = 0.0 * flight.tick
-    suspect(flight, p, work, settings, slow, 0)
-    if slow is not None:
-        if slow.aids > 0:
-            for s in range(AIDS):
-                suspect_group(flight, p, work, AID_GROUPS + s, mask)
+    _raise_alarms(flight, p, work, settings, mask)
     accel, corrected_a = one_way(flight, 0)
     gyro, corrected_g = one_way(flight, 3)
     drifting, accel, gyro = work.drifting > 0.0, mask & accel, mask & gyro
     inflated = drifting | accel | gyro
-    moved = mask & (flight.tick < 0.0)  # nobody
+    moved = mask & (flight.tick < 0.0)  # all false
     if slow is not None:
         if slow.estimates_drift:
-            climbed = work.doubted[_BAROMETER_GROUP] > 0.0
-            moved = mask & (drifts_suddenly(flight) | climbed)
+            moved = mask & (drifts_suddenly(flight) | (work.alarm[_BAROMETER_GROUP] > 0.0))
             moved = moved & logical_not(camera_fits(flight, p))
-    doubtful = inflated | moved
+    alarmed = inflated | moved
     for group in range(SENSOR_GROUPS):
-        doubtful = doubtful | (work.doubted[group] > 0.0)
-    if not any_of(doubtful):
+        alarmed = alarmed | (work.alarm[group] > 0.0)
+    if not any_of(alarmed):
         return
 
     L, P, factor = flight.L, work.P, select(inflated, _FACTOR, 1.0)
@@ -209,36 +231,31 @@ def raise_doubts(flight, p, work, settings, mask, slow, stages):
         if slow.estimates_drift:
             _inflate_drift(p, P, inflated)
     bound_inflation(flight, P, inflated, states)
-    _doubt_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
-    _doubt_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)
-    doubt(flight, p, work, settings, slow, 0)
+    _inflate_biases(flight, P, BA, drifting, accel, corrected_a, MOST_ACCEL_BIAS)
+    _inflate_biases(flight, P, BG, drifting, gyro, corrected_g, MOST_GYRO_BIAS)
+    call_sensors(flight, p, p, settings, work, stages, _INFLATE, 0)
     if slow is not None:
         if slow.estimates_drift:
-            doubt_position_and_drift(flight, P, moved)
-        if slow.aids > 0:
-            work.taking = select(doubtful, 1.0, 0.0)
-            for s in range(AIDS):
-                if slow.aid_on[s] > 0:
-                    call_stage(stages, _FIRST_AID + s, flight, p, p, slow, work, _DOUBT)
+            inflate_position_and_drift(flight, P, moved)
 
-    ok = doubtful & (cholesky(P, states, work.inverse_diagonal) > 0.0)
+    ok = alarmed & (cholesky(P, states, work.inverse_diagonal) > 0.0)
     for i in range(15):
         for j in range(i + 1):
             L[i, j] = select(ok, P[i, j], L[i, j])
     if slow is not None:
         keep_slow_factor(flight, slow, work, ok)
-    failed, status = doubtful & logical_not(ok), flight.filter_status
+    failed, status = alarmed & logical_not(ok), flight.filter_status
     flight.filter_status = select(failed, status | _UPDATE_FAILED, status)
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
-    flight.doubt_tick = select(doubtful, flight.tick, flight.doubt_tick)
+    flight.alarm_tick = select(alarmed, flight.tick, flight.alarm_tick)
     for group in range(SENSOR_GROUPS):
-        flight.reopened[group] = flight.reopened[group] + work.doubted[group]
+        flight.reopened[group] = flight.reopened[group] + work.alarm[group]
         row = flight.rejected_in_row[group]
-        flight.rejected_in_row[group] = select(work.doubted[group] > 0.0, 0.0, row)
+        flight.rejected_in_row[group] = select(work.alarm[group] > 0.0, 0.0, row)
         for i in range(3):
             mean = flight.innovation_drift[group, i]
-            flight.innovation_drift[group, i] = select(doubtful, 0.0, mean)
-    forget_corrections(flight, doubtful)
+            flight.innovation_drift[group, i] = select(alarmed, 0.0, mean)
+    forget_corrections(flight, alarmed)
     if slow is not None:
         if slow.estimates_drift:
             forget_drift_corrections(flight, moved)

@@ -1,12 +1,12 @@
-"""Measurements that reach the filter some time after they were taken, with their time stamps.
+"""Updates with delayed measurements, which arrive with their time stamps.
 
-A measurement waits in a flight's record, with what the IMU had summed up when it was taken. When
-it arrives, the estimate is taken back to that instant over the IMU's samples since then
-(`preintegration.py`), updated as usual, and carried forward again. For the covariance the white
-noise of these samples is removed on the way back and added on the way forward, as it is independent
-of the measurement. That neglects the drift of the biases in the meantime, and what measurements
-taken in between have told about this noise. Storing every sample and filtering again from the time
-stamp would neglect nothing.
+A measurement in transit waits in a flight's record, with the sums of the IMU when it was taken
+(`kernels/sensors/latency.py`). When it arrives, the estimate is retrodicted to that instant over
+the IMU's samples since then (`preintegration.py`), updated as usual, and carried forward again. For
+the covariance, the white noise of these samples is removed on the way back and added on the way
+forward, as it is independent of the measurement. That neglects the drift of the biases in the
+meantime, and the information of measurements taken in between on this noise. Storing every sample
+and filtering again from the time stamp would neglect nothing.
 
 Source: Y. Bar-Shalom, H. Chen and M. Mallick, "One-step solution for the multistep out-of-sequence-
 measurement problem in tracking", IEEE Trans. Aerospace and Electronic Systems 40(1), 2004.
@@ -16,6 +16,12 @@ import numpy as np
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
+from quad_gym.kernels.filter.measurements import (
+    choose_valid,
+    count_measured,
+    restore_valid,
+    store_valid,
+)
 from quad_gym.kernels.filter.preintegration import (
     NOISE,
     put_noise,
@@ -31,7 +37,6 @@ from quad_gym.kernels.filter.slow import (
     set_slow_aside,
     shift_carried_slow,
 )
-from quad_gym.kernels.filter.waiting import delay_of
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
     add_outer,
@@ -48,20 +53,10 @@ from quad_gym.kernels.maths.linalg import (
     sub,
     sum_of_outers,
 )
-from quad_gym.kernels.measurements.aid import (
-    choose_aids,
-    count_aids,
-    keep_valid_aids,
-    restore_valid_aids,
-)
-from quad_gym.kernels.measurements.blocks import choose, count, keep_valid
-from quad_gym.kernels.measurements.stamps import go_to_stamp
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
-from quad_gym.records import AIDS, DELAY_SLOTS, SENSORS, FilterForm, FilterStatus
+from quad_gym.records import DELAY_SLOTS, SENSORS, FilterForm, FilterStatus
 
-_PRESENT = SENSORS + AIDS
-"""The turn of what is not late, after those of GNSS, camera and aiding sensors."""
 _WATCH = int(FilterForm.GATE | FilterForm.INNOVATIONS)
 _UPDATE_FAILED = np.uint64(FilterStatus.UPDATE_FAILED)
 
@@ -84,24 +79,32 @@ def _keep_estimate(flight, work, slow):
 
 
 @kernel
-def _go_to(stamps, flight, work, delay, arrived):
-    for slot in range(DELAY_SLOTS):
-        here = arrived & (stamps[slot, 0] == flight.tick - delay)
-        go_to_stamp(stamps[slot], flight, work, here)
+def _matrix_of(row, k):
+    return (
+        (row[k], row[k + 1], row[k + 2]),
+        (row[k + 3], row[k + 4], row[k + 5]),
+        (row[k + 6], row[k + 7], row[k + 8]),
+    )
 
 
 @kernel
-def _find_stamp(flight, p, work, sensor, delay, arrived, slow):
-    """Fill work.since_* with the instant at which was measured what arrives, else with now."""
+def _find_stamp(flight, p, work, sensor, delay, arrived):
+    """Fill work.since_* with the IMU's sums of the measurement that arrives, else of the present.
+
+    Where one arrives, w_meas becomes the rates at that instant, for lever arms.
+    """
     store33(work.since_turn, load33(flight.imu_turn))
     store33(work.since_bias_gain, load33(flight.imu_bias_gain))
     store3(work.since_velocity, load3(flight.imu_velocity))
     store3(work.since_position, load3(flight.imu_position))
-    if sensor < SENSORS:
-        _go_to(flight.stamps[sensor], flight, work, delay, arrived)
-    if slow is not None:
-        if sensor >= SENSORS:
-            _go_to(flight.aid_stamps[sensor - SENSORS], flight, work, delay, arrived)
+    stamps = flight.stamps[sensor]
+    for slot in range(DELAY_SLOTS):
+        row, here = stamps[slot], arrived & (stamps[slot, 0] == flight.tick - delay)
+        keep33(work.since_turn, here, _matrix_of(row, 1))
+        keep33(work.since_bias_gain, here, _matrix_of(row, 16))
+        keep3(work.since_velocity, here, (row[10], row[11], row[12]))
+        keep3(work.since_position, here, (row[13], row[14], row[15]))
+        keep3(flight.w_meas, here, (row[25], row[26], row[27]))
     work.since_time = select(arrived, delay * p.dt, 0.0)
     work.since_noise = select(arrived, 1.0, 0.0)
     C_s, B_s = load33(work.since_turn), load33(work.since_bias_gain)
@@ -208,66 +211,41 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
 
 
 @kernel
-def _choose(flight, p, work, settings, slow, turn):
-    """Let be measured what has its turn; return where there is something, and its latency."""
-    delay = 0
-    for sensor in range(SENSORS):
-        latency = delay_of(settings, sensor)
-        its = turn == (sensor if latency > 0 else _PRESENT)
-        work.turn[sensor] = 1.0 if its else 0.0
-        if turn == sensor:
-            delay = latency
-    choose(flight, p, work, settings, slow, 0)
-    work.measured = 0.0 * flight.tick
-    count(flight, p, work, settings, slow, 0)
-    if slow is not None:
-        choose_aids(flight, work, slow, turn, _PRESENT)
-        count_aids(flight, work, slow, 0)
-        if turn >= SENSORS and turn < _PRESENT:
-            delay = slow.aid_delay[turn - SENSORS]
-    return work.measured > 0.0, delay
-
-
-@kernel
-def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
-    """Update with what has arrived, where `mask`: late fixes, late images, then what is fresh.
+def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
+    """Update with each delayed sensor in turn, then with all that are not, in the lanes `mask`.
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
-        p: Parameters as the filter believes them.
+        p: Parameters assumed by the filter.
         work: Workspace.
-        settings: Which sensors are late.
-        stages: Has the update.
-        mask: Which lanes.
+        settings: Delays of the sensors.
+        stages: Table of stages.
+        mask: Lanes to work on.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
-    keep_valid(flight, p, work, settings, slow, 0)
-    if slow is not None:
-        keep_valid_aids(flight, work, slow)
-    for turn in range(_PRESENT + 1):
-        late = turn != _PRESENT
-        measured, delay = _choose(flight, p, work, settings, slow, turn)
-        arrived = mask & measured if late else mask
+    store_valid(flight, work, settings)
+    for sensor in range(SENSORS + 1):
+        delayed = sensor != SENSORS
+        delay = choose_valid(flight, work, settings, sensor)
+        count_measured(flight, work, settings)
+        measured = work.measured > 0.0
+        arrived = mask & measured if delayed else mask
         if not any_of(mask & measured):
             continue
-        if late:
+        if delayed:
             _keep_estimate(flight, work, slow)
-            _find_stamp(flight, p, work, turn, delay, arrived, slow)
+            _find_stamp(flight, p, work, sensor, delay, arrived)
         good = arrived
-        for leg in range(2 if late else 1):  # loops, so that there is one copy of what is in them
-            if late:
+        for leg in range(2 if delayed else 1):  # a loop, so that `_carry` is compiled once
+            if delayed:
                 good = good & _carry(flight, p, work, leg == 0, delay, slow)
             if leg == 0:
                 work.mask = select(good, 1.0, 0.0)
                 call_stage(stages, Stage.UPDATE, flight, p, p, settings, work, 0)
-        if late:
+        if delayed:
             good = good & (flight.update_failures == work.kept_failures)
             _restore_estimate(flight, work, settings, arrived, good, slow)
-    for sensor in range(SENSORS):
-        work.turn[sensor] = 1.0
-    choose(flight, p, work, settings, slow, 0)
-    if slow is not None:
-        restore_valid_aids(flight, work, slow)
+    restore_valid(flight, work, settings)
     work.mask = select(mask, 1.0, 0.0)
 
 
@@ -276,14 +254,15 @@ def update_in_turn(flight, p, work, settings, stages, mask, slow=None):
 
 @stage
 def late_update_stage(flight, world, model, settings, work, stages, flag):
-    """Update with what has arrived, late or fresh."""
+    """Update with delayed and prompt measurements."""
     scratch = lanes_of(work)
-    update_in_turn(lanes_of(flight), lanes_of(model), scratch, settings, stages, scratch.mask > 0.0)
+    mask = scratch.mask > 0.0
+    update_by_sensor(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask)
 
 
 @stage
 def late_update_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """The same by a filter that estimates slow errors of sensors."""
+    """Update a filter with slow errors of sensors among its states."""
     scratch = lanes_of(work)
     mask = scratch.mask > 0.0
-    update_in_turn(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask, settings)
+    update_by_sensor(lanes_of(flight), lanes_of(model), scratch, settings, stages, mask, settings)

@@ -1,0 +1,132 @@
+"""Bookkeeping of measurements for an update: which are valid, and the calls of their sensors.
+
+The stacked measurement has three rows for each block that any lane has measured, in the order of
+`Sensor`; each sensor fills its own rows (`kernels/sensors/`). A sensor is a stage that is called
+with an `Act` and an argument. The filter knows sensors by these calls only.
+"""
+
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.records import (
+    BLOCK_NUMBERS,
+    FIRST_BLOCK,
+    SENSORS,
+    Act,
+    GateDecision,
+    Sensor,
+)
+
+ACTS = len(Act)
+_FIRST = int(Stage[Sensor(0).name])
+_FAILED = float(GateDecision.FAILED)
+_NUMBERS = tuple(map(float, BLOCK_NUMBERS))
+
+for _sensor in Sensor:  # their stages are in the same order
+    assert Stage[_sensor.name] == _FIRST + _sensor
+
+
+# ---- calls -----------------------------------------------------------------------------------
+
+
+@kernel
+def call_sensor(flight, world, model, settings, work, stages, sensor, act, argument):
+    """Call a sensor for an `Act`.
+
+    The argument is the sensor's first row in the stacked measurement; for `Act.SAMPLE`, 1 at the
+    start of an episode.
+    """
+    flag = act + ACTS * argument
+    call_stage(stages, _FIRST + sensor, flight, world, model, settings, work, flag)
+
+
+@kernel
+def call_sensors(flight, world, model, settings, work, stages, act, argument):
+    """Call all sensors for an `Act`."""
+    for sensor in range(SENSORS):
+        call_sensor(flight, world, model, settings, work, stages, sensor, act, argument)
+
+
+@kernel
+def call_measured(flight, p, work, settings, stages, act):
+    """Call the sensors that any lane has a measurement of, each with its first row."""
+    k = 0
+    for sensor in range(SENSORS):
+        rows = _rows_of(flight, settings, sensor)
+        if rows > 0:
+            call_sensor(flight, p, p, settings, work, stages, sensor, act, k)
+            k += rows
+
+
+# ---- validity --------------------------------------------------------------------------------
+
+
+@kernel
+def _rows_of(flight, settings, sensor):
+    """Count the rows of a sensor in the stacked measurement."""
+    rows, first = 0, FIRST_BLOCK[sensor]
+    for block in range(first, first + settings.sensor_blocks[sensor]):
+        if any_of(flight.block_valid[block] > 0.0):
+            rows += 3
+    return rows
+
+
+@kernel
+def count_measured(flight, work, settings):
+    """Fill work.measured with how many numbers each lane has; return the rows of all sensors."""
+    work.measured = 0.0 * flight.tick
+    k = 0
+    for sensor in range(SENSORS):
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            valid = flight.block_valid[block]
+            if any_of(valid > 0.0):
+                work.measured = work.measured + _NUMBERS[sensor] * valid
+                k += 3
+    return k
+
+
+@kernel
+def store_valid(flight, work, settings):
+    """Store which blocks are valid, to update by one delayed sensor after the other."""
+    for sensor in range(SENSORS):
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            work.kept_valid[block] = flight.block_valid[block]
+
+
+@kernel
+def choose_valid(flight, work, settings, turn):
+    """Leave the blocks of one delayed sensor valid; if `turn` is SENSORS, all that are not delayed.
+
+    Returns:
+        Ticks of the sensor's delay.
+    """
+    delay = 0
+    for sensor in range(SENSORS):
+        latency = settings.sensor_delay[sensor]
+        if turn == sensor:
+            delay = latency
+        share = 1.0 if turn == (sensor if latency > 0 else SENSORS) else 0.0
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            flight.block_valid[block] = share * work.kept_valid[block]
+    return delay
+
+
+@kernel
+def restore_valid(flight, work, settings):
+    """Restore the stored validity of all blocks."""
+    for sensor in range(SENSORS):
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            flight.block_valid[block] = work.kept_valid[block]
+
+
+@kernel
+def mark_failed(flight, settings, failed):
+    """Mark the valid blocks of an update that failed."""
+    for sensor in range(SENSORS):
+        first = FIRST_BLOCK[sensor]
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            lost = failed & (flight.block_valid[block] > 0.0)
+            flight.gate[block] = select(lost, _FAILED, flight.gate[block])

@@ -1,0 +1,286 @@
+"""Features of a camera: the directions of known points.
+
+Each measures `z = unit(R (X - r) - l_c)` in B with the noise of its pixel, as a direction in the
+camera frame differs from one in B by a fixed rotation only. With a pair of sigma points, R(+-e)
+R_hat = (I + even +- odd) R_hat, the vector before normalization is odd and even by
+
+    odd:   odd X_B -+ (I + even) dr_B,   even:   even X_B - odd dr_B,
+
+X_B = R_hat (X - r_hat), dr_B = R_hat dr; the derivative along an offset of a feature seen at
+distance s along u is (I - u u^T) (X_B x de - dr_B) / s.
+
+Each feature is a block of its own; an image is one group of the gate.
+"""
+
+import math
+
+from quad_gym.kernels.compiling import Stage, call_stage, kernel
+from quad_gym.kernels.filter.directions import direction_noise, direction_pair
+from quad_gym.kernels.filter.error_state import E, R
+from quad_gym.kernels.filter.gate import (
+    accept_group,
+    add_nis,
+    count_rejections,
+    gate_direction,
+    mask_block,
+)
+from quad_gym.kernels.filter.recovery import (
+    FITTING_FEATURES,
+    LARGEST,
+    MOST_ANGLE,
+    follow_drift,
+    inflate_gyro_bias,
+    raise_diagonal,
+    time_of,
+)
+from quad_gym.kernels.filter.rows import (
+    clear_slow_columns,
+    columns_of,
+    put_noise,
+    put_three,
+)
+from quad_gym.kernels.maths.elementary import clip, maximum, minimum
+from quad_gym.kernels.maths.linalg import (
+    add_outer,
+    add_scaled,
+    apply,
+    apply_transposed,
+    cross,
+    dot,
+    load3,
+    load4,
+    load33,
+    load_column3,
+    norm,
+    scale,
+    select3,
+    store3,
+    sub,
+)
+from quad_gym.kernels.maths.random import normal_pair, stream_of, uniform_pair
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm, turn_pair
+from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
+from quad_gym.kernels.sensors.latency import (
+    deliver_arrived,
+    exchange,
+    exchange_stamps,
+    keep_arrived,
+)
+from quad_gym.kernels.sensors.stage import sensor_stage
+from quad_gym.kernels.simd.lanes import any_of, logical_not, select
+from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterForm, Sensor
+
+_CAMERA, _EKF, _GATE = int(Sensor.CAMERA), int(FilterForm.EKF), int(FilterForm.GATE)
+
+_PIXEL = 2e-6  # [m]; it cancels, and no parameter has it: the report writes rays in meters
+
+# ---- simulation ------------------------------------------------------------------------------
+
+
+@kernel
+def project(X_I, r_I, R_BI, p):
+    """Pixel of a point, and whether it is in front of the camera and inside the image."""
+    v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))
+    in_front = v_C[2] > 1e-9
+    per_depth = p.focal_length / select(in_front, v_C[2], 1.0)
+    x, y = per_depth * v_C[0], per_depth * v_C[1]
+    seen = in_front & (abs(x) <= p.half_image[0]) & (abs(y) <= p.half_image[1])
+    return x, y, seen
+
+
+@kernel
+def measure(flight, p, feature_count, mask):
+    """Project the features and flag the visible ones, in the lanes `mask`."""
+    stream = stream_of(flight)
+    R_BI, r_I = quaternion_to_dcm(load4(flight.q)), load3(flight.r)
+    for i in range(feature_count):
+        x, y, seen = project(load3(p.features[i]), r_I, R_BI, p)
+        n_x, n_y = normal_pair(stream, DRAW_FEATURE + i)
+        seen = seen & mask
+        flight.pixels[i, 0] = select(seen, x + p.pixel_sigma * n_x, flight.pixels[i, 0])
+        flight.pixels[i, 1] = select(seen, y + p.pixel_sigma * n_y, flight.pixels[i, 1])
+        before = flight.block_valid[FEATURE_BLOCKS + i]
+        flight.block_valid[FEATURE_BLOCKS + i] = select(mask, select(seen, 1.0, 0.0), before)
+
+
+@kernel
+def _begin(flight, p, settings, mask):
+    _, share = uniform_pair(stream_of(flight), DRAW_PHASE)
+    begin_clock(flight, settings, _CAMERA, share, mask)
+
+
+@kernel
+def _corrupt(flight, p, settings, work, stages, due):
+    """Apply range, blur, ground, obstacles and faults to the image just taken."""
+    work.mask = select(due, 1.0, 0.0)
+    call_stage(stages, Stage.LIMIT_CAMERA, flight, p, p, settings, work, 0)
+    call_stage(stages, Stage.HIDE_FEATURES, flight, p, p, settings, work, 0)
+    call_stage(stages, Stage.CORRUPT_FEATURES, flight, p, p, settings, work, 0)
+
+
+@kernel
+def _sample(flight, p, settings, work, stages, mask, starting):
+    """Take an image when due."""
+    due, delayed = tick_clock(flight, settings, _CAMERA, mask), settings.sensor_delay[_CAMERA] > 0
+    for i in range(settings.feature_count):
+        before = flight.block_valid[FEATURE_BLOCKS + i]
+        flight.block_valid[FEATURE_BLOCKS + i] = select(mask, 0.0, before)
+        if delayed:
+            keep_arrived(work, FEATURE_BLOCKS + i, flight.pixels[i], 2)
+    if any_of(due):
+        measure(flight, p, settings.feature_count, due)
+        _corrupt(flight, p, settings, work, stages, due)
+    if delayed:
+        taken = exchange_stamps(flight, work, settings, _CAMERA, mask)
+        for i in range(settings.feature_count):
+            block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
+            exchange(flight, work, block, pixels, 2, mask, taken)
+            deliver_arrived(work, block, pixels, 2, mask)
+    else:
+        for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + settings.feature_count):
+            seen = due & (flight.block_valid[block] > 0.0)
+            flight.block_fresh[block] = select(seen, 1.0, flight.block_fresh[block])
+
+
+# ---- update ----------------------------------------------------------------------------------
+
+
+@kernel
+def _center(flight, p, work, settings, k):
+    """Fill the rows of predicted measurement, measurement and noise."""
+    R_BI, R_CB, r = load33(flight.R_hat), load33(p.R_CB), load3(flight.r_hat)
+    w_B = sub(load3(flight.w_meas), load3(flight.b_g_hat))
+    pixel_sigma = math.sqrt(p.pixel_sigma * p.pixel_sigma + p.blur * p.blur * dot(w_B, w_B))
+    for i in range(settings.feature_count):
+        valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
+        if any_of(valid):
+            X_B = apply(R_BI, sub(load3(p.features[i]), r))
+            to_feature = sub(X_B, load3(p.camera))
+            store3(work.X_B[i], X_B)
+            work.inverse_distance[i] = 1.0 / norm(to_feature)
+            put_three(work.z_hat, k, valid, scale(work.inverse_distance[i], to_feature))
+            ray_C = (
+                _PIXEL * flight.pixels[i, 0],
+                _PIXEL * flight.pixels[i, 1],
+                _PIXEL * p.focal_length,
+            )
+            length = norm(ray_C)
+            u_B = apply_transposed(R_CB, scale(1.0 / length, ray_C))
+            put_three(work.z, k, valid, u_B)
+            sigma = pixel_sigma * _PIXEL / length
+            predicted = scale(work.inverse_distance[i], to_feature)
+            u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
+            noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
+            # a pixel does not move along the optical axis c: less c c^T, across u
+            across = add_scaled(R_CB[2], -dot(R_CB[2], u_B), u_B)
+            less = scale(-p.noise_pinhole * sigma * sigma, across)
+            put_noise(work, k, valid, add_outer(noise, less, across))
+            k += 3
+
+
+@kernel
+def _column(flight, p, work, settings, k, j, A, S, R_BI):
+    """Fill the rows of all features in column j, with a derivative or a pair of sigma points."""
+    L, c, camera = flight.L, work.spread, load3(p.camera)
+    inverse_c, d, dr = work.inverse_spread, load_column3(L, E, j), load_column3(L, R, j)
+    by_derivative = (settings.form & _EKF) != 0
+    dr_B = apply(R_BI, dr) if by_derivative else apply(R_BI, scale(c, dr))
+    odd, even = load33(work.odd[j]), load33(work.even[j])
+    for i in range(settings.feature_count):
+        valid = flight.block_valid[FEATURE_BLOCKS + i] > 0.0
+        if any_of(valid):
+            X_B = load3(work.X_B[i])
+            if by_derivative:
+                u_B = load3(work.z_hat[k : k + 3])
+                v = scale(work.inverse_distance[i], sub(cross(X_B, d), dr_B))
+                put_three(A, k, valid, add_scaled(v, -dot(u_B, v), u_B))
+                put_three(S, k, valid, scale(0.0, dr))
+            else:
+                # (I + even +- odd) (X_B -+ dr_B) - l_c
+                v_odd, v_even = turn_pair(even, odd, X_B, dr_B)
+                v = sub(X_B, camera)
+                a, s = direction_pair(v, work.inverse_distance[i], v_even, v_odd)
+                put_three(A, k, valid, scale(inverse_c, a))
+                put_three(S, k, valid, scale(inverse_c, s))
+            k += 3
+    return k
+
+
+@kernel
+def _expect(flight, p, work, settings, k):
+    """Fill the rows from k on, three for each feature that any lane sees."""
+    R_BI, last, end = load33(flight.R_hat), columns_of(settings) - 1, k
+    _center(flight, p, work, settings, k)
+    for j in range(9):
+        end = _column(flight, p, work, settings, k, j, work.A[last - j], work.E[8 - j], R_BI)
+    for first in range(k, end, 3):
+        clear_slow_columns(work, first, settings)
+
+
+@kernel
+def _gate(flight, p, work, settings, k):
+    """Store the innovations in the rows from k on, and mask those beyond the gate.
+
+    A feature whose predicted direction is too uncertain for a linear model is masked, too: the
+    error of a direction is bounded, so it would pass any gate, and its update would be wrong and
+    overconfident.
+    """
+    gating, again = (settings.form & _GATE) != 0, work.again > 0.0
+    zero = 0.0 * p.sigma_beta
+    seen, refused, fresh, side, up = zero, zero, zero, zero, zero
+    for i in range(settings.feature_count):
+        block = FEATURE_BLOCKS + i
+        if any_of(flight.block_valid[block] > 0.0):
+            valid = (work.taking > 0.0) & (flight.block_valid[block] > 0.0)
+            rejected, unsure, scaled, nis = gate_direction(
+                flight, p, work, settings, k, block, valid, p.gate_uncertainty
+            )
+            counted = valid & logical_not(unsure | again)
+            add_nis(work, counted, nis, 2.0)
+            counts = select(counted, 1.0, 0.0)
+            fresh = fresh + counts
+            side = side + counts * clip(scaled[0], -LARGEST, LARGEST)
+            up = up + counts * clip(scaled[1], -LARGEST, LARGEST)
+            if gating:
+                out = rejected | unsure
+                mask_block(work, k, out, columns_of(settings))
+                work.left_out = work.left_out + select(out, 3.0, 0.0)
+                seen = seen + select(valid & logical_not(unsure), 1.0, 0.0)
+                refused = refused + select(rejected, 1.0, 0.0)
+            k += 3
+    root = math.sqrt(maximum(fresh, 1.0))
+    follow_drift(flight, FEATURE_BLOCKS, fresh > 0.0, side / root, up / root, zero)
+    if gating:
+        first = (seen > 0.0) & logical_not(again)
+        count_rejections(flight, FEATURE_BLOCKS, first, refused >= seen)
+        fits = (seen - refused >= FITTING_FEATURES) & (2.0 * refused < seen) & logical_not(again)
+        flight.fit_tick = select(fits, flight.tick, flight.fit_tick)
+    else:
+        accept_group(flight, FEATURE_BLOCKS, fresh > 0.0)
+
+
+# ---- inflation -------------------------------------------------------------------------------
+
+
+@kernel
+def _inflate(flight, p, work, settings):
+    """Inflate attitude, position and gyro biases after rejections of whole images.
+
+    The attitude is inflated by the largest innovation, the position by the offset that it means at
+    the feature's distance.
+    """
+    angle, offset, P = 0.0 * flight.tick, 0.0 * flight.tick, work.P
+    alarm, nu = work.alarm[FEATURE_BLOCKS], flight.innovation
+    for i in range(settings.feature_count):
+        s = FEATURE_BLOCKS + i
+        seen = (alarm > 0.0) & (flight.block_valid[s] > 0.0)
+        square = select(seen, nu[s, 0] * nu[s, 0] + nu[s, 1] * nu[s, 1], 0.0)
+        distance = norm(sub(load3(p.features[i]), load3(flight.r_hat)))
+        angle = maximum(angle, square)
+        offset = maximum(offset, square * distance * distance)
+    raise_diagonal(P, E, minimum(angle, MOST_ANGLE * MOST_ANGLE))
+    raise_diagonal(P, R, offset)
+    inflate_gyro_bias(P, math.sqrt(angle) / time_of(flight, p, FEATURE_BLOCKS), alarm)
+
+
+camera_stage = sensor_stage(Sensor.CAMERA, _begin, _sample, _expect, _gate, _inflate)

@@ -1,0 +1,104 @@
+"""Latency of sensors: measurements in transit wait in a flight's record until they arrive.
+
+With each waits its time stamp: the sums of the IMU when it was taken, with which
+`filter/delayed.py` retrodicts the estimate to that instant.
+"""
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.records import DELAY_SLOTS, FIRST_BLOCK, STAMP
+
+
+@kernel
+def forget_stamps(stamps, mask):
+    """Begin an episode with nothing in transit, in the lanes `mask`."""
+    for slot in range(DELAY_SLOTS):
+        stamps[slot, 0] = select(mask, np.nan, stamps[slot, 0])
+
+
+@kernel
+def _put_stamp(stamps, flight, taken):
+    """Shift the stamps of a sensor, (DELAY_SLOTS, STAMP), and stamp the first with the present."""
+    for slot in range(DELAY_SLOTS - 1, 0, -1):
+        for i in range(STAMP):
+            stamps[slot, i] = select(taken, stamps[slot - 1, i], stamps[slot, i])
+    row = stamps[0]
+    row[0] = select(taken, flight.tick, row[0])
+    for i in range(3):
+        for j in range(3):
+            k = 1 + 3 * i + j
+            row[k] = select(taken, flight.imu_turn[i, j], row[k])
+            row[k + 15] = select(taken, flight.imu_bias_gain[i, j], row[k + 15])
+        row[10 + i] = select(taken, flight.imu_velocity[i], row[10 + i])
+        row[13 + i] = select(taken, flight.imu_position[i], row[13 + i])
+        row[25 + i] = select(taken, flight.w_meas[i], row[25 + i])
+
+
+@kernel
+def keep_arrived(work, block, values, numbers):
+    """Keep the numbers of a block that have arrived, before new ones are measured."""
+    for i in range(numbers):
+        work.arrived[block, i] = values[i]
+
+
+@kernel
+def exchange_stamps(flight, work, settings, sensor, mask):
+    """Stamp what has just been measured; find what arrives, for `exchange`.
+
+    Returns:
+        Lanes in which the sensor has measured.
+    """
+    stamps, delay, first = flight.stamps[sensor], settings.sensor_delay[sensor], FIRST_BLOCK[sensor]
+    valid = 0.0 * flight.tick
+    for block in range(first, first + settings.sensor_blocks[sensor]):
+        valid = valid + flight.block_valid[block]
+    taken = mask & (valid > 0.0)
+    for slot in range(DELAY_SLOTS):
+        here = mask & (stamps[slot, 0] == flight.tick - delay)
+        work.arrives[slot] = select(here, 1.0, 0.0)
+    if any_of(taken):
+        _put_stamp(stamps, flight, taken)
+    return taken
+
+
+@kernel
+def exchange(flight, work, block, values, numbers, mask, taken):
+    """Hold back the block that has just been measured, and deliver the one that arrives.
+
+    Args:
+        flight: Record.
+        work: Workspace; reads what `keep_arrived` and `exchange_stamps` have stored.
+        block: Number of the block.
+        values: Its numbers in the record.
+        numbers: How many.
+        mask: Lanes to work on.
+        taken: Lanes in which the sensor has measured.
+    """
+    waiting, flags = flight.waiting[block], flight.waiting_valid[block]
+    valid, arrived = flight.block_valid[block], 0.0 * flight.tick
+    for slot in range(DELAY_SLOTS):
+        here = work.arrives[slot] > 0.0
+        for i in range(numbers):
+            kept = work.arrived[block, i]
+            work.arrived[block, i] = select(here, waiting[slot, i], kept)
+        arrived = select(here, flags[slot], arrived)
+    if any_of(taken):
+        for slot in range(DELAY_SLOTS - 1, 0, -1):
+            for i in range(numbers):
+                waiting[slot, i] = select(taken, waiting[slot - 1, i], waiting[slot, i])
+            flags[slot] = select(taken, flags[slot - 1], flags[slot])
+        for i in range(numbers):
+            waiting[0, i] = select(taken, values[i], waiting[0, i])
+        flags[0] = select(taken, valid, flags[0])
+    flight.block_valid[block] = select(mask, arrived, valid)
+    fresh = flight.block_fresh[block]
+    flight.block_fresh[block] = select(mask & (arrived > 0.0), 1.0, fresh)
+
+
+@kernel
+def deliver_arrived(work, block, values, numbers, mask):
+    """Replace the numbers that have just been measured by those that arrived last."""
+    for i in range(numbers):
+        values[i] = select(mask, work.arrived[block, i], values[i])

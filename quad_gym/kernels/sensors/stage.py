@@ -1,0 +1,61 @@
+"""The stage of a sensor, made of the sensor's own kernels."""
+
+from typing import Any
+
+from quad_gym.kernels.compiling import kernel, stage
+from quad_gym.kernels.filter.measurements import ACTS
+from quad_gym.kernels.simd.blocks import lanes_of
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import Act, Sensor
+
+_BEGIN, _SAMPLE, _EXPECT = int(Act.BEGIN), int(Act.SAMPLE), int(Act.EXPECT)
+_GATE, _INFLATE = int(Act.GATE), int(Act.INFLATE)
+
+
+@kernel
+def _cannot_align(flight, p, work, settings, mask):
+    """Placeholder for sensors that observe no heading; never called."""
+
+
+def sensor_stage(
+    sensor: Sensor,
+    begin: Any,
+    sample: Any,
+    expect: Any,
+    gate: Any,
+    inflate: Any,
+    align: Any = _cannot_align,
+) -> Any:
+    """Make the stage of a sensor; its flag is an `Act`, and an argument times `ACTS`.
+
+    Args:
+        sensor: The sensor.
+        begin: `(flight, p, settings, mask)`: begin an episode: clock and constant errors.
+        sample: `(flight, world, settings, work, stages, mask, starting)`: measure when due, and
+            deliver.
+        expect: `(flight, p, work, settings, k)`: fill the sensor's rows, from k on.
+        gate: `(flight, p, work, settings, k)`: store its innovations, and mask those beyond the
+            gate.
+        inflate: `(flight, p, work, settings)`: inflate variances where `work.alarm`.
+        align: `(flight, p, work, settings, mask)`: initialize the heading.
+    """
+
+    def call(flight, world, model, settings, work, stages, flag):  # type: ignore[no-untyped-def]
+        flying, scratch, act, argument = lanes_of(flight), lanes_of(work), flag % ACTS, flag // ACTS
+        p, mask = lanes_of(model), scratch.mask > 0.0
+        if act == _BEGIN:
+            begin(flying, lanes_of(world), settings, mask)
+        elif act == _SAMPLE:
+            sample(flying, lanes_of(world), settings, scratch, stages, mask, argument > 0)
+            scratch.mask = select(mask, 1.0, 0.0)
+        elif act == _EXPECT:
+            expect(flying, p, scratch, settings, argument)
+        elif act == _GATE:
+            gate(flying, p, scratch, settings, argument)
+        elif act == _INFLATE:
+            inflate(flying, p, scratch, settings)
+        else:
+            align(flying, p, scratch, settings, mask)
+
+    call.__name__ = call.__qualname__ = f"{sensor.name.lower()}_stage"  # for caches and messages
+    return stage(call)
