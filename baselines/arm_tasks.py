@@ -138,10 +138,10 @@ class CertaintyReward(LookAround):
     learn to crash at once.
     """
 
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """Return the reward described in the class, (n,)."""
+    def reward(self, view: "View") -> Parts:
+        """Return the terms of the reward described in the class, (n,) each."""
         sigma = view.estimate.position_sigma.max(axis=1)
-        return super().reward(view) + 0.3 * (1.0 - np.minimum(sigma / 0.5, 1.0))
+        return super().reward(view) | {"certainty": 0.3 * (1.0 - np.minimum(sigma / 0.5, 1.0))}
 
 
 class WithStdCertaintyReward(CertaintyReward, WithStd):
@@ -322,10 +322,10 @@ class ConstantCrashCost(Scaled):
         start[:, 0] = np.where(before == 0, start[:, 0], halfway)
         return {"position": start}
 
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """Return the reward described in the class, (n,)."""
+    def reward(self, view: "View") -> Parts:
+        """Return the terms of the reward described in the class, (n,) each."""
         less = self._crash_cost + view.state.earned - CONSTANT_CRASH_COST
-        return super().reward(view) + _CRASH(view) * less
+        return super().reward(view) | {"kept": _CRASH(view) * less}
 
 
 class ConstantCrashCostWithUncertainty(ConstantCrashCost, WithUncertainty):

@@ -20,6 +20,7 @@ from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
 from quad_gym.params.randomization import Randomization
+from quad_gym.params.reward import RewardParams
 from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
 from quad_gym.params.task import TaskParams
@@ -100,6 +101,7 @@ __all__ = [
     "QuadEnv",
     "QuadVectorEnv",
     "Randomization",
+    "RewardParams",
     "SensorSuite",
     "Task",
     "TaskError",

@@ -100,6 +100,8 @@ def _value(value: Any) -> str:
         return f"`{_digits(value)}`"
     if isinstance(value, str):
         return f'`"{value}"`'
+    if isinstance(value, quad_gym.RewardParams):
+        return "`RewardParams()`"
     if isinstance(value, tuple) and value:
         return f"{len(value)} of them"
     return f"`{value!r}`"
@@ -222,6 +224,7 @@ def _environment_page(env_id: str, sections: dict[str, str], docs: dict[str, str
         for key in TASK_KEYWORDS
         if ONE_TASK_KEYWORDS.get(key, defaults.kind) == defaults.kind
         and key not in KEYWORDS_WITHOUT_EFFECT.get(defaults.kind, ())
+        and not (own is not None and key == "reward_params")
     ]
     rows += [
         (f"`{key}`", _value(value), "a keyword of every environment")

@@ -263,7 +263,7 @@ class FlightBatch(FlightMemory):
         self._resets = np.zeros(self.count, np.uint8)
         self._observations = np.zeros((self.count, self._low.size), np.float32)
         self.final_observations = np.zeros((self.count, self._low.size), np.float32)
-        self._results = np.zeros((len(RESULTS), padded))
+        self._results = np.zeros((len(RESULTS), padded + WIDTH))  # no rows 4 KiB apart
         self._crew: Crew | None = None
 
     def reset(
@@ -421,9 +421,14 @@ class FlightBatch(FlightMemory):
 
     @property
     def results(self) -> NDArray[np.float64]:
-        """Results (count, 13) of the last step by RESULTS; the next step overwrites them."""
+        """Results (count, k) of the last step by RESULTS; the next step overwrites them."""
         return self._results[:, : self.count].T
 
     def result(self, name: str) -> NDArray[np.float64]:
         """Return one column of `RESULTS` of the last step, as a new array (count,)."""
         return self._results[RESULTS.index(name), : self.count].copy()
+
+    def reward_terms(self) -> dict[str, NDArray[np.float64]]:
+        """Return the terms of the last step's reward, (count,) each; their sum is the reward."""
+        names = (term.name.lower() for term in self.task.reward_params.terms(self.task.kind))
+        return {name: self.result(f"reward_{name}") for name in names}

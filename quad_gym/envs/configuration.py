@@ -123,7 +123,7 @@ class Flights:
         defaults, own = BENCHMARKS.get(name) or (TASK_DEFAULTS[name], {})
         given = {name: keywords.pop(name) for name in TASK_KEYWORDS if name in keywords}
         given = {name: value for name, value in given.items() if value is not None}
-        require_own_task(given, name, defaults.kind)
+        require_own_task(given, name, defaults.kind, own_reward=bool(own) and own_task is None)
         self.task: TaskParams = defaults.replace(**given)
         if "pad" in given and not self.task.may_start_on_ground:
             raise ValueError(
@@ -170,6 +170,7 @@ class Flights:
         action_delay: float,
         substeps: int,
         innovations: bool,
+        reward_terms: bool,
         true_vehicle: VehicleParams | None,
         true_sensors: SensorSuite | None,
         world: WorldParams | str,
@@ -184,6 +185,7 @@ class Flights:
         check.flag("camera", camera)
         check.flag("include_std", include_std)
         check.flag("privileged", privileged)
+        self.reward_terms = check.flag("reward_terms", reward_terms)
         suite = sensor_suite(sensors) if isinstance(sensors, str) else sensors
         if not isinstance(suite, SensorSuite):
             raise ValueError(f"sensors must be a SensorSuite or its name, got {sensors!r}")

@@ -22,17 +22,23 @@ KEYWORDS_WITHOUT_EFFECT = {
 """Keywords that have an effect with most tasks, by the tasks with which they have none."""
 
 
-def require_own_task(given: Collection[str], name: str, kind: str) -> None:
+def require_own_task(given: Collection[str], name: str, kind: str, *, own_reward: bool) -> None:
     """Refuse keywords of other tasks.
 
     Args:
         given: Names of fields of `TaskParams` that were given.
         name: Name of the task.
         kind: Kind of its reference.
+        own_reward: True if its class has a reward of its own.
 
     Raises:
         ValueError: If there is one.
     """
+    if own_reward and "reward_params" in given:
+        raise ValueError(
+            f"reward_params has no effect on the task {name}, and must not be given: its class has "
+            "weights of its own"
+        )
     for keyword in given:
         if ONE_TASK_KEYWORDS.get(keyword, kind) != kind:
             raise ValueError(

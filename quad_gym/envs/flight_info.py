@@ -28,10 +28,10 @@ def flight_info(batch: FlightBatch, bits: NDArray[np.float64]) -> Parts:
 
 
 def info_of_flight(parts: Parts, flight: int) -> dict[str, dict[str, Any]]:
-    """Return the entries of one flight, with booleans in place of arrays of one."""
+    """Return the entries of one flight, with Python's booleans and numbers for arrays of one."""
     return {
         name: {
-            key: values[flight] if values.ndim > 1 else bool(values[flight])
+            key: values[flight] if values.ndim > 1 else values[flight].item()
             for key, values in part.items()
         }
         for name, part in parts.items()

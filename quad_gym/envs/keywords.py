@@ -14,6 +14,7 @@ from quad_gym.faults.presets import FaultsGiven
 from quad_gym.params import checks as check
 from quad_gym.params.control import ActionParams
 from quad_gym.params.randomization import Given, Randomization
+from quad_gym.params.reward import RewardParams
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.params.vehicle import VehicleParams
@@ -32,6 +33,7 @@ class TaskKeywords(TypedDict, total=False):
     start: Literal["ground", "hover", "mixed", "moving"] | None
     pad: bool | None
     reward_per: Literal["step", "second"] | None
+    reward_params: RewardParams | None
     randomize_reference: bool | None
     duration: float | None
     out_of_bounds: float | None
@@ -56,6 +58,7 @@ class EnvKeywords(TaskKeywords, total=False):
     privileged: bool
     sensors: SensorSuite | str
     innovations: bool
+    reward_terms: bool
     vehicle: VehicleParams | str
     action_params: ActionParams | None
     camera: bool
@@ -91,6 +94,7 @@ DEFAULTS: EnvKeywords = {
     "privileged": False,
     "sensors": "standard",
     "innovations": False,
+    "reward_terms": False,
     "vehicle": "lab",
     "action_params": None,
     "camera": True,

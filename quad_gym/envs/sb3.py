@@ -135,6 +135,8 @@ class QuadSB3VecEnv(VecEnv):
             )
         ]
         more = flight_info(batch, results[:, COLUMN["faults"]])
+        if self.flights.reward_terms:
+            more["reward_terms"] = batch.reward_terms()
         if more:
             for i, info in enumerate(infos):
                 info |= info_of_flight(more, i)

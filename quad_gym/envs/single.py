@@ -100,11 +100,12 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
 
         exp(-2 e) + 0.5 exp(-20 e) + 0.1 h - 0.02 |da|^2 - 0.002 |w|^2
 
-    The maximum is 1.6, so 500 steps of a perfect circle return 800; an action that jumps from
-    corner to corner costs 0.32. In `Waypoints`, progress replaces the two exponentials: the speed
-    toward the next gate [m/s], and 1 s^-1 times the control rate (50) for each gate passed.
-    `reward_per="second"` multiplies all rewards by the control period, so that returns do not
-    depend on the control rate: 16 for a perfect circle.
+    `reward_params` sets these weights and decays, see `quad_gym.RewardParams`. The maximum is 1.6,
+    so 500 steps of a perfect circle return 800; an action that jumps from corner to corner costs
+    0.32. In `Waypoints`, progress replaces the two exponentials: the speed toward the next gate
+    [m/s], and 1 s^-1 times the control rate (50) for each gate passed. `reward_per="second"`
+    multiplies all rewards by the control period, so that returns do not depend on the control rate:
+    16 for a perfect circle.
 
     ## Episode end
     Terminated: farther than 3 m from the reference (`Hover`: 1.6 m, `LookAround`: 8 m, `Waypoints`
@@ -135,7 +136,9 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
     `truncate_when_diverged` or `innovations`; `gates_passed`. With `randomization` also `drawn`,
     the parameters of the episode by name. With `faults` also `faults`, True for each that is active
     at present, by name. With `innovations=True` also `innovations`: the filter's last innovations,
-    their NIS and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`.
+    their NIS and the decisions of its gate, see `quad_gym.envs.flight_info.innovations_of`. With
+    `reward_terms=True` also `reward_terms` in every step: the weighted terms of the reward by name,
+    whose sum is the reward (of your own task, what its `reward` returns by name).
 
     ## World
     By default the air is still, and vehicle and sensors are the same in all episodes.
@@ -166,6 +169,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             "one_wall" on `LookAround`, "stale" on `StaleRace`, "consumer" on `OutageDash`.
         innovations: Add the filter's innovations to `info` and `flights.batch.record`, block by
             block; the latter always has them with a gate, `faults` or `truncate_when_diverged`.
+        reward_terms: Add the terms of the reward to `info`.
         vehicle: Name of a preset, or `VehicleParams`.
         action_params: Scales of the actions, and bandwidths of the inner loops.
         camera: False: leave out the camera of the sensors.
@@ -188,7 +192,7 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
         faults: Faults of sensors and rotors, see `quad_gym.faults`: names of presets, such as
             "gnss_outage" or "gnss_outliers+rotor_loss", or instances.
         keywords: Keywords of the task: radius, period, height, start, pad, reward_per,
-            randomize_reference, duration, out_of_bounds, min_height, truncate_when_diverged,
+            reward_params, randomize_reference, duration, out_of_bounds, min_height, truncate_when_diverged,
             max_tilt, max_speed, max_acceleration, gate_count, gate_radius, preview, trajectory; see
             `quad_gym.TaskParams`.
         render_mode: "human" (a window), "rgb_array", "rgb_array_list", or None.
@@ -317,6 +321,8 @@ class QuadEnv(gymnasium.Env[Any, np.ndarray]):
             info |= drawn_info(batch.drawn(), 0)
         if batch.faults or batch.innovations:
             info |= info_of_flight(flight_info(batch, batch.results[:, _FAULTS]), 0)
+        if self.flights.reward_terms:
+            info |= info_of_flight({"reward_terms": batch.reward_terms()}, 0)
         return self.flights.split(observations[0]), row[_REWARD], terminated, truncated, info
 
     def render(self) -> Any:

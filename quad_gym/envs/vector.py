@@ -42,8 +42,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
     """N flights in one compiled call; flight i equals a `QuadEnv` seeded with seed + i.
 
     Observations, actions, rewards, endings and keywords are as in `QuadEnv`. `info` holds arrays
-    (n,) with the same names, each with its mask `_name`; `drawn`, `faults` and `innovations` are
-    dictionaries of such arrays.
+    (n,) with the same names, each with its mask `_name`; `drawn`, `faults`, `innovations` and
+    `reward_terms` are dictionaries of such arrays.
 
     Args:
         num_envs: Number of flights.
@@ -251,6 +251,8 @@ class QuadVectorEnv(gymnasium.vector.VectorEnv[Any, NDArray[Any], NDArray[Any]])
             infos["drawn"] = batch.drawn()
         if batch.faults or batch.innovations:
             infos |= flight_info(batch, results[:, COLUMN["faults"]])
+        if self.flights.reward_terms:
+            infos["reward_terms"] = batch.reward_terms()
         ended = np.flatnonzero(self._over)
         if ended.size:  # rare: members for every flight would cost more than the rest
             infos["ending"][ended] = _ENDINGS[results[ended, COLUMN["ending"]].astype(np.int64)]

@@ -30,6 +30,7 @@ from quad_gym.records import (
     Command,
     Layout,
     Result,
+    RewardTerm,
     offset_of,
 )
 
@@ -49,6 +50,7 @@ _EPISODE_ERROR_SUM = int(Result.EPISODE_ERROR_SUM)
 _GATES_PASSED = int(Result.GATES_PASSED)
 _FAULTS = int(Result.FAULTS)
 _FILTER_DIVERGED = int(Result.FILTER_DIVERGED)
+_TERMS, _REWARD_TERMS = len(RewardTerm), len(Result)
 
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
@@ -119,7 +121,7 @@ def _load_actions(call, flight, index):
 
 
 @kernel
-def _write_results(call, flight, index):
+def _write_results(call, flight, work, index):
     """What the caller wants to know of a step.
 
     Where an episode begins in the same step as one ends it is that of the end, else of the start.
@@ -137,6 +139,8 @@ def _write_results(call, flight, index):
     store_lanes(here + _GATES_PASSED * pitch, flight.gate_next)
     store_lanes(here + _FAULTS * pitch, flight.faults)
     store_lanes(here + _FILTER_DIVERGED * pitch, flight.diverged)
+    for k in range(_TERMS):
+        store_lanes(here + (_REWARD_TERMS + k) * pitch, work.reward_term[k])
     block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
     status = _floats_at(here + _FILTER_STATUS * pitch, WIDTH)
     for lane in range(WIDTH):
@@ -221,7 +225,7 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
         _load_actions(call, flight, index)
         begins, done = _fly_step(call, index, flight, true, believed, settings, work, stages)
         if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
-            _write_results(call, flight, index)  # of the episodes that end
+            _write_results(call, flight, work, index)  # of the episodes that end
             written = True
         if observing and any_of(begins & done):
             _observe(call, flight, true, believed, settings, work, stages)
@@ -229,7 +233,7 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
     if any_of(begins):
         begin_episode(flight, nominal, true, believed, settings, work, stages, begins)
     if command != Command.RESET and not written:
-        _write_results(call, flight, index)
+        _write_results(call, flight, work, index)
     if observing:
         _observe(call, flight, true, believed, settings, work, stages)
         _write_rows(call, call[_OBSERVATIONS], index, work, flight.tick >= 0.0)

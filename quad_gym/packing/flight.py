@@ -32,6 +32,7 @@ from quad_gym.records import (
     Control,
     FilterForm,
     Layout,
+    RewardTerm,
     Source,
     Start,
     Task,
@@ -279,6 +280,9 @@ def settings_record(
         task.randomize_reference,
     )
     s["reward_scale"] = clocks.control_rate if task.reward_per == "step" else 1.0
+    weights = task.reward_params
+    s["reward_weight"] = [getattr(weights, term.name.lower()) for term in RewardTerm]
+    s["near_decay"], s["fine_decay"] = weights.near_decay, weights.fine_decay
     s["harmonics"] = _HARMONICS.get(Task[task.kind.upper()], MAX_HARMONICS)
     s["max_steps"] = round(task.duration * clocks.control_rate)
     s["out_of_bounds"], s["min_height"] = task.out_of_bounds, task.min_height

@@ -3,12 +3,13 @@
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from quad_gym.params import checks as check
 from quad_gym.params.checks import Checked, Vector
+from quad_gym.params.reward import RewardParams
 from quad_gym.params.trajectories import Trajectory
 from quad_gym.records import MAX_GATES, Start, Task
 
@@ -53,6 +54,8 @@ class TaskParams(Checked):
     reward_per: str = "step"
     """unit of the reward. "step": of order one in each step, as learning algorithms expect;
     "second": the reward per step times the control period"""
+    reward_params: RewardParams = field(default_factory=RewardParams)
+    """weights of the terms of the built-in reward, see `quad_gym.RewardParams`"""
     randomize_reference: bool = False
     """True: draw the reference in each episode: azimuth and distance of the hover point; phase,
     radius, period and sense of circle and lemniscate; the heading of a random trajectory and of a
@@ -110,6 +113,8 @@ class TaskParams(Checked):
             raise ValueError(
                 f"TaskParams.gate_count must be at most {MAX_GATES}, got {self.gate_count}"
             )
+        check.instance("TaskParams.reward_params", self.reward_params, RewardParams)
+        self.reward_params.require_effect(self.kind)
         check.flag("TaskParams.truncate_when_diverged", self.truncate_when_diverged)
         if not 0.0 < check.number("TaskParams.max_tilt", self.max_tilt) <= math.pi:
             raise ValueError(f"TaskParams.max_tilt must be in (0, pi], got {self.max_tilt}")

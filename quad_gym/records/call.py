@@ -43,7 +43,7 @@ class Call(IntEnum):
     FINAL_OBSERVATIONS = auto()
     """Likewise, written where one episode ends and the next begins in this step."""
     RESULTS = auto()
-    """(len(RESULTS), blocks WIDTH) float64, written in a STEP."""
+    """(len(RESULTS), at least blocks WIDTH) float64, written in a STEP."""
     RESULT_PITCH = auto()
     """Bytes from one row of the results to the next."""
     SHOWN = auto()

@@ -258,3 +258,15 @@ class FaultKind(IntEnum):
     _ignore_ = "aid"
     for aid in Aid:  # an aiding sensor is silent: BAROMETER_LOSS and so on
         vars()[f"{aid.name}_LOSS"] = 12 + aid
+
+
+class RewardTerm(IntEnum):
+    """Terms of the built-in rewards; each has a weight in `RewardParams`, under its name."""
+
+    NEAR = 0
+    FINE = 1
+    PROGRESS = 2
+    GATE_PASSED = 3
+    HEADING = 4
+    ACTION_RATE = 5
+    BODY_RATES = 6

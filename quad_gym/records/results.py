@@ -2,6 +2,8 @@
 
 from enum import IntEnum
 
+from quad_gym.records.enums import RewardTerm
+
 
 class Result(IntEnum):
     """Rows of the results of a step, by their index."""
@@ -21,5 +23,8 @@ class Result(IntEnum):
     FILTER_DIVERGED = 12
 
 
-RESULTS = tuple(result.name.lower() for result in Result)
-"""Names of the columns of the results of a step."""
+RESULTS = (
+    *(result.name.lower() for result in Result),
+    *(f"reward_{term.name.lower()}" for term in RewardTerm),
+)
+"""Names of the columns of the results of a step, with the terms of the reward last."""

@@ -1,6 +1,7 @@
 """What a batch does, the same for all its flights."""
 
 from quad_gym.records.draws import DRAWN_SIZE
+from quad_gym.records.enums import RewardTerm
 from quad_gym.records.sizes import (
     AIDS,
     FAULT_KINDS,
@@ -56,6 +57,9 @@ SETTINGS_FIELDS = (
     Field("start", (), "-", "how episodes begin, see Start", "i8"),
     Field("pad", (), "0 or 1", "whether a launch pad carries vehicles that start on the ground", "i8"),
     Field("reward_scale", (), "-", "what a reward per second is multiplied by"),
+    Field("reward_weight", (len(RewardTerm),), "mixed", "of each term of the reward"),
+    Field("near_decay", (), "1/m", "of the term NEAR with distance"),
+    Field("fine_decay", (), "1/m", "of the term FINE with distance"),
     Field("randomize_reference", (), "0 or 1", "whether the reference is drawn anew each episode", "i8"),
     Field("max_steps", (), "steps", "time limit of an episode; 0: none", "f8"),
     Field("out_of_bounds", (), "m", "largest distance from the reference"),

@@ -1,5 +1,6 @@
 """The workspace of a thread: nothing in it outlasts a step."""
 
+from quad_gym.records.enums import RewardTerm
 from quad_gym.records.sizes import (
     DELAY_SLOTS,
     MAX_BLOCKS,
@@ -65,6 +66,7 @@ WORK_FIELDS = (
     Field("ground_impulse", (8, 3), "N s", "of the ground on a point, in I"),
     Field("ground_gap", (8,), "m", "height of a point above the ground"),
     # the batch
+    Field("reward_term", (len(RewardTerm),), "-", "terms of the reward of a step"),
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
     # what arrived before, while something new is measured

@@ -69,20 +69,29 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
     return found
 
 
-def reward(task: Task, view: "View", count: int) -> NDArray[Any]:
-    """Rewards of a task, (n,), which may still be NaN or infinite.
+def reward_terms(task: Task, view: "View", count: int) -> dict[str, NDArray[Any]]:
+    """Terms of a task's reward, (n,) each, which may still be NaN or infinite.
 
     Raises:
         TaskError: If the method fails, or returns another shape or type.
     """
     value = ask(task, "reward", view)
+    if not isinstance(value, Mapping):
+        return {"reward": _reward(task, value, count)}
+    if not value:
+        raise TaskError(f"{label(task)}.reward must return at least one term, got none")
+    return {str(name): _reward(task, term, count, str(name)) for name, term in value.items()}
+
+
+def _reward(task: Task, value: Any, count: int, name: str = "") -> NDArray[Any]:
+    """A reward, or its term of this name, (n,)."""
     if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (count,):
         return value  # almost always
-    found = numbers(task, "reward", value)
+    found = numbers(task, "reward", value, name)
     if found.shape != (count,):
         raise TaskError(
-            f"{label(task)}.reward must return shape ({count},), one number per flight, "
-            f"got {found.shape}"
+            f"{label(task)}.reward must return shape ({count},), one number per flight"
+            f"{_of(name)}, got {found.shape}"
         )
     return found
 

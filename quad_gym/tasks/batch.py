@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,7 @@ class TaskBatch(ReadableBatch):
         self.began: Truths = self._began_in_step
         self.began_some = False
         self._rewards, self._returns = np.zeros(self.count), np.zeros(self.count)
+        self._terms: dict[str, NDArray[Any]] = {}
         self._terminated: Truths = np.zeros(self.count, bool)
         self._truncated: Truths = np.zeros(self.count, bool)
         self._before = np.zeros_like(self.compared_shown)
@@ -221,7 +223,8 @@ class TaskBatch(ReadableBatch):
         """Call `reward`, `terminated` and `truncated`, and store their results."""
         own_task, view, methods, count = self.own_task, self.view, self.methods, self.count
         if "reward" in methods:
-            self._rewards[:] = answers.reward(own_task, view, count)
+            self._terms = answers.reward_terms(own_task, view, count)
+            self._rewards[:] = reduce(np.add, self._terms.values())
         if "terminated" in methods:
             self._terminated[:] = answers.truths(own_task, "terminated", view, count)
         if "truncated" in methods:
@@ -256,6 +259,20 @@ class TaskBatch(ReadableBatch):
         self._verdict[Verdict.RETURNS] = address_of(self._returns)
         self._verdict[Verdict.BEGAN] = address_of(self._began_in_step)
         return super()._calls_of_threads()
+
+    def reward_terms(self) -> dict[str, Floats]:
+        """Return the terms of the last step's reward, (count,) each; their sum is the reward.
+
+        A reward that the task returns as one array is one term, "reward".
+        """
+        if "reward" not in self.methods:
+            return super().reward_terms()
+        total = reduce(np.add, self._terms.values(), np.zeros(self.count))
+        none = self._began_in_step | ~(np.abs(total) <= LARGEST_REWARD)
+        return {
+            name: np.where(none, 0.0, self.reward_scale * values)
+            for name, values in self._terms.items()
+        }
 
     # ---- observing ----------------------------------------------------------------------------
 

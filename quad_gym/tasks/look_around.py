@@ -69,12 +69,12 @@ class LookAround(Task):
     def __init__(
         self, heading_weight: float = HEADING_WEIGHT, crash_cost: float = CRASH_COST
     ) -> None:
-        self.pieces: Term = (
-            WIDE_WEIGHT * Tracking(1.0)
-            + NEAR_WEIGHT * Tracking(5.0)
-            + check.number("heading_weight", heading_weight, least=0.0) * Heading()
-            - check.number("crash_cost", crash_cost, least=0.0) * Crash()
-        )
+        self._terms: dict[str, Term] = {
+            "wide": WIDE_WEIGHT * Tracking(1.0),
+            "near": NEAR_WEIGHT * Tracking(5.0),
+            "heading": check.number("heading_weight", heading_weight, least=0.0) * Heading(),
+            "crash": -check.number("crash_cost", crash_cost, least=0.0) * Crash(),
+        }
 
     def _require(self, sensors: "SensorSuite", world: "WorldParams") -> None:
         if sensors.camera is None:
@@ -83,9 +83,9 @@ class LookAround(Task):
                 "markers, got none: choose sensors that have one, and no camera=False"
             )
 
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """Return the reward described in the class, (n,)."""
-        return self.pieces(view)
+    def reward(self, view: "View") -> dict[str, NDArray[np.float64]]:
+        """Return the terms of the reward described in the class, (n,) each."""
+        return {name: term(view) for name, term in self._terms.items()}
 
     def observe(self, view: "View") -> dict[str, NDArray[np.float64]]:
         """Return `features_direction`: unit vector to the center of the markers, (n, 3) in B."""

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quad_gym.params import checks as check
 from quad_gym.params.obstacles import Wall
+from quad_gym.params.reward import RewardParams
 from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, Term
 from quad_gym.tasks.task import ObservationSpec, Task
 
@@ -29,10 +30,9 @@ CRASH_COST = 50.0
 """Cost of a crash, in addition to the rewards for progress so far. With a constant cost alone,
 hurrying through an outage late in the course would be worthwhile."""
 
-ACTION_COST, RATE_COST = 0.02, 0.002
-"""Weights of |change of action|^2 and |body rates|^2 in each step, as in the built-in reward."""
-
-_COSTS: Term = -ACTION_COST * ActionRate() - RATE_COST * BodyRates()
+_WEIGHTS = RewardParams()
+_ACTION_RATE: Term = -_WEIGHTS.action_rate * ActionRate()
+_BODY_RATES: Term = -_WEIGHTS.body_rates * BodyRates()
 _CRASH = Crash()
 
 PAST = 0.7
@@ -157,10 +157,14 @@ class OutageDash(Task):
         behind = gaps_behind(gaps_of(view), view.position)
         view.state.gates_passed = np.maximum(view.state.gates_passed, behind)
 
-    def reward(self, view: "View") -> Floats:
-        """Return the reward described in the class, (n,)."""
-        forfeited = _CRASH(view) * (self._crash_cost + view.state.earned)
-        return self._weight * view.period * westward(view) + _COSTS(view) - forfeited
+    def reward(self, view: "View") -> dict[str, Floats]:
+        """Return the terms of the reward described in the class, (n,) each."""
+        return {
+            "action_rate": _ACTION_RATE(view),
+            "body_rates": _BODY_RATES(view),
+            "progress": self._weight * view.period * westward(view),
+            "crash": -_CRASH(view) * (self._crash_cost + view.state.earned),
+        }
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """Return True where the vehicle has crashed or is beyond the finish, (n,)."""

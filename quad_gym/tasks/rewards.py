@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.kernels.task import reward_and_endings as shipped
 from quad_gym.params import checks as check
+from quad_gym.params.reward import RewardParams
 from quad_gym.records import Ending
 
 if TYPE_CHECKING:
@@ -231,15 +231,11 @@ def _dot(a: Floats, b: Floats) -> Floats:
     return total
 
 
-_COSTS = shipped.ACTION_COST * ActionRate() + shipped.RATE_COST * BodyRates()
-_HEADING = shipped.HEADING_WEIGHT * Heading()
+_W = RewardParams()
+_COMMON = _W.heading * Heading() - (_W.action_rate * ActionRate() + _W.body_rates * BodyRates())
 
-TRACKING: Term = (
-    shipped.NEAR_WEIGHT * Tracking(2.0) + shipped.FINE_WEIGHT * Tracking(20.0) + _HEADING - _COSTS
-)
-"""Built-in reward of all tasks except courses of gates, per step."""
+TRACKING: Term = _W.near * Tracking(_W.near_decay) + _W.fine * Tracking(_W.fine_decay) + _COMMON
+"""Built-in reward of all tasks except courses of gates, per step, with its default weights."""
 
-RACING: Term = (
-    shipped.PROGRESS_WEIGHT * Progress() + shipped.GATE_BONUS * GatePassed() + _HEADING - _COSTS
-)
-"""Built-in reward for courses of gates, per step."""
+RACING: Term = _W.progress * Progress() + _W.gate_passed * GatePassed() + _COMMON
+"""Built-in reward for courses of gates, per step, with its default weights."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params import checks as check
+from quad_gym.params.reward import RewardParams
 from quad_gym.tasks.rewards import ActionRate, BodyRates, Crash, GatePassed, Progress, Term
 from quad_gym.tasks.task import Task
 
@@ -57,14 +58,16 @@ class StaleRace(Task):
     """
 
     def __init__(self, crash_cost: float = CRASH_COST) -> None:
-        self._costs: Term = (
-            PROGRESS_WEIGHT * Progress()
-            - 0.02 * ActionRate()
-            - 0.002 * BodyRates()
-            - check.number("crash_cost", crash_cost, least=0.0) * Crash()
-        )
+        costs = RewardParams()
+        self._terms: dict[str, Term] = {
+            "progress": PROGRESS_WEIGHT * Progress(),
+            "action_rate": -costs.action_rate * ActionRate(),
+            "body_rates": -costs.body_rates * BodyRates(),
+            "crash": -check.number("crash_cost", crash_cost, least=0.0) * Crash(),
+        }
         self._gate: Term = GATE_REWARD * GatePassed()
 
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """Return the reward described in the class, (n,)."""
-        return self._costs(view) + view.period * self._gate(view)
+    def reward(self, view: "View") -> dict[str, NDArray[np.float64]]:
+        """Return the terms of the reward described in the class, (n,) each."""
+        terms = {name: term(view) for name, term in self._terms.items()}
+        return terms | {"gate_passed": view.period * self._gate(view)}

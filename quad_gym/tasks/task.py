@@ -57,7 +57,7 @@ class Task:
     |---|---|
     | `reset(view, rng)` | None, or start values by name; only rows of flights that begin an episode are used |
     | `update(view, rng)` | None; called first in a step, to change `view.state` |
-    | `reward(view)` | (n,) float: reward of the step; `reward_per="second"` multiplies it by the control period |
+    | `reward(view)` | (n,) float: reward of the step, or a dictionary of its terms, whose sum it is; `reward_per="second"` multiplies it by the control period |
     | `terminated(view)` | (n,) bool: True ends the episode by a crash or at the goal |
     | `truncated(view)` | (n,) bool: True cuts the episode short |
     | `observe(view)` | (n,) or (n, k) float, or a dictionary of such arrays |
@@ -148,8 +148,8 @@ class Task:
     def update(self, view: "View", rng: "FlightRandom") -> None:
         """Change `view.state` after a step, before reward, endings and observation are computed."""
 
-    def reward(self, view: "View") -> NDArray[np.float64]:
-        """Return the reward of the last step, (n,)."""
+    def reward(self, view: "View") -> "NDArray[np.float64] | dict[str, NDArray[np.float64]]":
+        """Return the reward of the last step, (n,), or its terms by name, (n,) each."""
         return view.builtin.reward  # type: ignore[no-any-return]
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:

@@ -210,6 +210,10 @@ PARAMETERS = {
     "PDGains": (quad_gym.PDGains(), lambda p: {"gains": p}),
     "ActionParams": (quad_gym.ActionParams(), lambda p: {"action_params": p}),
     "TaskParams": (TaskParams(), lambda p: {"task": p}),
+    "RewardParams": (
+        quad_gym.RewardParams(),
+        lambda p: {"task": TaskParams(start="hover", reward_params=p)},
+    ),
     "WorldParams": (quad_gym.WorldParams(), lambda p: {"world": p}),
     "BatteryParams": (
         quad_gym.BatteryParams(),

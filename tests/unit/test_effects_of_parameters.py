@@ -77,6 +77,17 @@ GROUPS = {
         lambda new: {"action_params": new, "control": Control.VELOCITY, "control_rate": 50.0},
     ),
     "task": (TaskParams(start="mixed"), lambda new: {"task": new, "world": "calm"}),
+    "reward_params": (
+        quad_gym.RewardParams(),
+        lambda new: {
+            "task": TaskParams(
+                kind="waypoints" if (new.progress, new.gate_passed) != (1.0, 1.0) else "hover",
+                start="hover",
+                reward_params=new,
+            ),
+            "world": "calm",
+        },
+    ),
     "world": (WORLD, lambda new: {"world": new}),
     "ground": (WORLD.ground, lambda new: {"world": WORLD.replace(ground=new)}),
     "battery": (WORLD.battery, lambda new: {"world": WORLD.replace(battery=new)}),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from quad_gym.analysis.reports import text_table
 from quad_gym.commands.benchmark.interfaces import random_actions
 from quad_gym.commands.benchmark.timing import Effort, Row, by_turns, lasting, percent, report
+from quad_gym.params.reward import RewardParams
 from quad_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -21,8 +22,9 @@ COUNTS = (8, 1024)
 """Flights in the batches."""
 
 # arrays of no axes: NumPy would make one of a Python number in every step, which takes a while
-NEAR_RATE, FINE_RATE, FINE_WEIGHT = np.array(-2.0), np.array(-20.0), np.array(0.5)
-HEADING_WEIGHT, ACTION_COST, RATE_COST = np.array(0.1), np.array(0.02), np.array(0.002)
+_W = RewardParams()
+NEAR_DECAY, FINE_DECAY, FINE = map(np.array, (-_W.near_decay, -_W.fine_decay, _W.fine))
+HEADING, ACTION_RATE, BODY_RATES = map(np.array, (_W.heading, _W.action_rate, _W.body_rates))
 FAR, LOW, MOST_STEPS = np.array(3.0), np.array(-0.5), np.array(500)
 TIPPED = np.array(math.cos(math.radians(100.0)))
 
@@ -39,10 +41,10 @@ class OwnCircle(Task):
     def reward(self, view: "View") -> NDArray[np.float64]:
         """(n,) closeness and heading less changes of the action and body rates, a second."""
         error, change, rates = view.position_error, view.action - view.last_action, view.body_rates
-        closeness = np.exp(NEAR_RATE * error) + FINE_WEIGHT * np.exp(FINE_RATE * error)
+        closeness = np.exp(NEAR_DECAY * error) + FINE * np.exp(FINE_DECAY * error)
         facing = np.vecdot(view.truth.forward, view.reference_heading)
-        costs = ACTION_COST * np.vecdot(change, change) + RATE_COST * np.vecdot(rates, rates)
-        return closeness + HEADING_WEIGHT * facing - costs
+        costs = ACTION_RATE * np.vecdot(change, change) + BODY_RATES * np.vecdot(rates, rates)
+        return closeness + HEADING * facing - costs
 
     def terminated(self, view: "View") -> NDArray[np.bool_]:
         """(n,) too far from the reference, tipped over, or on the ground."""

@@ -7,13 +7,12 @@ from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import logical_not, select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.records import MAX_GATES, Ending, Task
+from quad_gym.records import MAX_GATES, Ending, RewardTerm, Task
 
-NEAR_WEIGHT, FINE_WEIGHT, HEADING_WEIGHT, ACTION_COST, RATE_COST = 1.0, 0.5, 0.1, 0.02, 0.002
-"""Reward a second: exp(-2e), exp(-20e), alignment, |change of action|^2, |body rates|^2."""
-PROGRESS_WEIGHT, GATE_BONUS = 1.0, 1.0
-"""Reward of a course: per meter toward the next gate, and per gate passed."""
-
+_NEAR, _FINE = RewardTerm.NEAR.value, RewardTerm.FINE.value
+_PROGRESS, _GATE_PASSED = RewardTerm.PROGRESS.value, RewardTerm.GATE_PASSED.value
+_HEADING, _TERMS = RewardTerm.HEADING.value, len(RewardTerm)
+_ACTION_RATE, _BODY_RATES = RewardTerm.ACTION_RATE.value, RewardTerm.BODY_RATES.value
 _FILTER_DIVERGED = float(Ending.FILTER_DIVERGED)
 _TIME_LIMIT, _FILTER_FAILED = float(Ending.TIME_LIMIT), float(Ending.FILTER_FAILED)
 _ON_THE_GROUND, _TIPPED_OVER = float(Ending.BELOW_MIN_HEIGHT), float(Ending.TIPPED_OVER)
@@ -38,39 +37,61 @@ def _pass_gate(flight, settings, active):
 
 
 @kernel
-def judge(flight, p, settings, active):
+def _reward(flight, p, settings, work, active, R_BI, w_B):
+    """Return reward and position error of a step, whether it passed the last gate, and is finite.
+
+    The reward is not the sum of its terms in `work`, but is computed from the same factors with
+    fewer roundings.
+    """
+    seconds, weight, term = p.dt * settings.ticks_per_step, settings.reward_weight, work.reward_term
+    change, spin = 0.0 * seconds, dot(w_B, w_B)
+    for i in range(4):
+        gap = flight.action[i] - flight.last_action[i]
+        change = change + gap * gap
+    costs = weight[_ACTION_RATE] * change + weight[_BODY_RATES] * spin
+    scale = settings.reward_scale
+    finished = active & (change < 0.0)  # nowhere, as yet
+    if settings.task == Task.WAYPOINTS:
+        passed, progress = _pass_gate(flight, settings, active)
+        _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
+        facing, bonus = dot(R_BI[0], x_ref), select(passed, weight[_GATE_PASSED], 0.0)
+        reward = weight[_PROGRESS] * progress + bonus
+        reward = reward + seconds * (weight[_HEADING] * facing - costs)
+        finished = active & (flight.gate_next >= settings.gate_count)
+        error = norm(sub(load3(flight.ref_center), load3(flight.r)))
+        term[_PROGRESS] = scale * weight[_PROGRESS] * progress
+        term[_GATE_PASSED] = scale * bonus
+    else:
+        r_ref, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
+        facing, error = dot(R_BI[0], x_ref), norm(sub(r_ref, load3(flight.r)))
+        near, fine = exp(-settings.near_decay * error), exp(-settings.fine_decay * error)
+        closeness = weight[_NEAR] * near + weight[_FINE] * fine
+        reward = seconds * (closeness + weight[_HEADING] * facing - costs)
+        term[_NEAR] = scale * weight[_NEAR] * seconds * near
+        term[_FINE] = scale * weight[_FINE] * seconds * fine
+    term[_HEADING] = scale * weight[_HEADING] * seconds * facing
+    term[_ACTION_RATE] = -scale * weight[_ACTION_RATE] * seconds * change
+    term[_BODY_RATES] = -scale * weight[_BODY_RATES] * seconds * spin
+    sound = is_finite(error + spin + R_BI[2][2])
+    for k in range(_TERMS):
+        term[k] = select(active & sound, term[k], 0.0)
+    return select(sound, scale * reward, 0.0), error, finished, sound
+
+
+@kernel
+def judge(flight, p, settings, work, active):
     """Set reward, errors and endings of the step that has just been flown, where `active`.
 
     Args:
         flight: Record.
         p: Parameters, for the tick.
-        settings: What the batch does.
+        settings: Task, weights of the reward, and bounds.
+        work: Workspace, for the terms of the reward.
         active: Lanes that flew a step, not those that are about to begin an episode.
     """
-    seconds = p.dt * settings.ticks_per_step
     R_BI, w_B = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
     flight.step = select(active, flight.step + 1.0, flight.step)
-
-    change = 0.0 * seconds
-    for i in range(4):
-        gap = flight.action[i] - flight.last_action[i]
-        change = change + gap * gap
-    costs = ACTION_COST * change + RATE_COST * dot(w_B, w_B)
-    finished = active & (change < 0.0)  # nowhere, as yet
-    if settings.task == Task.WAYPOINTS:
-        passed, progress = _pass_gate(flight, settings, active)
-        _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-        reward = PROGRESS_WEIGHT * progress + select(passed, GATE_BONUS, 0.0)
-        reward = reward + seconds * (HEADING_WEIGHT * dot(R_BI[0], x_ref) - costs)
-        finished = active & (flight.gate_next >= settings.gate_count)
-        error = norm(sub(load3(flight.ref_center), load3(flight.r)))
-    else:
-        r_ref, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
-        error = norm(sub(r_ref, load3(flight.r)))
-        closeness = NEAR_WEIGHT * exp(-2.0 * error) + FINE_WEIGHT * exp(-20.0 * error)
-        reward = seconds * (closeness + HEADING_WEIGHT * dot(R_BI[0], x_ref) - costs)
-
-    sound = is_finite(error + dot(w_B, w_B) + R_BI[2][2])
+    reward, error, finished, sound = _reward(flight, p, settings, work, active, R_BI, w_B)
     lost = (error > settings.out_of_bounds) | logical_not(sound)
     tipped = R_BI[2][2] < settings.least_up
     grounded = flight.r[2] < settings.min_height
@@ -88,7 +109,6 @@ def judge(flight, p, settings, active):
     ending = select(lost, _OUT_OF_BOUNDS, ending)
     ending = select(finished, _LAST_GATE, ending)
     error = select(sound, error, settings.out_of_bounds)
-    reward = select(sound, settings.reward_scale * reward, 0.0)
     flight.position_error = select(active, error, flight.position_error)
     flight.reward = select(active, reward, 0.0)
     flight.terminated = select(terminated, 1.0, 0.0)
@@ -101,4 +121,5 @@ def judge(flight, p, settings, active):
 @stage
 def judge_stage(flight, world, model, settings, work, stages, flag):
     """Set reward, errors and endings of a step."""
-    judge(lanes_of(flight), lanes_of(model), settings, lanes_of(work).mask > 0.0)
+    working = lanes_of(work)
+    judge(lanes_of(flight), lanes_of(model), settings, working, working.mask > 0.0)
