@@ -4,7 +4,6 @@ All lanes of its block hold the same flight, or, while the heading is unknown, e
 blocks holds a flight with another heading (`headings.py`).
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ from quad_gym.estimation.samples import Measurement, Sample
 from quad_gym.kernels import single
 from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import Stage, needed_stages
-from quad_gym.packing.aids import pack_aid_settings, slow_falls
-from quad_gym.packing.flight import form_of, params_block, params_record
+from quad_gym.packing.aids import pack_aid_settings
+from quad_gym.packing.flight import form_of, pack_tick, params_block, params_record
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
 from quad_gym.records import (
@@ -35,17 +34,6 @@ from quad_gym.records import (
 
 Floats = NDArray[np.float64]
 
-_NOISE = (
-    *("accel_noise", "gyro_noise", "accel_error_noise"),
-    *("accel_thrust_noise", "gyro_thrust_noise"),
-)
-_OF_TICKS = (
-    *("dt", *_NOISE),
-    *("accel_bias_decay", "gyro_bias_decay", "accel_bias_drive", "gyro_bias_drive"),
-    *("slow_decay", "slow_drive"),
-)
-"""Fields of the parameter record that depend on how long a prediction is."""
-
 _PARTS = frozenset({"filter", "watch", "slow", "aids"})
 
 
@@ -63,8 +51,8 @@ class Engine:
         params = params_record(VehicleParams(), sensors)
         params["gravity"] = sensors.estimator.gravity
         self.params = params_block(params)
-        self._of_tick = {name: self.params[name].copy() for name in _OF_TICKS}
-        self._dt = sensors.imu.dt
+        self._dt = 0.0
+        self._set_dt(sensors.imu.dt)
         lever_arm = FilterForm.LEVER_SAMPLES if any(sensors.imu.lever_arm_B) else FilterForm(0)
         estimator = sensors.estimator.replace(kind=kind)
         self.form = form_of(estimator, innovations=True, lever_arm=lever_arm)
@@ -190,28 +178,10 @@ class Engine:
             self.params[name] = numbers
 
     def _set_dt(self, dt: float) -> None:
-        """Set the duration of a prediction in the parameters.
-
-        White noise is a density: longer averages have smaller noise.
-        """
-        if dt == self._dt:
-            return
-        self._dt, imu, p = dt, self.sensors.imu, self.params
-        for name, numbers in self._of_tick.items():
-            p[name] = numbers
-        if dt == imu.dt:
-            return
-        p["dt"] = dt
-        for name in _NOISE:
-            p[name] *= math.sqrt(imu.dt / dt)
-        for sensor in ("accel", "gyro"):
-            sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
-            p[f"{sensor}_bias_decay"] = math.exp(-dt / tau)
-            p[f"{sensor}_bias_drive"] = sigma * math.sqrt(-math.expm1(-2.0 * dt / tau))
-        if self.slow:
-            decay, drive = slow_falls(self.sensors, dt)
-            p["slow_decay"][0, : len(decay)] = decay[:, np.newaxis]
-            p["slow_drive"][0, : len(drive)] = drive[:, np.newaxis]
+        """Set the duration of a prediction in the parameters."""
+        if dt != self._dt:
+            self._dt = dt
+            pack_tick(self.params[0], self.sensors, dt)
 
     def _table(self) -> NDArray[Any]:
         """Return the table of the stages that the filter runs."""

@@ -217,7 +217,7 @@ def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, se
         load3(w_B),
         load4(rotor_speeds),
         load3(d_I),
-        load3(params[0].wind),
+        load3(params[0].wind_I),
         params[0],
         settings[0],
     )

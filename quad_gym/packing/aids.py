@@ -70,26 +70,16 @@ def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
     return (*range(FEATURE_BLOCKS + features), *(AID_BLOCKS + aid for aid in sensors.aids))
 
 
-def _fall(error: SlowError, time: float) -> tuple[float, float]:
+def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
     """Decay of a slow error over a time [s], and standard deviation of what drives it."""
     decay = math.exp(-time / error.tau)
     return decay, error.sigma * math.sqrt(-math.expm1(-2.0 * time / error.tau))
-
-
-def slow_falls(
-    sensors: SensorSuite, time: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Decays of the filter's slow errors over a time [s], and deviations of what drives them."""
-    falls = np.array([_fall(error, time) for error in slow_states(sensors).errors]).reshape(-1, 2)
-    return falls[:, 0], falls[:, 1]
 
 
 def pack_aids(p: Any, sensors: SensorSuite) -> None:
     """Write the numbers of aiding sensors and slow errors into a parameter record."""
     p["slow_decay"] = p["slow_sigma"] = 1.0
     states = slow_states(sensors)
-    for k, error in enumerate(states.errors):
-        p["slow_decay"][k], p["slow_drive"][k] = _fall(error, sensors.imu.dt)
     p["slow_sigma"][: len(states.errors)] = states.first_sigmas
     for aid, params in sensors.aids.items():
         p["aid_scale"][aid] = params.scale
@@ -100,7 +90,7 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
         for name in ("vector", "scalar"):
             slow = getattr(params, f"slow_{name}")
             if slow is not None:
-                decay, drive = _fall(slow, 1.0 / params.rate)
+                decay, drive = decay_and_drive(slow, 1.0 / params.rate)
                 p[f"aid_{name}_sigma"][aid] = slow.sigma
                 p[f"aid_{name}_decay"][aid], p[f"aid_{name}_drive"][aid] = decay, drive
         p["aid_numbers"][aid] = params.numbers

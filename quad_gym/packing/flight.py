@@ -1,24 +1,32 @@
 """Parameters as records: from the dataclasses that users write to the numbers that kernels read."""
 
 import math
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.frames import ecef_to_enu
-from quad_gym.packing.aids import pack_aid_settings, pack_aids, phase_ticks
+from quad_gym.packing.aids import (
+    decay_and_drive,
+    pack_aid_settings,
+    pack_aids,
+    phase_ticks,
+    slow_states,
+)
 from quad_gym.packing.gates import gate_limit
-from quad_gym.packing.world import pack_world
 from quad_gym.params import portable
+from quad_gym.params.aids import SlowError
 from quad_gym.params.clocks import Clocks
 from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
+from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.sensors import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.params.world import WorldParams
+from quad_gym.params.world import BatteryParams, WorldParams
 from quad_gym.records import (
     BASELINE_BLOCK,
     FOLLOWED,
@@ -26,6 +34,7 @@ from quad_gym.records import (
     MAX_HARMONICS,
     PARAMS,
     PARAMS_BLOCK,
+    PARAMS_FIELDS,
     POSITION_BLOCK,
     SETTINGS,
     Autoreset,
@@ -40,6 +49,15 @@ from quad_gym.records import (
     aligned_zeros,
 )
 
+_NAMES = frozenset(field.name for field in PARAMS_FIELDS)
+
+
+def _copy(p: Any, part: Any, prefix: str = "") -> None:
+    """Copy those fields of parameters that a record has, under their names; None stays zero."""
+    for name in (field.name for field in fields(part)):
+        if prefix + name in _NAMES and getattr(part, name) is not None:
+            p[prefix + name] = getattr(part, name)
+
 
 def params_record(
     vehicle: VehicleParams,
@@ -48,105 +66,122 @@ def params_record(
     action_params: ActionParams | None = None,
     world: WorldParams | None = None,
 ) -> NDArray[Any]:
-    """The numbers of a vehicle, its sensors, gains and world as one scalar record, shape (1,)."""
-    gains = PDGains() if gains is None else gains
-    scales = ActionParams() if action_params is None else action_params
-    imu, gnss, estimator = sensors.imu, sensors.gnss, sensors.estimator
+    """Return a vehicle, its sensors, gains and world as one scalar record, shape (1,).
+
+    Fields have the names of the parameters that they are; the others follow from them.
+    """
     record = np.zeros(1, PARAMS)
     p = record[0]
-
-    p["gravity"], p["mass"] = vehicle.gravity, vehicle.mass
-    p["inertia"], p["inertia_inverse"] = vehicle.inertia, portable.inverse(vehicle.inertia)
-    p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
-    p["kF"] = vehicle.thrust_coefficient
-    p["effectiveness"] = p["sound_effectiveness"] = vehicle.effectiveness
-    p["allocation"] = portable.inverse(vehicle.effectiveness)
-    p["motor_tau"], p["motor_gain"] = vehicle.motor_time_constant, vehicle.motor_speed_per_volt
-    p["max_voltage"], p["max_rotor_force"] = vehicle.max_voltage, vehicle.max_rotor_force
-    p["hover_voltage"] = vehicle.hover_voltage
-    pack_world(p, vehicle, WorldParams() if world is None else world)
-    p["gain_k"], p["gain_kd"] = gains.position, gains.velocity
-    p["gain_K"], p["gain_Kd"] = gains.attitude, gains.body_rates
-
-    p["rate_bandwidth"], p["attitude_bandwidth"] = (
-        scales.rate_bandwidth,
-        scales.attitude_bandwidth,
-    )
-    p["velocity_bandwidth"], p["velocity_scale"] = (
-        scales.velocity_bandwidth,
-        scales.velocity_scale,
-    )
-    p["rate_scale"], p["tilt_scale"] = scales.rate_scale, scales.tilt_scale
-    p["torque_scale"] = vehicle.hover_torques
-
-    p["dt"], p["imu_lever_arm"] = imu.dt, imu.lever_arm_B
-    p["accel_sigma"] = imu.accel_noise_density / math.sqrt(imu.dt)
-    p["gyro_sigma"] = imu.gyro_noise_density / math.sqrt(imu.dt)
-    p["accel_noise"], p["gyro_noise"] = imu.believed_accel_sigma, imu.believed_gyro_sigma
-    p["accel_error_noise"] = imu.believed_accel_error
-    for sensor in ("accel", "gyro"):  # rotors that lift g shake it like this
-        p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / vehicle.gravity
-    hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
-    for sensor in ("accel", "gyro"):
-        p[f"{sensor}_scale_sigma"] = getattr(imu, f"{sensor}_scale_sigma")
-        p[f"{sensor}_misalignment_sigma"] = getattr(imu, f"{sensor}_misalignment_sigma")
-        p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / hover_speed**2
-        sigma, tau = getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau")
-        p[f"{sensor}_bias_sigma"] = sigma
-        p[f"{sensor}_bias_decay"] = math.exp(-imu.dt / tau)
-        p[f"{sensor}_bias_drive"] = sigma * math.sqrt(-math.expm1(-2.0 * imu.dt / tau))
-
-    if gnss is not None:
-        p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
-        p["antenna"], p["gnss_sigma"] = gnss.primary_antenna_B, gnss.position_sigma_I
-        if gnss.has_baseline:
-            p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
-            p["baseline_sigma"] = gnss.baseline_sigma
-            p["heading_error_sigma"] = gnss.heading_error_sigma
-            p["first_baseline_sigma"] = gnss.first_baseline_sigma
-            p["baseline_noise"] = gnss.believed_baseline_sigma
-        else:  # one that is vertical, as that tells no heading either
-            p["baseline"], p["baseline_length"] = (0.0, 0.0, 1.0), 1.0
-            p["baseline_sigma"] = sensors.initial_pose.heading_sigma
-            p["first_baseline_sigma"] = p["baseline_noise"] = sensors.initial_pose.heading_sigma
-        p["velocity_sigma"] = gnss.velocity_sigma or 0.0
-        period = 1.0 / (gnss.rate * gnss.drift_tau)
-        p["drift_decay"] = math.exp(-period)
-        p["drift_drive"] = np.array(gnss.drift_sigma_I) * math.sqrt(-math.expm1(-2.0 * period))
-    else:  # the place of the start, as if its center and its x axis had been measured
-        p["R_IG"], p["baseline"], p["baseline_length"] = np.eye(3), (1.0, 0.0, 0.0), 1.0
-        p["gnss_sigma"] = sensors.initial_pose.position_sigma
-        p["baseline_sigma"] = sensors.initial_pose.heading_sigma
-        p["first_baseline_sigma"] = p["baseline_noise"] = sensors.initial_pose.heading_sigma
-
-    p["heading_sigma"] = sensors.initial_pose.heading_sigma
-
+    world = WorldParams() if world is None else world
+    _copy(p, sensors.estimator)
+    for part in (
+        vehicle,
+        world,
+        action_params or ActionParams(),
+        sensors.imu,
+        sensors.initial_pose,
+    ):
+        _copy(p, part)
+    _copy(p, world.ground or GroundParams())
+    _copy(p, world.battery or BatteryParams(), "battery_")
+    _copy(p, gains or PDGains(), "gain_")
+    _pack_vehicle(p, vehicle, world)
+    _pack_imu(p, sensors, vehicle)
+    _pack_gnss(p, sensors)
     if sensors.camera is not None:
         camera = sensors.camera
+        _copy(p, camera)
         p["camera"], p["R_CB"] = camera.position_B, portable.euler_dcm(camera.attitude)
-        p["focal_length"], p["half_image"] = camera.focal_length, np.array(camera.image_size) / 2
-        p["pixel_sigma"] = camera.pixel_sigma
-        p["max_range"], p["blur"] = camera.max_range, camera.blur
+        p["half_image"], p["blur"] = np.array(camera.image_size) / 2, camera.blur
         p["features"][: len(camera.features_I)] = camera.features_I
-
     pack_aids(p, sensors)
+    pack_tick(p, sensors, sensors.imu.dt)
+    _pack_filter(p, sensors)
+    noisy = sensors.noisy
+    p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
+    return record
+
+
+def _pack_vehicle(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
+    """Write the numbers that follow from the vehicle and the wind."""
+    for name in ("effectiveness", "max_rotor_force", "hover_voltage"):
+        p[name] = getattr(vehicle, name)
+    p["sound_effectiveness"], p["torque_scale"] = vehicle.effectiveness, vehicle.hover_torques
+    p["allocation"] = portable.inverse(vehicle.effectiveness)
+    p["inertia_inverse"] = portable.inverse(vehicle.inertia)
+    p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
+    p["half_disc"] = 0.5 * vehicle.disc_area * vehicle.air_density
+    east, north, _ = world.wind_I
+    p["wind_speed"], p["wind_direction"] = math.hypot(east, north), math.atan2(north, east)
+
+
+def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
+    """Write the noise of the IMU's samples, and of the rotors' vibration."""
+    imu = sensors.imu
+    p["imu_lever_arm"] = imu.lever_arm_B
+    hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
+    for sensor in ("accel", "gyro"):
+        p[f"{sensor}_sigma"] = getattr(imu, f"{sensor}_noise_density") / math.sqrt(imu.dt)
+        p[f"{sensor}_vibration"] = getattr(imu, f"{sensor}_vibration") / hover_speed**2
+
+
+def pack_tick(p: Any, sensors: SensorSuite, dt: float) -> None:
+    """Write the numbers that depend on the duration of a prediction.
+
+    White noise is a density: the mean of a longer time has less of it.
+
+    Args:
+        p: One record of parameters, or of a block of flights; it has the gravity of the vehicle.
+        sensors: Sensors that the filter assumes.
+        dt: Duration of the prediction [s]; of a tick, in flights.
+    """
+    imu, fewer = sensors.imu, math.sqrt(sensors.imu.dt / dt)
+    p["dt"], p["accel_error_noise"] = dt, imu.believed_accel_error * fewer
+    for sensor in ("accel", "gyro"):
+        p[f"{sensor}_noise"] = getattr(imu, f"believed_{sensor}_sigma") * fewer
+        # rotors that lift g shake it like this
+        p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"] * fewer
+        error = SlowError(getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau"))
+        p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = decay_and_drive(error, dt)
+    for k, error in enumerate(slow_states(sensors).errors):
+        p["slow_decay"][k], p["slow_drive"][k] = decay_and_drive(error, dt)
+
+
+def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
+    """Write GNSS, or where there is none the pose at the start as if GNSS had measured it."""
+    gnss, pose = sensors.gnss, sensors.initial_pose
+    if gnss is None:  # center and x axis
+        p["R_IG"], p["gnss_sigma"] = np.eye(3), pose.position_sigma
+    else:
+        _copy(p, gnss)
+        p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
+        p["antenna"], p["gnss_sigma"] = gnss.primary_antenna_B, gnss.position_sigma_I
+        drift = SlowError(1.0, gnss.rate * gnss.drift_tau)  # in measurements
+        p["drift_decay"], drive = decay_and_drive(drift, 1.0)
+        p["drift_drive"] = np.array(gnss.drift_sigma_I) * drive
+    if gnss is not None and gnss.has_baseline:
+        p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
+        p["first_baseline_sigma"] = gnss.first_baseline_sigma
+        p["baseline_noise"] = gnss.believed_baseline_sigma
+    else:  # beside GNSS a vertical one, as that tells no heading either
+        p["baseline"] = (1.0, 0.0, 0.0) if gnss is None else (0.0, 0.0, 1.0)
+        p["baseline_length"] = 1.0
+        for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
+            p[name] = pose.heading_sigma
+
+
+def _pack_filter(p: Any, sensors: SensorSuite) -> None:
+    """Write form and gates of the filter."""
+    estimator = sensors.estimator
     p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
     p["sigma_kappa"] = estimator.kappa
     p["direction_floor"] = estimator.direction_variance_floor
     p["noise_at_prediction"] = estimator.bearing_noise_at != "measured"
     p["noise_pinhole"] = estimator.bearing_noise_at == "pinhole"
-    p["initial_velocity_variance"] = estimator.initial_velocity_variance
-    p["initial_covariance_scale"] = estimator.initial_covariance_scale
-    p["initial_tilt_sigma"] = estimator.initial_tilt_sigma or 0.0
-    p["recursive_update_threshold"] = estimator.recursive_update_threshold or 0.0
     alarm = estimator.false_alarm_probability
     p["gate_position"] = gate_limit(FREEDOMS[POSITION_BLOCK], alarm)
     p["gate_direction"] = gate_limit(FREEDOMS[BASELINE_BLOCK], alarm)
-    p["max_rejections"] = estimator.max_rejections
-    p["gate_uncertainty"] = np.inf if gnss is None else estimator.max_direction_sigma**2
-    noisy = sensors.noisy
-    p["noisy_sigma"] = (noisy.position, noisy.velocity, noisy.attitude, noisy.body_rates)
-    return record
+    p["gate_uncertainty"] = np.inf if sensors.gnss is None else estimator.max_direction_sigma**2
 
 
 def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:

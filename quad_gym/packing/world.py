@@ -6,31 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.params.ground import GroundParams
 from quad_gym.params.randomization import FEATURE_DRAWS, DrawingTable, Randomization
 from quad_gym.params.sensors import SensorSuite
 from quad_gym.params.vehicle import VehicleParams
-from quad_gym.params.world import BatteryParams, WorldParams
+from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, MAX_START_VELOCITY, SETTINGS, Start, Supply
 
 FALLEN_THROUGH = 0.5
 """Below ground that carries vehicles, nothing flies at this depth [m]."""
-
-
-def pack_world(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
-    """Write the numbers of a world around a vehicle into a parameter record."""
-    east, north, _ = world.wind_I
-    p["kN"], p["rotors"] = vehicle.torque_coefficient, vehicle.rotor_positions_B
-    p["half_disc"] = 0.5 * vehicle.disc_area * vehicle.air_density
-    p["wind"], p["gust_wind_speed"] = world.wind_I, world.gust_wind_speed
-    p["wind_speed"], p["wind_direction"] = math.hypot(east, north), math.atan2(north, east)
-    p["linear_drag"], p["rotor_drag"] = world.linear_drag_B, world.rotor_drag_B
-    p["rotor_radius"], p["ground_height"] = world.rotor_radius, world.ground_height
-    p["feet"] = (GroundParams() if world.ground is None else world.ground).feet_B
-    battery = BatteryParams() if world.battery is None else world.battery
-    p["battery_charge"], p["battery_energy"] = battery.charge, battery.energy
-    p["battery_empty"], p["battery_resistance"] = battery.empty_voltage, battery.resistance
-    p["motor_efficiency"] = battery.motor_efficiency
 
 
 def pack_options(

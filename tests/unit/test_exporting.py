@@ -223,8 +223,8 @@ def test_zeros_hover_in_every_action(action):
     params = params_record(quad_gym.vehicle_params("lab"), quad_gym.sensor_suite("lab"))[0]
     offsets = [field.offset for field in action_fields(action, params)]
     if action == "motor":
-        speed = np.sqrt(0.78 * 9.8 / 4 / float(params["kF"]))
-        np.testing.assert_allclose(offsets, speed / float(params["motor_gain"]))
+        speed = np.sqrt(0.78 * 9.8 / 4 / float(params["thrust_coefficient"]))
+        np.testing.assert_allclose(offsets, speed / float(params["motor_speed_per_volt"]))
     else:
         hovering = 0.0 if action == "velocity" else 0.78 * 9.8
         np.testing.assert_allclose(offsets, [hovering, 0.0, 0.0, 0.0])

@@ -181,10 +181,10 @@ PARAMS = {
     "inertia": (3, 3),
     "inertia_inverse": (3, 3),
     "half_drag": (),
-    "kF": (),
+    "thrust_coefficient": (),
     "effectiveness": (4, 4),
-    "motor_tau": (),
-    "motor_gain": (),
+    "motor_time_constant": (),
+    "motor_speed_per_volt": (),
 }
 lanes_and_floats = Compiled(
     lambda f, substeps: integrate(f, f, substeps),

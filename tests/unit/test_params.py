@@ -22,6 +22,7 @@ CLASSES = [
     quad_gym.NoisyObservationParams,
     quad_gym.SensorSuite,
     quad_gym.PDGains,
+    quad_gym.RewardParams,
     quad_gym.ActionParams,
     Clocks,
     quad_gym.TaskParams,
@@ -210,6 +211,11 @@ BAD_VALUES = {
     ("BatteryParams", "empty_voltage"): [*NOT_POSITIVE, 1.1],
     ("BatteryParams", "resistance"): BELOW_ZERO,
     ("BatteryParams", "motor_efficiency"): [*NOT_POSITIVE, 1.1],
+    **{
+        ("RewardParams", field.name): BELOW_ZERO
+        for field in dataclasses.fields(quad_gym.RewardParams)
+    },
+    ("TaskParams", "reward_params"): [None, 1.0, {"near": 1.0}],
     ("TaskParams", "preview"): [(0.2,), 0.2, (-0.1, 0.2), (0.1, float("nan")), None],
     ("TaskParams", "trajectory"): [3, [], "nowhere.csv", [None], float("nan")],
 }

@@ -132,9 +132,9 @@ def _impose_body(flight, nominal, own, settings):
             own.inertia[i, j] = scale * nominal.inertia[i, j]
             own.inertia_inverse[i, j] = nominal.inertia_inverse[i, j] / scale
 
-    kF = _value(flight, settings, _KF, nominal.kF)
-    kN = _value(flight, settings, _KN, nominal.kN)
-    turn = (kN / kF) / (nominal.kN / nominal.kF)
+    kF = _value(flight, settings, _KF, nominal.thrust_coefficient)
+    kN = _value(flight, settings, _KN, nominal.torque_coefficient)
+    turn = (kN / kF) / (nominal.torque_coefficient / nominal.thrust_coefficient)
     zero = 0.0 * kF
     x = _value(flight, settings, _CENTER, zero)
     y = _value(flight, settings, _CENTER + 1, zero)
@@ -151,20 +151,20 @@ def _impose_body(flight, nominal, own, settings):
         own.allocation[i, 1] = A[i, 1] / e
         own.allocation[i, 2] = A[i, 2] / e
         own.allocation[i, 3] = A[i, 3] / (turn * e)
-        own.rotors[i, 0] = nominal.rotors[i, 0] - x
-        own.rotors[i, 1] = nominal.rotors[i, 1] - y
-        own.rotors[i, 2] = nominal.rotors[i, 2] - z
+        own.rotor_positions_B[i, 0] = nominal.rotor_positions_B[i, 0] - x
+        own.rotor_positions_B[i, 1] = nominal.rotor_positions_B[i, 1] - y
+        own.rotor_positions_B[i, 2] = nominal.rotor_positions_B[i, 2] - z
         if settings.grounded:
-            own.feet[i, 0] = nominal.feet[i, 0] - x
-            own.feet[i, 1] = nominal.feet[i, 1] - y
-            own.feet[i, 2] = nominal.feet[i, 2] - z
+            own.feet_B[i, 0] = nominal.feet_B[i, 0] - x
+            own.feet_B[i, 1] = nominal.feet_B[i, 1] - y
+            own.feet_B[i, 2] = nominal.feet_B[i, 2] - z
 
-    own.kF, own.kN = kF, kN
+    own.thrust_coefficient, own.torque_coefficient = kF, kN
     own.action_delay = _value(flight, settings, _ACTION_DELAY, nominal.action_delay)
-    own.motor_tau = _value(flight, settings, _TAU, nominal.motor_tau)
-    gain = _value(flight, settings, _GAIN, nominal.motor_gain)
+    own.motor_time_constant = _value(flight, settings, _TAU, nominal.motor_time_constant)
+    gain = _value(flight, settings, _GAIN, nominal.motor_speed_per_volt)
     full = _value(flight, settings, _VOLTAGE, nominal.max_voltage)
-    own.motor_gain, own.max_voltage = gain, full
+    own.motor_speed_per_volt, own.max_voltage = gain, full
     own.max_rotor_force = kF * (gain * full) * (gain * full)
     own.hover_voltage = math.sqrt(0.25 * own.mass * nominal.gravity / kF) / gain
     weight = own.mass / nominal.mass
@@ -179,13 +179,13 @@ def _impose_world(flight, nominal, own, settings):
     if settings.draw_kind[_DRAG] != FIXED:
         own.half_drag = flight.drawn[_DRAG] * nominal.half_disc
     for i in range(3):
-        own.wind[i] = _value(flight, settings, _WIND + i, nominal.wind[i])
-        own.linear_drag[i] = _value(flight, settings, _LINEAR_DRAG + i, nominal.linear_drag[i])
-        own.rotor_drag[i] = _value(flight, settings, _ROTOR_DRAG + i, nominal.rotor_drag[i])
+        own.wind_I[i] = _value(flight, settings, _WIND + i, nominal.wind_I[i])
+        own.linear_drag_B[i] = _value(flight, settings, _LINEAR_DRAG + i, nominal.linear_drag_B[i])
+        own.rotor_drag_B[i] = _value(flight, settings, _ROTOR_DRAG + i, nominal.rotor_drag_B[i])
     if settings.draw_kind[_WIND_SPEED] != FIXED or settings.draw_kind[_WIND_DIRECTION] != FIXED:
         speed = _value(flight, settings, _WIND_SPEED, nominal.wind_speed)
         s, c = sin_cos(_value(flight, settings, _WIND_DIRECTION, nominal.wind_direction))
-        own.wind[0], own.wind[1] = speed * c, speed * s
+        own.wind_I[0], own.wind_I[1] = speed * c, speed * s
     own.gust_wind_speed = _value(flight, settings, _GUST, nominal.gust_wind_speed)
     own.battery_charge = _value(flight, settings, _CHARGE, nominal.battery_charge)
     own.battery_resistance = _value(flight, settings, _RESISTANCE, nominal.battery_resistance)

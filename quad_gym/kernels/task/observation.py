@@ -171,7 +171,7 @@ def _put_privileged(flight, p, settings, row, k):
     k = _put3(row, k, load3(flight.w))
     k = _put3(row, k, load3(flight.b_a))
     k = _put3(row, k, load3(flight.b_g))
-    hover = p.motor_gain * p.hover_voltage
+    hover = p.motor_speed_per_volt * p.hover_voltage
     for i in range(4):
         row[k + i] = flight.rotor_speeds[i] / hover
     return k + 4

@@ -72,7 +72,7 @@ def draw_start(flight, p, model, settings, work, stream, mask):
         roll = hovering * START_TILT_SIGMA * n_roll
         pitch = hovering * START_TILT_SIGMA * n_pitch
         yaw = yaw + hovering * START_YAW_SIGMA * n_yaw
-        rotor_speed = hovering * model.motor_gain * model.hover_voltage
+        rotor_speed = hovering * model.motor_speed_per_volt * model.hover_voltage
     w_B = (zero, zero, zero)
     if settings.start == Start.MOVING:
         a, b = _signed_pair(stream, DRAW_MOTION)

@@ -65,7 +65,7 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
     force_I, torque_B = (zero, zero, zero), (zero, zero, zero)
     if settings.linear_drag:
         v_B = apply(R_BI, v_air_I)
-        D, D_W, speed = p.linear_drag, p.rotor_drag, W[0] + W[1] + W[2] + W[3]
+        D, D_W, speed = p.linear_drag_B, p.rotor_drag_B, W[0] + W[1] + W[2] + W[3]
         drag_B = (
             (D[0] + D_W[0] * speed) * v_B[0],
             (D[1] + D_W[1] * speed) * v_B[1],
@@ -77,8 +77,10 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
         level = maximum(up_B[2], 0.0)
         thrust, torque_x, torque_y = zero, zero, zero
         for i in range(4):
-            height = r_I[2] - p.ground_height + dot(up_B, load3(p.rotors[i]))
-            gained = level * ground_gain(height, p.rotor_radius) * (p.kF * W[i] * W[i])
+            height = r_I[2] - p.ground_height + dot(up_B, load3(p.rotor_positions_B[i]))
+            gained = (
+                level * ground_gain(height, p.rotor_radius) * (p.thrust_coefficient * W[i] * W[i])
+            )
             thrust = thrust + p.effectiveness[0, i] * gained
             torque_x = torque_x + p.effectiveness[1, i] * gained
             torque_y = torque_y + p.effectiveness[2, i] * gained
@@ -129,7 +131,7 @@ def meet_air(flight, p, settings, mask):
 
     The accelerometer feels these forces.
     """
-    wind_I = load3(p.wind)
+    wind_I = load3(p.wind_I)
     if settings.gusts:
         wind_I = add(wind_I, gust_velocity(flight, p))
     R_BI = quaternion_to_dcm(load4(flight.q))
@@ -172,7 +174,7 @@ def battery_voltage(charge, power, current, p):
         current: I, power over voltage of rotors at steady speeds [A].
         p: True parameters.
     """
-    U0 = p.max_voltage * (p.battery_empty + (1.0 - p.battery_empty) * charge)
+    U0 = p.max_voltage * (p.battery_empty_voltage + (1.0 - p.battery_empty_voltage) * charge)
     R = p.battery_resistance
     loaded = 0.5 * (U0 + math.sqrt(maximum(U0 * U0 - 4.0 * R * power, 0.0)))
     loaded = minimum(loaded, 0.25 * U0 * U0 / maximum(R * current, 1e-300))
@@ -188,10 +190,10 @@ def supply(flight, p, settings):
         W = load4(flight.rotor_speeds)
         power, current = 0.0 * W[0], 0.0 * W[0]
         for i in range(4):
-            torque = p.effectiveness[0, i] * p.kN * W[i] * W[i]
+            torque = p.effectiveness[0, i] * p.torque_coefficient * W[i] * W[i]
             power = power + torque * W[i]
-            current = current + torque * p.motor_gain
-        power, current = power / p.motor_efficiency, current / p.motor_efficiency
+            current = current + torque * p.motor_speed_per_volt
+        power, current = power / p.battery_motor_efficiency, current / p.battery_motor_efficiency
         limit, delivered = battery_voltage(flight.charge, power, current, p)
         flight.charge = maximum(flight.charge - p.dt * delivered / p.battery_energy, 0.0)
     for i in range(4):

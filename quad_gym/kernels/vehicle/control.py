@@ -60,7 +60,10 @@ def allocate(thrust, torque, p):
 
 @kernel
 def _voltage(force, p):
-    return math.sqrt(clip(force, 0.0, p.max_rotor_force) / p.kF) / p.motor_gain
+    return (
+        math.sqrt(clip(force, 0.0, p.max_rotor_force) / p.thrust_coefficient)
+        / p.motor_speed_per_volt
+    )
 
 
 @kernel
@@ -80,7 +83,7 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
     """
     r_ref, v_ref, a_ref, x_ref = reference
     F_I = add(
-        add(scale(p.gain_k, sub(r_ref, r)), scale(p.gain_kd, sub(v_ref, v))),
+        add(scale(p.gain_position, sub(r_ref, r)), scale(p.gain_velocity, sub(v_ref, v))),
         scale(p.mass, (a_ref[0], a_ref[1], a_ref[2] + p.gravity)),
     )
     z_I = R_BI[2]
@@ -89,7 +92,7 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
     R_ref = (cross(b, z_ref), b, z_ref)
     R_E = multiply(R_ref, transpose(R_BI))
     e = (R_E[1][2] - R_E[2][1], R_E[2][0] - R_E[0][2], R_E[0][1] - R_E[1][0])
-    K, Kd = p.gain_K, p.gain_Kd
+    K, Kd = p.gain_attitude, p.gain_body_rates
     gyroscopic = cross(w_B, apply(load33(p.inertia), w_B))
     torque = (
         K[0] * e[0] - Kd[0] * w_B[0] + gyroscopic[0],

@@ -55,7 +55,12 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     is the velocity relative to it.
     """
     W = rotor_speeds
-    forces = (p.kF * W[0] * W[0], p.kF * W[1] * W[1], p.kF * W[2] * W[2], p.kF * W[3] * W[3])
+    forces = (
+        p.thrust_coefficient * W[0] * W[0],
+        p.thrust_coefficient * W[1] * W[1],
+        p.thrust_coefficient * W[2] * W[2],
+        p.thrust_coefficient * W[3] * W[3],
+    )
     thrust, torque_x, torque_y, torque_z = combine(p.effectiveness, forces)
     z_I = R_BI[2]
     drag = p.half_drag * abs(dot(z_I, v_I))
@@ -72,7 +77,7 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
 @kernel
 def rotor_lag(W, voltages, p):
     """dW_i/dt = (cm ea_i - W_i) / taum [rad/s^2]."""
-    lag, gain = 1.0 / p.motor_tau, p.motor_gain
+    lag, gain = 1.0 / p.motor_time_constant, p.motor_speed_per_volt
     return (
         lag * (gain * voltages[0] - W[0]),
         lag * (gain * voltages[1] - W[1]),

@@ -84,7 +84,7 @@ def _prepare(work, p, R_BI, spread_I, height):
     zero, inverse_mass = 0.0 * height, 1.0 / p.mass
     one = zero + 1.0
     for i in range(_POINTS):
-        l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
+        l_B = load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
         arm = apply_transposed(R_BI, l_B)
         store3(work.ground_arm[i], arm)
         x = _effective_mass(arm, (one, zero, zero), spread_I, inverse_mass)
@@ -317,7 +317,7 @@ def begin_on_ground(flight, p, settings, work, mask):
     R_BI, height = quaternion_to_dcm(load4(flight.q)), flight.r[2] - p.ground_height
     lowest = height + math.inf
     for i in range(_POINTS):
-        l_B = load3(p.feet[i]) if i < _FEET else load3(p.rotors[i - _FEET])
+        l_B = load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
         lowest = minimum(lowest, height + apply_transposed(R_BI, l_B)[2])
     given = flight.start_given[2]
     placed = (work.on_ground > 0.0) & logical_not(given == given)

@@ -99,7 +99,7 @@ def draw_gust(flight, stream, mask):
 def carry_gust(flight, p):
     """Carry the gust over a tick, at the vehicle's height and airspeed of now."""
     _, _, L_u, L_w = gust_scales(flight.r[2] - p.ground_height, p.gust_wind_speed)
-    airspeed = norm(sub(load3(flight.v), load3(p.wind)))
+    airspeed = norm(sub(load3(flight.v), load3(p.wind_I)))
     way = p.dt * maximum(airspeed, LEAST_AIRSPEED)
     stream = stream_of(flight)
     n_u, n_v = normal_pair(stream, DRAW_GUST)
@@ -119,7 +119,7 @@ def gust_velocity(flight, p):
     u = sigma_u * gust[0]
     v = sigma_u * (_ROOT3 * gust[1] + (1.0 - _ROOT3) * gust[2])
     w = sigma_w * (_ROOT3 * gust[3] + (1.0 - _ROOT3) * gust[4])
-    x, y = p.wind[0], p.wind[1]
+    x, y = p.wind_I[0], p.wind_I[1]
     speed = math.sqrt(x * x + y * y)
     blows = speed > 0.0
     along = select(blows, speed, 1.0)
