@@ -204,7 +204,7 @@ def title_of(suite: SensorSuite, args: Args) -> str:
         f"attitude reset {'on' if choices.attitude_reset else 'off'}",
     ]
     if suite.camera is not None:
-        parts.append(f"feature noise across the {choices.bearing_noise_at} direction")
+        parts.append(f"bearing noise at the {choices.bearing_noise_at} direction")
     return ", ".join(parts)
 
 

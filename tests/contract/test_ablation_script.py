@@ -17,10 +17,10 @@ def run(output, *options):
 def test_wrong_models_stand_beside_the_matched_one(tmp_path):
     printed, found = run(tmp_path, "models")
     rows = found["rows"]
-    assert next(iter(rows)) == "as believed"
+    assert next(iter(rows)) == "nominal"
     assert {"mass 20 % more", "mass 20 % less", "steady wind of 8 m/s"} < set(rows)
     assert all(name in printed for name in rows)
-    assert rows["GNSS noise doubled"]["nees_state"] > 1.2 * rows["as believed"]["nees_state"]
+    assert rows["GNSS noise doubled"]["nees_state"] > 1.2 * rows["nominal"]["nees_state"]
     masses = [case["true_vehicle"]["mass"] for case in found["cases"] if "mass" in case["name"]]
     assert masses == pytest.approx([0.8 * 0.78, 1.2 * 0.78])
     assert found["seeds"] == [0, 47]
@@ -32,5 +32,5 @@ def test_forms_of_the_filter_stand_beside_each_other(tmp_path):
     assert list(rows)[:2] == ["UKF", "EKF"]
     assert all(name in printed for name in rows)
     assert rows["UKF"]["relative_cost"] == 1.0
-    whole = rows["UKF, images always whole"]["nees_state"]
+    whole = rows["UKF, no recursive image update"]["nees_state"]
     assert whole > 1.05 * rows["UKF"]["nees_state"]

@@ -35,12 +35,12 @@ Fields = tuple[str, SensorSuite, Mapping[str, Any]]
 
 def _models(suite: SensorSuite) -> Iterator[Fields]:
     """The model that the filter assumes, then others."""
-    yield "as believed", suite, {}
+    yield "nominal", suite, {}
     nominal, breeze = vehicle_params("lab"), world_params("breeze")
     for name, field, factor in (
         ("mass 20 % less", "mass", 0.8),
         ("mass 20 % more", "mass", 1.2),
-        ("motor lag 0.1 s for 0.05 s", "motor_time_constant", 2.0),
+        ("motor time constant 0.1 s (assumed 0.05 s)", "motor_time_constant", 2.0),
         ("thrust 10 % less", "thrust_coefficient", 0.9),
     ):
         true = nominal.replace(**{field: factor * getattr(nominal, field)})
@@ -49,7 +49,7 @@ def _models(suite: SensorSuite) -> Iterator[Fields]:
         steady = WorldParams(wind_I=(speed, 0.0, 0.0), linear_drag_B=breeze.linear_drag_B)
         yield f"steady wind of {speed:g} m/s", suite, {"world": steady}
     for world in ("breeze", "fresh_breeze"):
-        yield f"world {world}", suite, {"world": world_params(world)}
+        yield f'`world="{world}"`', suite, {"world": world_params(world)}
     for name, true_sensors in _sensors(suite).items():
         yield name, suite, {"true_sensors": true_sensors}
 
@@ -60,13 +60,13 @@ def _sensors(suite: SensorSuite) -> dict[str, SensorSuite]:
     found = {
         "IMU noise doubled": _scaled(imu, 2.0, "accel_noise_density", "gyro_noise_density"),
         "IMU biases tripled": _scaled(imu, 3.0, "accel_bias_sigma", "gyro_bias_sigma"),
-        "IMU 5 cm off its place": _moved(imu, (0.05, 0.0, 0.0), "lever_arm_B"),
+        "IMU displaced by 5 cm": _moved(imu, (0.05, 0.0, 0.0), "lever_arm_B"),
     }
     if gnss is not None:
         sigmas = ("position_sigma_I", "baseline_sigma", "velocity_sigma")
         antennas = ("primary_antenna_B", "secondary_antenna_B")
         found["GNSS noise doubled"] = _scaled(gnss, 2.0, *sigmas)
-        found["antennas 2 cm off their places"] = _moved(gnss, (0.0, 0.02, 0.0), *antennas)
+        found["antennas displaced by 2 cm"] = _moved(gnss, (0.0, 0.02, 0.0), *antennas)
     if camera is not None:
         turn = (0.0, 0.0, math.radians(0.5))
         found["pixel noise doubled"] = _scaled(camera, 2.0, "pixel_sigma")
@@ -102,14 +102,14 @@ def _filters(suite: SensorSuite) -> Iterator[Fields]:
     forms: dict[str, dict[str, Any]] = {
         "UKF": {"kind": "ukf"},
         "EKF": {"kind": "ekf"},
-        "UKF, covariance not turned": {"attitude_reset": False},
-        "UKF, IMU sampled and held": {"integration": "euler"},
+        "UKF, no attitude reset": {"attitude_reset": False},
+        "UKF, IMU zero-order hold": {"integration": "euler"},
     }
     if suite.camera is not None:
-        forms["UKF, images always whole"] = {"recursive_update_threshold": None}
-        across = "UKF, pixel noise across the measured direction"
+        forms["UKF, no recursive image update"] = {"recursive_update_threshold": None}
+        across = "UKF, bearing noise at the measured direction"
         forms[across] = {"bearing_noise_at": "measured"}
-    forms["UKF, the report's start"] = {
+    forms["UKF, the report's initialization"] = {
         "initial_tilt_sigma": None,
         "initial_covariance_scale": 2.0,
         "reuse_first_fix": True,
