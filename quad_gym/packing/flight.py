@@ -23,6 +23,7 @@ from quad_gym.params.control import ActionParams, PDGains
 from quad_gym.params.filter import FilterParams
 from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
+from quad_gym.params.randomization import nominal_values
 from quad_gym.params.sensors import SensorSuite, delay_ticks
 from quad_gym.params.task import TaskParams
 from quad_gym.params.vehicle import VehicleParams
@@ -32,6 +33,7 @@ from quad_gym.records import (
     FOLLOWED,
     FREEDOMS,
     MAX_HARMONICS,
+    PARAMETERS_DRAWN,
     PARAMS,
     PARAMS_BLOCK,
     PARAMS_FIELDS,
@@ -85,13 +87,17 @@ def params_record(
     _copy(p, world.ground or GroundParams())
     _copy(p, world.battery or BatteryParams(), "battery_")
     _copy(p, gains or PDGains(), "gain_")
-    _pack_vehicle(p, vehicle, world)
+    drawable = nominal_values(vehicle, sensors, world)[:PARAMETERS_DRAWN]
+    first = record.view(np.float64)[:PARAMETERS_DRAWN]
+    np.copyto(first, drawable, where=~np.isnan(drawable))
+    _pack_vehicle(p, vehicle)
     _pack_imu(p, sensors, vehicle)
     _pack_gnss(p, sensors)
     if sensors.camera is not None:
         camera = sensors.camera
         _copy(p, camera)
-        p["camera"], p["R_CB"] = camera.position_B, portable.euler_dcm(camera.attitude)
+        p["camera"] = camera.position_B
+        p["R_CB"] = portable.euler_dcm(camera.attitude)
         p["half_image"], p["blur"] = np.array(camera.image_size) / 2, camera.blur
         p["features"][: len(camera.features_I)] = camera.features_I
     pack_aids(p, sensors)
@@ -102,8 +108,8 @@ def params_record(
     return record
 
 
-def _pack_vehicle(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
-    """Write the numbers that follow from the vehicle and the wind."""
+def _pack_vehicle(p: Any, vehicle: VehicleParams) -> None:
+    """Write the numbers that follow from the vehicle."""
     for name in ("effectiveness", "max_rotor_force", "hover_voltage"):
         p[name] = getattr(vehicle, name)
     p["sound_effectiveness"], p["torque_scale"] = vehicle.effectiveness, vehicle.hover_torques
@@ -111,8 +117,6 @@ def _pack_vehicle(p: Any, vehicle: VehicleParams, world: WorldParams) -> None:
     p["inertia_inverse"] = portable.inverse(vehicle.inertia)
     p["half_drag"] = 0.5 * vehicle.drag_coefficient * vehicle.disc_area * vehicle.air_density
     p["half_disc"] = 0.5 * vehicle.disc_area * vehicle.air_density
-    east, north, _ = world.wind_I
-    p["wind_speed"], p["wind_direction"] = math.hypot(east, north), math.atan2(north, east)
 
 
 def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
@@ -151,11 +155,11 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
     """Write GNSS, or where there is none the pose at the start as if GNSS had measured it."""
     gnss, pose = sensors.gnss, sensors.initial_pose
     if gnss is None:  # center and x axis
-        p["R_IG"], p["gnss_sigma"] = np.eye(3), pose.position_sigma
+        p["R_IG"], p["position_sigma_I"] = np.eye(3), pose.position_sigma
     else:
         _copy(p, gnss)
         p["R_IG"] = ecef_to_enu(gnss.reference_antenna_G)
-        p["antenna"], p["gnss_sigma"] = gnss.primary_antenna_B, gnss.position_sigma_I
+        p["antenna"] = gnss.primary_antenna_B
         drift = SlowError(1.0, gnss.rate * gnss.drift_tau)  # in measurements
         p["drift_decay"], drive = decay_and_drive(drift, 1.0)
         p["drift_drive"] = np.array(gnss.drift_sigma_I) * drive
@@ -168,6 +172,8 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
         p["baseline_length"] = 1.0
         for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
             p[name] = pose.heading_sigma
+    p["gnss_sigma"] = p["position_sigma_I"]
+    p["secondary_antenna_B"] = p["antenna"] + p["baseline"]
 
 
 def _pack_filter(p: Any, sensors: SensorSuite) -> None:

@@ -60,6 +60,7 @@ from quad_gym.records.layout import (
     scalar_dtype,
 )
 from quad_gym.records.params import (
+    PARAMETERS_DRAWN,
     PARAMS_FIELDS,
 )
 from quad_gym.records.path import (
@@ -246,6 +247,7 @@ __all__ = [
     "MAX_STATES",
     "MAX_UNDER_WAY",
     "NORMAL",
+    "PARAMETERS_DRAWN",
     "PARAMS",
     "PARAMS_BLOCK",
     "PARAMS_FIELDS",

@@ -1,39 +1,34 @@
 """The numbers of a vehicle, its sensors and its world, as they are or as they are believed to be."""
 
+from quad_gym.records.draws import COLUMNS, DRAWABLES
 from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, Field
+
+PARAMETERS_DRAWN = COLUMNS["action_delay"].stop
+"""Columns of draws with which the parameters begin; features of the camera have the others."""
+_OTHER_NAMES = {"inertia": "moments"}
+"""Names of fields that differ from the names of draws."""
 
 # fmt: off
 PARAMS_FIELDS = (
+    *(Field(_OTHER_NAMES.get(d.name, d.name), (d.size,) if d.size > 1 else (), d.unit, d.meaning)
+      for d in DRAWABLES if COLUMNS[d.name].stop <= PARAMETERS_DRAWN),
     Field("gravity", (), "m/s^2", "gravity"),
-    Field("mass", (), "kg", "mass"),
     Field("inertia", (3, 3), "kg m^2", "inertia in B"),
     Field("inertia_inverse", (3, 3), "1/(kg m^2)", "its inverse"),
     Field("half_drag", (), "kg/m", "Cd Ad rho / 2"),
-    Field("thrust_coefficient", (), "N/(rad/s)^2", "thrust coefficient"),
     Field("effectiveness", (4, 4), "mixed", "total thrust and torque per rotor thrust"),
     Field("allocation", (4, 4), "mixed", "its inverse"),
-    Field("motor_time_constant", (), "s", "lag of the rotor speed"),
-    Field("motor_speed_per_volt", (), "rad/s/V", "rotor speed per volt"),
-    Field("max_voltage", (), "V", "largest voltage"),
     Field("max_rotor_force", (), "N", "thrust of a rotor at the largest voltage"),
     Field("hover_voltage", (), "V", "voltage that carries the weight"),
     # the world
-    Field("torque_coefficient", (), "N m/(rad/s)^2", "torque coefficient"),
     Field("half_disc", (), "kg/m", "Ad rho / 2"),
     Field("rotor_positions_B", (4, 3), "m", "rotor hubs in B"),
     Field("wind_I", (3,), "m/s", "steady wind in I"),
-    Field("wind_speed", (), "m/s", "its horizontal speed"),
-    Field("wind_direction", (), "rad", "its direction, from east toward north"),
-    Field("gust_wind_speed", (), "m/s", "W20"),
-    Field("linear_drag_B", (3,), "N s/m", "linear drag in B"),
-    Field("rotor_drag_B", (3,), "N s/m per rad/s", "linear drag in B per rotor speed"),
     Field("rotor_radius", (), "m", "radius of the rotors"),
     Field("ground_height", (), "m", "height of the ground in I"),
     Field("feet_B", (4, 3), "m", "soles of the feet in B"),
-    Field("battery_charge", (), "-", "charge at the start"),
     Field("battery_energy", (), "J", "energy of a full battery"),
     Field("battery_empty_voltage", (), "-", "voltage of an empty over that of a full battery"),
-    Field("battery_resistance", (), "ohm", "resistance of the battery"),
     Field("battery_motor_efficiency", (), "-", "mechanical over electrical power"),
     # faults
     Field("sound_effectiveness", (4, 4), "mixed", "effectiveness with four working rotors"),
@@ -48,7 +43,6 @@ PARAMS_FIELDS = (
     Field("torque_scale", (3,), "N m", "torque at full action"),
     Field("tilt_scale", (), "rad", "roll and pitch at full action"),
     Field("velocity_scale", (), "m/s", "velocity at full action"),
-    Field("action_delay", (), "steps", "from when an action is commanded to when it is carried out"),
     Field("dt", (), "s", "the tick"),
     Field("imu_lever_arm", (3,), "m", "accelerometer in B"),
     Field("accel_sigma", (), "m/s^2", "white noise of a sample"),
@@ -68,8 +62,6 @@ PARAMS_FIELDS = (
     Field("gyro_bias_decay", (), "-", "alpha_g"),
     Field("accel_bias_drive", (), "m/s^2", "sigma of the driving noise"),
     Field("gyro_bias_drive", (), "rad/s", "sigma of the driving noise"),
-    Field("accel_bias_sigma", (), "m/s^2", "stationary sigma"),
-    Field("gyro_bias_sigma", (), "rad/s", "stationary sigma"),
     Field("R_IG", (3, 3), "-", "ECEF to east-north-up"),
     Field("antenna", (3,), "m", "primary antenna in B"),
     Field("baseline", (3,), "m", "primary to secondary antenna in B"),
@@ -77,7 +69,6 @@ PARAMS_FIELDS = (
     Field("gnss_sigma", (3,), "m", "white position noise in I; of the placement where there is no GNSS"),
     Field("drift_decay", (), "-", "of the slow position error between two measurements"),
     Field("drift_drive", (3,), "m", "sigma of its driving noise"),
-    Field("baseline_sigma", (), "rad", "direction noise of the baseline"),
     Field("heading_error_sigma", (), "rad", "of the baseline's constant error"),
     Field("first_baseline_sigma", (), "rad", "of the direction of one baseline"),
     Field("baseline_noise", (), "rad", "direction noise of the baseline that the filter takes for white"),
@@ -85,9 +76,7 @@ PARAMS_FIELDS = (
     Field("velocity_sigma", (), "m/s", "velocity noise per axis; 0: not measured"),
     Field("camera", (3,), "m", "projection center in B"),
     Field("R_CB", (3, 3), "-", "body to camera"),
-    Field("focal_length", (), "pixels", "focal length"),
     Field("half_image", (2,), "pixels", "half the image's width and height"),
-    Field("pixel_sigma", (), "pixels", "noise per axis"),
     Field("max_range", (), "m", "beyond which a feature is too small"),
     Field("blur", (), "pixels/(rad/s)", "noise per body rate"),
     Field("features", (MAX_FEATURES, 3), "m", "features in I"),

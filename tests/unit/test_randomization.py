@@ -12,9 +12,18 @@ import quad_gym
 from quad_gym import LogUniform, Normal, Randomization, Uniform, WorldParams
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.kernels.task.draws import normal_quantile
+from quad_gym.packing.flight import params_record
 from quad_gym.params.distributions import Distribution
 from quad_gym.params.randomization import nominal_values
-from quad_gym.records import COLUMNS, DRAWABLES, DRAWN_SIZE, FEATURE_SLICE, Control, Source
+from quad_gym.records import (
+    COLUMNS,
+    DRAWABLES,
+    DRAWN_SIZE,
+    FEATURE_SLICE,
+    PARAMETERS_DRAWN,
+    Control,
+    Source,
+)
 from quad_gym.rotations import euler_to_dcm
 from tests.unit.alarms import ALARM, alarm_score
 from tests.unit.compiled import Compiled
@@ -356,6 +365,21 @@ def test_a_snapshot_keeps_what_was_drawn():
     for _ in range(20):
         fresh.step()
     assert fresh.snapshot().tobytes() == future.tobytes()
+
+
+def test_parameter_record_begins_with_the_columns_of_draws():
+    record = params_record(LAB, SUITE, world=WORLD)
+    columns = record.view(np.float64)[:PARAMETERS_DRAWN]
+    nominal = nominal_values(LAB, SUITE, WORLD)[:PARAMETERS_DRAWN]
+    second = COLUMNS["secondary_antenna_B"]  # the sum of antenna and baseline
+    np.testing.assert_allclose(columns[second], nominal[second], rtol=0.0, atol=1e-15)
+    columns[second] = nominal[second]
+    np.testing.assert_array_equal(columns, nominal)
+    for drawable in DRAWABLES:
+        if COLUMNS[drawable.name].stop <= PARAMETERS_DRAWN and drawable.name != "inertia":
+            np.testing.assert_array_equal(
+                np.ravel(record[drawable.name]), columns[COLUMNS[drawable.name]]
+            )
 
 
 def test_the_table_has_a_column_for_every_number():

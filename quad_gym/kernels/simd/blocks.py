@@ -88,14 +88,21 @@ def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyp
         return builder.load(_field_pointer(builder, block, pointer, name, kind), align=8)
 
     shape = block.record.typeof(name).shape[:-1]
-    strides, size = [], WIDTH * 8
+    data = _field_pointer(builder, block, pointer, name, kind.dtype)
+    return _array_of(context, builder, kind, data, shape)
+
+
+def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: Any) -> Any:
+    """An array of lanes in memory."""
+    strides: list[int] = []
+    size = WIDTH * 8
     for length in reversed(shape):
         strides.insert(0, size)
         size *= length
     array = make_array(kind)(context, builder)
     populate_array(
         array,
-        data=_field_pointer(builder, block, pointer, name, kind.dtype),
+        data=data,
         shape=cgutils.pack_array(builder, [context.get_constant(types.intp, n) for n in shape]),
         strides=cgutils.pack_array(builder, [context.get_constant(types.intp, s) for s in strides]),
         itemsize=context.get_constant(types.intp, WIDTH * 8),
@@ -103,6 +110,20 @@ def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyp
         parent=None,
     )
     return array._getvalue()
+
+
+@intrinsic
+def numbers_of(typing_context, block):  # type: ignore[no-untyped-def]
+    """All numbers of a block as one array of lanes, in the order of its fields."""
+    if not isinstance(block, LaneRecord):
+        return None
+    kind = types.Array(lanes, 1, "C", aligned=False)
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        data = builder.bitcast(args[0], kind.dtype.llvm_type.as_pointer())
+        return _array_of(context, builder, kind, data, (block.record.size // (WIDTH * 8),))
+
+    return kind(block), lower
 
 
 @lower_setattr_generic(LaneRecord)
