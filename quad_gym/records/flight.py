@@ -114,7 +114,6 @@ _CORE_FIELDS = (
     Field("filter_status", (), "bits", "failures so far, see FilterStatus", "u8"),
     Field("diverged", (), "0 or 1", "whether the covariance does not explain the last innovations"),
     Field("faults", (), "bits", "active at the present instant: the sum of 2^FaultKind"),
-    Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
     # the reference: r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)
     Field("ref_heading_rule", (), "-", "0: toward heading_point; 1: along heading_point; 2: along the velocity"),
     Field("ref_heading_point", (3,), "m", "point to look at, or direction to look along, in I"),
@@ -138,6 +137,7 @@ _CORE_FIELDS = (
     Field("b_g", (3,), "rad/s", "gyro bias"),
     Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
     Field("wait", (SENSORS,), "ticks", "until each sensor measures next"),
+    Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
     # to which batches a snapshot belongs
     Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
 )

@@ -12,8 +12,9 @@ from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
 from quad_gym.kernels.sensors.latency import (
     deliver_arrived,
     exchange,
-    exchange_stamps,
+    find_arrivals,
     keep_arrived,
+    stamp,
 )
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.records import (
@@ -97,17 +98,17 @@ def deliver(flight, work, settings, s, mask, due, values):
     sensor, block, measurement = FIRST_AID + s, AID_BLOCKS + s, flight.aid_measurement[s]
     if settings.faults:
         due = due & (flight.fault_active[_LOSS + s] <= 0.0)
-    delayed = settings.sensor_delay[sensor] > 0
-    if delayed:
-        keep_arrived(work, block, measurement, 3)
-    keep3(measurement, due, values)
+    arrives = find_arrivals(flight, work, settings, sensor, mask)
     flight.block_valid[block] = select(mask, select(due, 1.0, 0.0), flight.block_valid[block])
-    if delayed:
-        taken = exchange_stamps(flight, work, settings, sensor, mask)
+    if settings.sensor_delay[sensor] == 0:
+        keep3(measurement, due, values)
+        flight.block_fresh[block] = select(due, 1.0, flight.block_fresh[block])
+    elif any_of(due | arrives):
+        keep_arrived(work, block, measurement, 3)
+        keep3(measurement, due, values)
+        taken = stamp(flight, settings, sensor, mask)
         exchange(flight, work, block, measurement, 3, mask, taken)
         deliver_arrived(work, block, measurement, 3, mask)
-    else:
-        flight.block_fresh[block] = select(due, 1.0, flight.block_fresh[block])
 
 
 @kernel

@@ -63,8 +63,9 @@ from quad_gym.kernels.sensors.clock import begin_clock, tick_clock
 from quad_gym.kernels.sensors.latency import (
     deliver_arrived,
     exchange,
-    exchange_stamps,
+    find_arrivals,
     keep_arrived,
+    stamp,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
@@ -122,16 +123,19 @@ def _corrupt(flight, p, settings, work, stages, due):
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Take an image when due."""
     due, delayed = tick_clock(flight, settings, _CAMERA, mask), settings.sensor_delay[_CAMERA] > 0
-    for i in range(settings.feature_count):
-        before = flight.block_valid[FEATURE_BLOCKS + i]
-        flight.block_valid[FEATURE_BLOCKS + i] = select(mask, 0.0, before)
-        if delayed:
+    arrives = find_arrivals(flight, work, settings, _CAMERA, mask)
+    for block in range(FEATURE_BLOCKS, FEATURE_BLOCKS + settings.feature_count):
+        flight.block_valid[block] = select(mask, 0.0, flight.block_valid[block])
+    if not any_of(due | arrives):
+        return
+    if delayed:
+        for i in range(settings.feature_count):
             keep_arrived(work, FEATURE_BLOCKS + i, flight.pixels[i], 2)
     if any_of(due):
         measure(flight, p, settings.feature_count, due)
         _corrupt(flight, p, settings, work, stages, due)
     if delayed:
-        taken = exchange_stamps(flight, work, settings, _CAMERA, mask)
+        taken = stamp(flight, settings, _CAMERA, mask)
         for i in range(settings.feature_count):
             block, pixels = FEATURE_BLOCKS + i, flight.pixels[i]
             exchange(flight, work, block, pixels, 2, mask, taken)

@@ -11,8 +11,9 @@ from quad_gym.kernels.sensors.faults import gnss_heard
 from quad_gym.kernels.sensors.latency import (
     deliver_arrived,
     exchange,
-    exchange_stamps,
+    find_arrivals,
     keep_arrived,
+    stamp,
 )
 from quad_gym.kernels.sensors.stage import sensor_stage
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
@@ -71,8 +72,12 @@ def _flag(flags, mask, position, baseline, settings):
 @kernel
 def _sample(flight, p, settings, work, stages, mask, starting):
     """Measure when due, and at the start for the initialization of the filter."""
-    delayed = settings.sensor_delay[_GNSS] > 0
-    due = tick_clock(flight, settings, _GNSS, mask)
+    due, delayed = tick_clock(flight, settings, _GNSS, mask), settings.sensor_delay[_GNSS] > 0
+    arrives = find_arrivals(flight, work, settings, _GNSS, mask)
+    if not starting and not any_of(due | arrives):
+        nothing = 0.0 * flight.tick
+        _flag(flight.block_valid, mask, nothing, nothing, settings)
+        return
     if delayed:
         keep_arrived(work, POSITION_BLOCK, flight.gnss_position, 3)
         keep_arrived(work, BASELINE_BLOCK, flight.gnss_baseline, 3)
@@ -108,7 +113,7 @@ def _deliver_delayed(flight, work, settings, mask, starting):
 
     At the start of an episode the fix stays in the record, for the initialization of the filter.
     """
-    taken = exchange_stamps(flight, work, settings, _GNSS, mask)
+    taken = stamp(flight, settings, _GNSS, mask)
     exchange(flight, work, POSITION_BLOCK, flight.gnss_position, 3, mask, taken)
     exchange(flight, work, BASELINE_BLOCK, flight.gnss_baseline, 3, mask, taken)
     exchange(flight, work, VELOCITY_BLOCK, flight.gnss_velocity, 3, mask, taken)

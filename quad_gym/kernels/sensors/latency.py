@@ -44,22 +44,27 @@ def keep_arrived(work, block, values, numbers):
 
 
 @kernel
-def exchange_stamps(flight, work, settings, sensor, mask):
-    """Stamp what has just been measured; find what arrives, for `exchange`.
+def find_arrivals(flight, work, settings, sensor, mask):
+    """Fill work.arrives with the slot that arrives now; return the lanes in which one does."""
+    stamps, delay = flight.stamps[sensor], settings.sensor_delay[sensor]
+    some = mask & (flight.tick < 0.0)  # all false
+    if delay > 0:
+        for slot in range(DELAY_SLOTS):
+            here = mask & (stamps[slot, 0] == flight.tick - delay)
+            work.arrives[slot] = select(here, 1.0, 0.0)
+            some = some | here
+    return some
 
-    Returns:
-        Lanes in which the sensor has measured.
-    """
-    stamps, delay, first = flight.stamps[sensor], settings.sensor_delay[sensor], FIRST_BLOCK[sensor]
-    valid = 0.0 * flight.tick
+
+@kernel
+def stamp(flight, settings, sensor, mask):
+    """Stamp what has just been measured; return the lanes in which there is something."""
+    first, valid = FIRST_BLOCK[sensor], 0.0 * flight.tick
     for block in range(first, first + settings.sensor_blocks[sensor]):
         valid = valid + flight.block_valid[block]
     taken = mask & (valid > 0.0)
-    for slot in range(DELAY_SLOTS):
-        here = mask & (stamps[slot, 0] == flight.tick - delay)
-        work.arrives[slot] = select(here, 1.0, 0.0)
     if any_of(taken):
-        _put_stamp(stamps, flight, taken)
+        _put_stamp(flight.stamps[sensor], flight, taken)
     return taken
 
 
@@ -69,7 +74,7 @@ def exchange(flight, work, block, values, numbers, mask, taken):
 
     Args:
         flight: Record.
-        work: Workspace; reads what `keep_arrived` and `exchange_stamps` have stored.
+        work: Workspace; reads what `keep_arrived` and `find_arrivals` have stored.
         block: Number of the block.
         values: Its numbers in the record.
         numbers: How many.

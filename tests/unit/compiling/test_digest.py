@@ -58,7 +58,7 @@ EDITS = {
     "how it is linked": ("quad_gym/kernels/compiling/linking.py", "", STATEMENT, (1, 1, 1)),
     "decorators": ("quad_gym/kernels/compiling/decorators.py", "", STATEMENT, (1, 1, 1)),
     "its own file": (MOVE, "", STATEMENT, (1, 0, 0)),
-    "another room's": ("quad_gym/kernels/filter/gate.py", "", STATEMENT, (0, 1, 0)),
+    "another room's": ("quad_gym/kernels/filter/recovery.py", "", STATEMENT, (0, 1, 0)),
     "a test's own file": (HELPER, "", STATEMENT, (0, 0, 1)),
     "a test's helper": ("tests/help.py", "", STATEMENT, (0, 0, 1)),
     "a helper by a relative name": ("tests/near.py", "", STATEMENT, (0, 0, 1)),
