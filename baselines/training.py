@@ -74,6 +74,25 @@ def train(
         return _train(plan, folder, resume=resume, tensorboard=tensorboard, quiet=quiet)
 
 
+def require_model(plan: Plan) -> None:
+    """Make the untrained model once, to check a plan.
+
+    Raises:
+        ValueError: If the plan is invalid.
+        ImportError: If the training engine is not installed.
+    """
+    if plan.engine == "compiled":
+        from baselines.compiled_ppo.run import make_compiled
+
+        make_compiled(plan).env.close()
+        return
+    try:
+        from baselines.models import make_model
+    except ImportError as error:
+        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
+    make_model(plan, plan.make_flights())
+
+
 def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:
     """Record of the run in a folder that is resumed; None: a new run begins.
 

@@ -81,7 +81,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     """
     from baselines.plans import Plan
     from baselines.recipes import recipe
-    from baselines.training import run_in
+    from baselines.training import require_model, run_in
     from quad_gym.analysis.reports import require_writable
 
     args = with_full_id(args)
@@ -112,20 +112,6 @@ def configure(args: Args) -> tuple[Any, Path]:
     require_model(plan)
     require_writable("--output", folder)
     return plan, folder
-
-
-def require_model(plan: Any) -> None:
-    """Make the untrained model once, to check the plan."""
-    if plan.engine == "compiled":
-        from baselines.compiled_ppo.run import make_compiled
-
-        make_compiled(plan).env.close()
-        return
-    try:
-        from baselines.models import make_model
-    except ImportError as error:
-        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
-    make_model(plan, plan.make_flights())
 
 
 def main(args: Args) -> None:
