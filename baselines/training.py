@@ -10,7 +10,7 @@ The folder contains
 - `training.lock`: the process that trains in the folder, or did last;
 - files for TensorBoard.
 
-A resumed run continues exactly from its last evaluation.
+A resumed run continues exactly from its last checkpoint.
 """
 
 import json
