@@ -41,7 +41,7 @@ class RunError(ValueError):
 
 
 def last_file(plan: Plan, folder: Path) -> Path:
-    """File of the policy of the last evaluation, with the state for resuming."""
+    """File of the policy of the last checkpoint, with the state for resuming."""
     return folder / f"last{SUFFIXES[plan.engine]}"
 
 
@@ -133,8 +133,11 @@ class RunKeeper(ABC):
             self._bar.update(steps - self._bar.n)
         due = steps // self._interval > self.steps // self._interval
         self.steps = steps
-        if due or self._stop or not self.rows:
+        if due or not self.rows:
             self._keep(model)
+        elif self._stop:  # without an evaluation, which could change the best policy
+            self._count_seconds()
+            self._save(model, best=False)
 
     @property
     def stopping(self) -> bool:
@@ -181,8 +184,7 @@ class RunKeeper(ABC):
 
     def _keep(self, model: Policy) -> None:
         """Evaluate, and write a checkpoint."""
-        now = time.perf_counter()
-        self.seconds += now - (now if self._since is None else self._since)
+        self._count_seconds()
         episodes = roll_out(model, self._judge, seed=self._first_seed)
         known = episodes.summary() | {
             "steps": float(self.steps),
@@ -206,6 +208,11 @@ class RunKeeper(ABC):
         if self._bar is not None:
             self._bar.set_postfix_str(f"error {row['mean_error']:.3f} m")
         self._since = time.perf_counter()
+
+    def _count_seconds(self) -> None:
+        """Add the time since the last checkpoint to the time of the training."""
+        now = time.perf_counter()
+        self.seconds += now - (now if self._since is None else self._since)
 
     def state(self) -> dict[str, Any]:
         """State from which the next process resumes."""

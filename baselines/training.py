@@ -10,7 +10,7 @@ The folder contains
 - `training.lock`: the process that trains in the folder, or did last;
 - files for TensorBoard.
 
-A resumed run continues exactly from its last evaluation.
+A resumed run continues exactly from its last checkpoint.
 """
 
 import json
@@ -72,6 +72,25 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         return _train(plan, folder, resume=resume, tensorboard=tensorboard, quiet=quiet)
+
+
+def require_model(plan: Plan) -> None:
+    """Make the untrained model once, to check a plan.
+
+    Raises:
+        ValueError: If the plan is invalid.
+        ImportError: If the training engine is not installed.
+    """
+    if plan.engine == "compiled":
+        from baselines.compiled_ppo.run import make_compiled
+
+        make_compiled(plan).env.close()
+        return
+    try:
+        from baselines.models import make_model
+    except ImportError as error:
+        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
+    make_model(plan, plan.make_flights())
 
 
 def run_in(folder: Path, plan: Plan, *, resume: bool) -> dict[str, Any] | None:

@@ -84,34 +84,37 @@ def learning_figure(
     levels: Mapping[str, float],
     title: str = "",
     *,
-    unit: str = "million steps",
+    score: str = "mean position error [m]",
+    logarithmic: bool = True,
 ) -> Any:
-    """Make a figure of errors during training: a thin line per seed, a bold one for the median.
+    """Make a figure of scores during training: a thin line per seed, a bold one for the median.
 
     Args:
-        curves: Abscissae (k,) and errors (k,) [m] of each seed, by label.
-        levels: Horizontal lines for comparison [m], by label.
+        curves: Training steps (k,) and scores (k,) of each seed, by label.
+        levels: Horizontal lines for comparison, by label.
         title: Title of the figure.
-        unit: Unit of the abscissae.
+        score: Label of the ordinate.
+        logarithmic: True for a logarithmic ordinate.
 
     Returns:
         matplotlib Figure.
     """
     with house_style():
-        figure, axes = _figure((7.0, 3.8), title)
+        figure, axes = _figure((7.0, 4.0), title)
         for (label, seeds), (color, dashes) in zip(
             curves.items(), line_styles(len(curves), skip=1), strict=True
         ):
-            if len(seeds) > 1:
-                label = f"{label} (median of {len(seeds)})"
-            draw_seeds(axes, seeds, color=color, linestyle=dashes, label=label)
-        for label, level in levels.items():
-            axes.axhline(level, color=INK, linewidth=1.0, linestyle=(0, (4, 3)), label=label)
-        axes.set_yscale("log")
-        _plain_numbers(axes.yaxis)
+            in_millions = [(steps / 1e6, scores) for steps, scores in seeds]
+            draw_seeds(axes, in_millions, color=color, linestyle=dashes, label=label)
+        for k, (label, level) in enumerate(levels.items()):
+            dashes = [(0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2))][k % 3]
+            axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)
+        if logarithmic:
+            axes.set_yscale("log")
+            _plain_numbers(axes.yaxis)
         axes.set_xlim(left=0.0)
-        axes.set_xlabel(f"training [{unit}]")
-        axes.set_ylabel("mean position error [m]")
+        axes.set_xlabel("training [million steps]")
+        axes.set_ylabel(score)
         legend_below(figure, axes)
     return figure
 

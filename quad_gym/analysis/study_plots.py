@@ -1,13 +1,12 @@
-"""Figures of a study: returns during training, and single episodes of several policies."""
+"""Figures of a study: single episodes of several policies."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.analysis.comparison_plots import draw_seeds, legend_below, line_styles
 from quad_gym.analysis.plots import (
     BLUE,
     GREEN,
@@ -52,37 +51,6 @@ class Pace(NamedTuple):
     """Distance between estimated and true position [m]"""
     outage: Floats | None = None
     """GNSS outage: 1 while GNSS fails, else 0; None: no outage"""
-
-
-def returns_figure(
-    curves: Mapping[str, Sequence[tuple[Floats, Floats]]], levels: Mapping[str, float]
-) -> Any:
-    """Make a figure of returns during training, each arm evaluated on its own observations.
-
-    Args:
-        curves: Training steps (k,) [million] and mean returns (k,) of each seed, by label.
-        levels: Horizontal lines for comparison, by label.
-
-    Returns:
-        matplotlib Figure.
-    """
-    with house_style():
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-        axes: Any = figure.add_subplot()
-        for (label, seeds), (color, dashes) in zip(
-            curves.items(), line_styles(len(curves), skip=1), strict=True
-        ):
-            draw_seeds(axes, seeds, color=color, linestyle=dashes, label=label)
-        for k, (label, level) in enumerate(levels.items()):
-            dashes = [(0, (4, 3)), (0, (1, 1.5)), (0, (6, 2, 1, 2))][k % 3]
-            axes.axhline(level, color=INK, linewidth=1.0, linestyle=dashes, label=label)
-        axes.set_xlim(left=0.0)
-        axes.set_xlabel("training [million steps]")
-        axes.set_ylabel("return of an episode")
-        legend_below(figure, axes)
-    return figure
 
 
 def glance_figure(episodes: Mapping[str, Glance], half_view: float) -> Any:

@@ -41,11 +41,10 @@ from quad_gym.commands.options import (
     sensors_of,
     usage_errors,
     with_full_id,
-    without_idle_filter,
 )
+from quad_gym.envs.effects import with_effect
 from quad_gym.evaluation import Episodes, Policy, roll_out
-from quad_gym.faults.presets import felt_without_sensors
-from quad_gym.params.suites import contents_of_suite_files, sensor_suite
+from quad_gym.params.suites import contents_of_suite_files
 from quad_gym.rendering.video import checked_video_path, flight_of, save_video
 
 
@@ -139,16 +138,14 @@ def make_flights(args: Args, observation: str, count: int, policy: str) -> Any:
     """Make the environment with an observation, for a policy."""
     names = ("observation", "sensors", "threads")
     given = leave(args.env, {name: f"--{name}" for name in names})
-    keywords = {**keywords_of_policy(policy, args.env_id), **given}
-    if observation in ("truth", "noisy") and "faults" in keywords:
-        suite = sensor_suite(sensors_of(args.env_id, args.sensors))
-        keywords["faults"] = felt_without_sensors(keywords["faults"], suite)
+    keywords = {
+        **keywords_of_policy(policy, args.env_id),
+        **given,
+        "observation": observation,
+        "sensors": sensors_of(args.env_id, args.sensors),
+    }
     return gymnasium.make_vec(
-        args.env_id,
-        num_envs=count,
-        sensors=sensors_of(args.env_id, args.sensors),
-        threads=args.threads,
-        **without_idle_filter({**keywords, "observation": observation}),
+        args.env_id, num_envs=count, threads=args.threads, **with_effect(keywords)
     )
 
 

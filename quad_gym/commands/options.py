@@ -20,8 +20,6 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from quad_gym.envs import IDS
 from quad_gym.envs.benchmarks import BENCHMARKS
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.envs.effects import runs_no_sensor
-from quad_gym.envs.keywords import FILTER_KEYWORDS
 from quad_gym.params.checks import did_you_mean
 from quad_gym.params.suites import ALL_SUITES, SUITES
 
@@ -138,16 +136,6 @@ def sensors_of(env_id: str, given: str | None) -> str:
     """Name of the sensor suite: the one given, or else the task's default."""
     own = BENCHMARKS.get(IDS[env_id])
     return given or ("standard" if own is None else own.keywords["sensors"])
-
-
-def without_idle_filter(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """Remove keywords of a filter if none runs.
-
-    Comparisons use the same keywords for several observations, but environments reject keywords
-    that have no effect.
-    """
-    idle = FILTER_KEYWORDS if runs_no_sensor(keywords) else ()
-    return {name: value for name, value in keywords.items() if name not in idle}
 
 
 def free_folder(folder: Path, result: str) -> Path:

@@ -9,7 +9,7 @@ Hyperparameters for the task and the algorithm come from baselines/recipes.py. D
 policy is evaluated on the task by its true position error and saved: last.zip and best.zip (.npz
 with --engine compiled), which quad-gym evaluate can fly. The folder also contains training.json
 (everything needed to repeat the run), evaluations.csv, and files for TensorBoard. An interrupted
-run continues exactly from its last evaluation with --resume.
+run continues exactly from its last checkpoint with --resume.
 """
 
 import importlib.util
@@ -81,7 +81,7 @@ def configure(args: Args) -> tuple[Any, Path]:
     """
     from baselines.plans import Plan
     from baselines.recipes import recipe
-    from baselines.training import run_in
+    from baselines.training import require_model, run_in
     from quad_gym.analysis.reports import require_writable
 
     args = with_full_id(args)
@@ -112,20 +112,6 @@ def configure(args: Args) -> tuple[Any, Path]:
     require_model(plan)
     require_writable("--output", folder)
     return plan, folder
-
-
-def require_model(plan: Any) -> None:
-    """Make the untrained model once, to check the plan."""
-    if plan.engine == "compiled":
-        from baselines.compiled_ppo.run import make_compiled
-
-        make_compiled(plan).env.close()
-        return
-    try:
-        from baselines.models import make_model
-    except ImportError as error:
-        raise ImportError(f'training needs "quad-gym[train]" ({error})') from None
-    make_model(plan, plan.make_flights())
 
 
 def main(args: Args) -> None:

@@ -4,6 +4,8 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from quad_gym.envs.keywords import FILTER_KEYWORDS
+from quad_gym.faults.presets import felt_without_sensors
+from quad_gym.params.suites import sensor_suite
 
 ONE_TASK_KEYWORDS = {
     "max_speed": "random_trajectory",
@@ -78,3 +80,16 @@ def runs_no_sensor(keywords: Mapping[str, Any]) -> bool:
     """Return True if an environment with these keywords simulates no sensor."""
     asked = any(keywords.get(name) is True for name in ("include_std", "innovations"))
     return keywords.get("observation") in ("truth", "noisy") and not asked
+
+
+def with_effect(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """Remove keywords of a filter that does not run, and faults of sensors that are not used.
+
+    Comparisons use the same keywords for several observations, but environments reject keywords
+    that have no effect.
+    """
+    idle = FILTER_KEYWORDS if runs_no_sensor(keywords) else ()
+    kept = {name: value for name, value in keywords.items() if name not in idle}
+    if keywords.get("observation") in ("truth", "noisy") and {"faults", "sensors"} <= set(kept):
+        kept["faults"] = felt_without_sensors(kept["faults"], sensor_suite(kept["sensors"]))
+    return kept

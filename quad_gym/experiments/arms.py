@@ -5,8 +5,10 @@ episodes. To define your own arms, write a file like this one with a tuple `ARMS
 `quad-gym study --arms-file`.
 """
 
-from collections.abc import Mapping
+import runpy
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -231,3 +233,39 @@ OUTAGE_DASH = (
 
 ARMS_OF = {"look_around": ARMS, "stale_race": STALE_RACE, "outage_dash": OUTAGE_DASH}
 """Arms by task."""
+
+
+def read_arms(file: Path) -> tuple[Arm, ...]:
+    """Read the tuple `ARMS` of a Python file.
+
+    Raises:
+        ValueError: If there is no such file or tuple.
+    """
+    if not file.is_file():
+        raise ValueError(f"--arms-file must be a Python file, got {file}")
+    try:
+        arms = runpy.run_path(str(file)).get("ARMS")
+    except (SyntaxError, ValueError) as error:
+        raise ValueError(f"--arms-file must be a Python file, got {file}: {error}") from None
+    if not (isinstance(arms, tuple) and all(isinstance(arm, Arm) for arm in arms)):
+        raise ValueError(f"--arms-file {file} must have a tuple ARMS of Arm")
+    names = [arm.name for arm in arms]
+    if len(set(names)) != len(names):
+        raise ValueError(f"arms must have different names, got {', '.join(names)}")
+    return arms
+
+
+def chosen_arms(known: Sequence[Arm], wanted: Collection[str]) -> tuple[Arm, ...]:
+    """Arms with given names, in the order of the known ones.
+
+    Raises:
+        ValueError: If there is no such arm, or the arm whose policies another flies is missing.
+    """
+    for name in wanted:
+        check.choice("--arms", name, tuple(arm.name for arm in known))
+    found = tuple(arm for arm in known if arm.name in wanted)
+    trained = [arm.name for arm in found if arm.trained]
+    for arm in found:
+        if arm.flies is not None and arm.flies not in trained:
+            raise ValueError(f"--arms must name {arm.flies}, whose policies {arm.name} flies")
+    return found

@@ -1,20 +1,30 @@
-"""A film of a study: two policies side by side in the same episode, both flown on the estimate.
+"""Figure and film of a study: two policies in the same test episode.
 
-Which policies and which episode, `study_pair` says.
+The two arms are `truth` and the other trained arm with the largest return; of each arm, the
+training with the best validation is shown, so that test episodes do not affect the choice. The
+episode is the first test episode that shows a difference:
+
+- for "glance", the first one in which the rewarded heading is on average more than 100 degrees from
+  the features; otherwise policies see the features anyway;
+- for "pace", the first one that the policy trained on the truth ends with a crash.
+
+If there is none among the first `TRACED` episodes, it is the very first.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
+from baselines.policies import load_policy
 from quad_gym import FlightRecorder
 from quad_gym.evaluation import roll_out
-from quad_gym.experiments.arms import Arm
-from quad_gym.experiments.study_pair import label_of, pair_of
-from quad_gym.experiments.study_results import Results, Study
+from quad_gym.experiments.flown import Flown
+from quad_gym.experiments.study import Results, Study
 from quad_gym.rendering.canvas import load_pygame
 from quad_gym.rendering.side_by_side import Side, save_side_by_side
 from quad_gym.rendering.video import checked_video_path
@@ -22,82 +32,96 @@ from quad_gym.rendering.video import checked_video_path
 RATE = 10.0
 """Pictures per second of a film."""
 
+_TRAINING = "Of each arm it is the training with the best validation. The episode is the first one "
+CHOICES: Mapping[str, str] = {
+    "glance": _TRAINING + "of the test in which the rewarded heading is away from the features.",
+    "pace": _TRAINING + "of the test that the policy trained on the truth ends with a crash.",
+}
+"""Rules of the choice in words, by kind of figure."""
+
+AWAY = math.radians(100.0)
+"""Mean angle between rewarded heading and features above which an episode is shown [rad]."""
+
+
+class Pair(NamedTuple):
+    """Two trainings and a test episode."""
+
+    trainings: dict[str, int]
+    """Index of the seed by name of the arm, `truth` first"""
+    episode: int
+    """Index of the test episode"""
+
+
+def pair_of(results: Results) -> Pair | None:
+    """Policies and episode to show; None without `truth` and another trained arm."""
+    others = [name for name in results.trained() if name != "truth"]
+    if "truth" not in results.trained() or not others:
+        return None
+    trainings = {name: results.best_validated(name) for name in ("truth", results.best(others))}
+    truth, other = (results.flown[name][k] for name, k in trainings.items())
+    looks = results.study.about.figure == "glance"
+    return Pair(trainings, _first_away(other) if looks else _first_crash(truth))
+
+
+def label_of(results: Results, name: str) -> str:
+    """Label of a policy above a figure or a film."""
+    return f"trained on {results.arm(name).label}"
+
+
+def _first_away(flown: Flown) -> int:
+    off = flown.recorded["off_wall"] - flown.recorded["off_reward"]
+    wrapped = np.abs(np.angle(np.exp(1j * off)))
+    return int(np.argmax(np.nanmean(wrapped, axis=0) > AWAY))
+
+
+def _first_crash(flown: Flown) -> int:
+    return int(np.argmax(flown.episodes.crashed[: flown.recorded["speed"].shape[1]]))
+
 
 def require_film(study: Study, kind: str) -> None:
-    """See that a film can be made, before anything is trained.
-
-    Args:
-        study: The study.
-        kind: Of the film.
+    """Check, before training, that a film of a kind ("webp", "gif" or "mp4") can be made.
 
     Raises:
         ValueError: If the study has no two policies to compare.
-        ImportError: If a library that draws or writes it is not installed.
+        ImportError: If a library for drawing or writing is not installed.
     """
     trained = [arm.name for arm in study.arms if arm.trained]
     if "truth" not in trained or len(trained) < 2:
         given = ", ".join(arm.name for arm in study.arms)
         raise ValueError(f"--video needs the arm truth and another trained one, got {given}")
     load_pygame()
-    checked_video_path(film_file(study, kind))
+    checked_video_path(study.folder / f"film.{kind}")
 
 
-def film_file(study: Study, kind: str) -> Path:
-    """Where a study's film is."""
-    return study.folder / f"film.{kind}"
-
-
-def write_film(results: Results, kind: str, flights_of: Callable[[Arm, int], Any]) -> Path:
-    """Fly the two policies once more, and write the film.
-
-    Args:
-        results: Of the study; it compares two policies, see `require_film`.
-        kind: "webp", "gif" or "mp4".
-        flights_of: Makes the environment of the test of an arm, with so many flights.
-
-    Returns:
-        The file.
-    """
-    from tqdm import tqdm
-
-    study, pair = results.study, pair_of(results)
+def write_film(results: Results, kind: str) -> Path:
+    """Fly the two policies once more, and write the film; returns its path."""
+    pair = pair_of(results)
     assert pair is not None
-    sides = [
-        side_of(results, name, seed, pair.episode, flights_of)
-        for name, seed in pair.trainings.items()
-    ]
     return save_side_by_side(
-        sides,
-        film_file(study, kind),
+        [side_of(results, name, k, pair.episode) for name, k in pair.trainings.items()],
+        results.study.folder / f"film.{kind}",
         fps=RATE,
-        speed=study.about.film_speed,
+        speed=results.study.about.film_speed,
         progress=lambda times: tqdm(times, desc="filming", unit=" pictures"),
     )
 
 
-def side_of(
-    results: Results,
-    name: str,
-    seed: int,
-    episode: int,
-    flights_of: Callable[[Arm, int], Any],
-) -> Side:
-    """One episode of one training, flown among all episodes of the test as it was in the test.
+def side_of(results: Results, name: str, k: int, episode: int) -> Side:
+    """One test episode of the training with the k-th seed of an arm.
 
-    In a smaller batch the policy's matrix products would round differently, and a flight that is
-    lost can end elsewhere for it.
+    It is flown in a batch of all test episodes, as in the test: in a smaller batch, the matrix
+    products of the policy would round differently, and a diverging flight could end elsewhere.
     """
-    from baselines.policies import load_policy
-
-    study, arm = results.study, results.arm(name)
-    env = flights_of(arm, study.episodes)
-    policy = load_policy(study.policy_of(arm, seed), env)
+    study = results.study
+    trial = study.trials()[name]
+    env = trial.env
+    policy = load_policy(study.policies(trial)[k], env)
     recorder = FlightRecorder(env.unwrapped.flights.batch, episode)
     flying = True
 
     def keep(step: int, batch: Any, which: NDArray[np.bool_]) -> None:
         nonlocal flying
-        if flying:  # the instant at which it ends among them
+        if flying:  # including the instant at which it ends
             recorder.keep()
         flying = bool(which[episode])
 

@@ -1,7 +1,7 @@
-"""The tasks that are studied: arms, success, columns of the table and figures of each, as data."""
+"""Tasks of studies, as data: arms, success, columns of the table, figures."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,73 +9,77 @@ from numpy.typing import NDArray
 
 from quad_gym.analysis.intervals import Score, mean, worst_tenth
 from quad_gym.experiments.arms import ARMS_OF, Arm
-from quad_gym.experiments.study_flights import Flown
+from quad_gym.experiments.flown import Flown
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column of the table: one number of each episode, and what is made of them."""
+    """Column of the table: one number per episode, and their score."""
 
     heading: str
-    """for people, with its unit"""
+    """Heading with the unit"""
     of: Callable[[Flown], NDArray[Any]]
-    """(e,) one number of each episode"""
+    """Function that returns one number per episode, (e,)"""
     digits: int | None = None
-    """after the point; None: a share, in percent"""
+    """Number of decimals; None: a share, in percent"""
     score: Score = mean
-    """over the episodes"""
+    """Score of the episodes"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudiedTask:
-    """What a study of a task is made of."""
+    """Definition of the studies of a task."""
 
     arms: tuple[Arm, ...]
-    """all there are, in the order of the table"""
+    """All arms, in the order of the table"""
     carrying: tuple[str, ...]
-    """names of those that carry the conclusions"""
+    """Names of the arms that are studied by default"""
     success: Callable[[Flown], NDArray[np.bool_]]
-    """(e,) whether episodes are a success"""
+    """Function that returns True for successful episodes, (e,)"""
     meaning: str
-    """what success is, for people"""
+    """Definition of success in words"""
     columns: Mapping[str, Column]
-    """further ones of the table, by name"""
+    """Further columns of the table, by name"""
     telling: str
-    """the column that says how the task was done, beside successes and crashes"""
+    """Column that the conclusions quote, in addition to successes and crashes"""
     traced: tuple[str, ...]
-    """what is kept of the first episodes, for the figure; see `study_flights.TRACES`"""
+    """Traces of the first episodes that the figure shows, see `flown.TRACES`"""
     evaluations: int = 9
-    """how often a policy is evaluated over its training, to keep the best one"""
+    """Number of evaluations during a training, of which the best policy is kept"""
     figure: str
-    """"glance": where policies look; "pace": how fast they fly, and how sure the filter is"""
+    """"glance": heading of policies; "pace": speed, and standard deviations of the filter"""
     course: tuple[str, int] | None = None
-    """what is passed on a course, and how many there are; None: there is no course"""
+    """Name and number of the gates of a course; None: no course"""
     film_speed: float = 1.0
-    """seconds of flight per second of a film"""
+    """Seconds of flight per second of a film"""
 
+    def table(self) -> dict[str, Column]:
+        """Columns of the table by name, in their order."""
+        returns = Column(heading="return", of=lambda run: run.episodes.returns, digits=1)
+        return {
+            "return": returns,
+            "worst": replace(returns, heading="worst tenth", score=worst_tenth),
+            "success": Column(heading="success", of=self.success),
+            "crashed": Column(heading="crashed", of=lambda run: run.episodes.crashed),
+            **self.columns,
+        }
 
-ALWAYS: Mapping[str, Column] = {
-    "return": Column(heading="return", of=lambda run: run.returns, digits=1),
-    "worst": Column(heading="worst tenth", of=lambda run: run.returns, digits=1, score=worst_tenth),
-    "crashed": Column(heading="crashed", of=lambda run: run.crashed),
-}
-"""Columns of every table, beside that of success."""
 
 WITHIN = 0.5
-"""Mean position error in the second half that is a success in LookAround [m]."""
+"""Largest mean position error in the second half of a successful episode of LookAround [m]."""
 
 
 def stays(run: Flown, within: float = WITHIN) -> NDArray[np.bool_]:
-    """(e,) whether it flew to the end, in the second half with a mean error below `within`."""
-    return ~run.crashed & (np.nan_to_num(run.late_error, nan=np.inf) < within)
+    """Return True for complete episodes with a late error below `within` [m], (e,)."""
+    return ~run.episodes.crashed & (np.nan_to_num(run.episodes.late_error, nan=np.inf) < within)
 
 
 def passes(run: Flown, gates: int) -> NDArray[np.bool_]:
-    """(e,) whether it passed so many gates without a crash."""
-    return ~run.crashed & (run.gates >= gates)
+    """Return True for episodes with at least `gates` gates and no crash, (e,)."""
+    return ~run.episodes.crashed & (run.episodes.gates_passed >= gates)
 
 
-_SPEED = Column(heading="mean speed [m/s]", of=lambda run: run.speed, digits=2)
+_SPEED = Column(heading="mean speed [m/s]", of=lambda run: run.recorded["mean_speed"], digits=2)
 
 STUDIED: Mapping[str, StudiedTask] = {
     "look_around": StudiedTask(
@@ -91,8 +95,10 @@ STUDIED: Mapping[str, StudiedTask] = {
         meaning="flown to the end, with a mean position error below "
         f"{WITHIN:g} m in the second half",
         columns={
-            "error": Column(heading="position error [m]", of=lambda run: run.error, digits=3),
-            "in_view": Column(heading="features in view", of=lambda run: run.in_view),
+            "error": Column(
+                heading="position error [m]", of=lambda run: run.episodes.mean_error, digits=3
+            ),
+            "in_view": Column(heading="features in view", of=lambda run: run.recorded["in_view"]),
         },
         telling="error",
         traced=("off_wall", "off_reward", "sigma", "estimation_error", "position_error"),
@@ -108,7 +114,9 @@ STUDIED: Mapping[str, StudiedTask] = {
         success=lambda run: passes(run, 8),
         meaning="all eight gates passed",
         columns={
-            "gates": Column(heading="gates passed, of 8", of=lambda run: run.gates, digits=2),
+            "gates": Column(
+                heading="gates passed, of 8", of=lambda run: run.episodes.gates_passed, digits=2
+            ),
             "speed": _SPEED,
         },
         telling="gates",
@@ -123,7 +131,9 @@ STUDIED: Mapping[str, StudiedTask] = {
         success=lambda run: passes(run, 10),
         meaning="all ten gaps passed, without a crash",
         columns={
-            "gates": Column(heading="gaps passed, of 10", of=lambda run: run.gates, digits=2),
+            "gates": Column(
+                heading="gaps passed, of 10", of=lambda run: run.episodes.gates_passed, digits=2
+            ),
             "speed": _SPEED,
         },
         telling="gates",
@@ -133,4 +143,4 @@ STUDIED: Mapping[str, StudiedTask] = {
         film_speed=3.0,
     ),
 }
-"""By task."""
+"""Definitions by task."""

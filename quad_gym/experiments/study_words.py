@@ -1,33 +1,33 @@
-"""Conclusions of a study, in words that are computed from its numbers.
+"""Conclusions of a study, computed from its numbers.
 
-Two arms differ significantly where the 95 % interval of their difference excludes zero. Of equal
-arms that happens with a probability of 1 % with three trainings each, 2 % with five and at most
-5 % with many; more often of an arm that is the best of several in the same numbers.
+Two arms differ significantly if the 95 % interval of their difference excludes zero. For equal arms
+the probability of this is 1 % with three trainings each, 2 % with five, and at most 5 % with many;
+it is larger for an arm that was selected as the best of several by the same numbers.
 """
 
 from collections.abc import Mapping
 
 from quad_gym.analysis.intervals import Estimated, difference
-from quad_gym.experiments.study_results import Results
+from quad_gym.experiments.study import Results
 
 FEW = 5
-"""Seeds below which intervals over trainings are wide."""
+"""Number of seeds below which intervals over trainings are wide."""
 
 
 def number(found: Estimated, digits: int) -> str:
-    """A number with its interval."""
+    """Number with its interval."""
     low, high = f"{found.low:.{digits}f}", f"{found.high:.{digits}f}"
     return f"{found.value:.{digits}f} [{low}, {high}]"
 
 
 def share(found: Estimated) -> str:
-    """A share with its interval, in percent."""
+    """Share with its interval, in percent."""
     scaled = Estimated(*(100.0 * value for value in found))
     return number(scaled, 1 if scaled.value < 10.0 else 0) + " %"
 
 
 def conclusions(results: Results) -> list[str]:
-    """Sentences, each true of the numbers."""
+    """Conclusions that the intervals allow."""
     found = []
     learned = [name for name in results.trained() if name != "truth"]
     if "truth" in results.trained() and learned:
@@ -70,7 +70,7 @@ def _against_truth(results: Results, best: str) -> list[str]:
 
 
 def _how(results: Results, ours: Mapping[str, Estimated], truth: Mapping[str, Estimated]) -> str:
-    """What else tells two arms apart, by the task's column for it."""
+    """Difference in crashes and in the column of the task that conclusions quote."""
     telling = results.study.about.telling
     crashes = f"It crashes in {share(ours['crashed'])}, compared with {share(truth['crashed'])}"
     if telling != "error":

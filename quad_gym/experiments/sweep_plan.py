@@ -1,98 +1,48 @@
-"""What a sweep trains: a file, or options, expanded to a list of folders."""
+"""Trainings of a sweep: a file or options, expanded to all combinations of values."""
 
 import itertools
-import json
 import tomllib
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from baselines.keeping import has_checkpoint
-from baselines.plans import Plan, description
+from baselines.plans import Plan
 from baselines.recipes import Recipe, recipe
 from quad_gym import IDS
 from quad_gym.experiments.arms import Arm
+from quad_gym.experiments.experiment import Training, trainings_of
 from quad_gym.params import checks as check
 
-RECORD = "training.json"
-_SINGLE = ("algorithm", "steps", "n_envs")
-"""Fields of a recipe that are keys by themselves."""
-_ELSEWHERE = {**{name: name for name in _SINGLE}, "parameters": "set"}
-"""Fields of a recipe that `recipe` does not take, with the keys to use instead."""
+DEFAULTS: Mapping[str, Any] = {
+    "env_ids": ["QuadGym/Circle-v0"],
+    "arms": [],
+    "algorithm": "ppo",
+    "steps": None,
+    "n_envs": None,
+    "engine": "sb3",
+    "seeds": 1,
+    "evaluations": 20,
+    "episodes": 100,
+    "env": {},
+    "set": {},
+    "recipe": {},
+}
+"""Keys of a sweep, see `docs/sweeps.md`; None: as in the recipe."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Spec:
-    """A sweep as a file has it; where a list is given, its values are tried one by one."""
-
-    env_ids: list[str] = field(default_factory=lambda: ["QuadGym/Circle-v0"])
-    """ids of environments"""
-    arms: list[str] = field(default_factory=list)
-    """names of arms of a study; none: environments as `env` has them"""
-    algorithm: Any = "ppo"
-    steps: Any = None
-    """environment steps; None: the recipe's"""
-    n_envs: Any = None
-    """flights at a time; None: the recipe's"""
-    engine: str = "sb3"
-    seeds: Any = 1
-    """a number of them from 0 on, or a list"""
-    evaluations: int = 20
-    episodes: int = 100
-    env: Mapping[str, Any] = field(default_factory=dict)
-    """keywords of the environments"""
-    set: Mapping[str, Any] = field(default_factory=dict)
-    """parameters of the algorithm"""
-    recipe: Mapping[str, Any] = field(default_factory=dict)
-    """other fields of the recipe"""
-
-
-NAMES = tuple(f.name for f in fields(Spec))
 TABLES = ("env", "set", "recipe")
+_SINGLE = ("algorithm", "steps", "n_envs")
+"""Fields of a recipe that are separate keys."""
+_ELSEWHERE = {**{name: name for name in _SINGLE}, "parameters": "set"}
+"""Keys to use instead of fields of the recipe."""
+_RECIPE = tuple(f.name for f in fields(Recipe) if f.name not in (*_ELSEWHERE, "flights", "policy"))
 
-
-@dataclass(frozen=True)
-class Training:
-    """One training of a sweep."""
-
-    group: str
-    """what it has in common with those of other seeds; a name of a folder"""
-    plan: Plan
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        return f"{self.group}/seed_{self.plan.seed}"
-
-    def record(self) -> dict[str, Any]:
-        """What the folder says of it; empty where it was not begun.
-
-        Raises:
-            ValueError: If the folder holds another training.
-        """
-        if not has_checkpoint(self.folder):
-            return {}
-        found: dict[str, Any] = json.loads((self.folder / RECORD).read_text(encoding="utf-8"))
-        described = description(self.plan)
-        if found["plan"] != described:
-            differing = [k for k in described if found["plan"].get(k) != described[k]]
-            raise ValueError(
-                f"folder {self.folder} holds another training (different: "
-                f"{', '.join(differing)}): choose another --output"
-            )
-        return found
-
-    @property
-    def finished(self) -> bool:
-        """Whether nothing is left to be done."""
-        return bool(self.record().get("finished"))
+Axis = tuple[str, str]
+"""Table (empty for a separate key) and key of a value."""
 
 
 def read(file: Path) -> dict[str, Any]:
-    """What a file of a sweep gives.
+    """Read a sweep file.
 
     Raises:
         ValueError: If it is invalid.
@@ -103,133 +53,104 @@ def read(file: Path) -> dict[str, Any]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{file} is no valid TOML: {error}") from None
     for name, value in found.items():
-        check.choice(f"a key of {file}", name, NAMES)
+        check.choice(f"a key of {file}", name, tuple(DEFAULTS))
         if name in TABLES and not isinstance(value, dict):
             raise ValueError(f"{name} in {file} must be a table, got {value!r}")
-        if name in ("env_ids", "arms"):
-            _listed(name, value)
+        names = isinstance(value, list) and all(isinstance(each, str) for each in value)
+        if name in ("env_ids", "arms") and not names:
+            raise ValueError(f"{name} must be a list of names, got {value!r}")
     return found
 
 
 def expand(
     given: Mapping[str, Any], arms: Mapping[str, Arm], folder: Path, *, threads: int = 1
 ) -> list[Training]:
-    """All trainings of a sweep, the first seed of every group first.
+    """All trainings of a sweep, the first seed of every combination first.
 
     Args:
-        given: Fields of Spec; others keep their defaults.
-        arms: Those that `given` names.
-        folder: Of the sweep.
-        threads: Of each training.
+        given: Keys of `DEFAULTS`, with their values.
+        arms: Arms in `given`, by name.
+        folder: Folder of the sweep.
+        threads: Number of threads of each training.
 
     Raises:
         ValueError: If a value is invalid.
     """
-    spec = Spec(**given)
-    groups = [
-        (env_id, arm, dict(axes))
-        for env_id in spec.env_ids
-        for arm in tuple[str | None, ...](spec.arms) or (None,)
-        for axes in _products(spec)
-    ]
-    found = []
-    for seed in _seeds(spec.seeds):
-        for env_id, arm, axes in groups:
-            plan = _plan(spec, env_id, None if arm is None else arms[arm], axes, seed, threads)
-            name = _name(spec, env_id, arm, axes)
-            found.append(Training(name, plan, folder / "runs" / name / f"seed_{seed}"))
-    for name, count in Counter(training.name for training in found).items():
-        if count > 1:
+    spec = {**DEFAULTS, **given}
+    axes: dict[Axis, Any] = {(table, k): v for table in TABLES for k, v in spec[table].items()}
+    axes |= {("", key): spec[key] for key in _SINGLE if spec[key] is not None}
+    tried = [value if isinstance(value, list) else [value] for value in axes.values()]
+    if [] in tried:
+        empty = ".".join(filter(None, list(axes)[tried.index([])]))
+        raise ValueError(f"{empty} must have at least one value")
+    cases: dict[str, Plan] = {}
+    for env_id, arm, values in itertools.product(
+        spec["env_ids"], spec["arms"] or [None], itertools.product(*tried)
+    ):
+        chosen = dict(zip(axes, values, strict=True))
+        listed = {axis: chosen[axis] for axis in axes if isinstance(axes[axis], list)}
+        name = _name(spec, env_id, arm, chosen["", "algorithm"], listed)
+        if name in cases:
             raise ValueError(f"every value of a sweep must be given once, got {name} twice")
-    return found
-
-
-def _listed(name: str, values: Any) -> None:
-    if not (isinstance(values, list) and all(isinstance(value, str) for value in values)):
-        raise ValueError(f"{name} must be a list of names, got {values!r}")
+        cases[name] = _plan(spec, env_id, arms.get(arm), chosen, threads)
+    return trainings_of(cases, _seeds(spec["seeds"]), folder)
 
 
 def _seeds(given: Any) -> Sequence[int]:
-    if isinstance(given, list):
-        if not given:
-            raise ValueError("seeds must not be empty")
-        return [check.whole("seeds", seed, least=0) for seed in given]
-    return range(check.whole("seeds", given))
-
-
-def _products(spec: Spec) -> Iterator[dict[tuple[str, str], Any]]:
-    """Every combination of values, by table and key."""
-    axes: dict[tuple[str, str], list[Any]] = {}
-    for table in TABLES:
-        for key, value in getattr(spec, table).items():
-            axes[table, key] = value if isinstance(value, list) else [value]
-    for key in _SINGLE:
-        if (value := getattr(spec, key)) is not None:
-            axes["", key] = value if isinstance(value, list) else [value]
-    for (table, key), values in axes.items():
-        if not values:
-            raise ValueError(f"{f'{table}.{key}' if table else key} must have at least one value")
-    for combination in itertools.product(*axes.values()):
-        yield dict(zip(axes, combination, strict=True))
+    if not isinstance(given, list):
+        return range(check.whole("seeds", given))
+    if not given or len(set(given)) < len(given):
+        raise ValueError(f"seeds must be different numbers, at least one, got {given}")
+    return [check.whole("seeds", seed, least=0) for seed in given]
 
 
 def _plan(
-    spec: Spec,
-    env_id: str,
-    arm: Arm | None,
-    axes: Mapping[tuple[str, str], Any],
-    seed: int,
-    threads: int,
+    spec: Mapping[str, Any], env_id: str, arm: Arm | None, chosen: Mapping[Axis, Any], threads: int
 ) -> Plan:
-    tables = {t: {k: _frozen(v) for (u, k), v in axes.items() if u == t} for t in (*TABLES, "")}
+    tables = {t: {k: _frozen(v) for (u, k), v in chosen.items() if u == t} for t in (*TABLES, "")}
     arm = arm or Arm(name="none", label="none")
     if arm.policy is not None:
         raise ValueError(f"arms must be trained, got {arm.name}, whose policy is {arm.policy}")
-    chosen: Recipe = recipe(env_id, tables[""].pop("algorithm"))
-    others = [f.name for f in fields(Recipe) if f.name not in (*_ELSEWHERE, "flights", "policy")]
     for name in tables["recipe"]:
         if name in _ELSEWHERE:
             raise ValueError(f"recipe must not hold {name}: use {_ELSEWHERE[name]} instead")
-        check.choice("recipe", name, others)
-    chosen = chosen.replace(
-        **tables[""],
-        **tables["recipe"],
-        parameters={**chosen.parameters, **arm.parameters, **tables["set"]},
-    )
+        check.choice("recipe", name, _RECIPE)
+    base = recipe(env_id, tables[""].pop("algorithm"))
     return Plan(
         env_id=env_id,
         environment={**tables["env"], **arm.environment, **arm.training},
         learning=arm.learning,
-        recipe=chosen,
-        seed=seed,
+        recipe=base.replace(
+            **tables[""],
+            **tables["recipe"],
+            parameters={**base.parameters, **arm.parameters, **tables["set"]},
+        ),
         threads=threads,
-        engine=spec.engine,
-        evaluations=spec.evaluations,
-        episodes=spec.episodes,
+        **{name: spec[name] for name in ("engine", "evaluations", "episodes")},
     )
 
 
 def _frozen(value: Any) -> Any:
-    """Lists as the tuples that keywords and recipes take."""
+    """Convert lists to tuples, as keywords and recipes require."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def _name(spec: Spec, env_id: str, arm: str | None, axes: Mapping[tuple[str, str], Any]) -> str:
-    """Task, algorithm, arm, and every value of a list: no value that is added changes it."""
-    algorithm = axes["", "algorithm"]
-    words = [IDS[env_id], "compiled_ppo" if spec.engine == "compiled" else algorithm]
+def _name(
+    spec: Mapping[str, Any],
+    env_id: str,
+    arm: str | None,
+    algorithm: str,
+    listed: Mapping[Axis, Any],
+) -> str:
+    """Task, algorithm, arm, and each value from a list, so that further values do not change it."""
+    words = [IDS[env_id], "compiled_ppo" if spec["engine"] == "compiled" else algorithm]
     words += [] if arm is None else [arm]
-    words += [
-        f"{key}={_word(value)}"
-        for (table, key), value in axes.items()
-        if key != "algorithm"
-        and isinstance(getattr(spec, table)[key] if table else getattr(spec, key), list)
-    ]
+    words += [f"{key}={_word(value)}" for (_, key), value in listed.items() if key != "algorithm"]
     return ",".join(words)
 
 
 def _word(value: Any) -> str:
-    """A value in the name of a folder."""
+    """Value in the name of a folder."""
     if isinstance(value, list | tuple):
         return "x".join(map(_word, value))
     text = str(value).lower() if isinstance(value, bool) else str(value)

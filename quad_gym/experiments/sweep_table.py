@@ -1,9 +1,8 @@
-"""The table of a sweep, made from its folders alone, however these were trained.
+"""Tables of a sweep, made from its folders only, without times and paths.
 
-It holds neither times nor paths. Of a training that is not finished it has the steps alone.
+An unfinished training has only its steps.
 """
 
-import csv
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,37 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from baselines.keeping import EVALUATIONS
 from quad_gym.analysis.intervals import mean_interval, rate_over_trainings
 from quad_gym.analysis.reports import text_table, write_csv
-from quad_gym.experiments.sweep_plan import Training
+from quad_gym.experiments.experiment import Training
 
 SCORES = ("mean_error", "late_error", "crash_rate", "return", "gates_passed")
-"""Of the best evaluation of a training."""
+"""Scores of the best evaluation of a training."""
 
 FILES = ("trainings.csv", "groups.csv", "table.txt")
 
 
-def steps_done(folder: Path) -> int:
-    """Environment steps at the last evaluation of a training."""
-    try:
-        with (folder / EVALUATIONS).open(encoding="utf-8", newline="") as stream:
-            *_, last = csv.DictReader(stream)
-        return int(float(last["steps"]))
-    except (OSError, ValueError, KeyError):  # not begun
-        return 0
-
-
 def row_of(training: Training) -> dict[str, Any]:
-    """One training as its folder has it."""
+    """Row of a training, from its folder."""
     record = training.record()
     finished = bool(record.get("finished"))
     best = record["best"] if finished else {}
     return {
-        "group": training.group,
+        "group": training.case,
         "seed": training.plan.seed,
         "finished": finished,
-        "steps": record["steps"] if finished else steps_done(training.folder),
+        "steps": record["steps"] if finished else training.steps_done(),
         "best_steps": best.get("steps"),
         "episodes": training.plan.episodes,
         **{name: best.get(name) for name in SCORES},
@@ -49,9 +37,9 @@ def row_of(training: Training) -> dict[str, Any]:
 
 
 def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean of each score over the finished seeds of each group, and its 95 % interval.
+    """Mean of each score over the finished seeds of each group, with its 95 % interval.
 
-    By Student's t; of crash rates by `rate_over_trainings`.
+    Intervals are Student's t; for crash rates, `rate_over_trainings`.
     """
     found = []
     for group in dict.fromkeys(row["group"] for row in rows):
@@ -75,7 +63,7 @@ def groups_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The table for people: groups, then trainings."""
+    """Tables for the screen: groups, then trainings."""
 
     def cell(row: dict[str, Any], name: str, form: str) -> str:
         if row[name] is None:
@@ -113,10 +101,10 @@ def table_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:
-    """Write FILES; at any moment there is the old or the new one of each, whole.
+    """Write `FILES` atomically.
 
     Raises:
-        OSError: If they cannot be written.
+        OSError: If the folder is not writable.
     """
     parts = [folder / f"{name}.{os.getpid()}.part" for name in FILES]  # of this sweep alone
     for part, table in zip(parts, (rows, groups_of(rows)), strict=False):

@@ -1,6 +1,7 @@
 """Training with the compiled engine: repeatable, resumable after any death, without torch."""
 
 import json
+import signal
 import subprocess
 import sys
 import zipfile
@@ -77,9 +78,34 @@ def test_a_run_that_died_goes_on_as_if_it_had_not(tmp_path, monkeypatch, rollout
     die_after(rollouts, plan, tmp_path / "cut", monkeypatch)
     assert run(plan, tmp_path / "cut", resume=True).finished
     assert_same_policy(tmp_path / "whole", tmp_path / "cut")
-    rows = [(tmp_path / name / "evaluations.csv").read_text() for name in ("whole", "cut")]
-    timeless = [[line.split(",")[:1] + line.split(",")[2:] for line in r.split()] for r in rows]
-    assert timeless[0] == timeless[1]
+    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
+
+
+def evaluations(folder):
+    """Rows of the evaluations, without their times."""
+    lines = (folder / "evaluations.csv").read_text().split()
+    return [line.split(",")[:1] + line.split(",")[2:] for line in lines]
+
+
+def test_run_stopped_between_evaluations_has_no_further_evaluation(tmp_path, monkeypatch):
+    plan = small_plan()  # an evaluation every two rollouts
+    run(plan, tmp_path / "whole")
+    roll_out = CompiledPPO._roll_out
+    calls = iter(range(10_000))
+
+    def stop(self):
+        roll_out(self)
+        if next(calls) == 2:
+            signal.raise_signal(signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CompiledPPO, "_roll_out", stop)
+        stopped = run(plan, tmp_path / "cut")
+    assert (stopped.finished, stopped.steps) == (False, 768)
+    assert len(evaluations(tmp_path / "cut")) == 1 + 2  # a heading, and steps 0 and 512
+    assert run(plan, tmp_path / "cut", resume=True).finished
+    assert_same_policy(tmp_path / "whole", tmp_path / "cut")
+    assert evaluations(tmp_path / "whole") == evaluations(tmp_path / "cut")
 
 
 def asymmetric_plan(critic_only=15, **changes):

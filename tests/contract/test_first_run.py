@@ -116,10 +116,10 @@ def test_a_legend_is_within_its_figure_and_no_higher_than_needed(count, length):
     pytest.importorskip("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    from quad_gym.analysis.study_plots import returns_figure
+    from quad_gym.analysis.comparison_plots import learning_figure
 
     curve = [(np.linspace(0.0, 1.0, 5), np.linspace(0.0, 9.0, 5))]
-    figure = returns_figure({f"{k}".rjust(length, "n"): curve for k in range(count)}, {})
+    figure = learning_figure({f"{k}".rjust(length, "n"): curve for k in range(count)}, {})
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     (legend,) = figure.legends

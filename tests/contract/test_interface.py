@@ -12,8 +12,9 @@ import pytest
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
-from quad_gym.commands import compare, evaluate
+from quad_gym.commands import evaluate
 from quad_gym.envs.configuration import Flights
+from quad_gym.envs.effects import with_effect
 from quad_gym.envs.keywords import (
     DEFAULTS,
     RENDERING_KEYWORDS,
@@ -196,10 +197,10 @@ def test_a_comparison_gives_the_filters_keywords_where_a_filter_runs(tmp_path):
     for observation in ("truth", "noisy", "estimate"):
         evaluate.make_flights(args, observation, 1, "pd").close()
     given = {**args.env, "sensors": "rtk"}
-    assert compare.with_effect({**given, "observation": "truth"}) == {
+    assert with_effect({**given, "observation": "truth"}) == {
         **{"observation": "truth", "sensors": "rtk"}
     }
-    assert compare.with_effect({**given, "observation": "estimate"}) == {
+    assert with_effect({**given, "observation": "estimate"}) == {
         **{"observation": "estimate"},
         **given,
     }

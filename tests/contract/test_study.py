@@ -1,17 +1,20 @@
-"""`quad-gym study` from its arms to its report, resumed, with arms of a user's own."""
+"""Studies: arms, trainings, resumption, tables, conclusions."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from baselines.recipes import recipe
+from quad_gym import IDS
 from quad_gym.commands import study as command
 from quad_gym.commands.main import main
-from quad_gym.experiments import study_results
-from quad_gym.experiments.arms import ARMS, Arm
-from quad_gym.experiments.study_flights import Flown
-from quad_gym.experiments.study_results import Study
+from quad_gym.evaluation import Episodes
+from quad_gym.experiments import flown as flights
+from quad_gym.experiments.arms import ARMS, Arm, chosen_arms
+from quad_gym.experiments.flown import Flown
+from quad_gym.experiments.study import Study, results_of
 from quad_gym.experiments.study_tasks import STUDIED, stays
 from quad_gym.experiments.study_words import conclusions
 
@@ -26,7 +29,7 @@ ARMS = (
 """
 
 
-def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
+def test_study_continues_and_repeats_a_missing_training(tmp_path, capsys):
     (tmp_path / "mine.py").write_text(MINE)
     folder = tmp_path / "out"
     words = [*QUICK, "--arms-file", str(tmp_path / "mine.py"), "--output", str(folder)]
@@ -58,21 +61,21 @@ def test_a_study_runs_goes_on_and_repeats_what_is_missing(tmp_path, capsys):
         ("outage_dash", ["pd_waiting", "truth", "std", "truth_on_truth"]),
     ],
 )
-def test_each_task_is_studied_with_its_arms_and_controls(task, arms, tmp_path, capsys):
+def test_study_of_each_task_flies_all_arms(task, arms, tmp_path, capsys):
     folder = tmp_path / "out"
     short = ["--quick", "--steps", "4096", "--env", "duration=0.6", "--arms", *arms]
     assert main(["study", task, *short, "--output", str(folder)]) == 0
     summary = json.loads((folder / "summary.json").read_text())
     assert set(summary["rows"]) == set(arms)
     assert set(summary["rows"]["truth"]) >= {"success", "crashed", "gates", "speed"}
-    assert sorted(f.name for f in (folder / "runs").iterdir()) == sorted(arms)
-    assert not list((folder / "runs/truth_on_truth").rglob("best.npz"))
+    assert sorted(f.name for f in (folder / "flights").iterdir()) == sorted(arms)
+    assert not (folder / "runs/truth_on_truth").exists()
     text = (folder / "table.md").read_text()
     assert "passed" in text.partition("Success: ")[2].partition(".")[0]
     assert (folder / "pace.png").stat().st_size > 1000
 
 
-def test_arms_of_either_engine_are_trained_and_flown_in_one_study(tmp_path, capsys):
+def test_one_study_trains_arms_of_both_engines(tmp_path, capsys):
     pytest.importorskip("sb3_contrib")
     words = [*QUICK, "--set", "n_steps=8", "batch_size=512", "n_epochs=1"]
     words += ["--arms", "std_certainty_privileged", "recurrent", "--output", str(tmp_path / "out")]
@@ -92,7 +95,7 @@ def test_arms_of_either_engine_are_trained_and_flown_in_one_study(tmp_path, caps
     assert set(summary["study"]["recipes"]) == {"ppo", "recurrent_ppo"}
 
 
-def test_steps_are_told_of_each_algorithm():
+def test_steps_are_given_for_each_algorithm():
     two = command.configure(command.Args(arms=("std_certainty_privileged", "recurrent")))
     counts = [recipe("QuadGym/LookAround-v0", name).steps for name in ("ppo", "recurrent_ppo")]
     assert two.steps() == f"{counts[0]:,} (ppo) or {counts[1]:,} (recurrent_ppo) steps"
@@ -122,7 +125,7 @@ def test_steps_are_told_of_each_algorithm():
         (["--arms", "truth", "--set", "critic_only=3"], "critic_only must be the number of values"),
     ],
 )
-def test_wrong_options_end_the_study_before_it_begins(words, message, tmp_path, capsys):
+def test_invalid_options_are_rejected_before_training(words, message, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["study", *words, "--output", str(tmp_path / "none")])
     assert ended.value.code == 2
@@ -130,7 +133,7 @@ def test_wrong_options_end_the_study_before_it_begins(words, message, tmp_path, 
     assert not (tmp_path / "none").exists()
 
 
-def test_wrong_arms_are_refused():
+def test_invalid_arms_are_rejected():
     with pytest.raises(ValueError, match=r"Arm.name must be a word"):
         Arm(name="a b", label="x")
     with pytest.raises(ValueError, match="must not be trained"):
@@ -147,10 +150,10 @@ def test_wrong_arms_are_refused():
         Arm(name="a", label="x", environment=3)
 
 
-def test_a_reward_of_an_arm_holds_in_training_alone():
+def test_reward_of_an_arm_applies_in_training_only():
     args = command.Args(arms=("std_certainty",))
     setting = command.configure(args)
-    plan = command.plan_of(setting, setting.arms[0], 0)
+    plan = setting.trainings[0].plan
     learned = plan.make_vector_flights().unwrapped.flights.batch
     judged = plan.make_judge().unwrapped.flights.batch
     assert type(learned.own_task).__name__ == "WithStdCertaintyReward"
@@ -158,62 +161,73 @@ def test_a_reward_of_an_arm_holds_in_training_alone():
     assert judged.task.out_of_bounds == 8.0
 
 
-def test_flights_are_flown_again_after_another_training_or_another_flight(tmp_path, monkeypatch):
-    arms = tuple(arm for arm in ARMS if arm.name in ("truth", "truth_on_truth"))
-    study = Study(
-        *("QuadGym/StaleRace-v0", arms, (0,), {"ppo": recipe("QuadGym/StaleRace-v0")}),
-        *({}, 40, 0, STUDIED["stale_race"], tmp_path, None),
-    )
-    policy = tmp_path / "runs" / "truth" / "seed_0" / "best.npz"
-    policy.parent.mkdir(parents=True)
+def test_digest_of_flights_depends_on_policy_and_sources(tmp_path, monkeypatch):
+    arms = chosen_arms(STUDIED["stale_race"].arms, ("truth", "truth_on_truth"))
+    study = study_of("stale_race", arms, tmp_path, seeds=(0,))
+    trial = study.trials()["truth_on_truth"]
+    (policy,) = study.policies(trial)
+    assert policy == str(tmp_path / "runs/truth/seed_0/best.npz")
+    Path(policy).parent.mkdir(parents=True)
     found = []
     for content in (b"one training", b"another", b"another"):
-        policy.write_bytes(content)
-        found.append([study.test_digest(arm, 0) for arm in arms])
-    monkeypatch.setattr(study_results, "flights_digest", lambda: "of other sources")
-    found.append([study.test_digest(arm, 0) for arm in arms])
-    for first, second, same, last in zip(*found, strict=True):
-        assert first != second == same != last
+        Path(policy).write_bytes(content)
+        found.append(trial.digest(policy))
+    monkeypatch.setattr(flights, "flights_digest", lambda: "of other sources")
+    first, second, same, last = *found, trial.digest(policy)
+    assert first != second == same != last
+
+
+def study_of(task, arms, folder, seeds=(0, 1, 2, 3, 4)):
+    (env_id,) = (name for name, each in IDS.items() if each == task)
+    return Study(
+        env_id=env_id,
+        arms=arms,
+        seeds=seeds,
+        recipes={"ppo": recipe(env_id)},
+        environment={},
+        episodes=40,
+        first_episode=0,
+        about=STUDIED[task],
+        folder=folder,
+    )
 
 
 def flown(returns, crashed, error):
     count = len(returns)
-    return Flown(
-        np.array(returns, float),
-        np.array(crashed, bool),
-        np.full(count, error),
-        np.where(crashed, np.nan, error),
-        np.full(count, 0.5),
-        np.zeros(count, int),
-        np.ones(count),
-        np.zeros(1),
-        {},
+    episodes = Episodes(
+        returns=np.array(returns, float),
+        lengths=np.full(count, 100),
+        mean_error=np.full(count, error),
+        late_error=np.where(crashed, np.nan, error),
+        estimation_error=np.zeros(count),
+        crashed=np.array(crashed, bool),
+        gates_passed=np.zeros(count, int),
+        ending=np.full(count, "none"),
     )
+    return Flown(episodes, {"in_view": np.full(count, 0.5), "mean_speed": np.ones(count)})
 
 
 def results(tmp_path, numbers):
-    arms = tuple(arm for arm in ARMS if arm.name in numbers)
-    study = Study(
-        *("QuadGym/LookAround-v0", arms, (0, 1, 2, 3, 4), {"ppo": recipe("QuadGym/LookAround-v0")}),
-        *({}, 40, 0, STUDIED["look_around"], tmp_path, None),
-    )
+    study = study_of("look_around", chosen_arms(ARMS, numbers), tmp_path)
     rng = np.random.default_rng(0)
     found = {}
-    for arm in arms:
+    for arm in study.arms:
         level, crashes, error = numbers[arm.name]
-        for seed in study.seeds_of(arm):
-            wrong = np.arange(40) < 40 * crashes
-            found[arm.name, seed] = flown(rng.normal(level, 3.0, 40), wrong, error)
-    return study.results(found, {})
+        wrong = np.arange(40) < 40 * crashes
+        found[arm.name] = [
+            flown(rng.normal(level, 3.0, 40), wrong, error)
+            for _ in (study.seeds if arm.trained else [0])
+        ]
+    return results_of(study, found, {})
 
 
-def test_success_is_to_fly_to_the_end_near_the_reference():
+def test_success_needs_a_complete_episode_and_a_small_late_error():
     some = flown([1.0, 1.0, 1.0], [False, True, False], 0.3)
     np.testing.assert_array_equal(stays(some, 0.5), [True, False, True])
     np.testing.assert_array_equal(stays(some, 0.3), [False, False, False])
 
 
-def test_words_say_what_the_numbers_say(tmp_path):
+def test_conclusions_follow_from_the_numbers(tmp_path):
     clear = {"pd_features": (130, 0.0, 0.05), "truth": (60, 0.6, 1.2), "std": (150, 0.0, 0.1)}
     words = " ".join(conclusions(results(tmp_path, clear)))
     assert "a difference of 100 [88, 100] percentage points" in words
@@ -228,6 +242,6 @@ def test_words_say_what_the_numbers_say(tmp_path):
     assert "the intervals are wide" not in words
 
 
-def test_words_compare_arms_by_the_probability_of_improvement(tmp_path):
+def test_conclusions_contain_the_probability_of_improvement(tmp_path):
     words = " ".join(conclusions(results(tmp_path, {"estimate": (9, 0, 1), "std": (99, 0, 1)})))
     assert "with probability 1.00 [0.64, 1.00]." in words

@@ -1,20 +1,16 @@
-"""Sweeps: what a file means, tables from folders, and trainings that survive any death."""
+"""Sweeps: expansion of files and options, and tables from folders."""
 
 import csv
 import json
-import os
 import time
 
 import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from baselines.locks import BusyError, holder, is_locked, locked
 from baselines.plans import description
 from quad_gym.experiments.arms import ARMS
-from quad_gym.experiments.sweep_driver import Driver
-from quad_gym.experiments.sweep_executors import Ended, work
-from quad_gym.experiments.sweep_plan import expand, read
+from quad_gym.experiments.sweep_plan import expand
 from quad_gym.experiments.sweep_table import FILES, groups_of, row_of, write_tables
 from tests import console_commands
 
@@ -30,10 +26,10 @@ n_envs = 16
 """
 
 
-# ---- what a file means ---------------------------------------------------------------------------
+# ---- expansion -----------------------------------------------------------------------------------
 
 
-def test_every_combination_has_a_folder_the_first_seed_first(tmp_path):
+def test_every_combination_has_a_folder_and_first_seeds_are_first(tmp_path):
     given = {
         "env_ids": ["QuadGym/Hover-v0", "QuadGym/Circle-v0"],
         "seeds": [3, 1],
@@ -53,14 +49,14 @@ def test_every_combination_has_a_folder_the_first_seed_first(tmp_path):
     assert (first.plan.engine, first.plan.threads) == ("sb3", 2)
 
 
-def test_values_that_are_added_leave_the_other_folders_in_place(tmp_path):
+def test_further_values_do_not_change_folders(tmp_path):
     def folders(**more):
         return {t.folder for t in expand({"seeds": 1, **more}, {}, tmp_path)}
 
     assert folders(set={"gamma": [0.9]}) < folders(set={"gamma": [0.9, 0.99]}, seeds=2)
 
 
-def test_arms_bring_what_they_are_trained_on(tmp_path):
+def test_arms_define_observation_and_reward_of_trainings(tmp_path):
     arms = {arm.name: arm for arm in ARMS}
     given = {
         "env_ids": ["QuadGym/LookAround-v0"],
@@ -68,14 +64,14 @@ def test_arms_bring_what_they_are_trained_on(tmp_path):
         "engine": "compiled",
     }
     truth, sure = expand(given, arms, tmp_path)
-    assert truth.group == "look_around,compiled_ppo,truth"
+    assert truth.case == "look_around,compiled_ppo,truth"
     assert truth.plan.environment["observation"] == "truth"
     assert sure.plan.learning == arms["std_certainty"].learning
     with pytest.raises(ValueError, match="arms must be trained, got pd_reference"):
         expand({**given, "arms": ["pd_reference"]}, arms, tmp_path)
 
 
-def test_options_replace_what_the_file_has(tmp_path):
+def test_options_override_the_file(tmp_path):
     (tmp_path / "mine.toml").write_text(SMALL)
     options = [
         "mine.toml",
@@ -94,7 +90,7 @@ def test_options_replace_what_the_file_has(tmp_path):
     assert not (tmp_path / "results").exists()
 
 
-def test_steps_and_flights_are_options_as_those_of_train(tmp_path):
+def test_steps_and_n_envs_override_the_file(tmp_path):
     (tmp_path / "mine.toml").write_text("steps = 40960\nn_envs = 16")
     options = ("mine.toml", "--dry-run", "--steps", "1000", "--n-envs", "8", "4")
     done = console_commands.run("sweep", *options, where=tmp_path)
@@ -114,8 +110,9 @@ def test_steps_and_flights_are_options_as_those_of_train(tmp_path):
         ("sedes = 3", "must be one of env_ids, arms"),
         ("env = 3", "env in bad.toml must be a table, got 3"),
         ("seeds = 0", "seeds must be at least 1, got 0"),
-        ("seeds = []", "seeds must not be empty"),
-        ("seeds = [1, 1]", "every value of a sweep must be given once"),
+        ("seeds = []", "seeds must be different numbers, at least one, got []"),
+        ("seeds = [1, 1]", "seeds must be different numbers, at least one, got [1, 1]"),
+        ("set = {gamma = [0.9, 0.9]}", "every value of a sweep must be given once"),
         ('env_ids = "QuadGym/Hover-v0"', "env_ids must be a list of names"),
         ('env_ids = ["QuadGym/Howver-v0"]', "env_ids must be one of QuadGym/"),
         ('arms = ["nobody"]', "--arms must be one of"),
@@ -133,7 +130,7 @@ def test_steps_and_flights_are_options_as_those_of_train(tmp_path):
         ("env = {threads = 1}", "--env must not contain threads: use --threads instead"),
     ],
 )
-def test_an_invalid_file_gets_one_clear_line(tmp_path, text, message):
+def test_invalid_file_is_rejected_with_one_line(tmp_path, text, message):
     (tmp_path / "bad.toml").write_text(text)
     done = console_commands.run("sweep", "bad.toml", where=tmp_path)
     assert done.returncode == 2
@@ -152,14 +149,14 @@ def test_an_invalid_file_gets_one_clear_line(tmp_path, text, message):
         (["nowhere.toml"], "nowhere.toml does not exist"),
     ],
 )
-def test_wrong_options_end_the_sweep_before_it_begins(tmp_path, options, message):
+def test_invalid_options_are_rejected(tmp_path, options, message):
     done = console_commands.run("sweep", "--engine", "compiled", *options, where=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
 
 
 @pytest.mark.parametrize("executor", ["slurm", "ray"])
-def test_a_missing_package_is_named(tmp_path, monkeypatch, executor):
+def test_missing_package_of_executor_is_named(tmp_path, monkeypatch, executor):
     package = {"slurm": "submitit", "ray": "ray"}[executor]
     monkeypatch.setitem(__import__("sys").modules, package, None)
     options = ["--engine", "compiled", "--executor", executor]
@@ -172,7 +169,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, executor):
 
 
 def pretend(training, error):
-    """A folder as a training leaves it; without an error, one that is not finished."""
+    """Write the files of a training, finished if an error is given."""
     training.folder.mkdir(parents=True)
     (training.folder / "last.npz").touch()
     best = {"steps": 96.0, "mean_error": error, "crash_rate": 0.25, "return": 7.0}
@@ -182,7 +179,7 @@ def pretend(training, error):
     (training.folder / "evaluations.csv").write_text("steps,mean_error\n0,1\n64,0.5\n")
 
 
-def test_the_table_is_made_from_the_folders(tmp_path):
+def test_tables_contain_records_of_folders(tmp_path):
     trainings = expand({"seeds": 5, "env": TRUTH}, {}, tmp_path)
     for training, error in zip(trainings, (0.1, 0.2, 0.6, None), strict=False):
         pretend(training, error)
@@ -207,112 +204,10 @@ def test_the_table_is_made_from_the_folders(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*FILES, "runs"])
 
 
-def test_a_folder_with_another_training_is_refused(tmp_path):
+def test_folder_with_another_training_is_rejected(tmp_path):
     (training,) = expand({"env": TRUTH}, {}, tmp_path / "out")
     pretend(training, 0.1)
     options = ["--env", "duration=2.0", "--output", "out"]
     done = console_commands.run("sweep", *options, where=tmp_path)
     assert done.returncode == 2
-    assert "holds another training (different: environment)" in done.stderr
-
-
-# ---- locks ---------------------------------------------------------------------------------------
-
-
-def small(tmp_path, **more):
-    (tmp_path / "small.toml").write_text(SMALL)
-    return expand({**read(tmp_path / "small.toml"), **more}, {}, tmp_path / "out")
-
-
-def test_nobody_trains_in_a_folder_that_is_locked(tmp_path):
-    training = small(tmp_path)[0]
-    training.folder.mkdir(parents=True)
-    assert not is_locked(training.folder)
-    with locked(training.folder):
-        assert is_locked(training.folder)
-        assert f"process {os.getpid()} on " in holder(training.folder)
-        with pytest.raises(BusyError, match="is in use by process"), locked(training.folder):
-            pass
-        ended = work(training.plan, training.folder)
-        assert ended.kind == "busy"
-        assert [path.name for path in training.folder.iterdir()] == ["training.lock"]
-    assert not is_locked(training.folder)
-
-
-# ---- the driver, with jobs that end as they are told ---------------------------------------------
-
-
-class Silent:
-    """A progress bar."""
-
-    n, total = 0, 10**9
-
-    def set_postfix_str(self, text):
-        self.text = text
-
-
-class Told:
-    """An executor whose jobs end as a script says, training by training."""
-
-    pause = 0.0
-
-    def __init__(self, script):
-        self.script, self.started, self.most, self.now = script, [], 0, 0
-
-    def start(self, training):
-        self.started.append(training.name)
-        self.now += 1
-        self.most = max(self.most, self.now)
-        end = self.script[training.name].pop(0)
-        if isinstance(end, Exception):
-            self.now -= 1
-            raise end
-        return ToldJob(self, end)
-
-
-class ToldJob:
-    def __init__(self, executor, end):
-        self.executor, self.end = executor, end
-
-    def ended(self):
-        self.executor.now -= 1
-        return self.end
-
-    def stop(self):
-        raise AssertionError
-
-    kill = stop
-
-
-def test_what_dies_starts_again_what_fails_does_not_and_the_others_go_on(tmp_path):
-    trainings = expand({"seeds": 6, "env": TRUTH}, {}, tmp_path)
-    fine, died = Ended("finished"), Ended("died", "signal 9")
-    ends = [
-        [fine],
-        [died, Ended("stopped", "asked to end"), fine],
-        [died, died, died],
-        [Ended("failed", "OSError: no space")],
-        [Ended("busy"), Ended("busy"), Ended("busy"), Ended("busy"), fine],
-        [OSError("no processes")],
-    ]
-    executor = Told({t.name: end for t, end in zip(trainings, ends, strict=True)})
-    said = []
-    driver = Driver(trainings, executor, 2, 2, said.append, Silent())
-    assert driver.run()
-    names = [t.name for t in trainings]
-    assert [executor.started.count(name) for name in names] == [1, 3, 3, 1, 5, 1]
-    assert executor.most == 2
-    assert driver.failed == {
-        names[2]: "died 3 times, lastly: signal 9",
-        names[3]: "OSError: no space",
-        names[5]: "no processes",
-    }
-    assert f"{names[1]}: died (signal 9); starts again from its checkpoint (1 of 2)" in said
-
-
-def test_what_is_finished_is_not_started(tmp_path):
-    trainings = expand({"seeds": 2, "env": TRUTH}, {}, tmp_path)
-    pretend(trainings[0], 0.1)
-    executor = Told({trainings[1].name: [Ended("finished")]})
-    assert Driver(trainings, executor, None, 0, print, Silent()).run()
-    assert executor.started == [trainings[1].name]
+    assert "contains a run of another plan (different: environment)" in done.stderr

@@ -14,7 +14,7 @@ from baselines.pd import UNSURE
 from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.commands.main import main
 from quad_gym.envs.vector import QuadVectorEnv
-from quad_gym.experiments.study_flights import fly
+from quad_gym.experiments.flown import fly
 from quad_gym.tasks.look_around import LookAround
 
 ID = "QuadGym/LookAround-v0"
@@ -105,26 +105,26 @@ def test_features_in_view_are_those_within_the_angles_of_the_camera():
 def facing():
     """Flights of the rule that always looks at the features."""
     env = gymnasium.make_vec(ID, num_envs=60)
-    return fly(PDPolicy(env, faces="features"), env, 0)
+    return fly(PDPolicy(env, faces="features"), env, 0, traced=("sigma",))
 
 
 def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not(facing):
     env = gymnasium.make_vec(ID, num_envs=60)
-    blind = fly(PDPolicy(env), env, 0)
+    blind = fly(PDPolicy(env), env, 0, traced=("sigma",))
     # 64 % of 500 crash: of 60 at most 24 with a probability below 1e-4
-    assert blind.crashed.mean() > 0.4
-    assert not facing.crashed.any()
-    assert facing.in_view.mean() > 0.9 > 0.7 > blind.in_view.mean()
-    assert facing.returns.mean() > blind.returns.mean()
-    assert facing.error.mean() < 0.1
+    assert blind.episodes.crashed.mean() > 0.4
+    assert not facing.episodes.crashed.any()
+    assert facing.recorded["in_view"].mean() > 0.9 > 0.7 > blind.recorded["in_view"].mean()
+    assert facing.episodes.returns.mean() > blind.episodes.returns.mean()
+    assert facing.episodes.mean_error.mean() < 0.1
 
 
 def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_std=True)
     rule = fly(PDPolicy(env, faces="features_when_uncertain"), env, 0, traced=("sigma",))
-    assert rule.returns.mean() > facing.returns.mean()
-    assert UNSURE < np.nanmax(rule.traces["sigma"]) < 3.0
-    assert rule.crashed.mean() < 0.1
+    assert rule.episodes.returns.mean() > facing.episodes.returns.mean()
+    assert UNSURE < np.nanmax(rule.recorded["sigma"]) < 3.0
+    assert rule.episodes.crashed.mean() < 0.1
 
 
 def test_the_features_must_be_observed_to_be_faced():
@@ -190,9 +190,9 @@ def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_f
     shown = keywords_of_policy("pretrained", ID)
     env = gymnasium.make_vec(ID, num_envs=60, **shown)
     learned = fly(load_policy("pretrained", env), env, 0)
-    assert learned.crashed.mean() < 0.1
-    assert learned.returns.mean() > facing.returns.mean()
-    assert learned.error.mean() < 0.25
+    assert learned.episodes.crashed.mean() < 0.1
+    assert learned.episodes.returns.mean() > facing.episodes.returns.mean()
+    assert learned.episodes.mean_error.mean() < 0.25
 
 
 @pytest.mark.parametrize("observation", [pytest.param("truth", marks=pytest.mark.slow), "estimate"])

@@ -12,6 +12,7 @@ from baselines.plans import Plan, description
 from quad_gym.commands.compare import Args, configure
 from quad_gym.commands.main import main
 from quad_gym.params.suites import ALL_SUITES
+from tests.contract.test_sweep import pretend
 
 
 def read(tmp_path, text):
@@ -178,10 +179,12 @@ def test_a_comparison_refuses_two_files_of_one_name(tmp_path):
         configure(Args(sensors=tuple(files), engine="compiled", output=tmp_path / "out"))
 
 
-def test_a_comparison_keeps_its_files_in_its_folder(tmp_path):
+def test_comparison_with_a_changed_suite_file_is_rejected(tmp_path):
     file = str(quad_gym.sensor_suite("rtk").save(tmp_path / "mine.toml"))
-    setting = configure(Args(sensors=(file,), engine="compiled", output=tmp_path / "out"))
-    assert setting.run_folder((file, "PD", None)) == tmp_path / "out" / "runs" / "mine" / "PD"
+    args = Args(sensors=(file,), engine="compiled", output=tmp_path / "out")
+    training = configure(args).trainings[0]
+    assert training.folder == tmp_path / "out/runs/mine/truth/seed_0"
+    pretend(training, 0.1)
     quad_gym.sensor_suite("consumer").save(file)
-    with pytest.raises(ValueError, match=r"another comparison \(different: suite_files\)"):
-        configure(Args(sensors=(file,), engine="compiled", output=tmp_path / "out"))
+    with pytest.raises(ValueError, match=r"another plan \(different: suite_files\)"):
+        configure(args)

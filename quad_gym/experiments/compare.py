@@ -1,0 +1,362 @@
+"""Comparison of policies trained on the truth, on noise and on the estimate."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from baselines.plans import Plan
+from baselines.recipes import Recipe
+from quad_gym.analysis import plots
+from quad_gym.analysis.comparison_plots import (
+    error_over_time_figure,
+    learning_figure,
+    matrix_figure,
+    paths_figure,
+)
+from quad_gym.analysis.intervals import mean_interval, paired_difference
+from quad_gym.analysis.metrics import Interval
+from quad_gym.analysis.reports import text_table, versions, write_csv, write_json
+from quad_gym.envs.effects import with_effect
+from quad_gym.experiments import pages
+from quad_gym.experiments.experiment import Experiment, Floats
+from quad_gym.experiments.flown import Flown, Trial, path_of
+from quad_gym.params.suites import contents_of_suite_files, suite_label
+
+NAMES = {
+    "PD": "PD, tuned",
+    "truth": "trained on truth",
+    "noisy": "trained on truth with noise",
+    "estimate": "trained on the estimate",
+}
+"""Rows of the matrix."""
+
+FLOWN_ON = ("truth", "estimate")
+"""Observations of the flights: columns of the matrix."""
+
+_ENGINES = {"sb3": "Stable-Baselines3", "compiled": "the compiled engine"}
+MANY_CRASHES = 0.01
+"""Share of crashes above which mean errors are not compared."""
+ONE_SEED = (
+    "One training seed proves nothing: another seed may turn any of these differences round. "
+    "Run with five for intervals."
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison(Experiment):
+    """Trainings and flights of a comparison."""
+
+    suites: tuple[str, ...]
+    sources: tuple[str, ...]
+    """Observations in training"""
+    recipe: Recipe
+    engine: str
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Rows of the matrix, see `NAMES`."""
+        return ("PD", *self.sources)
+
+    def cases(self) -> dict[str, Plan]:
+        """Plans by `case_of`."""
+        return {
+            case_of(suite, source): Plan(
+                env_id=self.env_id,
+                environment=with_effect(
+                    {**self.environment, "observation": source, "sensors": suite}
+                ),
+                recipe=self.recipe,
+                engine=self.engine,
+                threads=1,
+            )
+            for suite in self.suites
+            for source in self.sources
+        }
+
+    def trials(self) -> dict[str, Trial]:
+        """Test flights by `case_of`, of all rows on both observations."""
+        return {
+            case_of(suite, source, observation): self.trial(
+                {"observation": observation, "sensors": suite},
+                "pd" if source == "PD" else case_of(suite, source),
+            )
+            for suite in self.suites
+            for source in self.rows
+            for observation in FLOWN_ON
+        }
+
+    def description(self) -> dict[str, Any]:
+        """Everything that affects the results, for JSON."""
+        return {
+            "env_id": self.env_id,
+            "engine": self.engine,
+            "recipe": self.recipe,
+            "sensors": self.suites,
+            "trained_on": self.sources,
+            "training_seeds": self.seeds,
+            "episodes": self.episodes,
+            "first_episode": self.first_episode,
+            "environment": self.environment,
+            **contents_of_suite_files(*self.suites),
+        }
+
+
+def case_of(suite: str, source: str, *flown_on: str) -> str:
+    """Name of a case, or of its flights on an observation."""
+    return "/".join([suite_label(suite), source, *flown_on])
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Cell of the matrix: one number per training seed, (s,)."""
+
+    errors: Floats
+    """Mean position errors [m]"""
+    late_errors: Floats
+    """Mean position errors in the second half of episodes [m]"""
+    crash_rates: Floats
+    interval: Interval | None
+    """95 % interval of the mean error by Student's t: over training seeds, or for PD over episodes;
+    None for a single seed"""
+
+    def texts(self) -> tuple[str, str, str]:
+        """Error and its interval, late error [mm], and crash rate."""
+        error = f"{1e3 * float(np.mean(self.errors)):.1f}"
+        if self.interval is not None:
+            error += f" [{1e3 * self.interval.low:.1f}, {1e3 * self.interval.high:.1f}]"
+        late, crashed = float(np.mean(self.late_errors)), float(np.mean(self.crash_rates))
+        return error, f"{1e3 * late:.1f}", f"{crashed:.1%}"
+
+    def description(self) -> dict[str, Any]:
+        """Numbers for JSON."""
+        return {
+            "mean_error": float(np.mean(self.errors)),
+            "interval_95": self.interval,
+            "late_error": float(np.mean(self.late_errors)),
+            "crash_rate": float(np.mean(self.crash_rates)),
+            "mean_error_of_each_seed": self.errors,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Matrix:
+    """Results of a comparison."""
+
+    comparison: Comparison
+    flown: Mapping[str, Sequence[Flown]]
+    """Flights of each training seed, by `case_of`"""
+
+    def cell(self, suite: str, source: str, observation: str) -> Cell:
+        """Cell of the matrix."""
+        episodes = [flown.episodes for flown in self.flown[case_of(suite, source, observation)]]
+        errors = np.array([float(each.mean_error.mean()) for each in episodes])
+        sample = episodes[0].mean_error if source == "PD" else errors
+        return Cell(
+            errors,
+            np.array([each.summary()["late_error"] for each in episodes]),
+            np.array([float(each.crashed.mean()) for each in episodes]),
+            mean_interval(sample) if len(sample) > 1 else None,
+        )
+
+    def cells(self, suite: str) -> dict[str, list[Cell]]:
+        """Rows of the matrix of a suite."""
+        rows = self.comparison.rows
+        return {source: [self.cell(suite, source, on) for on in FLOWN_ON] for source in rows}
+
+    def texts(self, suite: str) -> list[list[str]]:
+        """Table of a suite: policy, errors, late errors, crash rates."""
+        return [
+            [NAMES[source], *np.array([cell.texts() for cell in row]).T.ravel().tolist()]
+            for source, row in self.cells(suite).items()
+        ]
+
+
+def matrix_text(matrix: Matrix, suite: str) -> str:
+    """Matrix of a sensor suite, for the screen."""
+    flown = ["on truth", "on estimate"]
+    groups = {"": ["policy"], "mean error [mm]": flown, "second half [mm]": flown, "crashed": flown}
+    return text_table(groups, matrix.texts(suite))
+
+
+def conclusions(matrix: Matrix) -> list[str]:
+    """Conclusions that the intervals allow."""
+    comparison, sentences = matrix.comparison, []
+    for suite in comparison.suites:
+        for first, second in _questions(comparison.sources):
+            cells = [matrix.cell(suite, way.source, way.observation) for way in (first, second)]
+            if max(float(cell.crash_rates.max()) for cell in cells) > MANY_CRASHES:
+                continue  # errors of crashed episodes end early
+            # PD has no training seed: its one number is repeated
+            errors = [np.resize(cell.errors, len(comparison.seeds)) for cell in cells]
+            text = _sentence(first.name, second.name, *errors)
+            both = " Both flown on the estimate." if second.observation == "estimate" else ""
+            sentences.append(f"Sensors {suite}: {text}{both}")
+        for source in comparison.rows:
+            share = float(matrix.cell(suite, source, "estimate").crash_rates.max())
+            if share > MANY_CRASHES:
+                sentences.append(
+                    f"Sensors {suite}: {NAMES[source]}, up to {share:.0%} of the episodes crashed "
+                    "on the estimate, so that the errors are not compared."
+                )
+    return [*sentences, ONE_SEED] if len(comparison.seeds) == 1 else sentences
+
+
+class _Way(NamedTuple):
+    """Cell of the matrix, named for sentences."""
+
+    name: str
+    source: str
+    observation: str
+
+
+def _questions(sources: Sequence[str]) -> list[tuple[_Way, _Way]]:
+    """Pairs of cells to compare."""
+    ours = _Way("training on the estimate", "estimate", "estimate")
+    pairs = [
+        (
+            _Way("flying on the estimate", "truth", "estimate"),
+            _Way("on the truth", "truth", "truth"),
+        ),
+        (ours, _Way("training on the truth", "truth", "estimate")),
+        (ours, _Way("training on the noisy truth", "noisy", "estimate")),
+        (ours, _Way("tuned PD control", "PD", "estimate")),
+    ]
+    known = {*sources, "PD"}
+    return [pair for pair in pairs if all(way.source in known for way in pair)]
+
+
+def _sentence(first: str, second: str, errors: Floats, others: Floats) -> str:
+    """Difference of two mean errors, with an interval over training seeds."""
+    found = paired_difference(errors, others)
+    change, relative = 1e3 * found.spread.mean, found.spread.mean / float(np.mean(others))
+    more = f"{abs(change):.2f} mm ({abs(relative):.0%}) {'more' if change > 0.0 else 'less'}"
+    if found.interval is None:
+        return f"{first} gave {more} error than {second}, with this one seed."
+    low, high = (1e3 * x for x in found.interval)
+    span = f"{found.spread.count} seeds, 95 % interval {low:+.2f} to {high:+.2f} mm"
+    if not found.significant:
+        return f"{first} and {second} cannot be told apart ({span})."
+    return f"{first} gives {more} error than {second} ({span})."
+
+
+# ---- files ---------------------------------------------------------------------------------------
+
+
+def write_report(matrix: Matrix) -> list[Path]:
+    """Write numbers, figures and the page; the last file is the page."""
+    folder, figures = matrix.comparison.folder, _figures(matrix)
+    files = {name: plots.save_figure(figure, folder / name) for name, figure in figures.items()}
+    return [
+        *_write_numbers(matrix),
+        *(file for pair in files.values() for file in pair),
+        _write_page(matrix, {name: pair[0] for name, pair in files.items()}),
+    ]
+
+
+def _write_numbers(matrix: Matrix) -> list[Path]:
+    """Write all numbers as CSV, and the summary as JSON."""
+    comparison, rows = matrix.comparison, []
+    for suite, source, observation in product(comparison.suites, comparison.rows, FLOWN_ON):
+        trainings: list[Any] = comparison.trainings_of(case_of(suite, source)) or [None]
+        flights = matrix.flown[case_of(suite, source, observation)]
+        for training, flown in zip(trainings, flights, strict=True):
+            rows.append(
+                {
+                    "sensors": suite,
+                    "trained_on": source,
+                    "training_seed": training and training.plan.seed,
+                    "flown_on": observation,
+                    **flown.episodes.summary(),
+                    "training_seconds": training and training.record()["training_seconds"],
+                }
+            )
+    summary = {
+        **comparison.description(),
+        "matrix": [
+            {
+                "sensors": suite,
+                "trained_on": source,
+                "flown_on": observation,
+                **matrix.cell(suite, source, observation).description(),
+            }
+            for suite, source, observation in product(comparison.suites, comparison.rows, FLOWN_ON)
+        ],
+        "conclusions": conclusions(matrix),
+        "versions": versions("numpy", "numba", "scipy", "torch", "stable_baselines3"),
+    }
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    return [
+        write_csv(comparison.folder / "policies.csv", columns),
+        write_json(comparison.folder / "summary.json", summary),
+    ]
+
+
+def _figures(matrix: Matrix) -> dict[str, Any]:
+    """Learning curves, matrices, errors over time, and paths, by name."""
+    comparison, figures = matrix.comparison, {}
+    for suite in comparison.suites:
+        cells, label = matrix.cells(suite), suite_label(suite)
+        curves = {}
+        for source in comparison.sources:
+            trainings = comparison.trainings_of(case_of(suite, source))
+            each = [training.curve("mean_error") for training in trainings]
+            curves[NAMES[source]] = [(steps[1:], errors[1:]) for steps, errors in each]
+        level = {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])}
+        title = f"Evaluated on what is trained on, sensors {suite}"
+        figures[f"learning_{label}"] = learning_figure(curves, level, title)
+        figures[f"matrix_{label}"] = matrix_figure(
+            np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells.values()]),
+            [[cell.texts()[0] for cell in row] for row in cells.values()],
+            [NAMES[source] for source in cells],
+            ["flown on truth", "flown on the estimate"],
+            f"Mean position error [mm], sensors {suite}",
+        )
+        first = {NAMES[s]: matrix.flown[case_of(suite, s, "estimate")][0] for s in comparison.rows}
+        figures[f"errors_{label}"] = error_over_time_figure(
+            {name: (f.recorded["time"], f.recorded["percentiles"]) for name, f in first.items()},
+            f"Flown on the estimate, first training seed, sensors {suite}",
+        )
+        figures[f"paths_{label}"] = paths_figure(
+            {name: path_of(flown) for name, flown in first.items()},
+            f"From above, flown on the estimate, sensors {suite}",
+        )
+    return figures
+
+
+_CAPTIONS = {
+    "learning": "Error during training; thin lines are single seeds, bold ones their median.",
+    "matrix": "Mean error over whole episodes, with the 95 % interval over training seeds "
+    "(Student's t); for PD, over episodes.",
+    "errors": "Error over time: median and middle nine tenths of the episodes.",
+    "paths": "The first episode of the first training seed.",
+}
+
+
+def _write_page(matrix: Matrix, figures: Mapping[str, Path]) -> Path:
+    """Write the page, with the pictures of all figures."""
+    comparison = matrix.comparison
+    recipe, trainings = comparison.recipe, comparison.trainings
+    seconds = sum(training.record()["training_seconds"] for training in trainings)
+    parts = [
+        pages.element(
+            "p",
+            f"{recipe.algorithm.upper()} ({_ENGINES[comparison.engine]}), {recipe.steps:,} "
+            f"steps for each of {len(trainings)} policies, training seeds "
+            f"{', '.join(map(str, comparison.seeds))}; {seconds / 60:.1f} minutes of training. "
+            f"Each policy flew {comparison.episodes:,} episodes on the truth and on the estimate.",
+        ),
+        pages.bullets(conclusions(matrix)),
+    ]
+    shown = ("error [mm]", "second half [mm]", "crashed")
+    headings = ["policy", *(f"{what}, on {on}" for what in shown for on in FLOWN_ON)]
+    for suite in comparison.suites:
+        parts.append(pages.element("h2", f"Sensors {suite}"))
+        parts.append(pages.table(headings, matrix.texts(suite)))
+        for kind, caption in _CAPTIONS.items():
+            parts.append(pages.figure(figures[f"{kind}_{suite_label(suite)}"], caption))
+    title = f"{comparison.env_id}: what the estimate costs"
+    return pages.write_page(comparison.folder / "report.html", title, *parts)

@@ -1,0 +1,153 @@
+"""Experiments: cases and seeds, their trainings, and the test flights of the policies."""
+
+import csv
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from baselines.keeping import EVALUATIONS, best_file
+from baselines.plans import Plan
+from baselines.training import require_model, run_in
+from quad_gym.experiments.flown import Flown, Trial
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """Training of one case with one seed."""
+
+    case: str
+    """Name of the case, and of its folder below `runs`"""
+    plan: Plan
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the training in messages."""
+        return f"{self.case}/seed_{self.plan.seed}"
+
+    def record(self) -> dict[str, Any]:
+        """Contents of `training.json`; empty before the first checkpoint.
+
+        Raises:
+            ValueError: If the folder contains a training with another plan.
+        """
+        return run_in(self.folder, self.plan, resume=True) or {}
+
+    @property
+    def finished(self) -> bool:
+        """True if all steps are completed."""
+        return bool(self.record().get("finished"))
+
+    @property
+    def best(self) -> str:
+        """File of the policy of the best evaluation."""
+        return str(best_file(self.plan, self.folder))
+
+    def curve(self, score: str) -> tuple[Floats, Floats]:
+        """Steps and scores of the evaluations so far, (k,) each."""
+        file, rows = self.folder / EVALUATIONS, []
+        if file.exists():
+            with file.open(encoding="utf-8", newline="") as stream:
+                rows = [(float(row["steps"]), float(row[score])) for row in csv.DictReader(stream)]
+        steps, scores = np.array(rows).reshape(-1, 2).T
+        return steps, scores
+
+    def steps_done(self) -> int:
+        """Number of steps at the last evaluation."""
+        return int(max(self.curve("steps")[0], default=0))
+
+
+def trainings_of(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path) -> list[Training]:
+    """Trainings of all cases with all seeds; the first seed of every case is first."""
+    return [
+        Training(case, plan.replace(seed=seed), folder / "runs" / case / f"seed_{seed}")
+        for seed in seeds
+        for case, plan in cases.items()
+    ]
+
+
+def check_trainings(trainings: Iterable[Training]) -> None:
+    """Check all folders, and make model and environment of each unfinished case once.
+
+    Raises:
+        ValueError: If a folder contains another training, or a plan is invalid.
+        ImportError: If a package is missing.
+    """
+    for training in {each.case: each for each in trainings if not each.finished}.values():
+        try:
+            require_model(training.plan)
+            training.plan.make_judge().close()
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{training.case}: {error}") from None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Experiment(ABC):
+    """Cases that are trained with several seeds, and trials in which the policies fly."""
+
+    env_id: str
+    seeds: tuple[int, ...]
+    episodes: int
+    """Number of test episodes"""
+    first_episode: int
+    """Seed of the first test episode"""
+    environment: Mapping[str, Any]
+    """Keywords of the environment in training and test"""
+    folder: Path
+    threads: int | None = None
+
+    @abstractmethod
+    def cases(self) -> dict[str, Plan]:
+        """Plans of the trainings by name of the case, with any seed."""
+
+    @abstractmethod
+    def trials(self) -> dict[str, Trial]:
+        """Test flights by name."""
+
+    def trial(self, keywords: Mapping[str, Any], policy: str, *traced: str) -> Trial:
+        """Test flights with keywords of the environment; see `Trial` for the other arguments."""
+        return Trial(
+            env_id=self.env_id,
+            keywords={**self.environment, **keywords},
+            policy=policy,
+            episodes=self.episodes,
+            first_episode=self.first_episode,
+            traced=traced,
+            threads=self.threads,
+        )
+
+    @cached_property
+    def trainings(self) -> list[Training]:
+        """Trainings, the first seed of every case first."""
+        return trainings_of(self.cases(), self.seeds, self.folder)
+
+    def trainings_of(self, case: str) -> list[Training]:
+        """Trainings of a case, in the order of the seeds."""
+        return [training for training in self.trainings if training.case == case]
+
+    def check(self) -> None:
+        """Check all plans, folders and environments; raises the errors of `check_trainings`."""
+        check_trainings(self.trainings)
+        for trial in self.trials().values():
+            trial.make(1).close()
+
+    def policies(self, trial: Trial) -> list[str]:
+        """Policies that fly a trial: one per seed, or a fixed one."""
+        return [training.best for training in self.trainings_of(trial.policy)] or [trial.policy]
+
+    def fly(self) -> dict[str, list[Flown]]:
+        """Fly all policies; returns the flights of each policy, by name of the trial."""
+        flown = {}
+        for name, trial in tqdm(self.trials().items(), desc="flying", unit=" trials"):
+            place = self.folder / "flights" / name
+            flown[name] = [trial.flown(policy, place) for policy in self.policies(trial)]
+        return flown
