@@ -1,4 +1,4 @@
-"""What a view shows, against closed forms and the records of the flights."""
+"""Fields of a view, against closed forms and the records of the flights."""
 
 import copy
 import re
@@ -8,25 +8,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import quad_gym
-from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import FEATURE_SLICE
 from quad_gym.tasks.view import VIEW_FIELDS
+from tests.builders import flown, vec_env
 
 FLIGHTS = 5
 
 
-class Nothing(quad_gym.Task):
-    """Only there so that there is a view."""
+def view_of(base="circle", **keywords):
+    """The batch of some flights after some steps, and its view."""
+    batch = flown(base, task=quad_gym.Task(), **keywords).flights.batch
+    return batch, batch.view
 
 
-def flown(task="circle", steps=20, **keywords):
-    """Flights with a view, and the view after some steps."""
-    env = QuadVectorEnv(FLIGHTS, base=task, task=Nothing(), **keywords)
-    env.reset(seed=1)
-    rng = np.random.default_rng(0)
-    for _ in range(steps):
-        env.step(rng.uniform(-0.2, 0.3, (FLIGHTS, 4)))
-    return env.flights.batch, env.flights.batch.view
+def begun(base="circle", count=FLIGHTS, **keywords):
+    """An environment whose flights have begun."""
+    return vec_env(base, count, seed=1, task=quad_gym.Task(), **keywords)
 
 
 def value_of(view, name):
@@ -37,7 +34,7 @@ def value_of(view, name):
 
 @pytest.mark.parametrize("task", ["circle", "waypoints"])
 def test_fields_have_the_shape_and_type_of_the_table(task):
-    batch, view = flown(task, sensors="rtk", randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
+    batch, view = view_of(task, sensors="rtk", randomization={"mass": quad_gym.Uniform(0.7, 0.8)})
     lengths = {"n": FLIGHTS, "m": len(batch.sensors.camera.features_I), "k": 28}
     lengths["o"] = 0
     lengths["gates"] = 5 if task == "waypoints" else 0
@@ -55,7 +52,7 @@ def test_fields_have_the_shape_and_type_of_the_table(task):
 
 
 def test_truth_equals_the_records():
-    batch, view = flown(world="breeze")
+    batch, view = view_of(world="breeze")
     for name, field in {
         **{"position": "r", "velocity": "v", "quaternion": "q", "body_rates": "w"},
         **{"rotor_speeds": "rotor_speeds", "accel_bias": "b_a", "gyro_bias": "b_g"},
@@ -71,7 +68,7 @@ def test_truth_equals_the_records():
 
 
 def test_estimate_equals_the_state_of_the_filter():
-    batch, view = flown()
+    batch, view = view_of()
     estimate, P = view.estimate, batch.covariance()
     for name, field in {
         **{"position": "r_hat", "velocity": "v_hat", "R_BI": "R_hat"},
@@ -100,7 +97,7 @@ def test_estimate_equals_the_state_of_the_filter():
 
 
 def test_status_after_a_filter_failure_is_an_integer():
-    batch, view = flown()
+    batch, view = view_of()
     batch._blocks["filter_status"][0, 3] = 4
     batch.step(np.zeros((FLIGHTS, 4)))
     assert list(view.estimate.status) == [0, 0, 0, 4, 0]
@@ -108,7 +105,7 @@ def test_status_after_a_filter_failure_is_an_integer():
 
 
 def test_reference_of_a_circle_is_its_closed_form():
-    _, view = flown(steps=30)
+    _, view = view_of(steps=30)
     t, w, z = 30 / 50.0, 2.0 * np.pi / 10.0, 1.0
     assert view.time == pytest.approx(np.full(FLIGHTS, t), abs=1e-12)
     assert list(view.step) == [30] * FLIGHTS
@@ -129,7 +126,7 @@ def test_reference_of_a_circle_is_its_closed_form():
 
 
 def test_observed_errors_equal_the_builtin_observation():
-    batch, view = flown("lemniscate", randomize_reference=True)
+    batch, view = view_of("lemniscate", randomize_reference=True)
     layout = {field.name: field.slice for field in quad_gym.observation_layout()}
     for name in ("position_error", "velocity_error", "up", "heading", "reference_acceleration"):
         shipped = view.observation[:, layout[name]]
@@ -146,8 +143,7 @@ def test_observed_errors_equal_the_builtin_observation():
 
 def test_features_in_view_are_those_the_camera_measures():
     seen = np.zeros(2, int)
-    env = QuadVectorEnv(FLIGHTS, base="hover", task=Nothing(), start="hover")
-    env.reset(seed=1)
+    env = begun("hover", start="hover")
     view = env.flights.batch.view
     rng = np.random.default_rng(3)
     for _ in range(40):
@@ -163,11 +159,11 @@ def test_features_in_view_are_those_the_camera_measures():
 
 def test_measurements_not_taken_are_nan():
     suite = quad_gym.sensor_suite("rtk").with_rates(gnss=10.0, camera=10.0)
-    _, view = flown(sensors=suite, steps=7, start="hover")
+    _, view = view_of(sensors=suite, steps=7, start="hover")
     rows, valid = view.measured.gnss_position, view.measured.gnss_valid
     assert not valid.all()
     assert np.isnan(rows[~valid]).all()
-    batch, view = flown(steps=10, start="hover")
+    batch, view = view_of(steps=10, start="hover")
     assert view.measured.gnss_valid.all()
     gap = np.linalg.norm(view.measured.gnss_position - view.position, axis=1)
     assert (gap < 0.5).all()  # the antenna is on the vehicle
@@ -180,7 +176,7 @@ def test_measurements_not_taken_are_nan():
 
 
 def test_gates_and_progress_of_a_course_match_the_positions():
-    env = QuadVectorEnv(FLIGHTS, base="waypoints", task=Nothing(), autoreset_mode="Disabled")
+    env = begun("waypoints", autoreset_mode="Disabled")
     env.reset(seed=2)
     batch = env.flights.batch
     first = batch.view.gates[:, 0]
@@ -205,7 +201,7 @@ def test_gates_and_progress_of_a_course_match_the_positions():
 
 
 def test_faults_when_active_are_true_by_name():
-    batch, view = flown(sensors="rtk", faults="gnss_outage")
+    batch, view = view_of(sensors="rtk", faults="gnss_outage")
     batch.switch_faults(True)
     batch.step(np.zeros((FLIGHTS, 4)))
     view = batch.view
@@ -214,7 +210,7 @@ def test_faults_when_active_are_true_by_name():
 
 
 def test_misspelled_field_raises_an_error_with_its_group():
-    _, view = flown(steps=1)
+    _, view = view_of(steps=1)
     for group, misspelt, meant in (
         (view, "positon", "position"),
         (view, "reference_postion", "reference_position"),
@@ -228,7 +224,7 @@ def test_misspelled_field_raises_an_error_with_its_group():
 
 
 def test_estimate_without_a_filter_is_refused():
-    _, view = flown(observation="truth")
+    _, view = view_of(observation="truth")
     with pytest.raises(ValueError, match=r"view.estimate needs a filter"):
         _ = view.estimate.sigma
     with pytest.raises(ValueError, match=r"view.measured needs simulated sensors"):
@@ -246,8 +242,7 @@ def test_view_at_an_autoreset_shows_the_episode_of_the_step():
     task = quad_gym.Task.of(reward=reward)
     for mode, began in (("SameStep", 0), ("NextStep", 1)):
         said.clear()
-        env = QuadVectorEnv(1, base="hover", task=task, max_episode_steps=3, autoreset_mode=mode)
-        env.reset(seed=0)
+        env = vec_env(count=1, seed=0, task=task, max_episode_steps=3, autoreset_mode=mode)
         rewards = [float(env.step(np.zeros((1, 4)))[1][0]) for _ in range(5)]
         assert sum(b.sum() for _, b in said) == began
         assert rewards == ([1.0, 2.0, 3.0, 1.0, 2.0] if not began else [1.0, 2.0, 3.0, 0.0, 1.0])
@@ -266,8 +261,7 @@ def test_view_at_an_autoreset_shows_the_episode_of_the_step():
     ],
 )
 def test_arrays_kept_by_a_task_do_not_change(part):
-    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
-    env.reset(seed=1)
+    env = begun()
     view, kept = env.flights.batch.view, []
     for _ in range(4):
         env.step(np.full((FLIGHTS, 4), 0.1))
@@ -278,8 +272,7 @@ def test_arrays_kept_by_a_task_do_not_change(part):
 
 
 def test_arrays_kept_from_a_copy_do_not_change():
-    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
-    env.reset(seed=1)
+    env = begun()
     other = copy.deepcopy(env)
     for one in (other, env):
         kept = one.flights.batch.view.position
@@ -290,8 +283,7 @@ def test_arrays_kept_from_a_copy_do_not_change():
 
 
 def test_progress_after_a_restore_repeats():
-    env = QuadVectorEnv(FLIGHTS, base="circle", task=Nothing())
-    env.reset(seed=1)
+    env = begun()
     batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
     instant, progress = batch.snapshot(), []
     for _ in range(2):
@@ -305,10 +297,7 @@ def test_progress_after_a_restore_repeats():
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize("task", ["circle", "waypoints"])
 def test_view_after_a_restore_shows_the_restored_instant(task, mode):
-    env = QuadVectorEnv(
-        FLIGHTS, base=task, task=Nothing(), sensors="rtk", max_episode_steps=20, autoreset_mode=mode
-    )
-    env.reset(seed=1)
+    env = begun(task, sensors="rtk", max_episode_steps=20, autoreset_mode=mode)
     batch, actions = env.flights.batch, np.full((FLIGHTS, 4), 0.1)
     names = [f.name for f in VIEW_FIELDS if f.shape and not f.shape.startswith("dict")]
     of_a_step = ("builtin.", "truth.progress", "gate_passed")
@@ -338,13 +327,8 @@ def test_view_after_a_restore_shows_the_restored_instant(task, mode):
 
 @pytest.mark.parametrize("count", [1, 5, 8, 9])
 def test_arrays_of_a_view_share_no_memory_with_the_records(count):
-    env = QuadVectorEnv(
-        count,
-        base="waypoints",
-        **{"task": Nothing(), "sensors": "rtk"},
-        randomization={"mass": quad_gym.Uniform(0.7, 0.8)},
-    )
-    env.reset(seed=1)
+    drawn = {"mass": quad_gym.Uniform(0.7, 0.8)}
+    env = begun("waypoints", count, sensors="rtk", randomization=drawn)
     batch, kept = env.flights.batch, []
     for k in range(3):
         env.step(np.full((count, 4), 0.1 * k))
@@ -365,8 +349,7 @@ def test_arrays_of_a_view_share_no_memory_with_the_records(count):
 def test_covariance_has_the_same_bits_in_any_batch():
     found = {}
     for count in (1, 8, 16):
-        env = QuadVectorEnv(count, base="circle", task=Nothing())
-        env.reset(seed=list(range(count)))
+        env = begun(count=count)
         for _ in range(5):
             env.step(np.full((count, 4), 0.1))
         view = env.flights.batch.view
@@ -378,7 +361,7 @@ def test_covariance_has_the_same_bits_in_any_batch():
 
 
 def test_fields_of_a_view_cannot_be_written_or_deleted():
-    _, view = flown(steps=1)
+    _, view = view_of(steps=1)
     for group, name in ((view, "gates"), (view.truth, "position"), (view, "position")):
         with pytest.raises(ValueError, match="read-only"):
             getattr(group, name)[0] = 1.0
