@@ -31,7 +31,7 @@ from quad_gym.envs.spaces import ObservationField
 from quad_gym.flights.record import COLUMNS, FEATURES
 from quad_gym.params.suites import ALL_SUITES
 from quad_gym.records import DRAWABLES
-from quad_gym.tasks.fields import VIEW_FIELDS
+from quad_gym.tasks.view import VIEW_FIELDS
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx

@@ -19,7 +19,7 @@ from quad_gym.batch.starts import checked_keys, checked_mask, checked_start
 from quad_gym.batch.threads import Crew, resolve_threads
 from quad_gym.batch.warm_start import FILTER_STARTS, pack_warm_start
 from quad_gym.faults.presets import FaultsGiven, faults_of
-from quad_gym.kernels.compiling.linked import FLY, linked_table
+from quad_gym.kernels.compiling.linked import linked_table
 from quad_gym.kernels.compiling.stages import needed_stages, used_parts
 from quad_gym.packing.faults import pack_faults
 from quad_gym.packing.flight import (
@@ -253,7 +253,7 @@ class FlightBatch(FlightMemory):
                 task=self.task,
                 substeps=substeps,
             )
-        self._stages, self._entries = needed_stages(self._settings[0]), [FLY]
+        self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         configuration = configuration_digest(self._settings, model, true, *self._paths)
         self._allocate(room_of(used_parts(self._settings[0])), draws.low, configuration)
@@ -377,7 +377,7 @@ class FlightBatch(FlightMemory):
             Call.WORLD: self._world,
             Call.MODEL: self._model,
             Call.SETTINGS: self._settings,
-            Call.STAGES: linked_table(self._stages, self._entries),
+            Call.STAGES: linked_table(self._stages),
             Call.ACTIONS: self._actions,
             Call.LOW: self._low,
             Call.HIGH: self._high,

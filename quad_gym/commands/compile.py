@@ -48,7 +48,7 @@ class Args:
 def names_of_kinds(kinds: Sequence[str]) -> list[str]:
     """Names of the compiled functions of some kinds, slowest to compile first."""
     from quad_gym.envs.configuration import Flights
-    from quad_gym.kernels.compiling.linked import FLY, SETTLE, names_of
+    from quad_gym.kernels.compiling.linked import names_of
     from quad_gym.kernels.compiling.stages import SOURCES, needed_stages
     from quad_gym.kernels.single import FILTER_ENTRIES, FILTER_STAGES, SENSORS_AND_VEHICLE
     from quad_gym.records import Autoreset
@@ -60,8 +60,7 @@ def names_of_kinds(kinds: Sequence[str]) -> list[str]:
             needed |= set(needed_stages(flights.batch._settings[0]).values())
     if "all" in kinds:
         needed = {source.name for source in SOURCES}
-    entries = (FLY, SETTLE) if "all" in kinds else (FLY,)
-    names = names_of(needed, entries) if needed else []
+    names = names_of(needed) if needed else []
     if {"single", "all"} & set(kinds):
         filters = names_of({s.name for s in SOURCES if s.stage in FILTER_STAGES}, FILTER_ENTRIES)
         names = [*filters, *names, *SENSORS_AND_VEHICLE]

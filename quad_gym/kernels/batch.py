@@ -22,8 +22,7 @@ from quad_gym.records import (
     PARAMS_BLOCK,
     SENSORS,
     SETTINGS,
-    SHOWN,
-    SHOWN_FLOATS,
+    SHOWN_SIZE,
     WIDTH,
     WORK_BLOCK,
     Autoreset,
@@ -59,7 +58,6 @@ _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
 _RESULTS, _RESULT_PITCH = int(Call.RESULTS), int(Call.RESULT_PITCH)
 _SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
-_SHOWN_STEP, _SHOWN_STATUS = SHOWN["step"].start, SHOWN["filter_status"].start
 
 _CORE = offset_of(FLIGHT_BLOCK, "r")
 _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
@@ -70,7 +68,6 @@ _params_at = lanes_at(PARAMS_BLOCK)
 _work_at, _plain_work_at = lanes_at(WORK_BLOCK), record_at(WORK_BLOCK)
 _settings_at, _stages_at = record_at(SETTINGS), record_at(STAGE_TABLE)
 _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u1")
-_wholes_at = array_at("i8")
 
 
 @kernel
@@ -147,17 +144,11 @@ def _write_results(call, flight, work, index):
 
 @kernel
 def _show(call, index, flight, world, model, settings, work, stages):
-    """Show the present instant to a user's task."""
+    """Write the numbers of the present instant that a user's task reads."""
     call_stage(stages, Stage.SHOW, flight, world, model, settings, work, 0)
     here, pitch = call[_SHOWN] + index * (8 * WIDTH), call[_SHOWN_PITCH]
-    for k in range(SHOWN_FLOATS):
+    for k in range(SHOWN_SIZE):
         store_lanes(here + k * pitch, work.observation[k])
-    block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
-    step = _wholes_at(here + _SHOWN_STEP * pitch, WIDTH)
-    status = _wholes_at(here + _SHOWN_STATUS * pitch, WIDTH)
-    for lane in range(WIDTH):
-        step[lane] = int(block.step[lane])
-        status[lane] = block.filter_status[lane]
 
 
 @kernel

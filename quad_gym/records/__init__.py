@@ -78,8 +78,6 @@ from quad_gym.records.settings import (
 )
 from quad_gym.records.shown import (
     SHOWN,
-    SHOWN_FLOATS,
-    SHOWN_KINDS,
     SHOWN_SHAPES,
     SHOWN_SIZE,
 )
@@ -263,8 +261,6 @@ __all__ = [
     "SETTINGS",
     "SETTINGS_FIELDS",
     "SHOWN",
-    "SHOWN_FLOATS",
-    "SHOWN_KINDS",
     "SHOWN_SHAPES",
     "SHOWN_SIZE",
     "STAMP",

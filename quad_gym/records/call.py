@@ -47,7 +47,6 @@ class Call(IntEnum):
     RESULT_PITCH = auto()
     """Bytes from one row of the results to the next."""
     SHOWN = auto()
-    """(SHOWN_SIZE, blocks WIDTH) float64, the last rows int64, written where the settings say that
-    flights are shown."""
+    """(SHOWN_SIZE, blocks WIDTH) float64, written if the setting `shown` is on."""
     SHOWN_PITCH = auto()
     """Bytes from one row of it to the next."""

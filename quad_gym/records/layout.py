@@ -74,5 +74,7 @@ def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:
 
 def field_of_flights(blocks: NDArray[Any], name: str, count: int) -> NDArray[Any]:
     """One field of the first `count` flights, as an array (count, ...): a copy."""
-    values = np.moveaxis(blocks[name], -1, 1)
-    return values.reshape(-1, *values.shape[2:])[:count].copy()
+    values = blocks[name]
+    lane = values.ndim - 1
+    values = values.transpose(0, lane, *range(1, lane)).copy()
+    return values.reshape(-1, *values.shape[2:])[:count]

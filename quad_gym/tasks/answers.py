@@ -1,24 +1,19 @@
 """Checks of the return values of a task's methods; errors name the method and the flights."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quad_gym.params.checks import did_you_mean
-from quad_gym.tasks.fields import VIEW_FIELDS
-from quad_gym.tasks.lazy import Group
+from quad_gym.tasks.fields import Group
 from quad_gym.tasks.state import State
 from quad_gym.tasks.task import Task, TaskError, label
-
-if TYPE_CHECKING:
-    from quad_gym.tasks.view import View
+from quad_gym.tasks.view import VIEW_FIELDS, View
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
-
-_FLOAT, _TRUTH = np.dtype(np.float64), np.dtype(np.bool_)
 
 LONE = "observed"
 """Name in the table of observations for an array that `observe` returns without a name."""
@@ -69,7 +64,7 @@ def numbers(task: Task, method: str, value: Any, name: str = "") -> NDArray[Any]
     return found
 
 
-def reward_terms(task: Task, view: "View", count: int) -> dict[str, NDArray[Any]]:
+def reward_terms(task: Task, view: View) -> dict[str, Floats]:
     """Terms of a task's reward, (n,) each, which may still be NaN or infinite.
 
     Raises:
@@ -77,38 +72,33 @@ def reward_terms(task: Task, view: "View", count: int) -> dict[str, NDArray[Any]
     """
     value = ask(task, "reward", view)
     if not isinstance(value, Mapping):
-        return {"reward": _reward(task, value, count)}
+        return {"reward": _reward(task, value, view.count)}
     if not value:
         raise TaskError(f"{label(task)}.reward must return at least one term, got none")
-    return {str(name): _reward(task, term, count, str(name)) for name, term in value.items()}
+    return {str(name): _reward(task, term, view.count, str(name)) for name, term in value.items()}
 
 
-def _reward(task: Task, value: Any, count: int, name: str = "") -> NDArray[Any]:
-    """A reward, or its term of this name, (n,)."""
-    if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == (count,):
-        return value  # almost always
+def _reward(task: Task, value: Any, count: int, name: str = "") -> Floats:
+    """Reward, or its term with this name, (n,)."""
     found = numbers(task, "reward", value, name)
     if found.shape != (count,):
         raise TaskError(
             f"{label(task)}.reward must return shape ({count},), one number per flight"
             f"{_of(name)}, got {found.shape}"
         )
-    return found
+    return found.astype(np.float64)
 
 
-def truths(task: Task, method: str, view: "View", count: int) -> Truths:
+def truths(task: Task, method: str, view: View) -> Truths:
     """Boolean values that a method returns, (n,).
 
     Raises:
         TaskError: If the method fails, or returns another shape or type.
     """
-    value = ask(task, method, view)
-    if type(value) is np.ndarray and value.dtype is _TRUTH and value.shape == (count,):
-        return value  # almost always
-    found = numbers(task, method, value)
-    if found.dtype.kind != "b" or found.shape != (count,):
+    found = numbers(task, method, ask(task, method, view))
+    if found.dtype.kind != "b" or found.shape != (view.count,):
         raise TaskError(
-            f"{label(task)}.{method} must return booleans of shape ({count},), "
+            f"{label(task)}.{method} must return booleans of shape ({view.count},), "
             f"got {found.dtype} of {found.shape}"
         )
     return found
@@ -133,7 +123,7 @@ def parts(task: Task, value: Any, count: int) -> dict[str, NDArray[Any]]:
     return found
 
 
-def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted: str) -> None:
+def require(sound: Truths, task: Task, method: str, values: NDArray[Any], required: str) -> None:
     """Reject invalid values.
 
     Args:
@@ -141,7 +131,7 @@ def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted
         task: Task that returned them.
         method: Method that returned them.
         values: Values, (n, ...), for the message.
-        wanted: Description of valid values, for the message.
+        required: Description of valid values, for the message.
 
     Raises:
         TaskError: If a value is invalid.
@@ -149,7 +139,7 @@ def require(sound: Truths, task: Task, method: str, values: NDArray[Any], wanted
     wrong = np.flatnonzero(~sound)
     if wrong.size:
         raise TaskError(
-            f"{label(task)}.{method} must return {wanted}, got {_short(values[wrong[0]])} for "
+            f"{label(task)}.{method} must return {required}, got {_short(values[wrong[0]])} for "
             f"{flights_named(wrong)}"
         )
 

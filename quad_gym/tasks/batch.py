@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quad_gym.batch.calls import Calls, address_of
 from quad_gym.batch.starts import checked_mask
-from quad_gym.kernels.task.settle import LARGEST_REWARD, Verdict, settle
 from quad_gym.params import checks as check
-from quad_gym.records import WIDTH, Autoreset, Result
+from quad_gym.records import RESULTS, WIDTH, Autoreset, Ending, Result
 from quad_gym.tasks import answers
 from quad_gym.tasks.draws import FlightRandom
-from quad_gym.tasks.memory import COMPARED_ERROR, COMPARED_GATES, ReadableBatch
+from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.observing import Joiner, Part
 from quad_gym.tasks.starts import Start, starts
 from quad_gym.tasks.state import State
@@ -26,6 +24,8 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Truths = NDArray[np.bool_]
 
+LARGEST_REWARD = 1e30
+"""Larger rewards are errors; learning algorithms hold rewards in single precision."""
 _RESET_DRAWS, _UPDATE_DRAWS = 1, 2
 
 
@@ -62,26 +62,19 @@ class TaskBatch(ReadableBatch):
     ) -> None:
         self._in_kernel = autoreset == Autoreset.NEXT_STEP
         mode = Autoreset.NEXT_STEP if self._in_kernel else Autoreset.DISABLED
-        super().__init__(count, autoreset=mode, **keywords)
+        super().__init__(count, split, autoreset=mode, **keywords)
         self.own_task = own_task
         self.methods = frozenset(method for method in METHODS if own_task.has(method))
         self._same_step = autoreset == Autoreset.SAME_STEP
-        self._split, self._joiner = split, None
+        self._joiner: Joiner | None = None
         if parts is not None and "observe" in self.methods:
             self._joiner = Joiner(self.count, parts, self._low.size, split, kept)
-        self.period = 1.0 / self.clocks.control_rate
-        self.reward_scale = self.period if self.task.reward_per == "second" else 1.0
         self._state = State(self.count, own_task.state)
-        self._counts_gates = "gates_passed" in own_task.state
         self._failed: Truths | None = None  # None: no flight has failed
-        self._began_in_step: Truths = np.zeros(self.count, bool)
-        self.began: Truths = self._began_in_step
-        self.began_some = False
-        self._rewards, self._returns = np.zeros(self.count), np.zeros(self.count)
-        self._terms: dict[str, NDArray[Any]] = {}
-        self._terminated: Truths = np.zeros(self.count, bool)
-        self._truncated: Truths = np.zeros(self.count, bool)
-        self._before = np.zeros_like(self.compared_shown)
+        self._terms: Mapping[str, Floats] = {}
+        self._rewarded: Truths = np.zeros(self.count, bool)
+        self._all, self._returns = np.arange(self.count), np.zeros(self.count)
+        self._block, self._lane = np.divmod(self._all, WIDTH)
         size = self._joiner.size if self._joiner else self._low.size
         self._finals = np.zeros((self.count, size), np.float32)
         self._begun_again = False
@@ -107,12 +100,11 @@ class TaskBatch(ReadableBatch):
         """
         given: Start = {"position": position, "velocity": velocity, "yaw": yaw}
         chosen = checked_mask(self.count, mask)
-        shipped = super().reset(seeds=seeds, keys=keys, mask=mask, **given)
-        nobody = np.zeros(self.count, bool)
-        others = nobody if self._failed is None else self._failed & ~chosen
+        builtin = super().reset(seeds=seeds, keys=keys, mask=mask, **given)
+        others = ~chosen & (False if self._failed is None else self._failed)
         self._note_failed(others)
         try:
-            return self._observed(self._begin(chosen, given, shipped))
+            return self._observed(self._begin(chosen, given, builtin))
         except BaseException:
             self._note_failed(others | chosen)
             raise
@@ -130,13 +122,10 @@ class TaskBatch(ReadableBatch):
                 f"call reset() before step(): a method of {label(self.own_task)} has failed for "
                 f"{answers.flights_named(np.flatnonzero(self._failed))}"
             )
-        if not self._begun:
-            self._require_begun()
-        self._remember()
-        self.view.step_over()
-        shipped = super().step(actions)
+        self.view.forget()
+        builtin = super().step(actions)
         try:
-            return self._after_step(shipped)
+            return self._after_step(builtin)
         except BaseException:
             self._note_failed(np.ones(self.count, bool))
             raise
@@ -145,65 +134,49 @@ class TaskBatch(ReadableBatch):
         """Mark flights for which a method has failed; they need a reset before the next step."""
         self._failed = flights if flights.any() else None
 
-    def _remember(self) -> None:
-        """Store the quantities that the next step is compared with."""
-        self._before[:] = self.compared_shown
-        if self._counts_gates:
-            self._before[COMPARED_GATES] = self.columns("gate_next")
-
-    @property
-    def error_before(self) -> Floats:
-        """Distance from the reference before the step, (n,) [m]."""
-        return self._before[COMPARED_ERROR]
-
-    @property
-    def gates_before(self) -> Floats:
-        """Number of gates passed before the step, (n,)."""
-        return self._before[COMPARED_GATES]
-
-    def _after_step(self, shipped: Singles) -> Singles:
+    def _after_step(self, builtin: Singles) -> Singles:
         """Call the task's methods after a step; return the observations."""
-        self.began, self.began_some = self._began_in_step, False
+        steps = self._results[Result.EPISODE_STEPS, : self.count]
+        self.began = steps == 0.0 if self._in_kernel else np.zeros(self.count, bool)
         self._begun_again = False
-        if self._in_kernel:
-            np.logical_not(self.time_shown, out=self._began_in_step)
-            # bytes of booleans are 0 or 1; any() takes ten times longer for few flights
-            self.began_some = 1 in self._began_in_step.tobytes()
-        if self.began_some:
-            shipped = self._begin(self._began_in_step, {}, shipped)
+        if self.began.any():
+            builtin = self._begin(self.began, {}, builtin)
         if "update" in self.methods:
             with self._writing(~self.began, _UPDATE_DRAWS) as rng:
                 answers.ask(self.own_task, "update", self.view, rng)
-        self._judge()
-        observations = self._observed(shipped)
-        if self._joiner and self.own_task.privileged:
-            self.view.builtin.read()
-        ended = self._settle()
-        if ended and self._same_step:
-            over = self._flights_over()
+        terms: dict[str, Floats] = {}
+        if "reward" in self.methods:
+            terms = answers.reward_terms(self.own_task, self.view)
+        terminated, truncated = self._asked_truths("terminated"), self._asked_truths("truncated")
+        observations = self._observed(builtin)
+        if terms:
+            self._write_rewards(terms)
+        over = self._write_endings(terminated, truncated)
+        self._write_remaining()
+        if self._same_step and over.any():
             self._keep_innovations()
             self._finals[over] = observations[over]
-            shipped = self._begin(over, {}, super().reset(mask=over))
-            observations[over] = self._observed(shipped)[over]
+            builtin = self._begin(over, {}, super().reset(mask=over))
+            observations[over] = self._observed(builtin)[over]
         return observations
 
     # ---- episodes that begin ------------------------------------------------------------------
 
-    def _begin(self, chosen: Truths, given: Start, shipped: Singles) -> Singles:
+    def _begin(self, chosen: Truths, given: Start, builtin: Singles) -> Singles:
         """Call `reset` of the task for episodes begun by the kernels; return the observations."""
-        self.began, self.began_some = chosen, True
+        self.began = chosen
+        self.judged[:, chosen] = self._returns[chosen] = 0.0
         self._state.begin(chosen)
-        self._returns[chosen] = 0.0
-        self.view.begin(chosen)
+        self.view.forget()
         if "reset" not in self.methods:
-            return shipped
+            return builtin
         with self._writing(chosen, _RESET_DRAWS) as rng:
             start = answers.ask(self.own_task, "reset", self.view, rng)
         if start is not None:
-            shipped = self._begin_again(
+            builtin = self._begin_again(
                 chosen, starts(self.own_task, start, chosen, given, self.task, self.world)
             )
-        return shipped
+        return builtin
 
     def _begin_again(self, chosen: Truths, start: Start) -> Singles:
         """Begin the same episodes, with the same draws, at other start values."""
@@ -212,53 +185,35 @@ class TaskBatch(ReadableBatch):
         again = lanes.reshape(-1, WIDTH)
         self._blocks["instant"][again] -= np.uint64(1)
         self._blocks["episode"][again] -= 1.0
-        shipped = super().reset(mask=chosen, **start)
+        builtin = super().reset(mask=chosen, **start)
         self._begun_again = True
         self.view.forget()
-        return shipped
+        return builtin
 
     # ---- rewards and endings ------------------------------------------------------------------
 
-    def _judge(self) -> None:
-        """Call `reward`, `terminated` and `truncated`, and store their results."""
-        own_task, view, methods, count = self.own_task, self.view, self.methods, self.count
-        if "reward" in methods:
-            self._terms = answers.reward_terms(own_task, view, count)
-            self._rewards[:] = reduce(np.add, self._terms.values())
-        if "terminated" in methods:
-            self._terminated[:] = answers.truths(own_task, "terminated", view, count)
-        if "truncated" in methods:
-            self._truncated[:] = answers.truths(own_task, "truncated", view, count)
+    def _asked_truths(self, method: str) -> Truths | None:
+        """Return value of `terminated` or `truncated`; None: the built-in endings stay."""
+        if method not in self.methods:
+            return None
+        return answers.truths(self.own_task, method, self.view)
 
-    def _settle(self) -> int:
-        """Write reward and endings of the task to results and records; return the flights ended."""
-        ended: int = settle(self._calls.words, self._verdict, self.reward_scale)
-        if ended < 0:
-            sound = np.abs(self._rewards) <= LARGEST_REWARD
-            answers.require(sound, self.own_task, "reward", self._rewards, "finite rewards")
-        if self._counts_gates:
-            passed = np.where(self.began, 0.0, self._state.gates_passed)
-            self._results[Result.GATES_PASSED, : self.count] = passed
-            self.write("gate_next", passed)
-        if self._begun_again:
-            for name in ("position_error", "estimation_error", "filter_status"):
-                row = self._results[Result[name.upper()], : self.count]
-                row[self.began] = self.columns(name)[self.began]
-        return ended
+    def _write_rewards(self, terms: Mapping[str, Floats]) -> None:
+        """Write rewards; flights that begin, or whose state is not finite, have none.
 
-    def _calls_of_threads(self) -> Calls:
-        """Arguments of the compiled code, `settle` included."""
-        self._verdict = np.zeros(len(Verdict), np.int64)
-        for word, method, said in (
-            (Verdict.REWARDS, "reward", self._rewards),
-            (Verdict.TERMINATED, "terminated", self._terminated),
-            (Verdict.TRUNCATED, "truncated", self._truncated),
-        ):
-            if method in self.methods:
-                self._verdict[word] = address_of(said)
-        self._verdict[Verdict.RETURNS] = address_of(self._returns)
-        self._verdict[Verdict.BEGAN] = address_of(self._began_in_step)
-        return super()._calls_of_threads()
+        Raises:
+            TaskError: If another reward is not finite; nothing is written then.
+        """
+        rewards = reduce(np.add, terms.values())
+        sound = np.abs(rewards) <= LARGEST_REWARD  # NaN is not
+        if not sound.all():
+            failed = ~sound & ~self.began
+            failed[failed] = self.finite(np.flatnonzero(failed))
+            answers.require(~failed, self.own_task, "reward", rewards, "finite rewards")
+        self._terms, self._rewarded = terms, sound & ~self.began
+        reward = np.where(self._rewarded, self.reward_scale * rewards, 0.0)
+        self._returns += reward
+        self._write(slice(None), reward=reward, episode_return=self._returns)
 
     def reward_terms(self) -> dict[str, Floats]:
         """Return the terms of the last step's reward, (count,) each; their sum is the reward.
@@ -267,12 +222,58 @@ class TaskBatch(ReadableBatch):
         """
         if "reward" not in self.methods:
             return super().reward_terms()
-        total = reduce(np.add, self._terms.values(), np.zeros(self.count))
-        none = self._began_in_step | ~(np.abs(total) <= LARGEST_REWARD)
         return {
-            name: np.where(none, 0.0, self.reward_scale * values)
-            for name, values in self._terms.items()
+            name: np.where(self._rewarded, self.reward_scale * term, 0.0)
+            for name, term in self._terms.items()
         }
+
+    def _write_endings(self, terminated: Truths | None, truncated: Truths | None) -> Truths:
+        """Write endings and their reasons; return True for flights that have ended."""
+        crashed, cut = self.judged[1] > 0.0, self.judged[2] > 0.0
+        ends, truncates = crashed if terminated is None else terminated, cut
+        if terminated is not None and (crashed & ~terminated).any():  # a flight that is not finite
+            ends = terminated | crashed & ~self.finite(self._all)  # cannot go on
+        if truncated is not None:
+            truncates = truncated
+        ends, truncates = ends & ~self.began, truncates & ~self.began
+        over = ends | truncates
+        changed = np.flatnonzero(over | crashed | cut)
+        if changed.size:
+            why = np.where(truncates & cut, self._reasons_of_cuts(), Ending.TASK)
+            why = np.where(ends, np.where(crashed, self.judged[3], Ending.TASK), why)
+            self._write(
+                changed,
+                terminated=ends[changed],
+                truncated=truncates[changed],
+                ending=(over * why)[changed],
+                needs_reset=over[changed],
+            )
+        return over
+
+    def _reasons_of_cuts(self) -> NDArray[np.int64]:
+        """Reasons for which the built-in task truncates an episode, (n,)."""
+        failed, diverged = self.result("filter_status") > 0.0, self.result("filter_diverged") > 0.0
+        lost = diverged & self.task.truncate_when_diverged
+        cause = np.where(lost, Ending.FILTER_DIVERGED, Ending.TIME_LIMIT)
+        return np.where(failed, Ending.FILTER_FAILED, cause)
+
+    def _write(self, flights: NDArray[np.intp] | slice, **values: NDArray[Any]) -> None:
+        """Write values of some flights to records, and to results that have their names."""
+        for name, value in values.items():
+            self._blocks[name][self._block[flights], self._lane[flights]] = value
+            if name in RESULTS:
+                self._results[RESULTS.index(name), : self.count][flights] = value
+
+    def _write_remaining(self) -> None:
+        """Write gates passed, and the starts of episodes that `reset` has changed."""
+        if "gates_passed" in self._state:
+            passed = np.where(self.began, 0.0, self._state.gates_passed)
+            self._results[Result.GATES_PASSED, : self.count] = passed
+            self._write(slice(None), gate_next=passed)
+        if self._begun_again:
+            for name in ("position_error", "estimation_error", "filter_status"):
+                row = self._results[Result[name.upper()], : self.count]
+                row[self.began] = self.record(name)[self.began]
 
     # ---- observing ----------------------------------------------------------------------------
 
@@ -284,10 +285,6 @@ class TaskBatch(ReadableBatch):
     @final_observations.setter
     def final_observations(self, value: Singles) -> None:
         """Ignore the kernels' array: they begin episodes only at the start of a step."""
-
-    def builtin_observation(self) -> Singles:
-        """Built-in observation without its privileged part, (count, k)."""
-        return self._observations[:, : self._split]
 
     def ask_parts(self) -> dict[str, NDArray[Any]]:
         """Arrays that `observe` returns at the present instant, (count, k) each."""
@@ -301,11 +298,11 @@ class TaskBatch(ReadableBatch):
         finally:
             view.hide(False)
 
-    def _observed(self, shipped: Singles) -> Singles:
+    def _observed(self, builtin: Singles) -> Singles:
         """Observations of the environment."""
         if self._joiner is None:
-            return shipped
-        return self._joiner.join(self, self._asked_to_observe(), shipped)
+            return builtin
+        return self._joiner.join(self, self.own_task, self._asked_to_observe(), builtin)
 
     # ---- keeping ------------------------------------------------------------------------------
 
@@ -343,12 +340,10 @@ class TaskBatch(ReadableBatch):
         super().restore(flights)
         if len(self._state):
             self._state.read_from(snapshot["state"])
-        self._returns[:] = self.columns("episode_return")
-        self.began = self.time_shown == 0.0
-        self.began_some = bool(np.count_nonzero(self.began))
-        self._remember()  # the step before is unknown: no progress, no gate passed
+        self._returns = self.record("episode_return")
+        self.began = self.record("tick") == 0.0
         self._failed = None
-        self.view.step_over()
+        self.view.forget()
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the threads and the view, which a copy creates itself."""
@@ -362,7 +357,7 @@ class TaskBatch(ReadableBatch):
         kept = {} if np.count_nonzero(chosen) == self.count else self._state.copies()
         self._state.lock(False)
         try:
-            yield FlightRandom(self.rows("key"), self.columns("instant"), draws)
+            yield FlightRandom(self.record("key"), self.record("instant"), draws)
         finally:
             self._state.lock(True)
             if kept:

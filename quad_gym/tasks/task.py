@@ -28,10 +28,6 @@ class TaskError(RuntimeError):
     """Error raised when a method of a task fails or returns an invalid value."""
 
 
-class HiddenTruthError(RuntimeError):
-    """Error raised when `observe` of a task that is not privileged reads the true state."""
-
-
 class ObservationSpec(NamedTuple):
     """Unit, frame and bounds of an array that `observe` returns."""
 

@@ -1,247 +1,185 @@
-"""`View`: the arrays that methods of a task read; `fields.py` lists them in a table."""
+"""`View`: the fields that methods of a task read, and a table of them."""
 
-from typing import TYPE_CHECKING, NoReturn
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_gym.records import SHOWN
-from quad_gym.tasks.builtin import Builtin
-from quad_gym.tasks.groups import Estimate, Measured, Observed, Truth
-from quad_gym.tasks.lazy import Attribute, Group, Lazy, Shown
+from quad_gym.params.world import WorldParams
+from quad_gym.tasks.fields import Field, Group, field, record, shown
+from quad_gym.tasks.groups import Builtin, Estimate, Measured, Observed, Truth
+from quad_gym.tasks.memory import ReadableBatch
 from quad_gym.tasks.state import State
-from quad_gym.tasks.task import HiddenTruthError
-
-if TYPE_CHECKING:
-    from quad_gym.params.world import WorldParams
-    from quad_gym.tasks.batch import TaskBatch
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-_GATE_NEXT = SHOWN["gate_next"].start
+
+class HiddenTruthError(RuntimeError):
+    """Error raised when `observe` of a task that is not privileged reads the true state."""
 
 
+class Short:
+    """Field of `view.truth` as an attribute of the view."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Store the name of the field."""
+        self._name = name
+
+    @overload
+    def __get__(self, view: None, owner: type) -> "Short": ...
+
+    @overload
+    def __get__(self, view: "View", owner: type) -> Floats: ...
+
+    def __get__(self, view: "View | None", owner: type) -> Any:
+        """Return the field, unless the truth is hidden."""
+        if view is None:
+            return self
+        view._require_open(self._name)
+        return getattr(view._truth, self._name)
+
+
+# fmt: off
 class View(Group):
     """State of all flights at the end of a step, in the episode to which the step belongs.
 
-    Arrays have one row per flight, are computed when first read, and are read-only.
-    `quad_gym.tasks.fields.VIEW_FIELDS` lists them all with shapes, units and frames. They are
-    grouped: `truth`, `estimate` (of the filter), `observed` (by the controller), `measured`, and
-    `builtin` (built-in reward and endings). `view.position` is short for `view.truth.position`, and
-    so for the other true states. `view.state` holds the task's own variables.
+    Arrays have one row per flight, are computed when first read, and are read-only. `VIEW_FIELDS`
+    lists them with shapes, units and frames. They are grouped: `truth`, `estimate` (of the filter),
+    `observed` (by the controller), `measured`, and `builtin` (built-in reward and endings).
+    `view.position` is short for `view.truth.position`, and so for the other true states.
+    `view.state` holds the task's own variables.
     """
 
-    __slots__ = (
-        *("_hidden", "_builtin", "_truth"),
-        *("estimate", "measured", "observed", "state"),
-    )
-
+    __slots__ = ("_builtin", "_hidden", "_truth", "estimate", "measured", "observed", "state")
     estimate: Estimate
     observed: Observed
     measured: Measured
     state: State
 
-    def __init__(self, flights: "TaskBatch", state: State) -> None:
-        of_instant: list[Attribute] = []
-        super().__init__(flights, of_instant)
-        self._hidden = False
-        self._truth, self._builtin = Truth(flights, of_instant, self), Builtin(flights, [])
-        for name, group in (
-            ("estimate", Estimate(flights, of_instant)),
-            ("measured", Measured(flights, of_instant)),
-            ("observed", Observed(flights, of_instant)),
-            ("state", state),
-        ):
-            object.__setattr__(self, name, group)
+    def __init__(self, flights: ReadableBatch, state: State) -> None:
+        super().__init__(flights)
+        estimate = Estimate(flights)
+        self._truth, self._builtin, self._hidden = Truth(flights, estimate), Builtin(flights), False
+        object.__setattr__(self, "estimate", estimate)
+        object.__setattr__(self, "observed", Observed(flights))
+        object.__setattr__(self, "measured", Measured(flights))
+        object.__setattr__(self, "state", state)
 
-    def step_over(self) -> None:
-        """Drop all arrays after a step."""
-        self.forget()
-        self._builtin.step_over()
-
-    def begin(self, chosen: Truths) -> None:
-        """Drop arrays of the last episodes of flights that have begun new ones."""
-        self.forget()
-        self._builtin.begin(chosen)
+    def forget(self) -> None:
+        """Drop all values, after a step or when episodes have begun."""
+        super().forget()
+        for group in (self._truth, self._builtin, self.estimate, self.observed, self.measured):
+            group.forget()
 
     def hide(self, hidden: bool) -> None:
         """Hide the truth, as for `observe`, or show it again."""
-        object.__setattr__(self, "_hidden", hidden)  # past the check against writing
+        self._hidden = hidden
 
-    # ---- hidden from `observe`, unless the task is privileged ---------------------------------
-
-    def _refuse(self, name: str) -> NoReturn:
-        raise HiddenTruthError(
-            f"observe cannot read the truth (view.{name}), which is not available to controllers: "
-            "read view.observed or view.estimate, or set privileged = True in the task"
-        )
+    def _require_open(self, name: str) -> None:
+        if self._hidden:
+            raise HiddenTruthError(
+                f"observe cannot read the truth (view.{name}), which is not available to "
+                "controllers: read view.observed or view.estimate, or set privileged = True in "
+                "the task"
+            )
 
     @property
     def truth(self) -> Truth:
         """True state; `observe` may read it only if the task is privileged."""
-        if self._hidden:
-            self._refuse("truth")
+        self._require_open("truth")
         return self._truth
 
     @property
     def builtin(self) -> Builtin:
-        """Built-in reward and endings of the step, computed from the truth."""
-        if self._hidden:
-            self._refuse("builtin")
+        """Built-in reward and endings of the step; `observe` may read them as it may the truth."""
+        self._require_open("builtin")
         return self._builtin
 
-    @property
-    def position(self) -> Floats:
-        """True position, (n, 3) in I [m]."""
-        if self._hidden:
-            self._refuse("position")
-        return self._truth.position
-
-    @property
-    def velocity(self) -> Floats:
-        """True velocity, (n, 3) in I [m/s]."""
-        if self._hidden:
-            self._refuse("velocity")
-        return self._truth.velocity
-
-    @property
-    def R_BI(self) -> Floats:
-        """True attitude, (n, 3, 3), v_B = R_BI v_I."""
-        if self._hidden:
-            self._refuse("R_BI")
-        return self._truth.R_BI
-
-    @property
-    def quaternion(self) -> Floats:
-        """True attitude as a quaternion (w, x, y, z), (n, 4), B to I."""
-        if self._hidden:
-            self._refuse("quaternion")
-        return self._truth.quaternion
-
-    @property
-    def body_rates(self) -> Floats:
-        """True body rates, (n, 3) in B [rad/s]."""
-        if self._hidden:
-            self._refuse("body_rates")
-        return self._truth.body_rates
-
-    @property
-    def rotor_speeds(self) -> Floats:
-        """True rotor speeds, (n, 4) [rad/s]."""
-        if self._hidden:
-            self._refuse("rotor_speeds")
-        return self._truth.rotor_speeds
-
-    @property
-    def accel_bias(self) -> Floats:
-        """True accelerometer bias, (n, 3) in B [m/s^2]."""
-        if self._hidden:
-            self._refuse("accel_bias")
-        return self._truth.accel_bias
-
-    @property
-    def gyro_bias(self) -> Floats:
-        """True gyro bias, (n, 3) in B [rad/s]."""
-        if self._hidden:
-            self._refuse("gyro_bias")
-        return self._truth.gyro_bias
-
-    @property
-    def position_error(self) -> Floats:
-        """Distance of the true position from the reference, (n,) [m]."""
-        if self._hidden:
-            self._refuse("position_error")
-        return self._truth.position_error
-
-    @property
-    def estimation_error(self) -> Floats:
-        """Distance between observed and true position, (n,) [m]."""
-        if self._hidden:
-            self._refuse("estimation_error")
-        return self._truth.estimation_error
-
-    @property
-    def obstacle_distance(self) -> Floats:
-        """Distance of the true position from the nearest obstacle surface, (n,) [m]."""
-        if self._hidden:
-            self._refuse("obstacle_distance")
-        return self._truth.obstacle_distance
+    position, velocity, R_BI, quaternion, body_rates = Short(), Short(), Short(), Short(), Short()
+    rotor_speeds, accel_bias, gyro_bias = Short(), Short(), Short()
+    position_error, estimation_error, obstacle_distance = Short(), Short(), Short()
 
     # ---- never hidden -------------------------------------------------------------------------
 
-    @property
+    @field("", "-", "-", "number of flights, n")
     def count(self) -> int:
-        """Number of flights, n."""
-        return self._flights.count  # type: ignore[no-any-return]
+        return self._flights.count
 
-    @property
+    @field("", "s", "-", "control period, the duration of a step")
     def period(self) -> float:
-        """Control period, the duration of a step [s]."""
-        return self._flights.period  # type: ignore[no-any-return]
+        return self._flights.period
 
-    time = Shown("time", "Time since the start of the episode, (n,) [s].")
+    @field("(n,)", "s", "-", "time since the start of the episode")
+    def time(self) -> Floats:
+        return self._flights.read("time")
 
-    step = Shown("step", "Steps since the start of the episode, (n,).")
+    step = record("step", "(n,) int", "steps", "-", "steps since the start of the episode")
 
-    @Lazy
+    @field("(n,) bool", "-", "-", "True where an episode has just begun and no step of it has been flown")
     def is_first(self) -> Truths:
-        """True where an episode has just begun and no step of it has been flown, (n,)."""
         return self._flights.began.copy()
 
-    action = Shown("action", "Action of this step, (n, 4) in [-1, 1].")
+    action = record("action", "(n, 4)", "-", "-", "action of this step, in [-1, 1]")
+    last_action = record("last_action", "(n, 4)", "-", "-", "action of the step before, in [-1, 1]")
+    reference_position = shown("r_ref", "(n, 3)", "m", "I", "reference position; on a course, the next gate")
+    reference_velocity = shown("v_ref", "(n, 3)", "m/s", "I", "velocity of the reference")
+    reference_acceleration = shown("a_ref", "(n, 3)", "m/s^2", "I", "acceleration of the reference")
+    reference_heading = shown("x_ref", "(n, 3)", "-", "I", "desired heading: horizontal unit vector for body x")
+    preview = shown("preview", "(n, 2, 3)", "m", "I", "reference after each of the two times `preview`; on a course, the two gates after the next")
 
-    last_action = Shown("last_action", "Action of the step before, (n, 4) in [-1, 1].")
-
-    reference_position = Shown(
-        "r_ref", "Reference position, (n, 3) in I [m]; on a course, the next gate."
-    )
-
-    reference_velocity = Shown("v_ref", "Velocity of the reference, (n, 3) in I [m/s].")
-
-    reference_acceleration = Shown("a_ref", "Acceleration of the reference, (n, 3) in I [m/s^2].")
-
-    reference_heading = Shown(
-        "x_ref", "Desired heading: horizontal unit vector for body x, (n, 3) in I."
-    )
-
-    preview = Shown(
-        "preview",
-        "Reference at two later times, (n, 2, 3) in I [m]; on a course, the two gates after the "
-        "next.",
-    )
-
-    @Lazy
+    @field("(n, gates, 3)", "m", "I", "gates of a course, in order")
     def gates(self) -> Floats:
-        """Gates of a course in order, (n, gates, 3) in I [m]; (n, 0, 3) in other tasks."""
-        return self._flights.gates()
+        return self._flights.read("gates")
 
-    @Lazy
-    def gates_passed(self) -> NDArray[np.int64]:
-        """Number of gates passed in this episode, (n,)."""
-        return self._flights.shown[_GATE_NEXT].astype(np.int64)
+    gates_passed = record("gate_next", "(n,) int", "-", "-", "number of gates passed in this episode")
 
-    @Lazy
+    @field("(n,) bool", "-", "-", "True where this step passed a gate")
     def gate_passed(self) -> Truths:
-        """True where this step passed a gate, (n,)."""
-        return (self.gates_passed > self._flights.gates_before) & ~self._flights.began
+        return self._flights.gate_passed()
 
-    @Lazy
+    @field("(n, m, 3)", "m", "I", "positions of the markers in the filter's map of this episode")
     def features(self) -> Floats:
-        """Positions of the markers as mapped in the filter, (n, m, 3) in I [m]."""
         return self._flights.feature_places()
 
-    @property
-    def world(self) -> "WorldParams":
-        """Nominal world, without parameters drawn for the episode."""
-        return self._flights.world  # type: ignore[no-any-return]
+    @field("", "-", "-", "nominal `WorldParams`, without parameters drawn for the episode")
+    def world(self) -> WorldParams:
+        return self._flights.world
 
-    @Lazy
+    @field("(n, o, 3)", "m", "I", "centers of the obstacles in this episode, in the order given")
     def obstacles(self) -> Floats:
-        """Centers of the obstacles in this episode, (n, o, 3) in I [m], in the order given."""
-        return self._flights.obstacle_centers()
+        return self._flights.read("obstacles")
 
-    @Lazy
+    @field("(n, k)", "mixed", "mixed", "built-in observation without its privileged part")
     def observation(self) -> NDArray[np.float32]:
-        """Built-in observation without its privileged part, (n, k)."""
-        return self._flights.builtin_observation().copy()
+        return self._flights.builtin_observation()
+# fmt: on
+
+
+class ViewField(NamedTuple):
+    """Description of one field of a view."""
+
+    name: str
+    """Name with its group, such as "truth.position" """
+    shape: str
+    unit: str
+    frame: str
+    meaning: str
+
+
+GROUPS: dict[str, type[Group]] = {
+    "": View,
+    "truth.": Truth,
+    "estimate.": Estimate,
+    "observed.": Observed,
+    "measured.": Measured,
+    "builtin.": Builtin,
+}
+"""Groups of a view by their prefixes."""
+VIEW_FIELDS = tuple(
+    ViewField(prefix + name, value.shape, value.unit, value.frame, value.meaning)
+    for prefix, group in GROUPS.items()
+    for name, value in vars(group).items()
+    if isinstance(value, Field)
+)
+"""All fields of a view; for `quad_gym.tasks.fields.Field`, see the meaning of shapes and frames."""

@@ -1,6 +1,8 @@
-"""Bitwise comparison of what environments return, and actions that depend on the flight alone."""
+"""Bitwise comparisons of flights and of the return values of environments."""
 
 import numpy as np
+
+from tests.builders import SHORT, actions_of, alone, chosen, together, vec_env
 
 IDS = (
     "QuadGym/Hover-v0",
@@ -39,13 +41,41 @@ def assert_same(left, right, where="root"):
         assert left == right, f"{where}: {left!r} is not {right!r}"
 
 
-def actions_of(flight, steps):
-    """(steps, 4) random actions that lean to one side, so that flights end at different times."""
-    rng = np.random.default_rng([flight, 77])
-    lean = rng.uniform(-0.5, 0.5, 4)
-    return np.clip(lean + rng.uniform(-0.6, 0.6, (steps, 4)), -1.0, 1.0).astype(np.float32)
-
-
 def state_of(env):
     """The bits of all flights behind any of the three interfaces."""
     return getattr(env, "unwrapped", env).flights.batch.snapshot().tobytes()
+
+
+def assert_alone_as_together(base, count, mode, threads=1, **keywords):
+    """Flights in a batch are the flights alone; returns the columns of the batch."""
+    many = together(base, range(count), mode=mode, threads=threads, **keywords)
+    for i in range(count):
+        one = alone(base, i, wait=mode == "NextStep", **keywords)
+        assert_same(chosen(many, i), one, f"flight {i}")
+    return many
+
+
+def future_of(env, count, vector):
+    """Everything that the next 80 steps and two resets return."""
+    seen = []
+    for k in range(80):
+        action = actions_of(k, 1)[0]
+        result = env.step(np.tile(action, (count, 1)) if vector else action)
+        seen.append(result)
+        if not vector and (result[2] or result[3]):
+            seen.append(env.reset())
+    return [*seen, env.reset(), env.reset(seed=4)]
+
+
+def assert_snapshot_restores(count, **keywords):
+    """A snapshot in mid-episode has the same future in its own environment and in another one."""
+    made = {"autoreset_mode": "SameStep", **SHORT, **keywords}
+    env = vec_env("circle", count, seed=8, threads=2, **made)
+    for k in range(10):
+        env.step(np.tile(actions_of(k, 1), (count, 1)))
+    instant = env.flights.batch.snapshot()
+    future = future_of(env, count, vector=True)
+    fresh = vec_env("circle", count, seed=99, **made)
+    for other in (env, fresh):
+        other.flights.batch.restore(instant)
+        assert_same(future, future_of(other, count, vector=True))

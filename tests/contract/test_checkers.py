@@ -36,7 +36,7 @@ def passes_both_checkers(env_id, **keywords):
         sb3_check(gymnasium.make(env_id, **keywords).unwrapped)
 
 
-def test_the_covering_set_holds_every_pair_of_id_and_action_and_of_observation_and_action():
+def test_covering_set_has_every_pair():
     assert {(c[0], c[2]) for c in COVERING} == set(itertools.product(IDS, ACTIONS))
     assert {(c[1], c[2]) for c in COVERING} == set(itertools.product(OBSERVATIONS, ACTIONS))
     assert {(c[1], c[3]) for c in COVERING} == set(itertools.product(OBSERVATIONS, LAYOUTS))
@@ -48,7 +48,7 @@ def test_both_checkers_pass(env_id, observation, action, layout):
 
 
 @pytest.mark.slow
-def test_both_checkers_pass_for_every_id_observation_action_and_layout():
+def test_checkers_pass_for_every_combination():
     for env_id, observation, action, layout in EVERYTHING:
         passes_both_checkers(env_id, observation=observation, action=action, layout=layout)
 
@@ -80,7 +80,7 @@ def test_both_checkers_pass_at_other_rates(env_id):
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_gymnasiums_wrapped_environment_passes_its_passive_checker(env_id):
+def test_wrapped_environment_passes_the_passive_checker(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make(env_id)

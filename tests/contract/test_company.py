@@ -20,7 +20,8 @@ import quad_gym
 from quad_gym.batch import threads
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.kernels.compiling import cores
-from tests.contract.comparing import actions_of, assert_same
+from tests.builders import actions_of, vec_env
+from tests.contract.comparing import assert_same
 from tests.contract.hovering import SHORT, further, hover
 
 PATIENCE = 300
@@ -122,9 +123,8 @@ def in_a_fork(work):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_fork_after_the_first_step_flies_on_with_its_own_threads():
-    env = QuadVectorEnv(128, "circle", threads=2, **SHORT)
-    env.reset(seed=3)
+def test_forked_environment_starts_its_own_threads():
+    env = vec_env("circle", 128, seed=3, threads=2, **SHORT)
     env.step(np.zeros((128, 4)))
 
     def fly_on():
@@ -136,8 +136,7 @@ def test_a_fork_after_the_first_step_flies_on_with_its_own_threads():
 
 
 def test_an_environment_travels_to_a_worker_in_mid_episode():
-    env = QuadVectorEnv(9, "hover", threads=2)
-    env.reset(seed=3)
+    env = vec_env(count=9, seed=3, threads=2)
     env.step(np.zeros((9, 4)))
     code = (
         "import pickle, sys; from tests.contract.hovering import further;"
@@ -218,7 +217,7 @@ def test_a_damaged_cache_file_is_replaced(filled_cache, tmp_path, damage):
 
 
 @pytest.mark.slow  # nine processes; which edits count is in tests/unit/compiling/test_digest.py
-def test_a_change_in_a_kernel_that_it_reaches_means_compiling_anew(tmp_path):
+def test_changed_kernel_is_compiled_again(tmp_path):
     copy = tmp_path / "quad_gym"
     source = Path(quad_gym.__file__).parent
     shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -257,7 +256,7 @@ def run_in(folder, begin):
 
 
 @pytest.mark.slow  # the same with smaller kernels: tests/unit/compiling/test_cache.py
-def test_without_any_writable_folder_kernels_are_compiled_in_every_process(tmp_path):
+def test_kernels_without_a_writable_folder_compile_each_time(tmp_path):
     source, blocked = Path(quad_gym.__file__).parent, tmp_path / "file"
     copy = tmp_path / "quad_gym"
     shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))

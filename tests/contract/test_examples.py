@@ -23,9 +23,7 @@ def evaluations(text):
 
 
 @pytest.mark.parametrize(("algorithm", "steps"), [("sac", 130), ("ppo", 2048)])
-def test_the_defaults_of_stable_baselines_are_evaluated_as_they_learn(
-    script, algorithm, steps, tmp_path, capsys
-):
+def test_sb3_defaults_are_evaluated_while_learning(script, algorithm, steps, tmp_path, capsys):
     file = tmp_path / "policy.zip"
     args = script.Args(algorithm=algorithm, total_timesteps=130, num_envs=1, every=100, evaluate=4)
     args.save = file

@@ -10,8 +10,12 @@ from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.faults import GnssOutage, RotorLoss
 from quad_gym.faults.presets import faults_of
 from quad_gym.records import FEATURE_BLOCKS, Aid, FaultKind, GateDecision
-from tests.contract.comparing import actions_of, assert_same
-from tests.contract.test_same_flights import SHORT, STEPS, fly_single, fly_vector, future_of
+from tests.builders import SHORT, STEPS, actions_of, chosen, together
+from tests.contract.comparing import (
+    assert_alone_as_together,
+    assert_same,
+    assert_snapshot_restores,
+)
 
 OFTEN = tuple(
     type(fault)(rate=4.0, duration=(0.02, 0.2))
@@ -27,36 +31,23 @@ EVERYTHING = {
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("task", ["hover", "waypoints"])
-def test_a_flight_in_a_batch_is_the_flight_alone(task, mode):
-    together = fly_vector(task, list(range(10)), mode=mode, threads=2, **EVERYTHING)
-    for i in range(10):
-        alone = fly_single(task, i, wait=mode == "NextStep", **EVERYTHING)
-        assert_same(tuple(column[:, i].copy() for column in together), alone, f"flight {i}")
+def test_flight_in_a_batch_is_the_flight_alone(task, mode):
+    assert_alone_as_together(task, 10, mode, threads=2, **EVERYTHING)
 
 
 def test_a_weak_rotor_of_one_block_leaves_the_next_alone():
     """Without draws, too, each block has rotors of its own."""
     keywords = {"faults": RotorLoss(rate=4.0, duration=0.2, share=(0.2, 0.6))}
-    many = fly_vector("hover", list(range(40)), threads=2, **keywords)
-    few = fly_vector("hover", list(range(32, 40)), **keywords)
-    assert_same(tuple(column[:, 32:].copy() for column in many), few)
+    many = together("hover", range(40), threads=2, **keywords)
+    assert_same(chosen(many, range(32, 40)), together("hover", range(32, 40), **keywords))
 
 
-def test_a_restored_snapshot_has_the_same_future():
-    env = QuadVectorEnv(9, "circle", autoreset_mode="SameStep", threads=2, **SHORT, **EVERYTHING)
-    env.reset(seed=8)
-    for k in range(10):
-        env.step(np.tile(actions_of(k, 1), (9, 1)))
-    instant = env.flights.batch.snapshot()
-    future = future_of(env, 9, vector=True)
-    fresh = QuadVectorEnv(9, "circle", autoreset_mode="SameStep", **SHORT, **EVERYTHING)
-    fresh.reset(seed=99)
-    fresh.flights.batch.restore(instant)
-    assert_same(future, future_of(fresh, 9, vector=True))
+def test_restored_snapshot_has_the_same_future():
+    assert_snapshot_restores(9, **EVERYTHING)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_info_tells_every_interface_which_faults_there_are(mode):
+def test_info_has_the_same_faults_in_every_interface(mode):
     names = {kind.name.lower() for kind in FaultKind}
     names -= {f"{aid.name.lower()}_loss" for aid in Aid}  # sensors that this suite lacks
     env = QuadVectorEnv(3, "hover", autoreset_mode=mode, **SHORT, **EVERYTHING)
@@ -90,12 +81,12 @@ def test_info_tells_every_interface_which_faults_there_are(mode):
     assert all(values == {True, False} for values in seen.values())
 
 
-def test_without_faults_info_says_nothing_of_them():
+def test_info_without_faults_has_no_entry():
     assert not {"faults", "innovations"} & set(QuadEnv("hover").reset(seed=1)[1])
     assert not {"faults", "innovations"} & set(QuadVectorEnv(2, "hover").reset(seed=1)[1])
 
 
-def test_info_tells_every_interface_the_innovations():
+def test_info_has_the_same_innovations_in_every_interface():
     keywords = {"sensors": "rtk", "innovations": True, "faults": "gnss_outliers"}
     keywords |= {"out_of_bounds": 1e3, "min_height": -1e3, "max_tilt": np.pi}
     env = QuadVectorEnv(3, "hover", **keywords)
@@ -126,7 +117,7 @@ def test_info_tells_every_interface_the_innovations():
 
 
 @pytest.mark.parametrize("own_task", [None, quad_gym.Task()], ids=["built-in", "own"])
-def test_the_innovations_of_an_episodes_last_step_are_told_where_the_next_begins_in_it(own_task):
+def test_final_info_with_same_step_autoreset_has_the_innovations(own_task):
     keywords = {"sensors": "rtk", "innovations": True, "task": own_task, "base": "hover", **SHORT}
     env = QuadVectorEnv(3, autoreset_mode="SameStep", **keywords)
     sb3_id, told = "QuadGym/Hover-v0", 0
@@ -158,7 +149,7 @@ def test_the_innovations_of_an_episodes_last_step_are_told_where_the_next_begins
     assert told > 3
 
 
-def test_bad_faults_are_refused_by_every_interface():
+def test_invalid_faults_are_refused():
     for make in (
         lambda **k: QuadEnv("hover", **k),
         lambda **k: QuadVectorEnv(2, "hover", **k),

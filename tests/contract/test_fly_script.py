@@ -54,7 +54,7 @@ def test_every_task_is_made_with_the_default_options(env_id):
     assert env.unwrapped.flights.batch.sensors.camera is not None or "outage" in IDS[env_id]
 
 
-def test_actions_and_faults_are_those_of_the_task_unless_they_are_given():
+def test_actions_and_faults_default_to_those_of_the_task():
     flights = script.make_env(script.Args(env_id="outage_dash")).unwrapped.flights
     assert flights.action == "velocity"
     assert [type(fault).__name__ for fault in flights.batch.faults] == ["GnssOutage"]

@@ -63,7 +63,7 @@ def test_a_refused_start_changes_nothing_in_any_interface():
         sb3.reset()
 
 
-def test_a_task_that_ends_episodes_by_itself_may_start_anywhere_near_the_origin():
+def test_task_with_its_own_endings_may_start_elsewhere():
     class Patient(quad_gym.Task):
         """Ends no episode."""
 

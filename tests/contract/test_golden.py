@@ -56,6 +56,6 @@ def test_they_do_not_depend_on_the_number_of_lanes(lanes):
 
 
 @pytest.mark.slow
-def test_they_do_not_depend_on_the_processor_that_numpy_computes_for():
+def test_digests_do_not_depend_on_the_processor():
     """NumPy's linear algebra rounds as its code for the processor does; flights must not."""
     assert_the_same_with(OPENBLAS_CORETYPE="Prescott")

@@ -149,7 +149,7 @@ def test_the_action_of_the_caller_is_not_written_to():
     np.testing.assert_array_equal(action, [5.0, -5.0, 0.5, 0.0])
 
 
-def test_an_error_of_order_is_not_hidden_by_an_error_of_the_action():
+def test_invalid_action_before_reset_raises_reset_needed():
     env = QuadEnv("hover")
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))
@@ -198,13 +198,13 @@ def pairs():
 
 @settings(max_examples=500)
 @given(action=rows)
-def test_a_single_flight_flies_any_action_as_documented_or_refuses_it(pairs, action):
+def test_single_env_flies_or_refuses_any_action(pairs, action):
     check_one(pairs["single"], action, (4,))
 
 
 @settings(max_examples=250)
 @given(action=hnp.arrays(np.float64, (COUNT, 4), elements=numbers))
-def test_many_flights_fly_any_actions_as_documented_or_refuse_them(pairs, action):
+def test_vector_envs_fly_or_refuse_any_actions(pairs, action):
     check_one(pairs["vector"], action, (COUNT, 4))
     check_one(pairs["sb3"], action, (COUNT, 4))
 

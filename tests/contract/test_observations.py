@@ -7,7 +7,7 @@ import quad_gym
 from quad_gym.envs.spaces import layout_bounds
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import COLUMNS, MAX_FEATURES, MAX_OBSERVATION, Aid
-from tests.contract.comparing import actions_of
+from tests.builders import actions_of, vec_env
 from tests.contract.test_tasks import SECONDS, UNBOUNDED, body_axes, level, unit
 from tests.reference_ukf import east_north_up, rotation_312
 
@@ -33,8 +33,7 @@ def on_circle(t):
 
 def flown(steps=13, n=6, **keywords):
     """A vector environment after some steps, its observation, and the last action."""
-    env = QuadVectorEnv(n, "circle", autoreset_mode="Disabled", **{**UNBOUNDED, **keywords})
-    env.reset(seed=21)
+    env = vec_env("circle", n, seed=21, autoreset_mode="Disabled", **{**UNBOUNDED, **keywords})
     for k in range(steps):
         actions = 0.3 * np.stack([actions_of(i, steps)[k] for i in range(n)])
         observation, *_ = env.step(actions)
@@ -178,15 +177,14 @@ def test_measurements_come_with_flags_at_their_own_rates():
 
 def test_a_slow_controller_hears_of_every_fix_since_its_last_step():
     suite = quad_gym.sensor_suite("standard").with_rates(gnss=25.0)
-    env = QuadVectorEnv(2, "hover", observation="measurements", control_rate=10, sensors=suite)
-    env.reset(seed=1)
+    env = vec_env(count=2, seed=1, observation="measurements", control_rate=10, sensors=suite)
     for _ in range(5):
         seen = parts_of(env.step(np.zeros((2, 4)))[0], observation="measurements")
         assert seen["gnss_position_valid"].all()
 
 
 @pytest.mark.parametrize("suite", ["lab", "rtk"])  # instant samples; averages with vibration
-def test_the_mean_of_imu_samples_is_that_of_all_samples_since_the_last_step(suite):
+def test_imu_means_are_over_samples_since_the_last_step(suite):
     given = {"observation": "measurements", "action": "motor", "sensors": suite, "start": "hover"}
     slow = QuadVectorEnv(3, "circle", **given)
     fast = QuadVectorEnv(3, "circle", **given, control_rate=200)  # shows every sample
@@ -208,7 +206,7 @@ def test_the_mean_of_imu_samples_is_that_of_all_samples_since_the_last_step(suit
             np.testing.assert_allclose(seen[f"{name}_mean"], mean, rtol=1e-5, atol=1e-6)
 
 
-def test_an_episode_that_begins_in_a_step_shows_no_sample_of_the_one_before():
+def test_new_episode_has_no_samples_of_the_last_one():
     env = QuadVectorEnv(
         2, "hover", observation="measurements", duration=0.04, autoreset_mode="SameStep"
     )
@@ -271,8 +269,7 @@ def test_without_a_camera_no_features_are_seen():
 
 def test_noisy_observations_have_the_stated_noise_and_no_memory():
     n = 3000
-    env = QuadVectorEnv(n, "circle", observation="noisy", layout="absolute", **UNBOUNDED)
-    env.reset(seed=4)
+    env = vec_env("circle", n, seed=4, observation="noisy", layout="absolute", **UNBOUNDED)
     batch, sigma = env.flights.batch, quad_gym.sensor_suite("standard").noisy
     seconds = []
     for _ in range(2):

@@ -11,6 +11,7 @@ from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.flights.record import Flight, FlightRecorder
 from quad_gym.records import Ending
 from quad_gym.tasks.rewards import Crash
+from tests.builders import single_env
 
 WORLD = WorldParams(
     obstacles=(
@@ -63,8 +64,7 @@ def test_all_three_interfaces_fly_the_same_flights():
 
 
 def test_hitting_a_wall_is_a_crash_and_info_says_so():
-    env = QuadEnv(base="hover", world=WORLD, observation="truth", task=Near)
-    env.reset(seed=0)
+    env = single_env(seed=0, world=WORLD, observation="truth", task=Near)
     for _ in range(400):
         _, _, terminated, truncated, info = env.step(EASTWARD)
         if terminated or truncated:
@@ -82,8 +82,7 @@ def test_leaving_the_geofence_is_a_crash_too():
     env = QuadEnv(base="hover", world=fenced, observation="truth", task=Near, out_of_bounds=50.0)
     with pytest.raises(quad_gym.TaskError, match=r"finite 'wall_distance', got array\(\[inf\]\)"):
         env.reset(seed=0)
-    env = QuadEnv("hover", world=fenced, observation="truth", out_of_bounds=50.0)
-    env.reset(seed=0)
+    env = single_env(seed=0, world=fenced, observation="truth", out_of_bounds=50.0)
     for _ in range(400):
         *_, terminated, truncated, info = env.step(EASTWARD)
         if terminated or truncated:
@@ -139,7 +138,7 @@ def test_a_snapshot_brings_back_obstacles_and_contact():
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_task_reads_the_distance_of_what_is_seen_and_of_what_is_so():
+def test_view_has_observed_and_true_obstacle_distances():
     env = hovering(6, task=Near, sensors="rtk")
     seen, _ = env.reset(seed=3)
     batch = env.flights.batch

@@ -49,7 +49,7 @@ def direct():
 
 @pytest.mark.parametrize("layout", ["relative", "absolute"])
 @pytest.mark.parametrize("action", ["motor", "wrench"])
-def test_at_every_tick_it_flies_the_circle_like_the_compiled_controller(action, layout, direct):
+def test_policy_at_every_tick_equals_the_compiled_controller(action, layout, direct):
     given = {"action": action, "layout": layout, "control_rate": 200, "start": "ground"}
     env = QuadVectorEnv(60, "circle", autoreset_mode="Disabled", **given)
     policy = PDPolicy(env, gains="lab")
@@ -73,7 +73,7 @@ EPISODES = [200, pytest.param(1000, marks=pytest.mark.slow)]
 @pytest.mark.parametrize("count", EPISODES)
 @pytest.mark.parametrize("gains", ["lab", "tuned"])
 @pytest.mark.parametrize("env_id", TRACKING)
-def test_it_flies_every_episode_of_every_tracking_task_on_the_estimate(env_id, gains, count):
+def test_policy_flies_every_tracking_task_on_the_estimate(env_id, gains, count):
     env = gymnasium.make_vec(env_id, num_envs=count)
     episodes = roll_out(PDPolicy(env, gains), env, seed=0)
     assert not episodes.crashed.any()
@@ -137,7 +137,7 @@ def test_single_and_batched_predictions_agree(action, privileged):
         observation, *_ = env.step(together)
 
 
-def test_it_reads_its_environment_through_wrappers_and_all_interfaces():
+def test_policy_accepts_wrappers_and_all_interfaces():
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=2)
     single = gymnasium.make("QuadGym/Hover-v0")
     observation, _ = single.reset(seed=2)

@@ -10,7 +10,8 @@ import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
-from tests.contract.comparing import ACTIONS, IDS, OBSERVATIONS, actions_of, assert_same, state_of
+from tests.builders import actions_of, single_env, vec_env
+from tests.contract.comparing import ACTIONS, IDS, OBSERVATIONS, assert_same
 
 TASKS = tuple(quad_gym.IDS.values())
 
@@ -39,7 +40,7 @@ def test_episodes_after_a_seed_differ_and_repeat(env_id):
     assert_same(run, [env.reset(seed=5)[0], *(env.reset()[0] for _ in range(4))])
 
 
-def test_the_number_of_steps_in_an_episode_does_not_lead_back_to_an_earlier_start():
+def test_starts_do_not_depend_on_the_length_of_episodes():
     """The starts of a seed are one sequence, however long its episodes last."""
     env, runs = QuadEnv("hover"), []
     for longest in (0, 29):
@@ -55,8 +56,7 @@ def test_the_number_of_steps_in_an_episode_does_not_lead_back_to_an_earlier_star
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_options_of_reset_are_honoured_at_any_time(task):
-    env = QuadEnv(task)
-    env.reset(seed=3)
+    env = single_env(task, seed=3)
     place = env.flights.batch.read("reference_position")[0] + [0.2, 0.1, 0.3]
     start = {"position": place, "velocity": [0.1, -0.1, 0.2], "yaw": 0.7}
     for seed in (3, None):
@@ -71,48 +71,11 @@ def test_the_options_of_reset_are_honoured_at_any_time(task):
     assert (env.flights.batch.record("r")[0] != start["position"]).all()
 
 
-def test_options_that_are_unknown_or_no_numbers_change_nothing():
-    env = QuadEnv("hover")
-    env.reset(seed=1)
-    before = state_of(env)
-    for options in ({"speed": 1.0}, {"position": [1.0, 2.0]}, {"yaw": np.nan}):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            env.reset(options=options)
-        assert state_of(env) == before
-
-
-# ---- what is whose -------------------------------------------------------------------------------
-
-
-def test_a_final_observation_is_that_of_the_flight_that_ended():
-    count = 9
-    env = QuadVectorEnv(count, "hover", autoreset_mode="SameStep", max_tilt=0.6)
-    sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", count, seed=40, max_tilt=0.6)
-    alone = [QuadEnv("hover", max_tilt=0.6) for _ in range(count)]
-    env.reset(seed=40)
-    sb3.reset()
-    for i, one in enumerate(alone):
-        one.reset(seed=40 + i)
-    actions = np.stack([actions_of(i, 80) for i in range(count)], axis=1)
-    ended = []
-    for k in range(80):
-        *_, info = env.step(actions[k])
-        _, _, _, infos = sb3.step(actions[k])
-        for i, one in enumerate(alone):
-            observation, _, terminated, truncated, _ = one.step(actions[k, i])
-            mine = "final_obs" in info and info["_final_obs"][i]
-            assert mine == ("terminal_observation" in infos[i]) == (terminated or truncated)
-            if mine:
-                assert_same(info["final_obs"][i], observation)
-                assert_same(infos[i]["terminal_observation"], observation)
-                ended.append(i)
-                one.reset()
-    assert len(set(ended)) >= 5
+# ---- endings -------------------------------------------------------------------------------------
 
 
 def test_a_crash_is_terminated_and_the_time_limit_truncated():
-    env = QuadVectorEnv(64, "hover", autoreset_mode="SameStep", max_tilt=0.6, max_episode_steps=30)
-    env.reset(seed=2)
+    env = vec_env(count=64, seed=2, autoreset_mode="SameStep", max_tilt=0.6, max_episode_steps=30)
     counts = {Ending.TIME_LIMIT: 0, Ending.TIPPED_OVER: 0}
     for k in range(100):
         actions = np.stack([actions_of(100 * k + i, 1)[0] for i in range(64)])
@@ -125,18 +88,6 @@ def test_a_crash_is_terminated_and_the_time_limit_truncated():
         for why in counts:
             counts[why] += (ending == why).sum()
     assert min(counts.values()) > 20
-
-
-def test_a_crash_in_the_last_step_is_a_crash_and_the_time_limit():
-    down = np.array([-1.0, 0.0, 0.0, 0.0])
-    env = QuadEnv("circle", pad=False)
-    env.reset(seed=1)
-    last = next(k for k in range(1, 100) if env.step(down)[2])
-    env = QuadEnv("circle", pad=False, max_episode_steps=last)
-    env.reset(seed=1)
-    for _ in range(last):
-        _, _, terminated, truncated, info = env.step(down)
-    assert (terminated, truncated, info["ending"]) == (True, True, Ending.BELOW_MIN_HEIGHT)
 
 
 # ---- global state --------------------------------------------------------------------------------
@@ -252,26 +203,13 @@ def test_unknown_ids_are_refused(env_id):
         gymnasium.make(env_id)
 
 
-@pytest.mark.parametrize("count", [0, -1, 2.5, "two", None, True])
-def test_a_number_of_flights_that_is_invalid_is_refused(count):
-    with pytest.raises(ValueError, match=r"count|num_envs|n_envs"):
-        QuadVectorEnv(count, "hover")
-    with pytest.raises(ValueError, match=r"count|num_envs|n_envs"):
-        quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=count)
-
-
 @pytest.mark.parametrize("threads", [0, -2, 1.5, "all", True])
 def test_a_number_of_threads_that_is_invalid_is_refused(threads):
     with pytest.raises(ValueError, match="threads"):
         QuadVectorEnv(4, "hover", threads=threads)
 
 
-def test_an_unknown_task_is_refused():
-    with pytest.raises(ValueError, match="task"):
-        QuadEnv("loop")
-
-
-def test_an_unknown_keyword_is_refused_in_the_words_that_torchrl_looks_for():
+def test_unknown_keyword_raises_the_error_torchrl_expects():
     with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
         gymnasium.make("QuadGym/Hover-v0", frameskip=1)
 

@@ -15,7 +15,8 @@ from gymnasium.wrappers import RecordVideo
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from tests.contract.comparing import IDS, actions_of, assert_same
+from tests.builders import actions_of, vec_env
+from tests.contract.comparing import IDS, assert_same
 
 pytest.importorskip("pygame")
 
@@ -159,8 +160,7 @@ def test_rendering_chosen_flights_changes_no_flight():
     batches = []
     for mode in (None, "rgb_array"):
         look = {"render_mode": mode, "render_flights": (1, 8), **SMALL} if mode else {}
-        env = QuadVectorEnv(9, "hover", **look)
-        env.reset(seed=3)
+        env = vec_env(count=9, seed=3, **look)
         for k in range(30):
             env.step(np.stack([actions_of(i, 30)[k] for i in range(9)]))
             env.render() if mode else None
@@ -172,8 +172,7 @@ def test_rendering_chosen_flights_changes_no_flight():
 
 
 def test_a_vector_environment_renders_what_single_ones_do():
-    env = QuadVectorEnv(4, "circle", render_mode="rgb_array", render_flights=(3, 0), **SMALL)
-    env.reset(seed=5)
+    env = vec_env("circle", 4, seed=5, render_mode="rgb_array", render_flights=(3, 0), **SMALL)
     ones = [QuadEnv("circle", render_mode="rgb_array", **SMALL) for _ in range(2)]
     for one, seed in zip(ones, (8, 5), strict=True):
         one.reset(seed=seed)
@@ -185,8 +184,7 @@ def test_a_vector_environment_renders_what_single_ones_do():
 
 
 def test_lists_of_a_vector_environment_are_tiled():
-    env = QuadVectorEnv(3, "hover", render_mode="rgb_array_list", **SMALL)
-    env.reset(seed=0)
+    env = vec_env(count=3, seed=0, render_mode="rgb_array_list", **SMALL)
     env.step(np.zeros((3, 4)))
     frames = env.render()
     assert [frame.shape for frame in frames] == [(480, 640, 3)] * 2
@@ -194,8 +192,7 @@ def test_lists_of_a_vector_environment_are_tiled():
 
 
 def test_a_new_episode_begins_a_new_trail():
-    env = QuadVectorEnv(1, "hover", render_mode="rgb_array", max_episode_steps=5, **SMALL)
-    env.reset(seed=0)
+    env = vec_env(count=1, seed=0, render_mode="rgb_array", max_episode_steps=5, **SMALL)
     lengths = []
     for _ in range(8):
         env.step(np.zeros((1, 4)))
@@ -249,7 +246,7 @@ def run_python(code, **environment):
     )
 
 
-def test_pygame_is_imported_when_something_is_drawn_and_touches_no_window_and_no_audio():
+def test_pygame_is_imported_at_the_first_drawing():
     """Nor a variable of the environment."""
     done = run_python(
         """
@@ -274,7 +271,7 @@ assert dict(os.environ) == before
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
-def test_without_pygame_environments_that_ask_for_pictures_fly_and_render_gives_the_hint():
+def test_rendering_without_pygame_raises_a_hint():
     """Stable-Baselines3 asks for "rgb_array" wherever it makes an environment from an id."""
     done = run_python(
         """
@@ -305,8 +302,7 @@ def test_a_window_shows_the_flight_and_closes_twice():
         """
 import numpy as np, pygame
 from quad_gym.envs.single import QuadEnv
-env = QuadEnv("hover", observation="truth", render_mode="human", render_size=(320, 240))
-env.reset(seed=0)
+env = single_env(seed=0, observation="truth", render_mode="human", render_size=(320, 240))
 for _ in range(3):
     env.step(np.zeros(4))
 assert env.render() is None
@@ -331,7 +327,7 @@ except RuntimeError as error:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a display")
 @pytest.mark.parametrize("variables", [{}, {"SDL_VIDEODRIVER": "x11"}])
-def test_a_window_without_a_display_is_an_error_that_says_what_to_do(variables):
+def test_window_without_a_display_is_refused(variables):
     """SDL falls back on a driver without a display, silently, and a flight would go on for ever."""
     done = run_python(OPEN_A_WINDOW, **variables)
     assert "cannot open a window: " in done.stdout, done.stderr

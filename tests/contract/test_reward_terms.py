@@ -7,7 +7,7 @@ import pytest
 import quad_gym
 from quad_gym import QuadEnv, QuadVectorEnv, RewardParams, TaskParams, rewards
 from quad_gym.envs.benchmarks import BENCHMARKS
-from tests.contract.comparing import actions_of
+from tests.builders import actions_of
 
 PERIOD = 1 / 50
 BASE = {"observation": "truth", "reward_terms": True}

@@ -1,4 +1,4 @@
-"""The same seed and actions give the same flight, whoever flies it, where, and beside whom."""
+"""Equal seeds and actions give equal flights, in any interface, batch, process and copy."""
 
 import copy
 import hashlib
@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.single import QuadEnv
-from quad_gym.envs.vector import QuadVectorEnv
-from tests.contract.comparing import actions_of, assert_same, state_of
-
-STEPS = 60
-SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
-"""Episodes end by the time limit and by tipping over, at different steps in different flights."""
+from tests.builders import SHORT, STEPS, actions_for, actions_of, chosen, together, vec_env
+from tests.contract.comparing import (
+    assert_alone_as_together,
+    assert_same,
+    assert_snapshot_restores,
+    future_of,
+    state_of,
+)
 
 LAB = quad_gym.sensor_suite("lab")
 STANDARD = quad_gym.sensor_suite("standard")
@@ -30,49 +31,11 @@ AVERAGES = LAB.replace(
 )
 
 
-def fly_single(task, flight, *, wait, **keywords):
-    """What flight `flight` goes through: observations, rewards, terminated, truncated.
-
-    With `wait` a new episode takes a step to begin, else it begins in the step that ends the last.
-    """
-    env = QuadEnv(task, **SHORT, **keywords)
-    observation, _ = env.reset(seed=1000 + flight)
-    rows, over = [(observation, 0.0, False, False)], False
-    for action in actions_of(flight, STEPS):
-        if over:
-            rows.append((env.reset()[0], 0.0, False, False))
-            over = False
-            continue
-        observation, reward, terminated, truncated, _ = env.step(action)
-        over = terminated or truncated
-        if over and not wait:
-            observation, over = env.reset()[0], False
-        rows.append((observation, reward, terminated, truncated))
-    return tuple(np.array(column) for column in zip(*rows, strict=True))
-
-
-def fly_vector(task, flights, *, mode="NextStep", threads=1, **keywords):
-    """The same columns for several flights at once, (steps, n, ...)."""
-    env = QuadVectorEnv(
-        len(flights), task, autoreset_mode=mode, threads=threads, **SHORT, **keywords
-    )
-    observation, _ = env.reset(seed=[1000 + flight for flight in flights])
-    nothing = np.zeros(len(flights), bool)
-    rows = [(observation, np.zeros(len(flights)), nothing, nothing)]
-    actions = np.stack([actions_of(flight, STEPS) for flight in flights], axis=1)
-    rows += [env.step(action)[:4] for action in actions]
-    return tuple(np.array(column) for column in zip(*rows, strict=True))
-
-
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("task", list(quad_gym.IDS.values()))
-def test_a_flight_in_a_batch_is_the_flight_alone(task, mode):
-    flights = list(range(7))
-    together = fly_vector(task, flights, mode=mode)
-    assert (together[2] | together[3]).sum() >= 2 * len(flights)
-    for i in flights:
-        alone = fly_single(task, i, wait=mode == "NextStep")
-        assert_same(tuple(column[:, i].copy() for column in together), alone, f"flight {i}")
+def test_flight_in_a_batch_is_the_flight_alone(task, mode):
+    *_, terminated, truncated = assert_alone_as_together(task, 7, mode)
+    assert (terminated | truncated).sum() >= 2 * 7
 
 
 @pytest.mark.parametrize(
@@ -87,37 +50,31 @@ def test_a_flight_in_a_batch_is_the_flight_alone(task, mode):
     ],
     ids=lambda keywords: "+".join(map(str, keywords)),
 )
-def test_whatever_is_observed_and_commanded(keywords):
-    together = fly_vector("circle", range(3), mode="SameStep", **keywords)
-    for i in range(3):
-        alone = fly_single("circle", i, wait=False, **keywords)
-        assert_same(tuple(column[:, i].copy() for column in together), alone, f"flight {i}")
+def test_flight_with_other_options_is_the_flight_alone(keywords):
+    assert_alone_as_together("circle", 3, "SameStep", **keywords)
 
 
 @pytest.fixture(scope="module")
 def thousand():
-    return fly_vector("hover", list(range(1000)), threads=2)
+    return together("hover", range(1000), threads=2)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("count", [1, 2, 7, 64, 1000])
-def test_the_size_of_the_batch_and_the_number_of_threads_change_nothing(count, threads, thousand):
-    flown = fly_vector("hover", list(range(count)), threads=threads)
-    assert_same(flown, tuple(column[:, :count].copy() for column in thousand))
+def test_batch_size_and_threads_do_not_change_flights(count, threads, thousand):
+    few = together("hover", range(count), threads=threads)
+    assert_same(few, chosen(thousand, range(count)))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_order_of_the_flights_changes_nothing(seed, thousand):
+def test_order_of_flights_does_not_change_them(seed, thousand):
     order = np.random.default_rng(seed).permutation(1000)[:100]
-    flown = fly_vector("hover", order.tolist(), threads=seed)
-    assert_same(flown, tuple(column[:, order].copy() for column in thousand))
+    assert_same(together("hover", order.tolist(), threads=seed), chosen(thousand, order))
 
 
-def test_what_a_neighbor_does_changes_nothing():
-    env, twin = (QuadVectorEnv(8, "circle", out_of_bounds=50.0) for _ in range(2))
-    env.reset(seed=2)
-    twin.reset(seed=2)
-    calm = np.stack([0.1 * actions_of(i, 50) for i in range(8)], axis=1)
+def test_actions_of_one_flight_do_not_change_others():
+    env, twin = (vec_env("circle", 8, seed=2, out_of_bounds=50.0) for _ in range(2))
+    calm = 0.1 * actions_for(range(8), 50)
     wild = np.where(np.arange(8)[:, np.newaxis] == 3, np.sign(calm), calm)
     for k in range(50):
         mine, other = env.step(calm[k])[0], twin.step(wild[k])[0]
@@ -125,12 +82,12 @@ def test_what_a_neighbor_does_changes_nothing():
 
 
 @pytest.mark.parametrize("n_envs", [1, 7, 64])
-def test_stable_baselines3_sees_the_same_flights(n_envs):
-    expected = fly_vector("hover", list(range(n_envs)), mode="SameStep")
+def test_sb3_interface_returns_the_same_flights(n_envs):
+    expected = together("hover", range(n_envs), mode="SameStep")
     env = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", n_envs=n_envs, seed=1000, **SHORT)
     observation = env.reset()
     assert_same(observation, expected[0][0].copy())
-    actions = np.stack([actions_of(flight, STEPS) for flight in range(n_envs)], axis=1)
+    actions = actions_for(range(n_envs))
     for k in range(STEPS):
         observation, reward, done, infos = env.step(actions[k])
         assert_same(observation, expected[0][k + 1].copy(), f"step {k}")
@@ -141,11 +98,11 @@ def test_stable_baselines3_sees_the_same_flights(n_envs):
 
 
 def digest():
-    flown = fly_vector("random_trajectory", list(range(9)), mode="SameStep")
+    flown = together("random_trajectory", range(9), mode="SameStep")
     return hashlib.sha256(b"".join(column.tobytes() for column in flown)).hexdigest()
 
 
-def test_another_process_flies_the_same():
+def test_another_process_flies_the_same_flights():
     code = "from tests.contract.test_same_flights import digest; print(digest())"
     other = subprocess.run(
         [sys.executable, "-c", code],
@@ -164,21 +121,9 @@ def pickled(env):
     return pickle.loads(pickle.dumps(env))
 
 
-def future_of(env, count, vector):
-    """What the next 80 steps and a further reset bring."""
-    seen = []
-    for k in range(80):
-        action = actions_of(k, 1)[0]
-        result = env.step(np.tile(action, (count, 1)) if vector else action)
-        seen.append(result)
-        if not vector and (result[2] or result[3]):
-            seen.append(env.reset())
-    return [*seen, env.reset(), env.reset(seed=4)]
-
-
 @pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_a_copy_of_a_single_environment_has_the_same_future(twin_of, wrapped):
+def test_copied_environment_has_the_same_future(twin_of, wrapped):
     env = gymnasium.make("QuadGym/Hover-v0", max_tilt=0.6)
     env = env if wrapped else env.unwrapped
     env.reset(seed=6)
@@ -194,11 +139,10 @@ def test_a_copy_of_a_single_environment_has_the_same_future(twin_of, wrapped):
 @pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("count", [1, 5, 70])
-def test_a_copy_of_a_vector_environment_has_the_same_future(twin_of, mode, count):
-    env = QuadVectorEnv(count, "circle", autoreset_mode=mode, threads=2, **SHORT)
-    env.reset(seed=6)
-    for k in range(25):
-        env.step(np.stack([actions_of(i, 25)[k] for i in range(count)]))
+def test_copied_vector_environment_has_the_same_future(twin_of, mode, count):
+    env = vec_env("circle", count, seed=6, autoreset_mode=mode, threads=2, **SHORT)
+    for action in actions_for(range(count), 25):
+        env.step(action)
     twin = twin_of(env)
     past = state_of(twin)
     future = future_of(env, count, vector=True)
@@ -207,7 +151,7 @@ def test_a_copy_of_a_vector_environment_has_the_same_future(twin_of, mode, count
 
 
 @pytest.mark.parametrize("twin_of", [pickled, copy.deepcopy], ids=["pickled", "copied"])
-def test_a_copy_of_the_stable_baselines3_interface_has_the_same_future(twin_of):
+def test_copied_sb3_environment_has_the_same_future(twin_of):
     env = quad_gym.make_sb3_vec_env("QuadGym/Circle-v0", n_envs=9, seed=3, **SHORT)
     env.reset()
     for k in range(7):
@@ -223,24 +167,12 @@ def test_a_copy_of_the_stable_baselines3_interface_has_the_same_future(twin_of):
 
 
 @pytest.mark.parametrize("count", [1, 5, 70])
-def test_a_restored_snapshot_has_the_same_future(count):
-    env = QuadVectorEnv(count, "circle", autoreset_mode="SameStep", threads=2, **SHORT)
-    batch = env.flights.batch
-    env.reset(seed=8)
-    for k in range(10):
-        env.step(np.tile(actions_of(k, 1), (count, 1)))
-    instant = batch.snapshot()
-    future = future_of(env, count, vector=True)
-    batch.restore(instant)
-    assert_same(future, future_of(env, count, vector=True))
-    fresh = QuadVectorEnv(count, "circle", autoreset_mode="SameStep", **SHORT)
-    fresh.reset(seed=99)
-    fresh.flights.batch.restore(instant)
-    assert_same(future, future_of(fresh, count, vector=True))
+def test_restored_snapshot_has_the_same_future(count):
+    assert_snapshot_restores(count)
 
 
-def test_a_snapshot_of_another_batch_is_refused():
-    small, large = QuadVectorEnv(2, "hover"), QuadVectorEnv(20, "hover")
+def test_snapshot_of_another_batch_is_refused():
+    small, large = vec_env(count=2), vec_env(count=20)
     with pytest.raises(ValueError, match="snapshot"):
         small.flights.batch.restore(large.flights.batch.snapshot())
     with pytest.raises(ValueError, match="snapshot"):
@@ -263,10 +195,10 @@ def test_a_snapshot_of_another_batch_is_refused():
     ],
     ids=str,
 )
-def test_a_snapshot_of_another_configuration_is_refused(task, keywords):
+def test_snapshot_of_another_configuration_is_refused(task, keywords):
     drawn = {"randomization": {"mass": quad_gym.Uniform(0.7, 0.8)}}
-    mine = QuadVectorEnv(2, "hover", **(drawn if "randomization" in keywords else {})).flights.batch
-    other = QuadVectorEnv(2, task, **keywords).flights.batch
+    mine = vec_env(count=2, **(drawn if "randomization" in keywords else {})).flights.batch
+    other = vec_env(task, 2, **keywords).flights.batch
     mine.reset(seeds=[1, 2])
     before = mine.snapshot()
     other.reset(seeds=[1, 2])
@@ -275,9 +207,9 @@ def test_a_snapshot_of_another_configuration_is_refused(task, keywords):
     assert mine.snapshot().tobytes() == before.tobytes()
 
 
-def test_a_snapshot_is_that_of_any_time_limit_and_number_of_threads():
-    mine = QuadVectorEnv(9, "hover", threads=1, max_episode_steps=7).flights.batch
-    other = QuadVectorEnv(9, "hover", threads=2).flights.batch
+def test_snapshot_fits_any_time_limit_and_number_of_threads():
+    mine = vec_env(count=9, threads=1, max_episode_steps=7).flights.batch
+    other = vec_env(count=9, threads=2).flights.batch
     other.reset(seeds=range(9))
     mine.restore(pickle.loads(pickle.dumps(other.snapshot())))
     assert_same(mine.read("position"), other.read("position"))

@@ -11,7 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, Ve
 import quad_gym
 from quad_gym.envs.single import QuadEnv
 from quad_gym.records import Ending
-from tests.contract.comparing import actions_of, assert_same, state_of
+from tests.builders import actions_of
+from tests.contract.comparing import assert_same, state_of
 
 SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
 
@@ -27,7 +28,7 @@ def without_times(infos):
 
 
 @pytest.mark.parametrize("privileged", [False, True])
-def test_it_does_what_a_dummy_vec_env_of_monitored_environments_does(privileged):
+def test_sb3_env_equals_a_dummy_vec_env_of_monitors(privileged):
     keywords = {**SHORT, "privileged": privileged}
     env = make(**keywords)
     dummy = DummyVecEnv([lambda: Monitor(QuadEnv("hover", **keywords))] * 5)
@@ -53,7 +54,7 @@ def test_it_does_what_a_dummy_vec_env_of_monitored_environments_does(privileged)
     assert ended > 10
 
 
-def test_an_episode_ends_with_its_return_its_length_its_time_and_its_error():
+def test_info_at_an_ending_has_the_episode_statistics():
     env = make(3, max_episode_steps=10, observation="truth")
     env.reset()
     total, errors = np.zeros(3), np.zeros(3)
@@ -72,19 +73,7 @@ def test_an_episode_ends_with_its_return_its_length_its_time_and_its_error():
         assert info["ending"] == Ending.TIME_LIMIT
 
 
-def test_a_crash_is_not_reported_as_truncation():
-    env = make(2, "QuadGym/Circle-v0", pad=False)
-    env.reset()
-    for _ in range(60):
-        _, _, dones, infos = env.step(np.tile([-1.0, 0, 0, 0], (2, 1)))
-        if dones.any():
-            break
-    assert dones.all()
-    assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
-    assert infos[0]["ending"] == Ending.BELOW_MIN_HEIGHT
-
-
-def test_the_replay_of_sac_tells_time_limits_from_crashes_and_keeps_final_observations():
+def test_sac_replay_has_timeouts_and_final_observations():
     """What each flight did alone: no bootstrap over a crash, and one from the last observation."""
     limits = {"max_episode_steps": 25, "max_tilt": 0.3}
     env = make(3, **limits)
@@ -118,12 +107,6 @@ def test_a_seed_holds_for_the_next_reset_only():
     env.seed(9)
     assert_same(env.reset(), first)
     assert_same(env.reset(), second)
-
-
-def test_flight_i_is_seeded_with_seed_plus_i():
-    observation = make(4, seed=20).reset()
-    for i in range(4):
-        assert_same(observation[i], QuadEnv("hover").reset(seed=20 + i)[0])
 
 
 def test_options_hold_for_the_next_reset_only():

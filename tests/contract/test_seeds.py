@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from baselines.seeds import BLOCK, MAX_SEED, PURPOSES, TEST_END, first_seed, flight_seeds
-from quad_gym import FlightBatch, TaskParams
-from quad_gym.envs.vector import QuadVectorEnv
+from quad_gym import TaskParams
 from quad_gym.records import Control
+from tests.builders import batch, vec_env
 
 SEEDS, COUNT = range(10), 256
 
@@ -112,18 +112,18 @@ def starts_of(rng, episodes, count=11):
     task = TaskParams(
         kind="random_trajectory", start="hover", randomize_reference=True, duration=0.0
     )
-    batch = FlightBatch(count, task=task, sensors="rtk", control=Control.CTBR, control_rate=50.0)
-    batch.reset(seeds=range(300, 300 + count))
-    found = [{name: batch.record(name) for name in START}]
+    made = {"task": task, "sensors": "rtk", "control": Control.CTBR, "control_rate": 50.0}
+    flights = batch(count, seed=300, **made)
+    found = [{name: flights.record(name) for name in START}]
     for _ in range(episodes - 1):
         for _ in range(int(rng.integers(1, 30))):
-            batch.step(rng.uniform(-1.0, 1.0, (count, 4)))
-        batch.reset()
-        found.append({name: batch.record(name) for name in START})
+            flights.step(rng.uniform(-1.0, 1.0, (count, 4)))
+        flights.reset()
+        found.append({name: flights.record(name) for name in START})
     return found
 
 
-def test_flights_of_equal_seeds_stay_in_pairs_to_the_tenth_episode():
+def test_flights_of_equal_seeds_have_equal_starts():
     first, second = (starts_of(np.random.default_rng(seed), 10) for seed in (1, 2))
     for episode, (one, other) in enumerate(zip(first, second, strict=True)):
         for name in START:
@@ -131,21 +131,19 @@ def test_flights_of_equal_seeds_stay_in_pairs_to_the_tenth_episode():
     assert len({start["r"].tobytes() for start in first}) == 10
 
 
-def test_pairs_last_where_episodes_end_by_themselves_at_other_times():
+def test_equal_seeds_with_autoreset_have_equal_starts():
     """With autoreset each flight comes to its tenth episode when its crashes have it so."""
 
     def tenth(seed):
         rng, count = np.random.default_rng(seed), 9
-        env = QuadVectorEnv(
-            count, "hover", autoreset_mode="SameStep", max_tilt=0.3, max_episode_steps=25
-        )
-        env.reset(seed=70)
-        batch = env.flights.batch
+        made = {"autoreset_mode": "SameStep", "max_tilt": 0.3, "max_episode_steps": 25}
+        env = vec_env(count=count, seed=70, **made)
+        flights = env.flights.batch
         found, at = np.full((count, 10), np.nan), np.zeros(count, int)
         for step in range(260):
             _, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, (count, 4)))
-            begun = (terminated | truncated) & (batch.record("episode") == 10.0)
-            found[begun] = np.hstack([batch.record(name) for name in ("r", "q", "b_a")])[begun]
+            begun = (terminated | truncated) & (flights.record("episode") == 10.0)
+            found[begun] = np.hstack([flights.record(name) for name in ("r", "q", "b_a")])[begun]
             at[begun] = step
         assert np.isfinite(found).all()
         return found, at

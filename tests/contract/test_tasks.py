@@ -10,7 +10,7 @@ from baselines import PDPolicy
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
-from tests.contract.comparing import actions_of
+from tests.builders import actions_of, single_env, vec_env
 
 SECONDS = 1 / 50
 """A control period."""
@@ -122,8 +122,7 @@ def test_the_reward_of_waypoints_is_the_documented_formula():
 
 @pytest.mark.parametrize("action", ["ctbr", "wrench", "attitude", "velocity", "motor"])
 def test_nobody_earns_more_than_the_perfect_flight(action):
-    env = QuadVectorEnv(64, "circle", action=action, start="hover", autoreset_mode="SameStep")
-    env.reset(seed=5)
+    env = vec_env("circle", 64, seed=5, action=action, start="hover", autoreset_mode="SameStep")
     for k in range(50):
         _, reward, *_ = env.step(0.2 * np.stack([actions_of(64 * k + i, 1)[0] for i in range(64)]))
         assert (reward <= 1.6).all()
@@ -166,9 +165,8 @@ BOUNDS = {"hover": 1.6, "circle": 3.0, "lemniscate": 3.0, "random_trajectory": 3
 
 
 @pytest.mark.parametrize("task", BOUNDS)
-def test_farther_from_the_reference_than_its_bound_is_out_of_bounds(task):
-    start = QuadEnv(task)
-    start.reset(seed=1)
+def test_flight_beyond_its_bound_is_out_of_bounds(task):
+    start = single_env(task, seed=1)
     r_ref, _ = reference_of(task, 0.0, start.flights.batch)
     for speed, over in ((0.0, False), (20.0, True)):  # by 0.4 m in a step
         env = QuadEnv(task)
@@ -218,8 +216,7 @@ def test_half_a_meter_below_the_origin_is_on_the_ground(task, options):
 
 @pytest.mark.parametrize(("task", "steps"), [("hover", 500), ("waypoints", 1000)])
 def test_the_time_limit_truncates(task, steps):
-    env = QuadEnv(task, observation="truth", action="velocity")
-    env.reset(seed=1)
+    env = single_env(task, seed=1, observation="truth", action="velocity")
     for k in range(1, steps + 1):
         _, _, terminated, truncated, info = env.step(STILL)
         assert (terminated, truncated) == (False, k == steps)
@@ -228,8 +225,7 @@ def test_the_time_limit_truncates(task, steps):
 
 
 def test_the_last_gate_terminates():
-    env = QuadEnv("waypoints", gate_count=1)
-    env.reset(seed=1)
+    env = single_env("waypoints", seed=1, gate_count=1)
     gate = env.flights.batch.record("gates")[0, 0]
     env.reset(seed=1, options={"position": gate, "velocity": [0, 0, 0]})
     _, reward, terminated, truncated, info = env.step(STILL)
@@ -240,8 +236,7 @@ def test_the_last_gate_terminates():
 
 @pytest.mark.parametrize("privileged", [False, True])
 def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
-    env = QuadEnv("hover", privileged=privileged, include_std=True)
-    env.reset(seed=1)
+    env = single_env(seed=1, privileged=privileged, include_std=True)
     batch = env.flights.batch
     instant = batch.snapshot()
     instant["L"] *= 1e160  # its square does not fit into a float
@@ -261,8 +256,7 @@ def test_a_failed_filter_truncates_and_leaves_finite_observations(privileged):
 
 def test_a_hovering_start_has_the_documented_spread():
     n = 6000
-    env = QuadVectorEnv(n, "hover", observation="truth")
-    env.reset(seed=1)
+    env = vec_env(count=n, seed=1, observation="truth")
     batch = env.flights.batch
     offset = batch.record("r") - [4.0, 0.0, 1.0]
     axes = body_axes(batch.record("q"))
@@ -280,8 +274,7 @@ def test_a_hovering_start_has_the_documented_spread():
 
 
 def test_the_circle_starts_on_the_ground_or_hovering():
-    env = QuadVectorEnv(2000, "circle", observation="truth")
-    env.reset(seed=1)
+    env = vec_env("circle", 2000, seed=1, observation="truth")
     batch = env.flights.batch
     grounded = (batch.record("r") == [4.0, 0.0, 0.0]).all(axis=1)
     assert abs(grounded.mean() - 0.5) < 5.0 * 0.5 / np.sqrt(2000)
@@ -292,8 +285,7 @@ def test_the_circle_starts_on_the_ground_or_hovering():
 
 
 def test_a_start_on_the_ground_is_the_reports():
-    env = QuadVectorEnv(50, "circle", start="ground")
-    env.reset(seed=1)
+    env = vec_env("circle", 50, seed=1, start="ground")
     batch = env.flights.batch
     np.testing.assert_allclose(batch.record("r"), np.tile([4.0, 0.0, 0.0], (50, 1)), atol=1e-12)
     for name in ("v", "w", "rotor_speeds"):
@@ -332,8 +324,7 @@ def test_randomize_draws_phase_radius_period_and_sense(task):
 
 
 def test_random_trajectories_keep_their_bounds_and_differ():
-    env = QuadVectorEnv(300, "random_trajectory", autoreset_mode="Disabled", out_of_bounds=999)
-    env.reset(seed=1)
+    env = vec_env("random_trajectory", 300, seed=1, autoreset_mode="Disabled", out_of_bounds=999)
     batch = env.flights.batch
     path = np.array(
         [reference_of("random_trajectory", t, batch)[0] for t in np.arange(0, 12, 0.02)]
@@ -347,8 +338,7 @@ def test_random_trajectories_keep_their_bounds_and_differ():
 
 
 def test_gates_lie_within_the_radius_and_apart():
-    env = QuadVectorEnv(500, "waypoints")
-    env.reset(seed=1)
+    env = vec_env("waypoints", 500, seed=1)
     gates = env.flights.batch.record("gates")[:, :5]
     assert np.linalg.norm(gates[..., :2], axis=2).max() <= 3.5
     assert gates[..., 2].min() > 0.5

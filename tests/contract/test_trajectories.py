@@ -13,7 +13,7 @@ from quad_gym import FlightBatch, FlightRecorder, TaskParams, Trajectory
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Control, Source
-from tests.contract.comparing import actions_of
+from tests.builders import actions_of, single_env
 
 FIVE = [(0, 0, 1.5), (1, 0.5, 2), (1, -0.5, 1), (-1, 0.5, 2), (-1, -0.5, 1)]
 WHEN = [0.0, 1.0, 2.2, 3.2, 4.8]
@@ -250,8 +250,7 @@ def test_the_report_s_controller_follows_at_every_tick():
 
 
 def test_the_filter_starts_warm_on_it():
-    env = QuadEnv("trajectory", trajectory=OPEN, filter_start="warm", sensors="rtk")
-    env.reset(seed=0)
+    env = single_env("trajectory", seed=0, trajectory=OPEN, filter_start="warm", sensors="rtk")
     assert env.step(np.zeros(4))[4]["estimation_error"] < 0.5
 
 

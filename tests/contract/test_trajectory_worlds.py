@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym import Cylinder, FlightBatch, TaskParams, Trajectory, Wall, WorldParams
+from quad_gym import Cylinder, TaskParams, Trajectory, Wall, WorldParams
 from quad_gym.batch.surroundings import nearest_obstacle
 from quad_gym.records import Source
+from tests.builders import batch, part
 
 GAP = (
     Wall(center_I=(0.0, 5.5, 2.0), size=(0.2, 8.0, 4.0), shift_I=(0.0, 0.2, 0.0)),
@@ -20,8 +21,7 @@ INTO_A_WALL = Trajectory.through([(-3, 0, 1.5), (0, 3, 1.5), (3, 1, 1.5)], max_s
 def fly(trajectory, world, count=4, **options):
     """States of all ticks, and who has collided; under PD control on the estimate."""
     task = TaskParams(kind="trajectory", start="hover", trajectory=trajectory, duration=0.0)
-    flights = FlightBatch(count, task=task, sensors="indoor", gains="tuned", world=world, **options)
-    flights.reset(seeds=range(count))
+    flights = batch(count, task=task, sensors="indoor", gains="tuned", world=world, **options)
     seconds = max(path.duration for path in task.trajectories)
     found = []
     for _ in range(round(seconds * flights.clocks.imu_rate)):
@@ -31,7 +31,7 @@ def fly(trajectory, world, count=4, **options):
     return [np.array(part) for part in zip(*found, strict=True)]
 
 
-def test_a_trajectory_through_a_gap_touches_nothing_and_flies_as_without_walls():
+def test_trajectory_through_a_gap_does_not_collide():
     world = WorldParams(obstacles=GAP)
     seeing = {"source": Source.TRUTH}  # an estimate is worse behind walls, which hide markers
     r, collided, distance, centers = fly(THROUGH, world, **seeing)
@@ -42,7 +42,7 @@ def test_a_trajectory_through_a_gap_touches_nothing_and_flies_as_without_walls()
     assert (fly(THROUGH, WorldParams(), **seeing)[0] == r).all()
 
 
-def test_a_trajectory_into_a_wall_collides_where_it_comes_too_near():
+def test_trajectory_into_a_wall_collides():
     r, collided, distance, _ = fly(INTO_A_WALL, WorldParams(obstacles=GAP))
     assert collided[-1].all()
     first = collided.argmax(axis=0)
@@ -65,10 +65,11 @@ def test_each_episode_draws_a_trajectory_and_its_obstacles(mode):
     alone = gymnasium.make("QuadGym/Trajectory-v0", **made)
     many, _ = together.reset(seed=list(range(16)))
     one, _ = alone.reset(seed=3)
-    batch, single = together.unwrapped.flights.batch, alone.unwrapped.flights.batch
-    drawn = batch.record("path")
+    many_flights, one_flight = (env.unwrapped.flights.batch for env in (together, alone))
+    drawn = many_flights.record("path")
     assert set(drawn) == {0.0, 1.0}
-    assert (batch.record("obstacle_center")[3] == single.record("obstacle_center")[0]).all()
+    centers = many_flights.record("obstacle_center")[3]
+    assert (centers == one_flight.record("obstacle_center")[0]).all()
     for _ in range(80):
         assert (many[3] == one).all()
         action = np.array([0.3, 0.0, 0.0, 0.0], np.float32)
@@ -91,6 +92,5 @@ def test_a_task_sees_the_wall_and_the_way_ahead():
     env = gymnasium.make_vec("QuadGym/Trajectory-v0", num_envs=3, **made)
     observations, _ = env.reset(seed=0)
     flights = env.unwrapped.flights
-    place = next(field.slice for field in flights.table if field.name == "wall")
-    lengths = np.linalg.norm(observations[:, place], axis=1)
+    lengths = np.linalg.norm(part(env, observations, "wall"), axis=1)
     np.testing.assert_allclose(lengths, flights.batch.record("obstacle_distance"), rtol=1e-5)

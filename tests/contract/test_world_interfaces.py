@@ -10,8 +10,12 @@ from quad_gym import LogUniform, Normal, Randomization, Uniform
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.envs.single import QuadEnv
 from quad_gym.envs.vector import QuadVectorEnv
-from tests.contract.comparing import actions_of, assert_same
-from tests.contract.test_same_flights import SHORT, STEPS, fly_single, fly_vector, future_of
+from tests.builders import SHORT, STEPS, actions_of, chosen, together
+from tests.contract.comparing import (
+    assert_alone_as_together,
+    assert_same,
+    assert_snapshot_restores,
+)
 
 EVERYTHING = {
     "world": "fresh_breeze",
@@ -36,48 +40,32 @@ EVERYTHING = {
 KNOWN = {**EVERYTHING, "randomization": Randomization(EVERYTHING["randomization"], known=True)}
 
 
-def flat(observations):
-    """Both parts of dictionaries, side by side."""
-    first = observations[0]
-    if not isinstance(first, dict):
-        return np.array(observations)
-    return np.stack([np.concatenate([o[k] for k in first], axis=-1) for o in observations])
-
-
-def columns(flown, i=None):
-    parts = (flat(list(flown[0])), *flown[1:])
-    return tuple((part if i is None else part[:, i]).copy() for part in parts)
-
-
 @pytest.mark.parametrize("keywords", [EVERYTHING, KNOWN], ids=["unknown", "known"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("task", ["hover", "waypoints"])
-def test_a_flight_in_a_batch_is_the_flight_alone(task, mode, keywords):
-    together = fly_vector(task, list(range(5)), mode=mode, **keywords)
-    for i in range(5):
-        alone = fly_single(task, i, wait=mode == "NextStep", **keywords)
-        assert_same(columns(together, i), columns(alone), f"flight {i}")
+def test_flight_in_a_batch_is_the_flight_alone(task, mode, keywords):
+    assert_alone_as_together(task, 5, mode, **keywords)
 
 
 @pytest.fixture(scope="module")
 def hundred():
-    return columns(fly_vector("circle", list(range(100)), threads=2, **EVERYTHING))
+    return together("circle", range(100), threads=2, **EVERYTHING)
 
 
 @pytest.mark.parametrize(("count", "threads"), [(1, 1), (9, 2), (64, 2), (100, 1), (100, 3)])
-def test_size_and_threads_change_nothing(count, threads, hundred):
-    flown = columns(fly_vector("circle", list(range(count)), threads=threads, **EVERYTHING))
-    assert_same(flown, tuple(column[:, :count].copy() for column in hundred))
+def test_batch_size_and_threads_do_not_change_flights(count, threads, hundred):
+    few = together("circle", range(count), threads=threads, **EVERYTHING)
+    assert_same(few, chosen(hundred, range(count)))
 
 
 @given(st.permutations(range(100)))
 @settings(max_examples=5, deadline=None)
-def test_order_changes_nothing(hundred, order):
-    flown = columns(fly_vector("circle", order[:17], threads=2, **EVERYTHING))
-    assert_same(flown, tuple(column[:, order[:17]].copy() for column in hundred))
+def test_order_of_flights_does_not_change_them(hundred, order):
+    few = together("circle", order[:17], threads=2, **EVERYTHING)
+    assert_same(few, chosen(hundred, order[:17]))
 
 
-def test_info_tells_every_interface_the_same_draws():
+def test_info_has_the_same_draws_in_every_interface():
     names = set(EVERYTHING["randomization"])
     env = QuadVectorEnv(3, "hover", autoreset_mode="SameStep", **SHORT, **EVERYTHING)
     sb3 = quad_gym.make_sb3_vec_env("QuadGym/Hover-v0", 3, seed=7, **SHORT, **EVERYTHING)
@@ -109,7 +97,7 @@ def test_info_tells_every_interface_the_same_draws():
             drawn.append(mine["drawn"])
 
 
-def test_without_draws_info_says_nothing_of_them():
+def test_info_without_draws_has_no_entry():
     assert "drawn" not in QuadEnv("hover").reset(seed=1)[1]
     assert "drawn" not in QuadVectorEnv(2, "hover", world="breeze").reset(seed=1)[1]
 
@@ -137,26 +125,17 @@ def test_the_privileged_truth_ends_with_wind_and_draws():
     assert env.observation_space.contains(observation)
 
 
-def test_a_calm_privileged_truth_is_what_it_was():
+def test_privileged_truth_of_a_calm_world_has_no_wind():
     calm, windy = (QuadEnv("hover", privileged=True, world=world) for world in ("calm", "breeze"))
     assert calm.observation_space["privileged"].shape == (25,)
     assert windy.observation_space["privileged"].shape == (28,)
 
 
-def test_a_restored_snapshot_has_the_same_future():
-    env = QuadVectorEnv(9, "circle", autoreset_mode="SameStep", threads=2, **SHORT, **EVERYTHING)
-    env.reset(seed=8)
-    for k in range(10):
-        env.step(np.tile(actions_of(k, 1), (9, 1)))
-    instant = env.flights.batch.snapshot()
-    future = future_of(env, 9, vector=True)
-    fresh = QuadVectorEnv(9, "circle", autoreset_mode="SameStep", **SHORT, **EVERYTHING)
-    fresh.reset(seed=99)
-    fresh.flights.batch.restore(instant)
-    assert_same(future, future_of(fresh, 9, vector=True))
+def test_restored_snapshot_has_the_same_future():
+    assert_snapshot_restores(9, **EVERYTHING)
 
 
-def test_bad_worlds_and_draws_are_refused_by_every_interface():
+def test_invalid_worlds_and_draws_are_refused():
     for make in (
         lambda **k: QuadEnv("hover", **k),
         lambda **k: QuadVectorEnv(2, "hover", **k),

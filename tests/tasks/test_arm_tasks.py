@@ -11,6 +11,7 @@ from baselines.plans import Plan
 from baselines.policies import interface_of, load_policy
 from baselines.recipes import recipe
 from quad_gym.experiments.arms import OUTAGE_DASH
+from tests.builders import part
 
 ID = "QuadGym/LookAround-v0"
 
@@ -24,17 +25,12 @@ def make(name, count=6, env_id=ID, **keywords):
     return env, observations
 
 
-def part(env, observations, name):
-    field = next(f for f in env.unwrapped.flights.table if f.name == name)
-    return observations[:, field.slice]
-
-
 def largest_sigma(env):
     L = env.unwrapped.flights.batch.record("L")
     return np.sqrt(np.diagonal(L @ L.transpose(0, 2, 1), axis1=1, axis2=2)[:, :3]).max(axis=1)
 
 
-def test_doubt_is_the_logarithm_of_the_largest_standard_deviation_of_the_position():
+def test_log_sigma_is_that_of_the_largest_position_sigma():
     env, observations = make("WithStd")
     for _ in range(30):
         expected = np.log10(largest_sigma(env) / 0.03)
@@ -44,12 +40,12 @@ def test_doubt_is_the_logarithm_of_the_largest_standard_deviation_of_the_positio
 
 
 @pytest.mark.parametrize("observation", ["truth", "noisy"])
-def test_a_controller_on_the_truth_has_no_doubt(observation):
+def test_log_sigma_without_a_filter_is_the_lowest(observation):
     env, observations = make("WithStd", observation=observation)
     np.testing.assert_array_equal(part(env, observations, "log_sigma"), -1.0)
 
 
-def test_memory_holds_every_tenth_observation_newest_first():
+def test_history_has_every_tenth_observation_newest_first():
     env, observations = make("WithStdHistory")
     names = ("position_error", "velocity_error", "up", "heading", "body_rates")
     seen = []
@@ -66,13 +62,13 @@ def test_memory_holds_every_tenth_observation_newest_first():
 
 
 @pytest.mark.parametrize(("name", "told"), [("REPORTED_STD_X1_2", 0.5), ("REPORTED_STD_X4", 4.0)])
-def test_a_controller_may_be_told_another_standard_deviation(name, told):
+def test_reported_std_is_scaled(name, told):
     (plain, a), (misled, b) = make("WithStd"), make(name)
     change = part(misled, b, "log_sigma") - part(plain, a, "log_sigma")
     np.testing.assert_allclose(change, np.log10(told), atol=1e-5)
 
 
-def test_a_race_tells_the_standard_deviations_but_those_withheld():
+def test_masked_std_of_a_race_is_constant():
     task, steps = "QuadGym/StaleRace-v0", 30
     plain = gymnasium.make_vec(task, num_envs=6, autoreset_mode="Disabled", include_std=True)
     told, some = make("ALL_SHOWN", env_id=task), make("ATTITUDE_MASKED", env_id=task)
@@ -89,7 +85,7 @@ def test_a_race_tells_the_standard_deviations_but_those_withheld():
         (shown, *_), (observed, *_), (partly, *_) = (e.step(actions) for e in (plain, told, some))
 
 
-def test_what_is_recalled_in_a_race_is_every_fifth_observation_newest_first():
+def test_history_of_a_race_has_every_fifth_observation():
     env, observations = make("RaceWithHistory", env_id="QuadGym/StaleRace-v0")
     names, seen = ("position_error", "velocity_error", "up", "body_rates"), []
     for step in range(1, 27):
@@ -103,7 +99,7 @@ def test_what_is_recalled_in_a_race_is_every_fifth_observation_newest_first():
             np.testing.assert_allclose(past[:, k], expected, atol=1e-5)
 
 
-def test_a_race_seen_without_residuals_is_the_shipped_observation():
+def test_observed_race_equals_the_builtin_observation():
     (plain, a), (own, b) = (
         make(name, env_id="QuadGym/StaleRace-v0") for name in ("RaceWithHistory", "ObservedRace")
     )
@@ -116,7 +112,7 @@ def test_a_race_seen_without_residuals_is_the_shipped_observation():
         a, b = plain.step(action)[0], own.step(action)[0]
 
 
-def test_residuals_of_a_race_are_what_the_model_draws():
+def test_residuals_of_a_race_are_those_of_the_model():
     env, b = make("ResidualRace", env_id="QuadGym/StaleRace-v0", observation="truth")
     batch = env.unwrapped.flights.batch
     for _ in range(30):
@@ -134,7 +130,7 @@ def next_width(env):
     return np.stack([walls[:, k] - walls[:, k + 1] - 30.0 for k in (0, 2)], axis=1)
 
 
-def test_doubt_says_whether_two_standard_deviations_fit_through_the_gap():
+def test_uncertainty_is_two_sigma_over_the_room_in_the_gap():
     env, observations = make("WithUncertainty", env_id="QuadGym/OutageDash-v0")
     for _ in range(10):
         room = 0.5 * next_width(env) - 0.5
@@ -145,7 +141,7 @@ def test_doubt_says_whether_two_standard_deviations_fit_through_the_gap():
     np.testing.assert_array_equal(part(env, observations, "uncertainty"), -4.0)
 
 
-def test_a_steady_crash_costs_the_same_everywhere():
+def test_constant_crash_cost_is_the_same_everywhere():
     env, _ = make(
         "ConstantCrashCostWithUncertainty", env_id="QuadGym/OutageDash-v0", observation="truth"
     )
@@ -163,7 +159,7 @@ def test_a_steady_crash_costs_the_same_everywhere():
     raise AssertionError("nobody crashed")
 
 
-def test_steady_episodes_begin_before_the_first_wall_or_between_two():
+def test_starts_are_before_the_first_wall_or_between_two():
     env = gymnasium.make_vec(
         "QuadGym/OutageDash-v0",
         num_envs=300,
@@ -176,7 +172,7 @@ def test_steady_episodes_begin_before_the_first_wall_or_between_two():
     assert count.min() > 10
 
 
-def test_scaled_observations_are_those_of_the_task_over_their_scales():
+def test_scaled_observations_are_divided_by_their_scales():
     plain = gymnasium.make_vec("QuadGym/OutageDash-v0", num_envs=6)
     seen = plain.reset(seed=3)[0]
     env, scaled = make("Scaled", env_id="QuadGym/OutageDash-v0")
@@ -198,7 +194,7 @@ def test_scaled_observations_are_those_of_the_task_over_their_scales():
 @pytest.mark.parametrize(
     "name", ["Scaled", "WithUncertainty", "ConstantCrashCost", "ConstantCrashCostWithUncertainty"]
 )
-def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
+def test_scaled_parts_have_their_own_names_and_no_unit(name):
     env, _ = make(name, count=1, env_id="QuadGym/OutageDash-v0", include_std=True)
     table = {field.name: field for field in env.unwrapped.flights.table}
     scaled = ["position_error", "velocity_error", "body_rates"]
@@ -210,7 +206,7 @@ def test_scaled_parts_have_names_of_their_own_and_no_unit(name):
             PDPolicy(env, pace=pace)
 
 
-def test_actions_are_held_longer_in_training_than_where_policies_are_judged():
+def test_control_rate_in_training_is_lower_than_in_evaluation():
     shipped = recipe("QuadGym/OutageDash-v0").replace(n_envs=2)
     plan = Plan(env_id="QuadGym/OutageDash-v0", recipe=shipped, episodes=2)
     learned, judged = plan.make_vector_flights(), plan.make_judge()
@@ -219,7 +215,7 @@ def test_actions_are_held_longer_in_training_than_where_policies_are_judged():
     assert learned.observation_space == judged.observation_space
 
 
-def test_rules_of_the_study_fly_the_plain_task_and_trained_arms_the_scaled_one():
+def test_rules_fly_the_plain_task_and_arms_the_scaled_one():
     for arm in OUTAGE_DASH:
         keywords = {"observation": "estimate", **arm.environment}
         env = gymnasium.make_vec("QuadGym/OutageDash-v0", num_envs=1, **keywords)
@@ -251,7 +247,7 @@ def true_state(env, target):
     }
 
 
-def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_sees():
+def test_critic_of_look_around_observes_the_truth():
     task = "baselines.arm_tasks:WithStdCertaintyReward"
     plain = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", task=task)
     shipped = gymnasium.make_vec(ID, num_envs=6, autoreset_mode="Disabled", privileged=True)
@@ -275,7 +271,7 @@ def test_the_critic_of_look_around_sees_the_truth_at_the_end_of_what_the_policy_
     assert abs(part(env, observations, "actual_position_error") - seen).max() > 0.01
 
 
-def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails():
+def test_critic_of_outage_dash_observes_gap_and_outage():
     task = "QuadGym/OutageDash-v0"
     name = "baselines.arm_critics:ConstantCrashCostWithUncertaintyForCritic"
     env = gymnasium.make_vec(task, num_envs=20, autoreset_mode="Disabled", task=name)
@@ -319,7 +315,7 @@ def test_the_critic_of_outage_dash_sees_the_true_next_gap_and_whether_gnss_fails
     assert kinds == {0.0, 1.0}
 
 
-def test_being_sure_is_paid_for():
+def test_certainty_reward_is_added():
     (plain, _), (paid, _) = make("WithStd"), make("WithStdCertaintyReward")
     for _ in range(40):
         actions = np.zeros((6, 4), np.float32)

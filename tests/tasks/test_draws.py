@@ -14,7 +14,7 @@ def generator(flights, method=1, seed=0):
     return FlightRandom(keys, np.full(flights, 2**32, np.uint64), method)
 
 
-def test_threefry_gives_the_published_answers_for_thirteen_rounds():
+def test_threefry_with_13_rounds_has_the_published_answers():
     # known answers of the Random123 library, threefry2x64 with 13 rounds
     ones = 2**64 - 1
     pi = (0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 0x082EFA98EC4E6C89)
@@ -41,7 +41,7 @@ def test_draws_have_their_distributions():
 
 
 @pytest.mark.parametrize("flights", [1, 3, 8])
-def test_a_flight_draws_the_same_in_any_batch(flights):
+def test_draws_of_a_flight_are_the_same_in_any_batch(flights):
     many, few = generator(50), generator(50)
     few._key0, few._key1 = few._key0[:flights], few._key1[:flights]
     few._instants = few._instants[:flights]
@@ -61,7 +61,7 @@ def test_methods_instants_and_calls_draw_different_numbers():
     assert len(np.unique(np.concatenate(drawn))) == 16
 
 
-def test_sizes_have_to_begin_with_the_flights():
+def test_invalid_sizes_and_names_are_refused():
     with pytest.raises(ValueError, match="size must begin with the number of flights, 4, got"):
         generator(4).normal(size=3)
     with pytest.raises(ValueError, match="high must be greater than low"):

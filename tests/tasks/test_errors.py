@@ -8,8 +8,8 @@ import pytest
 
 import quad_gym
 from quad_gym import TaskError
-from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
+from tests.builders import vec_env
 from tests.contract.comparing import assert_same
 
 FLIGHTS = 9
@@ -98,13 +98,11 @@ class Switch:
 def with_switch(method, wrong, mode):
     switch = Switch(method, wrong)
     task = quad_gym.Task.of(state={"count": 0.0}, **{method: switch})
-    env = QuadVectorEnv(FLIGHTS, base="hover", task=task, autoreset_mode=mode, threads=1)
-    env.reset(seed=3)
-    return env, switch
+    return vec_env(count=FLIGHTS, seed=3, task=task, autoreset_mode=mode, threads=1), switch
 
 
 @pytest.mark.parametrize(("method", "wrong", "message"), CASES)
-def test_the_error_names_the_method_and_the_flights_and_a_reset_makes_good(method, wrong, message):
+def test_error_names_method_and_flights_and_reset_recovers(method, wrong, message):
     actions = np.zeros((FLIGHTS, 4))
     env, switch = with_switch(method, wrong, "NextStep")
     fresh, _ = with_switch(method, wrong, "NextStep")
@@ -125,7 +123,7 @@ def test_the_error_names_the_method_and_the_flights_and_a_reset_makes_good(metho
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_a_snapshot_from_before_an_error_can_be_flown_on(mode):
+def test_snapshot_from_before_an_error_flies_on(mode):
     env, switch = with_switch("reward", lambda v: at([1], np.nan), mode)
     actions = np.full((FLIGHTS, 4), 0.1)
     env.step(actions)
@@ -140,7 +138,7 @@ def test_a_snapshot_from_before_an_error_can_be_flown_on(mode):
     assert_same(env.step(actions), expected)
 
 
-def test_a_reset_of_the_flights_that_failed_is_needed():
+def test_flights_that_failed_must_be_reset():
     class Wrong(quad_gym.Task):
         """Starts where it must not, if told so."""
 
@@ -149,9 +147,8 @@ def test_a_reset_of_the_flights_that_failed_is_needed():
         def reset(self, view, rng):
             return self.wrong
 
-    env = QuadVectorEnv(3, base="hover", task=Wrong(), autoreset_mode="Disabled")
+    env = vec_env(count=3, seed=0, task=Wrong(), autoreset_mode="Disabled")
     task = env.flights.batch.own_task
-    env.reset(seed=0)
     mask = np.array([False, True, False])
     for wrong, message in (
         ({"position": np.full((3, 3), np.nan)}, "finite numbers for 'position'.*flight 1"),
@@ -170,7 +167,7 @@ def test_a_reset_of_the_flights_that_failed_is_needed():
     env.step(np.zeros((3, 4)))
 
 
-def test_no_flight_has_failed_where_none_was_reset():
+def test_failed_reset_of_no_flight_needs_no_reset():
     def fail(view):
         raise OSError("full")
 
@@ -183,7 +180,7 @@ def test_no_flight_has_failed_where_none_was_reset():
     batch.step(np.zeros((FLIGHTS, 4)))
 
 
-def test_an_interruption_leaves_flights_that_need_a_reset():
+def test_interrupted_step_needs_a_reset():
     def stop(view):
         raise KeyboardInterrupt
 
@@ -195,7 +192,7 @@ def test_an_interruption_leaves_flights_that_need_a_reset():
         env.step(np.zeros((FLIGHTS, 4)))
 
 
-def test_a_privileged_task_may_observe_the_truth():
+def test_privileged_task_observes_the_truth():
     class Open(quad_gym.Task):
         """Sees it all."""
 
@@ -205,8 +202,8 @@ def test_a_privileged_task_may_observe_the_truth():
             return {"truth": view.position, "reward": view.builtin.reward}
 
     for mode in ("SameStep", "NextStep"):
-        env = QuadVectorEnv(2, base="hover", task=Open(), autoreset_mode=mode, max_episode_steps=3)
-        plain = QuadVectorEnv(2, "hover", autoreset_mode=mode, max_episode_steps=3)
+        made = {"count": 2, "autoreset_mode": mode, "max_episode_steps": 3}
+        env, plain = vec_env(task=Open(), **made), vec_env(**made)
         assert_same(env.reset(seed=0)[0][:, :28].copy(), plain.reset(seed=0)[0])
         for _ in range(7):
             action = np.full((2, 4), 0.1)
@@ -224,14 +221,13 @@ def test_a_privileged_task_may_observe_the_truth():
                 np.testing.assert_array_equal(final[:, 31], reward.astype(np.float32))
 
 
-def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
+def test_flight_with_a_state_that_is_not_finite_ends():
     task = quad_gym.Task.of(
         terminated=lambda view: np.zeros(view.count, bool),
         reward=lambda view: view.position[:, 0],
         observe=lambda view: view.observed.position,
     )
-    env = QuadVectorEnv(2, base="hover", task=task, autoreset_mode="SameStep")
-    env.reset(seed=0)
+    env = vec_env(count=2, seed=0, task=task, autoreset_mode="SameStep")
     env.flights.batch._blocks["v"][0, :, 1] = np.nan
     with np.errstate(invalid="ignore"):
         observation, reward, terminated, _, info = env.step(np.zeros((2, 4)))
@@ -264,18 +260,18 @@ def test_flights_whose_state_is_not_finite_end_whatever_the_task_says():
         ({"replaces_observation": 1}, "replaces_observation of Task must be True or False"),
     ],
 )
-def test_wrong_declarations_are_refused_when_the_environment_is_made(attributes, message):
+def test_invalid_declarations_are_refused(attributes, message):
     with pytest.raises(ValueError, match=message):
         gymnasium.make("QuadGym/Hover-v0", task=quad_gym.Task.of(**attributes))
 
 
-def test_a_wrong_observe_is_refused_when_the_environment_is_made():
+def test_environment_with_an_invalid_observe_is_refused():
     task = quad_gym.Task.of(observe=lambda view: view.position)
     with pytest.raises(TaskError, match=r"observe failed.*cannot read the truth"):
         gymnasium.make("QuadGym/Hover-v0", task=task)
 
 
-def test_a_method_whose_name_is_nearly_right_is_warned_of():
+def test_misspelled_method_is_warned_of():
     with pytest.warns(UserWarning, match=r"Mine\.rewards is not called; did you mean reward\?"):
 
         class Mine(quad_gym.Task):
@@ -293,15 +289,14 @@ def test_a_method_whose_name_is_nearly_right_is_warned_of():
                 return view.time
 
 
-def test_no_name_is_suggested_of_an_object_of_the_user():
+def test_missing_attribute_of_a_user_object_has_no_suggestion():
     class Silent:
         """Does not say what it has."""
 
         def __dir__(self):
             raise RuntimeError("nobody may ask")
 
-    env = QuadVectorEnv(2, base="hover", task=quad_gym.Task.of(reward=lambda view: Silent().gain))
-    env.reset(seed=0)
+    env = vec_env(count=2, seed=0, task=quad_gym.Task.of(reward=lambda view: Silent().gain))
     with pytest.raises(TaskError, match=r"reward failed.*no attribute 'gain'$") as caught:
         env.step(np.zeros((2, 4)))
     assert isinstance(caught.value.__cause__, AttributeError)

@@ -16,7 +16,7 @@ from quad_gym.evaluation import evaluate, roll_out
 from quad_gym.tasks import ObservationSpec
 from tests import console_commands
 from tests.contract.comparing import assert_same
-from tests.tasks.chase import Chase
+from tests.tasks.tasks import Chase
 
 
 class Half(quad_gym.Task):
@@ -79,7 +79,7 @@ def test_roll_out_sums_the_rewards_of_the_task():
     np.testing.assert_allclose(returns(task=Half()), 0.5 * returns(), rtol=1e-12)
 
 
-def test_an_ending_of_the_task_is_no_crash():
+def test_ending_of_the_task_is_not_a_crash():
     def late(view):
         return view.time > 0.5
 
@@ -111,7 +111,7 @@ def test_pd_control_refuses_an_observation_without_its_part():
         PDPolicy(env)
 
 
-def test_the_table_of_observations_has_the_part_of_the_task_before_the_privileged_one():
+def test_parts_of_the_task_precede_the_privileged_ones():
     env = gymnasium.make("QuadGym/Hover-v0", task=Chase(), privileged=True)
     table = env.unwrapped.flights.table
     named = {field.name: field for field in table}
@@ -125,7 +125,7 @@ def test_the_table_of_observations_has_the_part_of_the_task_before_the_privilege
     assert observation["privileged"].shape == plain["privileged"].shape
 
 
-def test_observations_are_held_within_the_bounds_of_the_task():
+def test_observations_are_clipped_to_their_bounds():
     far = quad_gym.Task.of(
         observe=lambda view: {"a": np.full((view.count, 2), 7.0), "b": np.full(view.count, -1e9)},
         observes={"a": ObservationSpec(low=0.0, high=0.5)},
@@ -157,7 +157,7 @@ def test_reward_per_second_multiplies_the_reward_of_the_task():
 
 def test_a_task_is_named_by_its_module():
     named = gymnasium.make_vec(
-        "QuadGym/Hover-v0", num_envs=2, task="tests.tasks.chase:Chase"
+        "QuadGym/Hover-v0", num_envs=2, task="tests.tasks.tasks:Chase"
     ).reset(seed=0)
     assert_same(named, gymnasium.make_vec("QuadGym/Hover-v0", num_envs=2, task=Chase).reset(seed=0))
 
@@ -165,27 +165,27 @@ def test_a_task_is_named_by_its_module():
 @pytest.mark.parametrize(
     ("own", "message"),
     [
-        ("tests.tasks.chase", '"module:name"'),
-        ("tests.tasks.chase:Nobody", "must name a quad_gym.Task.*Nobody"),
+        ("tests.tasks.tasks", '"module:name"'),
+        ("tests.tasks.tasks:Nobody", "must name a quad_gym.Task.*Nobody"),
         ("no.such.module:Chase", "must name a quad_gym.Task.*No module"),
-        ("tests.tasks.chase:np", "must be a quad_gym.Task"),
+        ("tests.tasks.tasks:np", "must be a quad_gym.Task"),
         (lambda view: 0.0, "must be a quad_gym.Task"),
         (quad_gym.QuadEnv, "must be a quad_gym.Task"),
     ],
 )
-def test_what_is_no_task_is_refused(own, message):
+def test_task_keyword_without_a_task_is_refused(own, message):
     with pytest.raises(ValueError, match=message):
         gymnasium.make("QuadGym/Hover-v0", task=own)
 
 
-def test_functions_have_to_have_the_names_of_methods():
+def test_functions_without_names_of_methods_are_refused():
     with pytest.raises(TypeError, match=r"a task has no rewards"):
         quad_gym.Task.of(rewards=distance)
     with pytest.raises(TypeError, match="reward must be a function"):
         quad_gym.Task.of(reward=1.0)
 
 
-def test_the_command_line_flies_and_names_a_task_of_the_working_directory(tmp_path):
+def test_command_line_flies_a_task_of_the_working_directory(tmp_path):
     (tmp_path / "task_of_mine.py").write_text(
         "import numpy as np\nimport quad_gym\n"
         "One = quad_gym.Task.of(reward=lambda view: np.ones(view.count))\n"

@@ -16,6 +16,7 @@ from quad_gym.commands.main import main
 from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.experiments.flown import fly
 from quad_gym.tasks.look_around import LookAround
+from tests.builders import part
 
 ID = "QuadGym/LookAround-v0"
 WALL = np.array([(-8.0, y, z) for y in (-3.0, -1.0, 1.0, 3.0) for z in (0.8, 2.8)])
@@ -29,12 +30,7 @@ def actions(rng, count):
     return np.clip(rng.normal(0.0, 0.15, (count, 4)), -1.0, 1.0).astype(np.float32)
 
 
-def part(env, observations, name):
-    field = next(f for f in env.unwrapped.flights.table if f.name == name)
-    return observations[:, field.slice]
-
-
-def test_what_the_task_is_by_default():
+def test_defaults_are_those_of_the_description():
     flights = make(1).unwrapped.flights
     assert flights.name == "look_around"
     assert flights.task.kind == "random_trajectory"
@@ -46,7 +42,7 @@ def test_what_the_task_is_by_default():
     assert abs(width - 60.0) < 0.01
 
 
-def test_the_reward_is_that_of_its_equation():
+def test_reward_is_its_equation():
     env, rng = make(), np.random.default_rng(0)
     env.reset(seed=0)
     batch, crashes = env.unwrapped.flights.batch, 0
@@ -69,7 +65,7 @@ def test_the_reward_is_that_of_its_equation():
 
 
 @pytest.mark.parametrize("observation", ["estimate", "truth", "noisy"])
-def test_the_direction_of_the_features_is_what_the_source_believes(observation):
+def test_features_direction_is_computed_from_the_observed_state(observation):
     env, rng = make(observation=observation), np.random.default_rng(1)
     observed, _ = env.reset(seed=5)
     batch = env.unwrapped.flights.batch
@@ -81,7 +77,7 @@ def test_the_direction_of_the_features_is_what_the_source_believes(observation):
         observed, *_ = env.step(actions(rng, 20))
 
 
-def test_features_in_view_are_those_within_the_angles_of_the_camera():
+def test_features_in_view_are_within_the_camera_angles():
     env, rng = make(60), np.random.default_rng(2)
     env.reset(seed=9)
     batch, camera = env.unwrapped.flights.batch, quad_gym.sensor_suite("one_wall").camera
@@ -108,7 +104,7 @@ def facing():
     return fly(PDPolicy(env, faces="features"), env, 0, traced=("sigma",))
 
 
-def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not(facing):
+def test_rule_that_never_looks_crashes_more_than_one_that_does(facing):
     env = gymnasium.make_vec(ID, num_envs=60)
     blind = fly(PDPolicy(env), env, 0, traced=("sigma",))
     # 64 % of 500 crash: of 60 at most 24 with a probability below 1e-4
@@ -119,7 +115,7 @@ def test_a_rule_that_never_looks_loses_itself_and_one_that_always_looks_does_not
     assert facing.episodes.mean_error.mean() < 0.1
 
 
-def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_more_heading(facing):
+def test_rule_that_looks_when_uncertain_earns_more(facing):
     env = gymnasium.make_vec(ID, num_envs=60, include_std=True)
     rule = fly(PDPolicy(env, faces="features_when_uncertain"), env, 0, traced=("sigma",))
     assert rule.episodes.returns.mean() > facing.episodes.returns.mean()
@@ -127,7 +123,7 @@ def test_a_rule_that_looks_when_unsure_keeps_the_filter_sure_and_is_paid_for_mor
     assert rule.episodes.crashed.mean() < 0.1
 
 
-def test_the_features_must_be_observed_to_be_faced():
+def test_policy_without_features_in_its_observation_is_refused():
     circle = gymnasium.make("QuadGym/Circle-v0")
     with pytest.raises(ValueError, match='must observe features_direction for faces="features"'):
         PDPolicy(circle, faces="features")
@@ -137,7 +133,7 @@ def test_the_features_must_be_observed_to_be_faced():
         PDPolicy(circle, faces="north")
 
 
-def test_it_takes_other_weights_sensors_and_tasks():
+def test_other_weights_and_sensors_are_used():
     for weight in (0.0, 0.3):
         env = gymnasium.make(ID, task=LookAround(heading_weight=weight), sensors="indoor")
         env.reset(seed=0)
@@ -162,7 +158,7 @@ def test_sensors_without_a_camera_are_refused(keywords):
             make(ID, **keywords)
 
 
-def test_a_users_task_can_be_based_on_it():
+def test_registered_task_based_on_it_keeps_its_defaults():
     quad_gym.register_task("Test/LookMore-v0", LookAround(heading_weight=0.2), ID)
     env = gymnasium.make_vec("Test/LookMore-v0", num_envs=2)
     assert env.unwrapped.flights.name == "look_around"
@@ -175,7 +171,7 @@ def test_keywords_of_another_task_are_refused():
     assert QuadVectorEnv(1, "look_around", max_speed=2.0).flights.task.max_speed == 2.0
 
 
-def test_it_is_imported_only_where_it_is_used():
+def test_tasks_are_not_imported_before_use():
     code = (
         "import sys, gymnasium, quad_gym; gymnasium.make('QuadGym/Circle-v0'); "
         "print([m for m in sys.modules if m.startswith('quad_gym.tasks') or 'baselines' in m])"
@@ -184,7 +180,7 @@ def test_it_is_imported_only_where_it_is_used():
     assert done.stdout.strip() == "[]"
 
 
-def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_faces_the_wall(
+def test_pretrained_policy_earns_more_than_the_facing_rule(
     facing,
 ):
     shown = keywords_of_policy("pretrained", ID)
@@ -196,7 +192,7 @@ def test_the_policy_that_ships_stays_found_and_is_paid_more_than_the_rule_that_f
 
 
 @pytest.mark.parametrize("observation", [pytest.param("truth", marks=pytest.mark.slow), "estimate"])
-def test_the_policy_that_ships_flies_by_command(observation, tmp_path, capsys):
+def test_pretrained_policy_flies_by_command(observation, tmp_path, capsys):
     words = ["evaluate", ID, "--policy", "pd", "pretrained", "--observation", observation]
     assert main([*words, "--episodes", "3", "--output", str(tmp_path)]) == 0
     assert "sensors one_wall" in capsys.readouterr().out

@@ -11,6 +11,7 @@ from baselines.policies import keywords_of_policy, load_policy
 from quad_gym.evaluation import roll_out
 from quad_gym.records import Ending
 from quad_gym.tasks.outage_dash import OutageDash
+from tests.builders import part
 
 ID = "QuadGym/OutageDash-v0"
 FAST = {"action": "ctbr", "control_rate": 50.0}
@@ -28,11 +29,6 @@ def actions(rng, count):
     return np.clip(rng.normal(0.0, 0.1, (count, 4)), -1.0, 1.0).astype(np.float32)
 
 
-def part(env, observations, name):
-    field = next(f for f in env.unwrapped.flights.table if f.name == name)
-    return observations[:, field.slice]
-
-
 def edges(batch):
     """(n, 10) places of the walls, and of the northern and southern edges of their gaps."""
     walls = batch.record("obstacle_center")[:, :20]
@@ -40,7 +36,7 @@ def edges(batch):
     return walls[:, ::2, 0], walls[:, ::2, 1] - 15.0, walls[:, 1::2, 1] + 15.0
 
 
-def test_what_the_task_is_by_default():
+def test_defaults_are_those_of_the_description():
     flights = make(1).unwrapped.flights
     assert flights.name == "outage_dash"
     assert flights.batch.max_steps == 450
@@ -52,7 +48,7 @@ def test_what_the_task_is_by_default():
     assert flights.space.shape == (25,)
 
 
-def test_gaps_are_where_the_specification_says():
+def test_gaps_have_the_specified_distribution():
     env = make(500, observation="truth")
     env.reset(seed=0)
     x, north, south = edges(env.unwrapped.flights.batch)
@@ -66,7 +62,7 @@ def test_gaps_are_where_the_specification_says():
 
 
 @pytest.mark.parametrize("keywords", [{}, FAST])
-def test_the_reward_is_that_of_its_equation(keywords):
+def test_reward_is_its_equation(keywords):
     env, rng = make(30, observation="truth", **keywords), np.random.default_rng(0)
     env.reset(seed=0)
     batch, crashes, over = env.unwrapped.flights.batch, 0, np.zeros(30, bool)
@@ -90,7 +86,7 @@ def test_the_reward_is_that_of_its_equation(keywords):
 
 
 @pytest.mark.parametrize("observation", ["estimate", "truth"])
-def test_the_observation_is_what_the_source_believes(observation):
+def test_observation_is_computed_from_the_observed_state(observation):
     env = make(12, observation=observation, **FAST)
     policy = PDPolicy(env)
     observed, _ = env.reset(seed=5)
@@ -122,7 +118,7 @@ def test_the_observation_is_what_the_source_believes(observation):
     assert {0, 1, 2} <= passed
 
 
-def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
+def test_reward_after_the_finish_is_zero():
     env = make(2, observation="truth", **FAST)
     env.reset(seed=0, options={"position": (-65.0, 0.0, 4.0), "velocity": (-3.0, 0.0, 0.0)})
     observed, reward, *_ = env.step(np.zeros((2, 4), np.float32))
@@ -138,7 +134,7 @@ def test_after_the_last_gap_comes_the_finish_and_no_more_reward():
 
 
 @pytest.mark.parametrize("mode", ["Disabled", "SameStep", "NextStep"])
-def test_gaps_are_counted_by_the_true_position(mode):
+def test_gaps_passed_are_counted_by_the_true_position(mode):
     env = gymnasium.make_vec(ID, num_envs=8, observation="truth", autoreset_mode=mode, **FAST)
     policy = PDPolicy(env)
     observed, _ = env.reset(
@@ -163,7 +159,7 @@ def test_gaps_are_counted_by_the_true_position(mode):
     assert counted.max() > 6
 
 
-def test_the_standard_deviations_tell_that_gnss_is_gone():
+def test_standard_deviations_grow_during_the_outage():
     env = make(16, include_std=True, **FAST)
     assert env.unwrapped.flights.space.shape == (40,)
     policy = PDPolicy(env, max_position_error=0.2)
@@ -186,7 +182,7 @@ def test_the_standard_deviations_tell_that_gnss_is_gone():
     assert sigma[lasted > 4.5].min() > 0.4
 
 
-def test_flights_on_the_truth_have_no_outage_and_asking_for_one_is_refused():
+def test_outage_without_sensors_is_refused():
     assert make(1, observation="truth").unwrapped.flights.batch.faults == ()
     watched = make(1, observation="truth", include_std=True)
     assert len(watched.unwrapped.flights.batch.faults) == 1
@@ -194,7 +190,7 @@ def test_flights_on_the_truth_have_no_outage_and_asking_for_one_is_refused():
         make(1, observation="truth", faults=[quad_gym.faults.GnssOutage(start=1.0)])
 
 
-def test_fixed_rules_are_neither_lost_nor_safe():
+def test_fixed_rules_crash_in_some_flights():
     """Of 60 flights each, 0 crash on the truth, 19 on the estimate, and 6 of those that wait."""
     crashed, returns = {}, {}
     for name, shown in (
@@ -213,7 +209,7 @@ def test_fixed_rules_are_neither_lost_nor_safe():
     assert returns["pd:waiting"] < returns["pd truth"] - 20.0
 
 
-def test_the_policy_that_ships_slows_down_as_doubt_grows():
+def test_pretrained_policy_slows_down_with_uncertainty():
     env = gymnasium.make_vec(ID, num_envs=60, **keywords_of_policy("pretrained", ID))
     speed, sigma = [], []
 
@@ -228,7 +224,7 @@ def test_the_policy_that_ships_slows_down_as_doubt_grows():
     assert learned.returns.mean() > 420.0
 
 
-def test_rules_that_need_what_is_not_shown_are_refused():
+def test_rules_without_their_observations_are_refused():
     with pytest.raises(ValueError, match='env must observe position_sigma for pace="waiting"'):
         load_policy("pd:waiting", make(1))
     circle = gymnasium.make("QuadGym/Circle-v0")
@@ -238,7 +234,7 @@ def test_rules_that_need_what_is_not_shown_are_refused():
         PDPolicy(circle, pace="hasty")
 
 
-def test_worlds_without_gaps_and_wrong_weights_are_refused():
+def test_worlds_without_gaps_and_invalid_weights_are_refused():
     cylinders = quad_gym.WorldParams(obstacles=(quad_gym.Cylinder(center_I=(0.0, 0.0, 1.0)),) * 2)
     for world in ("calm", cylinders):
         with pytest.raises(ValueError, match="world must have pairs of walls for OutageDash"):
@@ -258,7 +254,7 @@ class KeepsSome(quad_gym.Task):
         return {"height": view.observed.position[:, 2]}
 
 
-def test_a_task_that_replaces_the_observation_may_keep_parts_of_it():
+def test_task_that_replaces_the_observation_keeps_named_parts():
     env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, task=KeepsSome, privileged=True)
     plain = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=3, privileged=True)
     assert [f.name for f in env.unwrapped.flights.table][:3] == ["up", "body_rates", "height"]

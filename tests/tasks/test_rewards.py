@@ -1,4 +1,4 @@
-"""Pieces of rewards: sums of them are the rewards that ship, and each is what it says."""
+"""Terms of rewards, against their formulas and the built-in rewards."""
 
 import pickle
 
@@ -10,13 +10,13 @@ import quad_gym
 from baselines import PDPolicy
 from quad_gym import rewards
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.tasks.rewards import BLOCKS, Constant, Term
+from tests.builders import flown, vec_env
 
 
 @pytest.mark.parametrize("per", ["step", "second"])
 @pytest.mark.parametrize("task", [i for i, task in quad_gym.IDS.items() if task in TASK_DEFAULTS])
-def test_sums_of_pieces_are_the_rewards_that_ship(task, per):
+def test_sums_of_terms_equal_the_builtin_rewards(task, per):
     piece = rewards.RACING if "Waypoints" in task else rewards.TRACKING
     made = {"num_envs": 6, "reward_per": per, "randomize_reference": True, "max_episode_steps": 120}
     plain = gymnasium.make_vec(task, **made)
@@ -34,17 +34,11 @@ def test_sums_of_pieces_are_the_rewards_that_ship(task, per):
 
 
 def view_after(steps=10, **keywords):
-    env = QuadVectorEnv(
-        4, base="hover", task=quad_gym.Task(), autoreset_mode="Disabled", **keywords
-    )
-    env.reset(seed=2)
-    rng = np.random.default_rng(2)
-    for _ in range(steps):
-        env.step(rng.uniform(-0.3, 0.3, (4, 4)))
-    return env.flights.batch.view
+    made = {"task": quad_gym.Task(), "autoreset_mode": "Disabled", **keywords}
+    return flown("hover", count=4, steps=steps, seed=2, **made).flights.batch.view
 
 
-def test_sums_differences_and_multiples_are_pieces():
+def test_sums_differences_and_multiples_are_terms():
     view = view_after()
     a, b = rewards.Tracking(1.0), rewards.ActionRate()
     x, y = a(view), b(view)
@@ -66,7 +60,7 @@ def test_sums_differences_and_multiples_are_pieces():
         a * np.nan
 
 
-def test_each_piece_is_what_it_says():
+def test_each_term_equals_its_formula():
     view = view_after()
     change = view.action - view.last_action
     for piece, expected in (
@@ -83,7 +77,7 @@ def test_each_piece_is_what_it_says():
 
 
 @pytest.mark.parametrize("block", BLOCKS)
-def test_uncertainty_is_the_trace_or_the_log_determinant_of_the_block(block):
+def test_uncertainty_is_the_trace_or_log_determinant(block):
     view, k = view_after(), 3 * BLOCKS.index(block)
     P = view.estimate.covariance[:, k : k + 3, k : k + 3]
     np.testing.assert_allclose(
@@ -95,7 +89,7 @@ def test_uncertainty_is_the_trace_or_the_log_determinant_of_the_block(block):
     )
 
 
-def test_uncertainty_refuses_what_it_does_not_know():
+def test_uncertainty_of_unknown_blocks_is_refused():
     with pytest.raises(ValueError, match="of must be one of"):
         rewards.Uncertainty("height")
     with pytest.raises(ValueError, match="measure must be one of"):
@@ -110,11 +104,9 @@ def test_progress_is_the_speed_toward_the_reference():
     )
 
 
-def test_a_crash_costs_where_the_vehicle_crashes():
-    env = QuadVectorEnv(
-        2, base="hover", autoreset_mode="SameStep", task=quad_gym.Task.of(reward=rewards.Crash())
-    )
-    env.reset(seed=0)
+def test_crash_term_is_one_where_the_vehicle_crashes():
+    task = quad_gym.Task.of(reward=rewards.Crash())
+    env = vec_env(count=2, seed=0, autoreset_mode="SameStep", task=task)
     total, ended = np.zeros(2), np.zeros(2)
     for _ in range(100):
         _, reward, terminated, _, _ = env.step(np.tile([-1.0, 0.0, 0.0, 0.0], (2, 1)))

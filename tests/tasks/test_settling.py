@@ -1,18 +1,19 @@
-"""What a task says of rewards and endings, in results and records, against a plain reference."""
+"""Rewards and endings of a task in results and records, against a plain reference."""
 
 import numpy as np
 import pytest
 
 import quad_gym
-from quad_gym.envs.vector import QuadVectorEnv
 from quad_gym.records import Ending
+from tests.builders import vec_env
 from tests.contract.comparing import assert_same
+from tests.tasks.tasks import Same
 
 FLIGHTS, STEPS, LIMIT = 13, 60, 40
 
 
 class Said:
-    """Answers of a task, drawn anew for every step."""
+    """Return values of a task, drawn for every step."""
 
     def __init__(self, methods):
         self.rng, self.methods = np.random.default_rng(7), methods
@@ -27,21 +28,8 @@ class Said:
         return quad_gym.Task.of(**answers)
 
 
-class Same(quad_gym.Task):
-    """Says of each step what the built-in task says."""
-
-    def reward(self, view):
-        return view.builtin.reward
-
-    def terminated(self, view):
-        return view.builtin.terminated
-
-    def truncated(self, view):
-        return view.builtin.truncated
-
-
 def expected_endings(said, plain):
-    """Terminated, truncated and why, from the rules, of what the built-in task says."""
+    """Terminated, truncated and the reason, by the rules, from results of the built-in task."""
     crashed = plain.result("terminated") > 0.0
     late, failed = plain.result("episode_steps") >= LIMIT, plain.result("filter_status") > 0.0
     terminated = said.terminated if "terminated" in said.methods else crashed
@@ -63,15 +51,14 @@ def expected_endings(said, plain):
     ],
 )
 @pytest.mark.parametrize("per", ["step", "second"])
-def test_results_and_records_say_what_the_task_has_said(methods, per):
+def test_results_and_records_have_the_judgment_of_the_task(methods, per):
     said = Said(methods)
     keywords = {"autoreset_mode": "Disabled", "max_episode_steps": LIMIT, "max_tilt": 0.5}
     keywords["reward_per"] = per
-    own = QuadVectorEnv(FLIGHTS, base="hover", task=said.task(), **keywords)
-    plain = QuadVectorEnv(FLIGHTS, "hover", **keywords)
-    for env in (own, plain):
-        env.reset(seed=5)
-    own, plain = own.flights.batch, plain.flights.batch
+    own, plain = (
+        vec_env(count=FLIGHTS, seed=5, task=task, **keywords).flights.batch
+        for task in (said.task(), None)
+    )
     rng, returns, endings = np.random.default_rng(2), np.zeros(FLIGHTS), set()
     for _ in range(STEPS):
         actions = rng.uniform(-0.6, 0.7, (FLIGHTS, 4))
@@ -93,9 +80,9 @@ def test_results_and_records_say_what_the_task_has_said(methods, per):
     assert len(endings) >= 3, "too few kinds of endings came"
 
 
-def test_returns_go_on_after_a_snapshot_has_been_restored():
+def test_returns_after_a_restore_continue():
     said = Said(("reward",))
-    batch = QuadVectorEnv(FLIGHTS, base="hover", task=said.task()).flights.batch
+    batch = vec_env(count=FLIGHTS, task=said.task()).flights.batch
     batch.reset(seeds=range(FLIGHTS))
     actions = np.full((FLIGHTS, 4), 0.05)
     said.draw()
@@ -115,7 +102,7 @@ def test_returns_go_on_after_a_snapshot_has_been_restored():
 @pytest.mark.parametrize(
     ("task", "sensors", "faults"), [("hover", "rtk", "all"), ("waypoints", "standard", "gnss_jump")]
 )
-def test_a_task_that_says_what_is_built_in_changes_nothing(task, sensors, faults, mode):
+def test_task_with_builtin_judgment_changes_no_ending(task, sensors, faults, mode):
     keywords = {
         "sensors": sensors,
         "faults": faults,
@@ -123,8 +110,7 @@ def test_a_task_that_says_what_is_built_in_changes_nothing(task, sensors, faults
         "reward_per": "step",
     }
     keywords |= {"autoreset_mode": mode, "max_episode_steps": 90, "max_tilt": 0.25}
-    plain = QuadVectorEnv(FLIGHTS, task, **keywords)
-    same = QuadVectorEnv(FLIGHTS, base=task, task=Same(), **keywords)
+    plain, same = (vec_env(task, FLIGHTS, task=own, **keywords) for own in (None, Same()))
     rng, seen = np.random.default_rng(3), set()
     assert_same(plain.reset(seed=3), same.reset(seed=3))
     for env in (plain, same):

@@ -11,7 +11,7 @@ from quad_gym.batch.quantities import QUANTITIES
 from quad_gym.flights.record import COLUMNS
 from quad_gym.params.randomization import DRAWABLES
 from quad_gym.records import FLIGHT_FIELDS, Source
-from quad_gym.tasks.fields import VIEW_FIELDS
+from quad_gym.tasks.view import VIEW_FIELDS
 
 ONLY_IN_FLIGHTS = {"covariance", "nees", "gnss_decision", "feature_decision"}
 AIDED = sensor_suite("rtk").replace(

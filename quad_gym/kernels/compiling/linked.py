@@ -12,8 +12,6 @@ from quad_gym.kernels.compiling.workers import dispatcher_of, prepare
 
 FLY = "quad_gym.kernels.batch:fly"
 """The entry that flies a batch."""
-SETTLE = "quad_gym.kernels.task.settle:settle"
-"""The entry that a user's task needs beside it."""
 _addresses: dict[str, int] = {}
 _lock = threading.Lock()
 

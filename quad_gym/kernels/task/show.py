@@ -1,4 +1,4 @@
-"""What a user's task is shown of flights, for the views of `quad_gym.tasks`."""
+"""Numbers that the views of user-defined tasks read, see `quad_gym.records.SHOWN`."""
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3, load4, load33
@@ -8,46 +8,22 @@ from quad_gym.kernels.task.observation import put_relative, reference_shown
 
 
 @kernel
-def _put(row, k, values, count):
-    """Write the first numbers of an array or a tuple; return the next place."""
-    for i in range(count):
-        row[k + i] = values[i]
-    return k + count
-
-
-@kernel
-def _put_matrix(row, k, R):
-    """Write a matrix row by row; return the next place."""
+def _show(flight, p, settings, row):
+    """Write the fields of `SHOWN` in their order."""
+    reference = reference_shown(flight, p, settings)
+    R_BI = quaternion_to_dcm(load4(flight.q))
     for i in range(3):
         for j in range(3):
-            row[k + 3 * i + j] = R[i][j]
-    return k + 9
-
-
-@kernel
-def _show(flight, p, settings, row):
-    """Write the numbers of `quad_gym.records.SHOWN`, in its order, but for whole ones."""
-    reference = reference_shown(flight, p, settings)
-    row[0] = flight.tick * p.dt
-    k = _put(row, 1, load3(flight.r), 3)
-    k = _put(row, k, load3(flight.v), 3)
-    k = _put(row, k, load4(flight.q), 4)
-    k = _put(row, k, load3(flight.w), 3)
-    k = _put_matrix(row, k, quaternion_to_dcm(load4(flight.q)))
-    k = _put(row, k, load3(flight.r_seen), 3)
-    k = _put(row, k, load3(flight.v_seen), 3)
-    k = _put_matrix(row, k, flight.R_seen)
+            row[3 * i + j] = R_BI[i][j]
     r, v, w = load3(flight.r_seen), load3(flight.v_seen), load3(flight.w_seen)
-    k = put_relative(reference, row, k, r, v, load33(flight.R_seen), w)
-    k = _put(row, k, flight.action, 4)
-    k = _put(row, k, flight.last_action, 4)
+    k = put_relative(reference, row, 9, r, v, load33(flight.R_seen), w)
     for vector in reference:
-        k = _put(row, k, vector, 3)
-    row[k] = flight.position_error
-    row[k + 1] = flight.gate_next
+        for i in range(3):
+            row[k + i] = vector[i]
+        k += 3
 
 
 @stage
 def show_stage(flight, world, model, settings, work, stages, flag):
-    """Fill the workspace's observation with what is shown."""
+    """Fill the workspace's observation with the numbers that a task's view reads."""
     _show(lanes_of(flight), lanes_of(model), settings, lanes_of(work).observation)

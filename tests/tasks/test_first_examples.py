@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.builders import part
+
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[:3]
 
@@ -23,12 +25,12 @@ def run():
     return names, envs
 
 
-def test_they_are_short():
+def test_examples_are_short():
     assert [len(lines(block)) for block in BLOCKS] <= [3, 5, 10]
     assert all(len(lines(block)) <= most for block, most in zip(BLOCKS, (3, 5, 10), strict=True))
 
 
-def test_they_do_what_they_say():
+def test_examples_do_what_the_page_says():
     names, (reward, path, wall) = run()
     plain = reward.unwrapped.spec
     reward.reset(seed=0)
@@ -44,10 +46,9 @@ def test_they_do_what_they_say():
     path.reset(seed=0)
 
     observation, _ = wall.reset(seed=0)
-    flights = wall.unwrapped.flights
-    place = next(field.slice for field in flights.table if field.name == "wall")
-    seen = flights.batch.record("r_seen")[0]
+    batch = wall.unwrapped.flights.batch
+    seen = batch.record("r_seen")[0]
     level = np.maximum(np.abs(seen[:2] - [6.0, 0.0]) - [2.0, 0.1], 0.0)
     above = max(abs(seen[2] - 1.5) - 1.5, 0.0)
     expected = np.linalg.norm([*level, above])
-    np.testing.assert_allclose(observation[place], expected, rtol=1e-5)
+    np.testing.assert_allclose(part(wall, observation, "wall"), expected, rtol=1e-5)

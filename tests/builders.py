@@ -1,0 +1,103 @@
+"""Builders of environments, batches and flights for tests."""
+
+import numpy as np
+
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.single import QuadEnv
+from quad_gym.envs.vector import QuadVectorEnv
+
+STEPS = 60
+SHORT = {"max_episode_steps": 25, "max_tilt": 0.6}
+"""Episodes end by the time limit and by tipping over, at different steps in different flights."""
+
+
+def single_env(base="hover", seed=None, **keywords):
+    """A single environment, reset if a seed is given."""
+    made = QuadEnv(base=base, **keywords)
+    if seed is not None:
+        made.reset(seed=seed)
+    return made
+
+
+def vec_env(base="hover", count=5, seed=None, **keywords):
+    """A vector environment, reset if a seed is given."""
+    made = QuadVectorEnv(count, base=base, **keywords)
+    if seed is not None:
+        made.reset(seed=seed)
+    return made
+
+
+def batch(count=5, seed=0, **keywords):
+    """A batch of flights that have begun, with seeds from the given one on."""
+    made = FlightBatch(count, **keywords)
+    made.reset(seeds=range(seed, seed + count))
+    return made
+
+
+def flown(base="circle", count=5, steps=20, seed=1, **keywords):
+    """A vector environment after some steps of random actions."""
+    made, rng = vec_env(base, count, seed, **keywords), np.random.default_rng(seed)
+    for _ in range(steps):
+        made.step(rng.uniform(-0.2, 0.3, (count, 4)))
+    return made
+
+
+def part(env, observations, name):
+    """One part of observations, by its name in the table."""
+    field = next(f for f in env.unwrapped.flights.table if f.name == name)
+    return observations[..., field.slice]
+
+
+def actions_of(flight, steps=STEPS):
+    """(steps, 4) random actions that lean to one side, so that flights end at different times."""
+    rng = np.random.default_rng([flight, 77])
+    lean = rng.uniform(-0.5, 0.5, 4)
+    return np.clip(lean + rng.uniform(-0.6, 0.6, (steps, 4)), -1.0, 1.0).astype(np.float32)
+
+
+def actions_for(flights, steps=STEPS):
+    """(steps, n, 4) random actions of some flights."""
+    return np.stack([actions_of(flight, steps) for flight in flights], axis=1)
+
+
+def _columns(rows):
+    """Columns of rows; both parts of observations that are dictionaries, side by side."""
+    observations, *others = zip(*rows, strict=True)
+    if isinstance(observations[0], dict):
+        observations = [np.concatenate(list(o.values()), axis=-1) for o in observations]
+    return tuple(np.array(column) for column in (observations, *others))
+
+
+def alone(base, flight, *, wait, **keywords):
+    """Fly a flight by itself: observations, rewards, terminated, truncated, (steps, ...) each.
+
+    With `wait` a new episode takes a step to begin, else it begins in the step that ends the last.
+    """
+    env = QuadEnv(base=base, **SHORT, **keywords)
+    rows, over = [(env.reset(seed=1000 + flight)[0], 0.0, False, False)], False
+    for action in actions_of(flight):
+        if over:
+            rows.append((env.reset()[0], 0.0, False, False))
+            over = False
+            continue
+        observation, reward, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+        if over and not wait:
+            observation, over = env.reset()[0], False
+        rows.append((observation, reward, terminated, truncated))
+    return _columns(rows)
+
+
+def together(base, flights, *, mode="NextStep", threads=1, **keywords):
+    """Fly several flights in one batch: the same columns as `alone`, (steps, n, ...) each."""
+    count = len(flights)
+    env = QuadVectorEnv(count, base=base, autoreset_mode=mode, threads=threads, **SHORT, **keywords)
+    observation, _ = env.reset(seed=[1000 + flight for flight in flights])
+    rows = [(observation, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
+    rows += [env.step(action)[:4] for action in actions_for(flights)]
+    return _columns(rows)
+
+
+def chosen(columns, flights):
+    """Columns of some flights."""
+    return tuple(column[:, flights].copy() for column in columns)
