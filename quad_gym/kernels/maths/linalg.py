@@ -1,14 +1,15 @@
-"""Small linear algebra on any number type.
+"""Loading, storing and products of vectors and matrices, which `vectors.py` gives operators.
 
-A vector is a tuple of three numbers, a matrix a tuple of three rows; they live in registers. Larger
-matrices are arrays in a workspace and are handled in blocks of 3 x 3, since the filter's states and
-its measurements all come in threes: nine sums run side by side and hide the latency of the
+Larger matrices are arrays in a workspace and are handled in blocks of 3 x 3, since the filter's
+states and measurements come in threes: nine sums run in parallel, which hides the latency of the
 multiply-adds.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.vectors import outer as outer
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.lanes import select
 
 # ---- vectors of three -------------------------------------------------------------------------
@@ -17,7 +18,7 @@ from quad_gym.kernels.simd.lanes import select
 @kernel
 def load3(a):
     """The first three numbers of an array, as a vector."""
-    return (a[0], a[1], a[2])
+    return vector(a[0], a[1], a[2])
 
 
 @kernel
@@ -38,25 +39,25 @@ def keep3(a, mask, v):
 @kernel
 def add(a, b):
     """A + b."""
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+    return vector(a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 @kernel
 def sub(a, b):
     """A - b."""
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+    return a - b
 
 
 @kernel
 def scale(s, a):
     """S a."""
-    return (s * a[0], s * a[1], s * a[2])
+    return s * a
 
 
 @kernel
 def add_scaled(a, s, b):
     """A + s b, in one multiply-add for each number."""
-    return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
+    return a + s * b
 
 
 @kernel
@@ -68,7 +69,7 @@ def dot(a, b):
 @kernel
 def cross(a, b):
     """A x b."""
-    return (
+    return vector(
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
@@ -87,7 +88,7 @@ def unit_or(a, fallback):
     square = dot(a, a)
     usable = square > 1e-60
     inverse = 1.0 / math.sqrt(select(usable, square, 1.0))
-    return (
+    return vector(
         select(usable, inverse * a[0], fallback[0]),
         select(usable, inverse * a[1], fallback[1]),
         select(usable, inverse * a[2], fallback[2]),
@@ -97,7 +98,7 @@ def unit_or(a, fallback):
 @kernel
 def select3(mask, a, b):
     """The vector `a` where `mask`, else `b`."""
-    return (select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
+    return vector(select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
 
 
 @kernel
@@ -108,8 +109,8 @@ def select33(mask, a, b):
 
 @kernel
 def load4(a):
-    """The first four numbers of an array, as a tuple."""
-    return (a[0], a[1], a[2], a[3])
+    """The first four numbers of an array, as a vector."""
+    return vector(a[0], a[1], a[2], a[3])
 
 
 @kernel
@@ -133,6 +134,12 @@ def load33(a):
 
 
 @kernel
+def load44(a):
+    """A 4 x 4 array as a matrix."""
+    return (load4(a[0]), load4(a[1]), load4(a[2]), load4(a[3]))
+
+
+@kernel
 def store33(a, m):
     """Write a matrix into a 3 x 3 array."""
     for i in range(3):
@@ -151,37 +158,25 @@ def keep33(a, mask, m):
 @kernel
 def transpose(m):
     """m^T."""
-    return (
-        (m[0][0], m[1][0], m[2][0]),
-        (m[0][1], m[1][1], m[2][1]),
-        (m[0][2], m[1][2], m[2][2]),
-    )
+    return m.T
 
 
 @kernel
 def apply(m, v):
     """M v."""
-    return (dot(m[0], v), dot(m[1], v), dot(m[2], v))
+    return m @ v
 
 
 @kernel
 def apply_transposed(m, v):
     """m^T v."""
-    return (
-        m[0][0] * v[0] + m[1][0] * v[1] + m[2][0] * v[2],
-        m[0][1] * v[0] + m[1][1] * v[1] + m[2][1] * v[2],
-        m[0][2] * v[0] + m[1][2] * v[1] + m[2][2] * v[2],
-    )
+    return m.T @ v
 
 
 @kernel
 def multiply(a, b):
     """A b."""
-    return (
-        apply_transposed(b, a[0]),
-        apply_transposed(b, a[1]),
-        apply_transposed(b, a[2]),
-    )
+    return a @ b
 
 
 # ---- blocks of larger arrays -----------------------------------------------------------------
@@ -214,29 +209,9 @@ def keep_block(a, i, j, mask, m):
 
 
 @kernel
-def outer(a, b):
-    """A b^T."""
-    return (scale(a[0], b), scale(a[1], b), scale(a[2], b))
-
-
-@kernel
 def add_outer(m, a, b):
     """M + a b^T."""
-    return (
-        (m[0][0] + a[0] * b[0], m[0][1] + a[0] * b[1], m[0][2] + a[0] * b[2]),
-        (m[1][0] + a[1] * b[0], m[1][1] + a[1] * b[1], m[1][2] + a[1] * b[2]),
-        (m[2][0] + a[2] * b[0], m[2][1] + a[2] * b[1], m[2][2] + a[2] * b[2]),
-    )
-
-
-@kernel
-def subtract_outer(m, a, b):
-    """M - a b^T."""
-    return (
-        (m[0][0] - a[0] * b[0], m[0][1] - a[0] * b[1], m[0][2] - a[0] * b[2]),
-        (m[1][0] - a[1] * b[0], m[1][1] - a[1] * b[1], m[1][2] - a[1] * b[2]),
-        (m[2][0] - a[2] * b[0], m[2][1] - a[2] * b[1], m[2][2] - a[2] * b[2]),
-    )
+    return m + outer(a, b)
 
 
 @kernel
@@ -244,7 +219,7 @@ def sum_of_outers(a, i, b, k, columns):
     """The sum over the first columns j of a[i : i + 3, j] b[k : k + 3, j]^T."""
     total = outer(load_column3(a, i, 0), load_column3(b, k, 0))
     for j in range(1, columns):
-        total = add_outer(total, load_column3(a, i, j), load_column3(b, k, j))
+        total = total + outer(load_column3(a, i, j), load_column3(b, k, j))
     return total
 
 
@@ -263,12 +238,15 @@ def sum_of_squares(a, i, columns):
 @kernel
 def sum_of_outers_of_rows(a, b, i, k, rows):
     """The sum over the first rows j of a[j, i : i + 3]^T b[j, k : k + 3]."""
-    total = outer((a[0, i], a[0, i + 1], a[0, i + 2]), (b[0, k], b[0, k + 1], b[0, k + 2]))
+    total = outer(_load_row3(a, 0, i), _load_row3(b, 0, k))
     for j in range(1, rows):
-        total = add_outer(
-            total, (a[j, i], a[j, i + 1], a[j, i + 2]), (b[j, k], b[j, k + 1], b[j, k + 2])
-        )
+        total = total + outer(_load_row3(a, j, i), _load_row3(b, j, k))
     return total
+
+
+@kernel
+def _load_row3(a, i, j):
+    return vector(a[i, j], a[i, j + 1], a[i, j + 2])
 
 
 @kernel
@@ -278,15 +256,9 @@ def add33(a, b):
 
 
 @kernel
-def add_scaled33(a, s, b):
-    """A + s b."""
-    return (add_scaled(a[0], s, b[0]), add_scaled(a[1], s, b[1]), add_scaled(a[2], s, b[2]))
-
-
-@kernel
 def scale33(s, a):
     """S a."""
-    return (scale(s, a[0]), scale(s, a[1]), scale(s, a[2]))
+    return s * a
 
 
 @kernel
@@ -302,4 +274,11 @@ def add_to_diagonal(m, s):
 @kernel
 def load_column3(a, i, j):
     """Rows i to i + 2 of column j."""
-    return (a[i, j], a[i + 1, j], a[i + 2, j])
+    return vector(a[i, j], a[i + 1, j], a[i + 2, j])
+
+
+@kernel
+def store_column3(a, i, j, v):
+    """Write a vector into rows i to i + 2 of column j."""
+    for k in range(3):
+        a[i + k, j] = v[k]
