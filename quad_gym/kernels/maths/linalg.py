@@ -9,6 +9,7 @@ multiply-adds.
 import math
 
 from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.maths.vectors import matrix, vector
 from quad_gym.kernels.simd.lanes import select
 
 # ---- vectors of three -------------------------------------------------------------------------
@@ -17,7 +18,7 @@ from quad_gym.kernels.simd.lanes import select
 @kernel
 def load3(a):
     """The first three numbers of an array, as a vector."""
-    return (a[0], a[1], a[2])
+    return vector(a[0], a[1], a[2])
 
 
 @kernel
@@ -38,25 +39,25 @@ def keep3(a, mask, v):
 @kernel
 def add(a, b):
     """A + b."""
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+    return vector(a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 @kernel
 def sub(a, b):
     """A - b."""
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+    return vector(a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
 @kernel
 def scale(s, a):
     """S a."""
-    return (s * a[0], s * a[1], s * a[2])
+    return vector(s * a[0], s * a[1], s * a[2])
 
 
 @kernel
 def add_scaled(a, s, b):
     """A + s b, in one multiply-add for each number."""
-    return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
+    return vector(a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
 
 
 @kernel
@@ -68,7 +69,7 @@ def dot(a, b):
 @kernel
 def cross(a, b):
     """A x b."""
-    return (
+    return vector(
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
@@ -87,7 +88,7 @@ def unit_or(a, fallback):
     square = dot(a, a)
     usable = square > 1e-60
     inverse = 1.0 / math.sqrt(select(usable, square, 1.0))
-    return (
+    return vector(
         select(usable, inverse * a[0], fallback[0]),
         select(usable, inverse * a[1], fallback[1]),
         select(usable, inverse * a[2], fallback[2]),
@@ -97,19 +98,19 @@ def unit_or(a, fallback):
 @kernel
 def select3(mask, a, b):
     """The vector `a` where `mask`, else `b`."""
-    return (select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
+    return vector(select(mask, a[0], b[0]), select(mask, a[1], b[1]), select(mask, a[2], b[2]))
 
 
 @kernel
 def select33(mask, a, b):
     """The matrix `a` where `mask`, else `b`."""
-    return (select3(mask, a[0], b[0]), select3(mask, a[1], b[1]), select3(mask, a[2], b[2]))
+    return matrix(select3(mask, a[0], b[0]), select3(mask, a[1], b[1]), select3(mask, a[2], b[2]))
 
 
 @kernel
 def load4(a):
-    """The first four numbers of an array, as a tuple."""
-    return (a[0], a[1], a[2], a[3])
+    """The first four numbers of an array, as a vector."""
+    return vector(a[0], a[1], a[2], a[3])
 
 
 @kernel
@@ -125,11 +126,17 @@ def store4(a, v):
 @kernel
 def load33(a):
     """A 3 x 3 array as a matrix."""
-    return (
+    return matrix(
         (a[0, 0], a[0, 1], a[0, 2]),
         (a[1, 0], a[1, 1], a[1, 2]),
         (a[2, 0], a[2, 1], a[2, 2]),
     )
+
+
+@kernel
+def load44(a):
+    """A 4 x 4 array as a matrix."""
+    return matrix(load4(a[0]), load4(a[1]), load4(a[2]), load4(a[3]))
 
 
 @kernel
@@ -151,7 +158,7 @@ def keep33(a, mask, m):
 @kernel
 def transpose(m):
     """m^T."""
-    return (
+    return matrix(
         (m[0][0], m[1][0], m[2][0]),
         (m[0][1], m[1][1], m[2][1]),
         (m[0][2], m[1][2], m[2][2]),
@@ -161,13 +168,13 @@ def transpose(m):
 @kernel
 def apply(m, v):
     """M v."""
-    return (dot(m[0], v), dot(m[1], v), dot(m[2], v))
+    return vector(dot(m[0], v), dot(m[1], v), dot(m[2], v))
 
 
 @kernel
 def apply_transposed(m, v):
     """m^T v."""
-    return (
+    return vector(
         m[0][0] * v[0] + m[1][0] * v[1] + m[2][0] * v[2],
         m[0][1] * v[0] + m[1][1] * v[1] + m[2][1] * v[2],
         m[0][2] * v[0] + m[1][2] * v[1] + m[2][2] * v[2],
@@ -177,7 +184,7 @@ def apply_transposed(m, v):
 @kernel
 def multiply(a, b):
     """A b."""
-    return (
+    return matrix(
         apply_transposed(b, a[0]),
         apply_transposed(b, a[1]),
         apply_transposed(b, a[2]),
@@ -190,7 +197,7 @@ def multiply(a, b):
 @kernel
 def load_block(a, i, j):
     """The 3 x 3 block of an array whose corner is at row i, column j."""
-    return (
+    return matrix(
         (a[i, j], a[i, j + 1], a[i, j + 2]),
         (a[i + 1, j], a[i + 1, j + 1], a[i + 1, j + 2]),
         (a[i + 2, j], a[i + 2, j + 1], a[i + 2, j + 2]),
@@ -216,13 +223,13 @@ def keep_block(a, i, j, mask, m):
 @kernel
 def outer(a, b):
     """A b^T."""
-    return (scale(a[0], b), scale(a[1], b), scale(a[2], b))
+    return matrix(scale(a[0], b), scale(a[1], b), scale(a[2], b))
 
 
 @kernel
 def add_outer(m, a, b):
     """M + a b^T."""
-    return (
+    return matrix(
         (m[0][0] + a[0] * b[0], m[0][1] + a[0] * b[1], m[0][2] + a[0] * b[2]),
         (m[1][0] + a[1] * b[0], m[1][1] + a[1] * b[1], m[1][2] + a[1] * b[2]),
         (m[2][0] + a[2] * b[0], m[2][1] + a[2] * b[1], m[2][2] + a[2] * b[2]),
@@ -232,7 +239,7 @@ def add_outer(m, a, b):
 @kernel
 def subtract_outer(m, a, b):
     """M - a b^T."""
-    return (
+    return matrix(
         (m[0][0] - a[0] * b[0], m[0][1] - a[0] * b[1], m[0][2] - a[0] * b[2]),
         (m[1][0] - a[1] * b[0], m[1][1] - a[1] * b[1], m[1][2] - a[1] * b[2]),
         (m[2][0] - a[2] * b[0], m[2][1] - a[2] * b[1], m[2][2] - a[2] * b[2]),
@@ -257,7 +264,7 @@ def sum_of_squares(a, i, columns):
         x, y, z = load_column3(a, i, j)
         xx, yx, yy = xx + x * x, yx + y * x, yy + y * y
         zx, zy, zz = zx + z * x, zy + z * y, zz + z * z
-    return ((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
+    return matrix((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
 
 
 @kernel
@@ -274,25 +281,25 @@ def sum_of_outers_of_rows(a, b, i, k, rows):
 @kernel
 def add33(a, b):
     """A + b."""
-    return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
+    return matrix(add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
 
 
 @kernel
 def add_scaled33(a, s, b):
     """A + s b."""
-    return (add_scaled(a[0], s, b[0]), add_scaled(a[1], s, b[1]), add_scaled(a[2], s, b[2]))
+    return matrix(add_scaled(a[0], s, b[0]), add_scaled(a[1], s, b[1]), add_scaled(a[2], s, b[2]))
 
 
 @kernel
 def scale33(s, a):
     """S a."""
-    return (scale(s, a[0]), scale(s, a[1]), scale(s, a[2]))
+    return matrix(scale(s, a[0]), scale(s, a[1]), scale(s, a[2]))
 
 
 @kernel
 def add_to_diagonal(m, s):
     """M + s I."""
-    return (
+    return matrix(
         (m[0][0] + s, m[0][1], m[0][2]),
         (m[1][0], m[1][1] + s, m[1][2]),
         (m[2][0], m[2][1], m[2][2] + s),
@@ -302,4 +309,4 @@ def add_to_diagonal(m, s):
 @kernel
 def load_column3(a, i, j):
     """Rows i to i + 2 of column j."""
-    return (a[i, j], a[i + 1, j], a[i + 2, j])
+    return vector(a[i, j], a[i + 1, j], a[i + 2, j])

@@ -51,19 +51,19 @@ class _VectorType(types.Type):
 
 
 class Lanes(_VectorType):
-    """Eight float64, one per flight of a block."""
+    """Float64, one per flight of a block."""
 
     llvm_type = _FLOATS
 
 
 class Words(_VectorType):
-    """Eight uint64, one per flight of a block."""
+    """Uint64, one per flight of a block."""
 
     llvm_type = _WORDS
 
 
 class Mask(_VectorType):
-    """Eight booleans, one per flight of a block."""
+    """Booleans, one per flight of a block."""
 
     llvm_type = _BITS
 
@@ -99,7 +99,7 @@ def vector_of(
     return splat(builder, context.cast(builder, value, source, plain))
 
 
-# ---- conversions: a plain number is eight equal lanes ----------------------------------------
+# ---- conversions: a plain number is lanes that are equal ----------------------------------------
 
 _PLAIN = {lanes: (types.Float, types.Integer), words: (types.Integer,), mask: (types.Boolean,)}
 
@@ -120,7 +120,7 @@ default_type_manager.set_compatible(types.boolean, mask, Conversion.safe)
 
 # ---- operators -------------------------------------------------------------------------------
 
-_FIRST = {"target": "cpu"}
+ASKED_FIRST = {"target": "cpu"}
 """Numba asks templates of a target before those of any, a dozen of which an operator has: a tenth
 of the time that kernels take to compile."""
 
@@ -132,7 +132,7 @@ def _binary(
 
     @infer_global(operation)
     class _Typing(AbstractTemplate):
-        metadata = _FIRST
+        metadata = ASKED_FIRST
 
         def generic(self, args, kws):  # type: ignore[no-untyped-def]
             fits = all(a == operand or isinstance(a, _PLAIN[operand]) for a in args)
@@ -161,31 +161,37 @@ def _ordered(symbol: str) -> Callable[[ir.IRBuilder, Any, Any], Any]:
     return lambda builder, left, right: builder.fcmp_ordered(symbol, left, right)
 
 
-def _is_product(value: Any) -> bool:
+def is_product(value: Any) -> bool:
+    """Say whether an LLVM value is a product that has just been computed."""
     return isinstance(value, ir.Instruction) and value.opname == "fmul"
 
 
-def _add(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+def fuse(builder: ir.IRBuilder, factor: Any, other: Any, summand: Any) -> Any:
+    """Multiply-add: factor * other + summand, rounded once."""
+    return call_llvm(builder, "llvm.fma", factor, other, summand)
+
+
+def add_numbers(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
     """Left + right; a product that is added is fused into the sum, the left one of two."""
-    if _is_product(left):
-        return call_llvm(builder, "llvm.fma", *left.operands, right)
-    if _is_product(right):
-        return call_llvm(builder, "llvm.fma", *right.operands, left)
+    if is_product(left):
+        return fuse(builder, *left.operands, right)
+    if is_product(right):
+        return fuse(builder, *right.operands, left)
     return builder.fadd(left, right)
 
 
 def _subtract(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
-    """Left - right, likewise."""
-    if _is_product(left):
-        return call_llvm(builder, "llvm.fma", *left.operands, builder.fneg(right))
-    if _is_product(right):
+    """Left - right, with the same rule."""
+    if is_product(left):
+        return fuse(builder, *left.operands, builder.fneg(right))
+    if is_product(right):
         factor, other = right.operands
-        return call_llvm(builder, "llvm.fma", builder.fneg(factor), other, left)
+        return fuse(builder, builder.fneg(factor), other, left)
     return builder.fsub(left, right)
 
 
 for _operation, _in_place, _emit in (
-    (operator.add, operator.iadd, _add),
+    (operator.add, operator.iadd, add_numbers),
     (operator.sub, operator.isub, _subtract),
     (operator.mul, operator.imul, _method("fmul")),
     (operator.truediv, operator.itruediv, _method("fdiv")),
@@ -219,7 +225,7 @@ for _operation, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 def _unary(operation: Any, emit: Callable[[Any, ir.IRBuilder, Any], Any]) -> None:
     @infer_global(operation)
     class _Typing(AbstractTemplate):
-        metadata = _FIRST
+        metadata = ASKED_FIRST
 
         def generic(self, args, kws):  # type: ignore[no-untyped-def]
             if args == (lanes,):

@@ -16,6 +16,7 @@ from quad_gym.kernels.maths.linalg import (
     load3,
     load4,
     load33,
+    load44,
     multiply,
     scale,
     store4,
@@ -23,10 +24,10 @@ from quad_gym.kernels.maths.linalg import (
     transpose,
     unit_or,
 )
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
-from quad_gym.kernels.vehicle.dynamics import combine
 from quad_gym.records import Control
 
 
@@ -41,8 +42,8 @@ def allocate(thrust, torque, p):
     """
     limit = p.max_rotor_force
     zero = 0.0 * thrust
-    base = combine(p.allocation, (minimum(thrust, 3.6 * limit), zero, zero, zero))
-    turn = combine(p.allocation, (zero, torque[0], torque[1], torque[2]))
+    base = load44(p.allocation) @ vector(minimum(thrust, 3.6 * limit), zero, zero, zero)
+    turn = load44(p.allocation) @ vector(zero, torque[0], torque[1], torque[2])
     alpha = zero + 1.0
     for i in range(4):
         loaded = turn[i] > 0.0

@@ -4,46 +4,10 @@ A state is (r_I, v_I, q, w_B, rotor_speeds), a tuple of tuples; its derivative h
 """
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import (
-    add,
-    add_scaled,
-    apply,
-    apply_transposed,
-    cross,
-    dot,
-    load3,
-    load4,
-    load33,
-    scale,
-    store3,
-    store4,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, load44, store3, store4
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.blocks import lanes_of
-
-
-@kernel
-def combine(matrix, column):
-    """A (4, 4) array times a tuple of four."""
-    return (
-        matrix[0, 0] * column[0]
-        + matrix[0, 1] * column[1]
-        + matrix[0, 2] * column[2]
-        + matrix[0, 3] * column[3],
-        matrix[1, 0] * column[0]
-        + matrix[1, 1] * column[1]
-        + matrix[1, 2] * column[2]
-        + matrix[1, 3] * column[3],
-        matrix[2, 0] * column[0]
-        + matrix[2, 1] * column[1]
-        + matrix[2, 2] * column[2]
-        + matrix[2, 3] * column[3],
-        matrix[3, 0] * column[0]
-        + matrix[3, 1] * column[1]
-        + matrix[3, 2] * column[2]
-        + matrix[3, 3] * column[3],
-    )
 
 
 @kernel
@@ -55,35 +19,27 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     is the velocity relative to it.
     """
     W = rotor_speeds
-    forces = (
+    forces = vector(
         p.thrust_coefficient * W[0] * W[0],
         p.thrust_coefficient * W[1] * W[1],
         p.thrust_coefficient * W[2] * W[2],
         p.thrust_coefficient * W[3] * W[3],
     )
-    thrust, torque_x, torque_y, torque_z = combine(p.effectiveness, forces)
+    thrust, torque_x, torque_y, torque_z = load44(p.effectiveness) @ forces
     z_I = R_BI[2]
     drag = p.half_drag * abs(dot(z_I, v_I))
-    force_I = add(add_scaled(scale(thrust, z_I), -drag, v_I), d_I)
-    inverse_mass = 1.0 / p.mass
-    a_I = scale(inverse_mass, force_I)
-    a_I = (a_I[0], a_I[1], a_I[2] - p.gravity)
+    force_I = thrust * z_I - drag * v_I + d_I
+    a_I = (1.0 / p.mass) * force_I - vector(0.0, 0.0, p.gravity)
 
-    J = load33(p.inertia)
-    N_B = sub((torque_x, torque_y, torque_z), cross(w_B, apply(J, w_B)))
-    return a_I, apply(load33(p.inertia_inverse), N_B)
+    torque_B = vector(torque_x, torque_y, torque_z)
+    dw_B = load33(p.inertia_inverse) @ (torque_B - cross(w_B, load33(p.inertia) @ w_B))
+    return a_I, dw_B
 
 
 @kernel
 def rotor_lag(W, voltages, p):
     """dW_i/dt = (cm ea_i - W_i) / taum [rad/s^2]."""
-    lag, gain = 1.0 / p.motor_time_constant, p.motor_speed_per_volt
-    return (
-        lag * (gain * voltages[0] - W[0]),
-        lag * (gain * voltages[1] - W[1]),
-        lag * (gain * voltages[2] - W[2]),
-        lag * (gain * voltages[3] - W[3]),
-    )
+    return -(1.0 / p.motor_time_constant) * (W - p.motor_speed_per_volt * voltages)
 
 
 @kernel
@@ -95,45 +51,29 @@ def derivative(state, voltages, d_I, p):
 
 
 @kernel
-def _advance4(x, h, k):
-    return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3])
-
-
-@kernel
 def advance(state, h, rate):
     """State + h rate."""
     return (
-        add_scaled(state[0], h, rate[0]),
-        add_scaled(state[1], h, rate[1]),
-        _advance4(state[2], h, rate[2]),
-        add_scaled(state[3], h, rate[3]),
-        _advance4(state[4], h, rate[4]),
+        state[0] + h * rate[0],
+        state[1] + h * rate[1],
+        state[2] + h * rate[2],
+        state[3] + h * rate[3],
+        state[4] + h * rate[4],
     )
 
 
 @kernel
 def load_state(flight):
     """The true state of a flight."""
-    return (
-        load3(flight.r),
-        load3(flight.v),
-        load4(flight.q),
-        load3(flight.w),
-        load4(flight.rotor_speeds),
-    )
+    r, v, w = load3(flight.r), load3(flight.v), load3(flight.w)
+    return r, v, load4(flight.q), w, load4(flight.rotor_speeds)
 
 
 @kernel
 def load_start(work):
     """The true state at the start of the tick, as the workspace keeps it."""
     s = work.start
-    return (
-        (s[0], s[1], s[2]),
-        (s[3], s[4], s[5]),
-        (s[6], s[7], s[8], s[9]),
-        (s[10], s[11], s[12]),
-        (s[13], s[14], s[15], s[16]),
-    )
+    return load3(s), load3(s[3:]), load4(s[6:]), load3(s[10:]), load4(s[13:])
 
 
 @kernel
@@ -170,13 +110,13 @@ def integrate(flight, p, substeps):
 @kernel
 def body_point_velocity(R_BI, v_I, w_B, l_B):
     """Velocity of a body-fixed point in I: v_I + R^T (w x l)."""
-    return add(v_I, apply_transposed(R_BI, cross(w_B, l_B)))
+    return v_I + R_BI.T @ cross(w_B, l_B)
 
 
 @kernel
 def imu_point_acceleration(R_BI, a_I, w_B, dw_B, l_B):
     """Acceleration of a body-fixed point in I: a_I + R^T (dw x l + w x (w x l)); report 2.3."""
-    return add(a_I, apply_transposed(R_BI, add(cross(dw_B, l_B), cross(w_B, cross(w_B, l_B)))))
+    return a_I + R_BI.T @ (cross(dw_B, l_B) + cross(w_B, cross(w_B, l_B)))
 
 
 @stage

@@ -1,0 +1,281 @@
+"""Vectors and matrices with `+ - * @`, so that kernels read like equations.
+
+A vector is a tuple of three or four numbers, a matrix a tuple of as many rows; both live in
+registers. One operand may mix lanes and floats: `inverse_mass * force_I - (0.0, 0.0, p.gravity)`.
+
+| expression                    | operands                                                    |
+|-------------------------------|-------------------------------------------------------------|
+| `a + b`, `a - b`, `-a`        | vectors or matrices                                         |
+| `s * a`                       | a number and a vector or a matrix                           |
+| `M @ a`, `M.T`, `outer(a, b)` | a matrix and a vector or a matrix; its transpose; `a b^T`   |
+
+**A sum fuses the product on its right.** `a + s * b`, `a - s * b` and `M + outer(a, b)` are one
+multiply-add for each number, if the same branch of the same function computes the product. The
+product on the left of a sum is rounded first; `a + rounded(s * b)` rounds one on the right, too.
+
+Tuples of lanes are Numba's own. The instance of a kernel for floats has a type of its own, as `+`
+concatenates tuples of floats: arithmetic returns it, and so do `vector`, `matrix` and whatever
+loads from arrays, so that a sum needs one operand that comes from these. It fuses nothing.
+"""
+
+import itertools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core.datamodel import models
+from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_global, signature
+from numba.extending import infer_getattr, intrinsic, lower_builtin, lower_getattr, register_model
+
+from quad_gym.kernels.simd.lanes import ASKED_FIRST, add_numbers, fuse, is_product, lanes
+
+# ---- types -----------------------------------------------------------------------------------
+
+_LENGTHS = (3, 4)
+
+
+class Floats(types.UniTuple):
+    """A vector of float64, or a matrix of such vectors."""
+
+
+register_model(Floats)(models.UniTupleModel)
+
+
+def _shape(kind: Any) -> tuple[int, ...] | None:
+    """The shape of a type as NumPy would have it, () for a number; None for any other type."""
+    if kind == lanes or isinstance(kind, types.Float | types.Integer):
+        return ()
+    if isinstance(kind, types.BaseTuple) and len(kind) in _LENGTHS:
+        shapes = {_shape(part) for part in kind}
+        part = shapes.pop() if len(shapes) == 1 else None
+        if part is not None and len(part) < 2:
+            return (len(kind), *part)
+    return None
+
+
+def _has_lanes(kind: Any) -> bool:
+    return kind == lanes or (isinstance(kind, types.BaseTuple) and any(map(_has_lanes, kind)))
+
+
+def _number_of(*kinds: Any) -> Any:
+    """The type of the numbers that result from an operation on these types."""
+    return lanes if any(map(_has_lanes, kinds)) else types.float64
+
+
+def _type(shape: tuple[int, ...], number: Any) -> Any:
+    if not shape:
+        return number
+    return (types.UniTuple if number == lanes else Floats)(_type(shape[1:], number), shape[0])
+
+
+# ---- values ----------------------------------------------------------------------------------
+
+
+def _parts(builder: ir.IRBuilder, value: Any) -> list[Any]:
+    """The parts of a vector or matrix: those that it was made of, so that products show."""
+    parts: dict[int, Any] = {}
+    made = value
+    while isinstance(made, ir.instructions.InsertValue) and len(made.indices) == 1:
+        parts.setdefault(made.indices[0], made.operands[1])
+        made = made.operands[0]
+    count = value.type.count
+    return [parts[i] if i in parts else builder.extract_value(value, i) for i in range(count)]
+
+
+def _made_of(builder: ir.IRBuilder, parts: Any) -> Any:
+    parts = list(parts)
+    value = ir.Constant(ir.ArrayType(parts[0].type, len(parts)), ir.Undefined)
+    for i, part in enumerate(parts):
+        value = builder.insert_value(value, part, i)
+    return value
+
+
+def _each(builder: ir.IRBuilder, emit: Callable[..., Any], *values: Any) -> Any:
+    """Apply `emit` to corresponding numbers of vectors or matrices."""
+    if not isinstance(values[0].type, ir.ArrayType):
+        return emit(builder, *values)
+    parts = zip(*(_parts(builder, value) for value in values), strict=True)
+    return _made_of(builder, [_each(builder, emit, *some) for some in parts])
+
+
+def _is_fused(right: Any) -> bool:
+    return isinstance(right.type, ir.VectorType) and is_product(right)
+
+
+def _add(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+    if _is_fused(right):
+        return fuse(builder, *right.operands, left)
+    return builder.fadd(left, right)
+
+
+def _subtract(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+    if _is_fused(right):
+        factor, other = right.operands
+        return fuse(builder, builder.fneg(factor), other, left)
+    return builder.fsub(left, right)
+
+
+def _multiply(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+    if isinstance(left.type, ir.ArrayType):
+        left, right = right, left
+    return _each(builder, lambda builder, number: builder.fmul(left, number), right)
+
+
+def _dot(builder: ir.IRBuilder, left: list[Any], right: list[Any]) -> Any:
+    """The number left[0] * right[0] + left[1] * right[1] + ..."""
+    add = add_numbers if isinstance(left[0].type, ir.VectorType) else ir.IRBuilder.fadd
+    total, *others = (builder.fmul(a, b) for a, b in zip(left, right, strict=True))
+    for product in others:
+        total = add(builder, total, product)
+    return total
+
+
+def _transposed(builder: ir.IRBuilder, value: Any) -> Any:
+    rows = [_parts(builder, row) for row in _parts(builder, value)]
+    return _made_of(builder, [_made_of(builder, column) for column in zip(*rows, strict=True)])
+
+
+def _matrix_product(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
+    if isinstance(right.type.element, ir.ArrayType):  # (A B)^T = B^T A^T, column by column
+        columns = _parts(builder, _transposed(builder, right))
+        products = [_matrix_product(builder, left, column) for column in columns]
+        return _transposed(builder, _made_of(builder, products))
+    numbers = _parts(builder, right)
+    rows = [_parts(builder, row) for row in _parts(builder, left)]
+    return _made_of(builder, [_dot(builder, row, numbers) for row in rows])
+
+
+# ---- operators -------------------------------------------------------------------------------
+
+
+def _operator(operation: Any, shape_of: Callable[..., Any], emit: Callable[..., Any]) -> None:
+    """Define `operation`.
+
+    Args:
+        operation: A function of `operator`.
+        shape_of: The result's shape, given those of the operands; None where there is none.
+        emit: The result, given the operands' values.
+    """
+
+    @infer_global(operation)
+    class _Typing(AbstractTemplate):
+        metadata = ASKED_FIRST
+
+        def generic(self, args, kws):  # type: ignore[no-untyped-def]
+            shapes = [_shape(kind) for kind in args]
+            shape = None if None in shapes else shape_of(*shapes)
+            number = _number_of(*args)
+            numbas = number != lanes and not any(isinstance(kind, Floats) for kind in args)
+            if not shape or (operation is operator.add and numbas):
+                return None
+            return signature(_type(shape, number), *(_type(each, number) for each in shapes))
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return emit(builder, *args)
+
+    shapes = [(), *((n,) for n in _LENGTHS), *((n, n) for n in _LENGTHS)]
+    unary = operation is operator.neg
+    for given in itertools.product(shapes, repeat=1 if unary else 2):
+        if shape_of(*given):
+            for number in (lanes, types.float64):
+                lower_builtin(operation, *(_type(shape, number) for shape in given))(lower)
+
+
+def _number_by_number(emit: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda builder, *values: _each(builder, emit, *values)
+
+
+def _of_sum(a: Any, b: Any) -> Any:
+    return a if a == b else None
+
+
+def _of_multiple(a: Any, b: Any) -> Any:
+    return None if a and b else a or b
+
+
+def _of_product(a: Any, b: Any) -> Any:
+    return (a[0], *b[1:]) if len(a) == 2 and b and a[1] == b[0] else None
+
+
+_operator(operator.add, _of_sum, _number_by_number(_add))
+_operator(operator.sub, _of_sum, _number_by_number(_subtract))
+_operator(operator.mul, _of_multiple, _multiply)
+_operator(operator.matmul, _of_product, _matrix_product)
+_operator(operator.neg, lambda a: a, _number_by_number(ir.IRBuilder.fneg))
+
+
+@infer_getattr
+class _MatrixAttributes(AttributeTemplate):
+    key = types.UniTuple
+
+    def generic_resolve(self, kind: Any, name: str) -> Any:
+        shape = _shape(kind)
+        if name == "T" and shape is not None and len(shape) == 2:
+            return _type(shape[::-1], _number_of(kind))
+        return None
+
+
+@lower_getattr(types.UniTuple, "T")
+def _transpose(context, builder, kind, value):  # type: ignore[no-untyped-def]
+    return _transposed(builder, value)
+
+
+# ---- functions -------------------------------------------------------------------------------
+
+
+def vector(*numbers: Any) -> Any:
+    """The vector of these numbers, for sums in the instance for floats."""
+    raise NotImplementedError("vector is available inside kernels only")
+
+
+def matrix(*rows: Any) -> Any:
+    """The matrix of these rows, for sums in the instance for floats."""
+    raise NotImplementedError("matrix is available inside kernels only")
+
+
+def _constructor(function: Callable[..., Any], rank: int) -> None:
+    @infer_global(function)
+    class _Typing(AbstractTemplate):
+        metadata = ASKED_FIRST
+
+        def generic(self, args, kws):  # type: ignore[no-untyped-def]
+            shapes = {_shape(part) for part in args}
+            shape = shapes.pop() if len(shapes) == 1 else None
+            if shape is None or len(shape) != rank:
+                return None
+            whole = _type((len(args), *shape), _number_of(*args))
+            return signature(whole, *whole.types)
+
+    @lower_builtin(function, types.VarArg(types.Any))
+    def _lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        return _made_of(builder, args)
+
+
+_constructor(vector, 0)
+_constructor(matrix, 1)
+
+
+@intrinsic
+def outer(typing_context, a, b):  # type: ignore[no-untyped-def]
+    """The matrix a b^T."""
+    number = _number_of(a, b)
+    a, b = _type(_shape(a), number), _type(_shape(b), number)
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        numbers = _parts(builder, args[0])
+        return _made_of(builder, [_multiply(builder, number, args[1]) for number in numbers])
+
+    return _type((len(a), len(b)), number)(a, b), lower
+
+
+@intrinsic
+def rounded(typing_context, value):  # type: ignore[no-untyped-def]
+    """A vector or matrix as it is, with which no sum is fused."""
+
+    def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        count = len(value)
+        return _made_of(builder, [builder.extract_value(args[0], i) for i in range(count)])
+
+    return value(value), lower
