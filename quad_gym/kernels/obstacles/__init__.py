@@ -1,1 +1,1 @@
-"""What stands in the way: shapes, contact and lines of sight. Imports maths."""
+"""Obstacles: shapes, contact and lines of sight. Imports maths."""

@@ -1,10 +1,11 @@
-"""Where obstacles are in an episode, who touches one, and who leaves the geofence."""
+"""Positions of obstacles in an episode, contact with them, and the geofence."""
 
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import add, keep3, load3, select3
+from quad_gym.kernels.maths.linalg import keep3, load3, select3
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.obstacles.shapes import distance_from
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import logical_not, select
@@ -16,30 +17,29 @@ _LAST_GATE = float(Ending.LAST_GATE)
 
 @kernel
 def place_obstacles(flight, settings, mask):
-    """Draw where the obstacles are in a new episode, where `mask`."""
+    """Draw the positions of obstacles in a new episode, where `mask`."""
     stream = stream_of(flight)
     for k in range(settings.obstacle_count):
         u, v = uniform_pair(stream, DRAW_OBSTACLES + 2 * k)
         w, _ = uniform_pair(stream, DRAW_OBSTACLES + 2 * k + 1)
         reach, center = load3(settings.obstacle_shift[k]), load3(settings.obstacle_center[k])
-        shift = (
+        shift = vector(
             reach[0] * (2.0 * u - 1.0),
             reach[1] * (2.0 * v - 1.0),
             reach[2] * (2.0 * w - 1.0),
         )
         other = settings.obstacle_follows[k]
         if other >= 0:
-            there, nominal = flight.obstacle_center[other], settings.obstacle_center[other]
-            shared = (there[0] - nominal[0], there[1] - nominal[1], there[2] - nominal[2])
-            shift = add(shift, shared)
-        keep3(flight.obstacle_center[k], mask, add(shift, center))
+            nominal = load3(settings.obstacle_center[other])
+            shift = shift + (load3(flight.obstacle_center[other]) - nominal)
+        keep3(flight.obstacle_center[k], mask, shift + center)
     flight.collided = select(mask, 0.0, flight.collided)
     flight.left_fence = select(mask, 0.0, flight.left_fence)
 
 
 @kernel
 def touch(flight, settings, mask):
-    """Find the nearest obstacle, and who touches it or is beyond the geofence, where `mask`."""
+    """Find the nearest obstacle, contact with it, and departure from the fence, where `mask`."""
     r_I = load3(flight.r)
     zero = 0.0 * flight.tick
     nearest, vector = zero + math.inf, (zero, zero, zero)
@@ -61,9 +61,9 @@ def touch(flight, settings, mask):
 
 @kernel
 def judge_contacts(flight, active):
-    """End the episodes of those who have touched an obstacle or left the geofence, where `active`.
+    """Terminate episodes whose vehicle touched an obstacle or left the geofence, where `active`.
 
-    A collision comes before what else ends the episode in the same step, except the last gate.
+    A collision has priority over any other ending in the same step, except the last gate.
     """
     hit, left = active & (flight.collided > 0.0), active & (flight.left_fence > 0.0)
     over, flying = hit | left, logical_not(flight.terminated > 0.0)
@@ -83,11 +83,11 @@ def begin_contacts_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def touch_stage(flight, world, model, settings, work, stages, flag):
-    """Find who touches an obstacle, or is beyond the geofence, at the present instant."""
+    """Find vehicles that touch an obstacle or are outside the geofence at the present instant."""
     touch(lanes_of(flight), settings, lanes_of(work).mask > 0.0)
 
 
 @stage
 def judge_contacts_stage(flight, world, model, settings, work, stages, flag):
-    """End the episodes of those who have touched an obstacle or left the geofence."""
+    """Terminate episodes whose vehicle touched an obstacle or left the geofence."""
     judge_contacts(lanes_of(flight), lanes_of(work).mask > 0.0)

@@ -1,20 +1,20 @@
-"""Walls and cylinders: how far a point is from one, and where a line enters one.
+"""Walls and cylinders: the distance of a point, and intersection with a line.
 
-Both are upright. A wall is a box that is turned about the vertical, `half` its half length,
-thickness and height; a cylinder has `half` radius, radius and half height.
+Both are upright. A wall is a box that is turned about the vertical; `half` has its half length,
+half thickness and half height. For a cylinder, `half` has radius, radius and half height.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum
-from quad_gym.kernels.maths.linalg import load3, norm, select3, sub
+from quad_gym.kernels.maths.linalg import load3, norm, select3
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import Shape
 
 AT_THE_END = 1e-3
-"""A line that enters an obstacle so little before its end does not cross it: a marker may hang on a
-wall [m]."""
+"""Length before a line's end in which an obstacle does not count, as a marker may hang on a wall
+[m]."""
 _FAR, _PARALLEL = 1e30, 1e-12
 
 
@@ -59,7 +59,7 @@ def _from_wall(p, half):
 
 @kernel
 def _from_cylinder(p, half):
-    """Likewise of a point in a cylinder's axes."""
+    """(distance, vector to the nearest point of the surface) of a point in a cylinder's axes."""
     zero = 0.0 * p[0]
     rho = math.sqrt(p[0] * p[0] + p[1] * p[1])
     aside = rho > _PARALLEL
@@ -76,18 +76,18 @@ def _from_cylinder(p, half):
 
 @kernel
 def distance_from(r_I, center_I, settings, k):
-    """Distance of a point from the surface of obstacle k, negative inside, and the vector there.
+    """Distance of a point from the surface of obstacle k, negative inside, and the vector to it.
 
     Args:
         r_I: The point in I [m].
-        center_I: Where the obstacle's middle is in I [m].
-        settings: Have its shape.
-        k: Its number.
+        center_I: Center of the obstacle in I [m].
+        settings: Shapes of obstacles.
+        k: Number of the obstacle.
 
     Returns:
         Distance [m]; vector in I to the surface's nearest point [m].
     """
-    p, half = to_obstacle(sub(r_I, center_I), settings, k), load3(settings.obstacle_half[k])
+    p, half = to_obstacle(r_I - center_I, settings, k), load3(settings.obstacle_half[k])
     if settings.obstacle_shape[k] == Shape.CYLINDER:
         distance, vector = _from_cylinder(p, half)
     else:
@@ -97,7 +97,7 @@ def distance_from(r_I, center_I, settings, k):
 
 @kernel
 def _slab(start, along, half):
-    """The shares of a line at which it enters and leaves the slab [-half, half]."""
+    """Fractions of a line at which it enters and leaves the slab [-half, half]."""
     across = abs(along) > _PARALLEL
     per = 1.0 / select(across, along, 1.0)
     a, b = (-half - start) * per, (half - start) * per
@@ -109,7 +109,7 @@ def _slab(start, along, half):
 
 @kernel
 def _disc(start, along, radius):
-    """Likewise the infinite cylinder around the vertical."""
+    """Fractions of a line at which it enters and leaves an infinite vertical cylinder."""
     a = along[0] * along[0] + along[1] * along[1]
     across = a > _PARALLEL * _PARALLEL
     b = start[0] * along[0] + start[1] * along[1]
@@ -127,21 +127,20 @@ def _disc(start, along, radius):
 
 @kernel
 def crosses(start_I, end_I, center_I, settings, k):
-    """Whether the line from one point to another crosses obstacle k, before AT_THE_END.
+    """Check if the line from one point to another crosses obstacle k, before AT_THE_END.
 
-    It does where the share at which it has entered all slabs is before that at which it leaves the
-    first one.
+    It does if it has entered all slabs before it leaves the first.
 
     Args:
-        start_I: Where the line starts, in I [m].
-        end_I: Where it ends [m].
-        center_I: Where the obstacle's middle is [m].
-        settings: Have its shape.
-        k: Its number.
+        start_I: Start of the line in I [m].
+        end_I: End of the line in I [m].
+        center_I: Center of the obstacle in I [m].
+        settings: Shapes of obstacles.
+        k: Number of the obstacle.
     """
-    along_I = sub(end_I, start_I)
+    along_I = end_I - start_I
     length = norm(along_I)
-    start = to_obstacle(sub(start_I, center_I), settings, k)
+    start = to_obstacle(start_I - center_I, settings, k)
     along, half = to_obstacle(along_I, settings, k), load3(settings.obstacle_half[k])
     enters, leaves = _slab(start[2], along[2], half[2])
     if settings.obstacle_shape[k] == Shape.CYLINDER:

@@ -1,26 +1,16 @@
-"""What a world that is not calm does to a flight: moving air, rotor drag, ground effect, battery.
+"""Moving air, rotor drag, ground effect and battery. These stages run only in worlds with any.
 
-A calm world never comes here. The air's velocity is held over a tick, as the motor voltages are.
+The air's velocity is held over a tick, as the motor voltages are.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import maximum, minimum
-from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
-    apply_transposed,
-    dot,
-    keep3,
-    load3,
-    load4,
-    load33,
-    scale,
-    sub,
-)
+from quad_gym.kernels.maths.linalg import dot, keep3, load3, load4, load33
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.vehicle.dynamics import (
@@ -36,7 +26,7 @@ from quad_gym.records import Supply
 
 @kernel
 def ground_gain(height, radius):
-    """Thrust near the ground over that far from it, less one: 1 / (1 - (R / 4z)^2) - 1.
+    """Relative gain of thrust near the ground: 1 / (1 - (R / 4z)^2) - 1.
 
     I. C. Cheeseman and W. E. Bennett, 1955, for hover. Heights below R/2 count as R/2.
     """
@@ -58,20 +48,15 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
         v_air_I: Velocity relative to the air [m/s].
         rotor_speeds: [rad/s].
         p: True parameters.
-        settings: Which of both there are.
+        settings: Whether there is linear drag, and a ground effect.
     """
     W = rotor_speeds
     zero = 0.0 * r_I[0]
-    force_I, torque_B = (zero, zero, zero), (zero, zero, zero)
+    force_I, torque_B = vector(zero, zero, zero), vector(zero, zero, zero)
     if settings.linear_drag:
-        v_B = apply(R_BI, v_air_I)
-        D, D_W, speed = p.linear_drag_B, p.rotor_drag_B, W[0] + W[1] + W[2] + W[3]
-        drag_B = (
-            (D[0] + D_W[0] * speed) * v_B[0],
-            (D[1] + D_W[1] * speed) * v_B[1],
-            (D[2] + D_W[2] * speed) * v_B[2],
-        )
-        force_I = sub(force_I, apply_transposed(R_BI, drag_B))
+        v_B = R_BI @ v_air_I
+        D = load3(p.linear_drag_B) + (W[0] + W[1] + W[2] + W[3]) * load3(p.rotor_drag_B)
+        force_I = force_I - R_BI.T @ vector(D[0] * v_B[0], D[1] * v_B[1], D[2] * v_B[2])
     if settings.ground_effect:
         up_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
         level = maximum(up_B[2], 0.0)
@@ -84,18 +69,18 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
             thrust = thrust + p.effectiveness[0, i] * gained
             torque_x = torque_x + p.effectiveness[1, i] * gained
             torque_y = torque_y + p.effectiveness[2, i] * gained
-        force_I = add(force_I, scale(thrust, R_BI[2]))
-        torque_B = (torque_x, torque_y, zero)
+        force_I = thrust * R_BI[2] + force_I
+        torque_B = vector(torque_x, torque_y, zero)
     return force_I, torque_B
 
 
 @kernel
 def accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, wind_I, p, settings):
-    """As `vehicle.accelerations`, in air that moves with the velocity wind_I."""
-    v_air_I = sub(v_I, wind_I)
+    """As `dynamics.accelerations`, in air that moves with the velocity wind_I."""
+    v_air_I = v_I - wind_I
     force_I, torque_B = air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings)
-    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, rotor_speeds, add(d_I, force_I), p)
-    return a_I, add(dw_B, apply(load33(p.inertia_inverse), torque_B))
+    a_I, dw_B = accelerations(R_BI, v_air_I, w_B, rotor_speeds, d_I + force_I, p)
+    return a_I, dw_B + load33(p.inertia_inverse) @ torque_B
 
 
 @kernel
@@ -108,7 +93,7 @@ def _derivative(state, voltages, d_I, wind_I, p, settings):
 
 @kernel
 def integrate_in_air(flight, p, settings):
-    """As `vehicle.integrate`, in the air that moves past the vehicle."""
+    """As `dynamics.integrate`, in moving air."""
     h = p.dt / settings.substeps
     voltages, d_I, wind_I = load4(flight.voltages), load3(flight.disturbance), load3(flight.wind)
     for _ in range(settings.substeps):
@@ -126,16 +111,16 @@ def integrate_in_air(flight, p, settings):
 
 
 @kernel
-def meet_air(flight, p, settings, mask):
-    """Set the air's velocity and what it adds to the forces of the present instant, where `mask`.
+def set_air(flight, p, settings, mask):
+    """Set the air's velocity, force and torque at the present instant, where `mask`.
 
-    The accelerometer feels these forces.
+    The accelerometer measures their effect.
     """
     wind_I = load3(p.wind_I)
     if settings.gusts:
-        wind_I = add(wind_I, gust_velocity(flight, p))
+        wind_I = wind_I + gust_velocity(flight, p)
     R_BI = quaternion_to_dcm(load4(flight.q))
-    v_air_I = sub(load3(flight.v), wind_I)
+    v_air_I = load3(flight.v) - wind_I
     force_I, torque_B = air_wrench(
         load3(flight.r), R_BI, v_air_I, load4(flight.rotor_speeds), p, settings
     )
@@ -146,19 +131,19 @@ def meet_air(flight, p, settings, mask):
 
 @kernel
 def begin_in_air(flight, p, settings, stream, mask):
-    """Draw the gust and meet the air at the start of an episode, where `mask`."""
+    """Draw the gust and set the air at the start of an episode, where `mask`."""
     if settings.gusts:
         draw_gust(flight, stream, mask)
-    meet_air(flight, p, settings, mask)
+    set_air(flight, p, settings, mask)
 
 
 @kernel
 def fly_through_air(flight, p, settings):
-    """Carry the true state and the gust over a tick, and meet the air at its end."""
+    """Carry the true state and the gust over a tick, and set the air at its end."""
     integrate_in_air(flight, p, settings)
     if settings.gusts:
         carry_gust(flight, p)
-    meet_air(flight, p, settings, flight.tick >= 0.0)
+    set_air(flight, p, settings, flight.tick >= 0.0)
 
 
 @kernel
@@ -169,7 +154,7 @@ def battery_voltage(charge, power, current, p):
     deliver. An empty battery cuts off.
 
     Args:
-        charge: Of the battery, 1: full.
+        charge: State of charge; 1 is full.
         power: P, electrical power of the rotors at their present speeds [W].
         current: I, power over voltage of rotors at steady speeds [A].
         p: True parameters.
@@ -184,7 +169,7 @@ def battery_voltage(charge, power, current, p):
 
 @kernel
 def supply(flight, p, settings):
-    """Hold the motor voltages to what there is, and take a tick's energy from the battery."""
+    """Limit the motor voltages, and take a tick's energy from the battery."""
     limit = p.max_voltage
     if settings.supply == Supply.BATTERY:
         W = load4(flight.rotor_speeds)
@@ -202,18 +187,18 @@ def supply(flight, p, settings):
 
 @stage
 def move_in_air_stage(flight, world, model, settings, work, stages, flag):
-    """Carry the true state over a tick in a world that is not calm."""
+    """Carry the true state over a tick in moving air."""
     fly_through_air(lanes_of(flight), lanes_of(world), settings)
 
 
 @stage
 def begin_in_air_stage(flight, world, model, settings, work, stages, flag):
-    """Draw the gust and meet the air at the start of an episode."""
+    """Draw the gust and set the air at the start of an episode."""
     flying = lanes_of(flight)
     begin_in_air(flying, lanes_of(world), settings, stream_of(flying), lanes_of(work).mask > 0.0)
 
 
 @stage
 def supply_stage(flight, world, model, settings, work, stages, flag):
-    """Hold the motor voltages to what the battery supplies."""
+    """Limit the motor voltages to the battery's."""
     supply(lanes_of(flight), lanes_of(world), settings)

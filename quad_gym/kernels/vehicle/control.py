@@ -1,4 +1,4 @@
-"""From what the controller sees to motor voltages: PD control and the actions' inner loops.
+"""From the observed state to motor voltages: PD control, and inner loops of the actions.
 
 All use the nominal parameters `p`, never the true ones.
 """
@@ -8,23 +8,16 @@ import math
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
 from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
-    apply_transposed,
     cross,
     dot,
     load3,
     load4,
     load33,
     load44,
-    multiply,
-    scale,
     store4,
-    sub,
-    transpose,
     unit_or,
 )
-from quad_gym.kernels.maths.vectors import vector
+from quad_gym.kernels.maths.vectors import matrix, rounded, vector
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
@@ -35,10 +28,10 @@ from quad_gym.records import Control
 def allocate(thrust, torque, p):
     """Motor voltages for a total thrust [N] and a torque in B [N m].
 
-    The thrust is held to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha <= 1
-    that keeps every rotor force at most Fmax: with the forces f + alpha t that is the least (Fmax -
-    f_i) / t_i over the rotors that it loads. Negative forces are set to zero, and a rotor
-    that the thrust alone overloads, as unequal arms allow, is held to Fmax.
+    The thrust is limited to 0.9 of the rotors' sum. The torque is multiplied by the largest alpha
+    <= 1 that keeps every rotor force at most Fmax: with the forces f + alpha t, alpha is the least
+    (Fmax - f_i) / t_i over the rotors with t_i > 0. Negative forces are set to zero, and a rotor
+    that the thrust alone overloads, as unequal arms allow, is limited to Fmax.
     """
     limit = p.max_rotor_force
     zero = 0.0 * thrust
@@ -51,12 +44,8 @@ def allocate(thrust, torque, p):
             loaded, minimum(alpha, (limit - base[i]) / select(loaded, turn[i], 1.0)), alpha
         )
     alpha = maximum(alpha, 0.0)
-    return (
-        _voltage(base[0] + alpha * turn[0], p),
-        _voltage(base[1] + alpha * turn[1], p),
-        _voltage(base[2] + alpha * turn[2], p),
-        _voltage(base[3] + alpha * turn[3], p),
-    )
+    f = base + alpha * turn
+    return (_voltage(f[0], p), _voltage(f[1], p), _voltage(f[2], p), _voltage(f[3], p))
 
 
 @kernel
@@ -71,9 +60,9 @@ def _voltage(force, p):
 def pd_wrench(r, v, R_BI, w_B, reference, p):
     """Thrust and torque of the report's PD controller.
 
-    `F_I = k (r* - r) + kd (v* - v) + m g e3 + m a*`, `z* = F_I/|F_I|`, thrust `F_I . z_I`; with `b
-    = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and `[e x] = R_E^T - R_E`, so
-    that e is twice the vector of an antisymmetric part, `N = K e - Kd w + w x J w`.
+    `F_I = k (r* - r) + kd (v* - v) + m (a* + g e3)`, `z* = F_I / |F_I|`, thrust `F_I . z_I`; with
+    `b = unit(z* x x*)`, `R*_BI = [b x z*, b, z*]^T`, `R_E = R* R_BI^T` and `[e x] = R_E^T - R_E`,
+    so that e is twice the vector of an antisymmetric part, `N = K e - Kd w + w x J w`.
 
     Args:
         r, v: Position [m] and velocity [m/s] in I.
@@ -83,18 +72,19 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
         p: Nominal parameters with the gains.
     """
     r_ref, v_ref, a_ref, x_ref = reference
-    F_I = add(
-        add(scale(p.gain_position, sub(r_ref, r)), scale(p.gain_velocity, sub(v_ref, v))),
-        scale(p.mass, (a_ref[0], a_ref[1], a_ref[2] + p.gravity)),
+    F_I = (
+        p.gain_position * (r_ref - r)
+        + rounded(p.gain_velocity * (v_ref - v))
+        + rounded(p.mass * vector(a_ref[0], a_ref[1], a_ref[2] + p.gravity))
     )
     z_I = R_BI[2]
     z_ref = unit_or(F_I, z_I)
     b = unit_or(cross(z_ref, x_ref), R_BI[1])
-    R_ref = (cross(b, z_ref), b, z_ref)
-    R_E = multiply(R_ref, transpose(R_BI))
+    R_ref = matrix(cross(b, z_ref), b, z_ref)
+    R_E = R_ref @ R_BI.T
     e = (R_E[1][2] - R_E[2][1], R_E[2][0] - R_E[0][2], R_E[0][1] - R_E[1][0])
     K, Kd = p.gain_attitude, p.gain_body_rates
-    gyroscopic = cross(w_B, apply(load33(p.inertia), w_B))
+    gyroscopic = cross(w_B, load33(p.inertia) @ w_B)
     torque = (
         K[0] * e[0] - Kd[0] * w_B[0] + gyroscopic[0],
         K[1] * e[1] - Kd[1] * w_B[1] + gyroscopic[1],
@@ -104,11 +94,10 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
 
 
 @kernel
-def rate_torque(w_wanted, w_B, p):
+def rate_torque(w_desired, w_B, p):
     """Torque of the inner rate loop: J k_w (w* - w) + w x J w."""
     J = load33(p.inertia)
-    wanted = apply(J, scale(p.rate_bandwidth, sub(w_wanted, w_B)))
-    return add(wanted, cross(w_B, apply(J, w_B)))
+    return J @ (p.rate_bandwidth * (w_desired - w_B)) + cross(w_B, J @ w_B)
 
 
 @kernel
@@ -117,15 +106,15 @@ def level_axes(R_BI):
     x_B_I = R_BI[0]
     zero = 0.0 * x_B_I[0]
     ahead = unit_or((x_B_I[0], x_B_I[1], zero), (1.0, 0.0, 0.0))
-    return (ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
+    return matrix(ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
 
 
 @kernel
-def tilt_rates(z_wanted_I, R_BI, yaw_rate, p):
+def tilt_rates(z_desired_I, R_BI, yaw_rate, p):
     """Body rates that turn the thrust axis toward a direction: k_a (e3 x R z*), and a yaw rate."""
-    z_wanted_B = apply(R_BI, z_wanted_I)
+    z_desired_B = R_BI @ z_desired_I
     k = p.attitude_bandwidth
-    return (-k * z_wanted_B[1], k * z_wanted_B[0], yaw_rate)
+    return vector(-k * z_desired_B[1], k * z_desired_B[0], yaw_rate)
 
 
 @kernel
@@ -133,10 +122,10 @@ def act(flight, a, p, mode, reference):
     """Set the motor voltages of the coming tick.
 
     Args:
-        flight: Record; reads what the controller sees, sets voltages.
+        flight: Record; reads the observed state, sets voltages.
         a: (4,) the action, in [-1, 1].
         p: Nominal parameters.
-        mode: What the action means, a `Control`.
+        mode: Meaning of the action, a `Control`.
         reference: (r*, v*, a*, x*) in I, for `Control.PD`.
     """
     R_BI, w_B = load33(flight.R_seen), load3(flight.w_seen)
@@ -157,17 +146,17 @@ def act(flight, a, p, mode, reference):
             torque = (scales[0] * a[1], scales[1] * a[2], scales[2] * a[3])
         elif mode == Control.CTBR:
             rates = p.rate_scale
-            torque = rate_torque((rates[0] * a[1], rates[1] * a[2], rates[2] * a[3]), w_B, p)
+            w_desired = vector(rates[0] * a[1], rates[1] * a[2], rates[2] * a[3])
+            torque = rate_torque(w_desired, w_B, p)
         elif mode == Control.ATTITUDE:
             s_roll, c_roll = sin_cos(p.tilt_scale * a[1])
             s_pitch, c_pitch = sin_cos(p.tilt_scale * a[2])
-            z_level = (s_pitch, -c_pitch * s_roll, c_pitch * c_roll)
-            z_I = apply_transposed(level_axes(R_BI), z_level)
-            rates_wanted = tilt_rates(z_I, R_BI, p.rate_scale[2] * a[3], p)
-            torque = rate_torque(rates_wanted, w_B, p)
+            z_I = level_axes(R_BI).T @ (s_pitch, -c_pitch * s_roll, c_pitch * c_roll)
+            w_desired = tilt_rates(z_I, R_BI, p.rate_scale[2] * a[3], p)
+            torque = rate_torque(w_desired, w_B, p)
         elif mode == Control.VELOCITY:
             level = level_axes(R_BI)
-            v_level = apply(level, load3(flight.v_seen))
+            v_level = level @ load3(flight.v_seen)
             s = p.velocity_scale
             k = p.mass * p.velocity_bandwidth
             F_level = (
@@ -175,10 +164,10 @@ def act(flight, a, p, mode, reference):
                 clip(k * (s * a[1] - v_level[1]), -weight, weight),
                 weight + clip(k * (s * a[2] - v_level[2]), -0.5 * weight, weight),
             )
-            F_I = apply_transposed(level, F_level)
+            F_I = level.T @ F_level
             thrust = dot(F_I, R_BI[2])
-            rates_wanted = tilt_rates(unit_or(F_I, R_BI[2]), R_BI, p.rate_scale[2] * a[3], p)
-            torque = rate_torque(rates_wanted, w_B, p)
+            w_desired = tilt_rates(unit_or(F_I, R_BI[2]), R_BI, p.rate_scale[2] * a[3], p)
+            torque = rate_torque(w_desired, w_B, p)
         else:
             thrust, torque = pd_wrench(
                 load3(flight.r_seen), load3(flight.v_seen), R_BI, w_B, reference, p

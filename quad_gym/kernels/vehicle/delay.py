@@ -1,7 +1,7 @@
-"""Actions that reach the vehicle some time after they were commanded.
+"""Actions that reach the vehicle some time after they are commanded.
 
-Transport from a computer to the inner loops takes its time, so that a policy acts on a vehicle that
-still carries out what was commanded before. The inner loops themselves run on board, without delay.
+Transport from a computer to the inner loops takes time, in which the vehicle still carries out
+earlier commands. The inner loops themselves run on board, without delay.
 """
 
 from quad_gym.kernels.compiling import kernel, stage
@@ -12,7 +12,7 @@ from quad_gym.kernels.simd.lanes import select
 
 @kernel
 def forget_actions(flight, settings, mask):
-    """Begin an episode as if zeros had been commanded before it, where `mask`: they hover."""
+    """Begin an episode as if zero, which is hover, had been commanded before it, where `mask`."""
     for k in range(settings.action_delays + 1):
         for i in range(4):
             past = flight.past_actions[k, i]
@@ -23,14 +23,13 @@ def forget_actions(flight, settings, mask):
 def delay_action(flight, p, settings):
     """Set the action of the coming tick: the one commanded `action_delay` steps ago.
 
-    The delay counts in control steps, rounded to whole ticks: with T ticks in a step, tick j of a
-    step carries out the action of k steps ago, where k is the number of whole or begun steps in
-    `delay T - j` ticks.
+    The delay is in control steps, and is rounded to whole ticks: with T ticks per step, tick j of a
+    step carries out the action of k steps ago, where k is `delay T - j` ticks in steps, rounded up.
 
     Args:
         flight: Record; reads the present action, sets the delayed one.
-        p: Parameters as they are.
-        settings: What the batch does.
+        p: True parameters.
+        settings: Ticks per step and the largest delay.
     """
     T, past = settings.ticks_per_step, flight.past_actions
     since = flight.tick - T * flight.step

@@ -71,7 +71,7 @@ def load_state(flight):
 
 @kernel
 def load_start(work):
-    """The true state at the start of the tick, as the workspace keeps it."""
+    """The true state at the start of the tick, from the workspace."""
     s = work.start
     return load3(s), load3(s[3:]), load4(s[6:]), load3(s[10:]), load4(s[13:])
 

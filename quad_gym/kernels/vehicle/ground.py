@@ -1,18 +1,17 @@
 """The ground as a level plane that carries a vehicle: contact of its feet and rotor hubs.
 
-Each tick is flown freely first. Where a point would be below the plane at its end, impulses at all
-points take its place: with the gap g_i and the velocity u_i of point i, and the tick h,
+Each tick is flown freely first. Where a point would be below the plane at its end, impulses act at
+all points: with the gap g_i, velocity u_i and impulse j_i of point i, and the tick h,
 
     u_iz >= -g_i / h,   j_iz >= 0,   |(j_ix, j_iy)| <= friction j_iz,
 
-found by Gauss-Seidel sweeps; then r+ = r + h v+ and q+ = q exp(h w+). Impulses that fulfil this do
-no positive work at the velocities that they lead to, u_i . j_i <= 0, and contact gains no energy.
-The number of sweeps is fixed, however: where they have not converged, as in an impact of several
-points at once, their impulses may add some, and a last scaling of all of them takes that away, see
-`_share_without_gain`. As r+ and q+ follow from velocities, points of a vehicle that turns fast may
-end a tick below the plane; they go no deeper, and nothing pushes them out, which would gain energy.
-A vehicle that is at rest, and that normal forces and static friction can hold so, stays exactly
-where it is.
+found by Gauss-Seidel sweeps; then r+ = r + h v+ and q+ = q exp(h w+). Impulses that satisfy this do
+no positive work at the resulting velocities, u_i . j_i <= 0, so contact adds no energy. The number
+of sweeps is fixed, however: sweeps that have not converged, as in an impact of several points at
+once, may add energy, which a final scaling of all impulses removes (`_share_without_gain`). As r+
+and q+ follow from velocities, points of a vehicle that rotates fast may end a tick below the plane;
+they go no deeper, and nothing pushes them out, which would add energy. A vehicle at rest that
+normal forces and static friction can hold keeps its exact state.
 """
 
 import math
@@ -20,34 +19,28 @@ import math
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import clip, maximum, minimum, sin_cos
 from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
-    apply_transposed,
     cross,
     dot,
     keep3,
     load3,
     load4,
     load33,
-    multiply,
-    scale,
     select3,
     store3,
-    sub,
-    transpose,
 )
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_to_dcm
+from quad_gym.kernels.maths.vectors import rounded
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, logical_not, select
 from quad_gym.kernels.vehicle.dynamics import accelerations, load_start
 from quad_gym.records import Ending
 
 SWEEPS = 24
-"""Of all points; in each a point meets what the others have changed."""
+"""Gauss-Seidel sweeps over all points in a tick."""
 STILL_SPEED, STILL_RATE, STILL_GAP = 5e-3, 0.05, 2e-4
 """Speed [m/s], body rate [rad/s] and gap of the feet [m] below which a vehicle can come to rest.
 
-Feet that an impact has left below the plane, at an angle or not, stand as well as those on it.
+Feet that an impact has left below the plane count as standing on it.
 """
 _FEET, _POINTS = 4, 8
 _ON_THE_GROUND = float(Ending.BELOW_MIN_HEIGHT)
@@ -55,41 +48,41 @@ _ON_THE_GROUND = float(Ending.BELOW_MIN_HEIGHT)
 
 @kernel
 def _free_accelerations(flight, p, R_BI):
-    """Acceleration in I and angular acceleration in B that the ground has no part in."""
-    v_air_I = sub(load3(flight.v), load3(flight.wind))
-    d_I = add(load3(flight.disturbance), load3(flight.air_force))
+    """Acceleration in I and angular acceleration in B without contact."""
+    v_air_I = load3(flight.v) - load3(flight.wind)
+    d_I = load3(flight.disturbance) + load3(flight.air_force)
     W = load4(flight.rotor_speeds)
     a_I, dw_B = accelerations(R_BI, v_air_I, load3(flight.w), W, d_I, p)
-    return a_I, add(dw_B, apply(load33(p.inertia_inverse), load3(flight.air_torque)))
+    return a_I, dw_B + load33(p.inertia_inverse) @ load3(flight.air_torque)
 
 
 @kernel
-def _effective_mass(arm, along, spread_I, inverse_mass):
-    """Impulse on a point along a direction, over the change of its velocity along it [kg]."""
+def _effective_mass(arm, along, inverse_inertia_I, inverse_mass):
+    """Effective mass of a point along a direction: impulse per change of its velocity [kg]."""
     turn = cross(arm, along)
-    return 1.0 / (inverse_mass + dot(turn, apply(spread_I, turn)))
+    return 1.0 / (inverse_mass + dot(turn, inverse_inertia_I @ turn))
 
 
 @kernel
-def _prepare(work, p, R_BI, spread_I, height):
-    """Set arms in I, effective masses and gaps of all points; no impulses as yet.
+def _prepare(work, p, R_BI, inverse_inertia_I, height):
+    """Set arms in I, effective masses and gaps of all points, and zero impulses.
 
     Args:
         work: Workspace.
-        p: Parameters as they are.
+        p: True parameters.
         R_BI: Attitude.
-        spread_I: Inverse of the inertia in I.
+        inverse_inertia_I: Inverse of the inertia, in I.
         height: Of the center of mass above the plane [m].
     """
     zero, inverse_mass = 0.0 * height, 1.0 / p.mass
     one = zero + 1.0
     for i in range(_POINTS):
         l_B = load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
-        arm = apply_transposed(R_BI, l_B)
+        arm = R_BI.T @ l_B
         store3(work.ground_arm[i], arm)
-        x = _effective_mass(arm, (one, zero, zero), spread_I, inverse_mass)
-        y = _effective_mass(arm, (zero, one, zero), spread_I, inverse_mass)
-        z = _effective_mass(arm, (zero, zero, one), spread_I, inverse_mass)
+        x = _effective_mass(arm, (one, zero, zero), inverse_inertia_I, inverse_mass)
+        y = _effective_mass(arm, (zero, one, zero), inverse_inertia_I, inverse_mass)
+        z = _effective_mass(arm, (zero, zero, one), inverse_inertia_I, inverse_mass)
         # one for all level directions, so that friction opposes the sliding
         store3(work.ground_mass[i], (minimum(x, y), minimum(x, y), z))
         store3(work.ground_impulse[i], (zero, zero, zero))
@@ -97,62 +90,64 @@ def _prepare(work, p, R_BI, spread_I, height):
 
 
 @kernel
-def _pushed(v_I, w_I, arm, j_I, spread_I, inverse_mass):
+def _pushed(v_I, w_I, arm, j_I, inverse_inertia_I, inverse_mass):
     """Velocity and body rates in I after an impulse at the end of an arm."""
-    return add(v_I, scale(inverse_mass, j_I)), add(w_I, apply(spread_I, cross(arm, j_I)))
+    return inverse_mass * j_I + v_I, w_I + inverse_inertia_I @ cross(arm, j_I)
 
 
 @kernel
-def _sweep(work, v_I, w_I, spread_I, inverse_mass, friction, rate):
+def _sweep(work, v_I, w_I, inverse_inertia_I, inverse_mass, friction, rate):
     """One sweep over all points; returns velocity and body rates in I after it."""
     zero = 0.0 * v_I[0]
     for i in range(_POINTS):
         arm, mass = load3(work.ground_arm[i]), load3(work.ground_mass[i])
         old = load3(work.ground_impulse[i])
         floor = -maximum(work.ground_gap[i], zero) * rate
-        u = add(v_I, cross(w_I, arm))
+        u = v_I + cross(w_I, arm)
         up = maximum(old[2] + mass[2] * (floor - u[2]), zero)
-        v_I, w_I = _pushed(v_I, w_I, arm, (zero, zero, up - old[2]), spread_I, inverse_mass)
-        u = add(v_I, cross(w_I, arm))
+        v_I, w_I = _pushed(
+            v_I, w_I, arm, (zero, zero, up - old[2]), inverse_inertia_I, inverse_mass
+        )
+        u = v_I + cross(w_I, arm)
         x, y = old[0] - mass[0] * u[0], old[1] - mass[1] * u[1]
         size, most = math.sqrt(x * x + y * y), friction * up
         share = select(size > most, most / select(size > most, size, 1.0), 1.0)
         x, y = share * x, share * y
         aside = (x - old[0], y - old[1], zero)
-        v_I, w_I = _pushed(v_I, w_I, arm, aside, spread_I, inverse_mass)
+        v_I, w_I = _pushed(v_I, w_I, arm, aside, inverse_inertia_I, inverse_mass)
         store3(work.ground_impulse[i], (x, y, up))
     return v_I, w_I
 
 
 @kernel
 def _share_without_gain(start, before, after, ahead, p):
-    """Share of the impulses with which a vehicle has no more energy than it would without any.
+    """Share of the impulses with which a vehicle has no more energy than in free flight.
 
-    The forces of free flight, mean over the tick, do work along the way: their acceleration is
-    a = (v_free - v_start) / h. Kinetic energy less that work, at the end of the tick, less the
-    same of free flight, is `A s^2 / 2 + B s + C` in the share s, with
+    The mean forces of free flight over the tick do work along the path: their acceleration is
+    a = (v_free - v_start) / h. Kinetic energy minus that work, at the end of the tick, exceeds its
+    value in free flight by `A s^2 / 2 + B s + C` with a share s of the impulses, where
 
         A = m |dv|^2 + dw . J dw,   B = m (v_free - h a) . dv + w_free . J dw,   C = -m a . ahead.
 
-    With the impulses that the sweeps converge to it is never positive at s = 1. Gravity alone in
-    place of all forces would take a stand under thrust for a gain.
+    It is never positive at s = 1 once the sweeps have converged. With gravity alone in place of all
+    forces, standing still under thrust would count as an energy gain.
 
     Args:
         start: Velocity (I) at the tick's start.
         before: Velocity (I) and body rates (B) at its end without impulses.
-        after: Likewise with them.
-        ahead: By how much the way at the velocity of the end is beyond that of free flight, in I
-            [m].
-        p: Parameters as they are.
+        after: Velocity (I) and body rates (B) at its end with impulses.
+        ahead: Displacement in a tick at the final velocity, minus the displacement in free flight,
+            in I [m].
+        p: True parameters.
 
     Returns:
         The largest share in [0, 1] for which the energy is not positive.
     """
     J = load33(p.inertia)
-    dv, dw = sub(after[0], before[0]), sub(after[1], before[1])
-    a = p.mass * dot(dv, dv) + dot(dw, apply(J, dw))
-    b = p.mass * dot(start, dv) + dot(before[1], apply(J, dw))  # v_free - h a is the start's
-    c = -p.mass * dot(sub(before[0], start), ahead) / p.dt
+    dv, dw = after[0] - before[0], after[1] - before[1]
+    a = p.mass * dot(dv, dv) + dot(dw, J @ dw)
+    b = p.mass * dot(start, dv) + dot(before[1], J @ dw)  # v_free - h a = v_start
+    c = -p.mass * dot(before[0] - start, ahead) / p.dt
     changes = a > 1e-300
     root = math.sqrt(maximum(b * b - 2.0 * a * c, 0.0))
     return clip((root - b) / select(changes, a, 1.0), 0.0, 1.0)
@@ -160,10 +155,10 @@ def _share_without_gain(start, before, after, ahead, p):
 
 @kernel
 def _can_hold(work, F, T, friction):
-    """Whether the feet can give an impulse F and an angular impulse T, both in I.
+    """Check that the feet can give an impulse F and an angular impulse T, both in I.
 
-    Normal forces are those of least squares among the four; static friction is that of the whole
-    vehicle, as if the feet shared the load.
+    Normal forces are the least-squares solution among the four; static friction is evaluated for
+    the whole vehicle, as if the feet shared the load.
     """
     zero = 0.0 * F[0]
     c_x, c_y, c_z = zero, zero, zero
@@ -177,11 +172,8 @@ def _can_hold(work, F, T, friction):
     first, second, third = (n, y, x), (y, yy, xy), (x, xy, xx)
     b = (F[2], T[0] + c_z * F[1], T[1] - c_z * F[0])
     across = cross(second, third)
-    m = add(
-        add(scale(b[0], across), scale(b[1], cross(third, first))),
-        scale(b[2], cross(first, second)),
-    )
-    m = scale(1.0 / dot(first, across), m)
+    m = b[0] * across + rounded(b[1] * cross(third, first)) + rounded(b[2] * cross(first, second))
+    m = (1.0 / dot(first, across)) * m
     least, reach = zero + math.inf, zero + math.inf
     for i in range(_FEET):
         arm = load3(work.ground_arm[i])
@@ -195,27 +187,27 @@ def _can_hold(work, F, T, friction):
 
 @kernel
 def carry(p, settings, work, pose, rates, free, ahead):
-    """Let the ground push for one tick.
+    """Apply the ground's impulses over one tick.
 
     Args:
-        p: Parameters as they are.
-        settings: Friction, and what a crash is.
+        p: True parameters.
+        settings: Friction, and limits of a crash.
         work: Workspace.
         pose: Position in I and attitude quaternion at the tick's start.
         rates: Velocity in I and body rates in B at its start.
-        free: Likewise at its end, as without the ground.
+        free: Velocity in I and body rates in B at its end without the ground.
         ahead: See `_share_without_gain`.
 
     Returns:
-        Velocity in I and body rates in B at its end; which lanes the ground pushes, which of them
-        stay as they are, which crash; how many feet carry.
+        Velocity in I and body rates in B at its end; masks of the lanes in contact, at rest, and
+        crashed; number of feet that carry load.
     """
     (r_I, q), (v_start, w_start), (v_free, w_free) = pose, rates, free
     R_BI, rate, J = quaternion_to_dcm(q), 1.0 / p.dt, load33(p.inertia)
-    spread_I = multiply(transpose(R_BI), multiply(load33(p.inertia_inverse), R_BI))
+    inverse_inertia_I = R_BI.T @ (load33(p.inertia_inverse) @ R_BI)
     inverse_mass, zero = 1.0 / p.mass, 0.0 * r_I[0]
-    w_I = apply_transposed(R_BI, w_free)
-    _prepare(work, p, R_BI, spread_I, r_I[2] - p.ground_height)
+    w_I = R_BI.T @ w_free
+    _prepare(work, p, R_BI, inverse_inertia_I, r_I[2] - p.ground_height)
     meets, hard, still = zero > 1.0, zero > 1.0, zero < 1.0
     for i in range(_POINTS):
         down = v_free[2] + cross(w_I, load3(work.ground_arm[i]))[2]
@@ -229,16 +221,18 @@ def carry(p, settings, work, pose, rates, free, ahead):
     v, w, feet = v_free, w_free, zero
     stays = meets & still & (dot(v_start, v_start) <= STILL_SPEED * STILL_SPEED)
     stays = stays & (dot(w_start, w_start) <= STILL_RATE * STILL_RATE)
-    T_I = apply_transposed(R_BI, scale(-1.0, apply(J, w_free)))
-    stays = stays & _can_hold(work, scale(-p.mass, v_free), T_I, settings.friction)
+    T_I = R_BI.T @ -(J @ w_free)
+    stays = stays & _can_hold(work, -p.mass * v_free, T_I, settings.friction)
     if any_of(meets & logical_not(stays)):
         v_I = v_free
         for _ in range(SWEEPS):
-            v_I, w_I = _sweep(work, v_I, w_I, spread_I, inverse_mass, settings.friction, rate)
-        w_B = apply(R_BI, w_I)
+            v_I, w_I = _sweep(
+                work, v_I, w_I, inverse_inertia_I, inverse_mass, settings.friction, rate
+            )
+        w_B = R_BI @ w_I
         share = _share_without_gain(v_start, free, (v_I, w_B), ahead, p)
-        v = add(v_free, scale(share, sub(v_I, v_free)))
-        w = add(w_free, scale(share, sub(w_B, w_free)))
+        v = share * (v_I - v_free) + v_free
+        w = share * (w_B - w_free) + w_free
         for i in range(_FEET):
             feet = feet + select(work.ground_impulse[i, 2] > 0.0, 1.0, 0.0)
     nothing = (zero, zero, zero)
@@ -249,36 +243,35 @@ def carry(p, settings, work, pose, rates, free, ahead):
 
 @kernel
 def _feel(flight, p, R_BI, gained, mask):
-    """Keep what the accelerometer feels of the ground: of an acceleration in I, and angular in B.
+    """Set the specific force at the accelerometer that the ground adds.
 
     Args:
         flight: Record, at the end of the tick.
-        p: Parameters as they are.
+        p: True parameters.
         R_BI: Attitude there.
-        gained: Mean acceleration and angular acceleration over the tick.
-        mask: Lanes that the ground pushes; others feel nothing.
+        gained: Mean acceleration in I and angular acceleration in B over the tick.
+        mask: Lanes in contact; in others it is zero.
     """
     a_I, dw_B = _free_accelerations(flight, p, R_BI)
-    push = apply(R_BI, sub(gained[0], a_I))
-    push = add(push, cross(sub(gained[1], dw_B), load3(p.imu_lever_arm)))
+    push = R_BI @ (gained[0] - a_I) + cross(gained[1] - dw_B, load3(p.imu_lever_arm))
     zero = 0.0 * p.dt
     store3(flight.ground_push, select3(mask, push, (zero, zero, zero)))
 
 
 @kernel
 def stand(flight, p, settings, work, start):
-    """Let the ground carry a vehicle over the tick that has just been flown.
+    """Apply the ground's contact forces to the tick that has just been flown.
 
     Args:
         flight: Record, after the tick's free motion.
-        p: Parameters as they are.
-        settings: Friction, and what a crash is.
+        p: True parameters.
+        settings: Friction, and limits of a crash.
         work: Workspace.
-        start: The true state at the tick's start, as of `load_start`.
+        start: The true state at the tick's start, from `load_start`.
     """
     r_I, v_I, q, w_B, _ = start
     free = load3(flight.v), load3(flight.w)
-    ahead = sub(add(r_I, scale(p.dt, free[0])), load3(flight.r))
+    ahead = p.dt * free[0] + r_I - load3(flight.r)
     pose = (r_I, q)
     v, w, meets, stays, crashes, feet = carry(p, settings, work, pose, (v_I, w_B), free, ahead)
     flight.footing = feet
@@ -289,7 +282,7 @@ def stand(flight, p, settings, work, start):
         turns = half > 1e-100
         per = select(turns, 0.5 * p.dt * sine / select(turns, half, 1.0), 0.5 * p.dt)
         a, (x, y, z) = q[0], (q[1], q[2], q[3])
-        d = scale(per, w)
+        d = per * w
         turned = normalize_quaternion(
             (
                 a * cosine - x * d[0] - y * d[1] - z * d[2],
@@ -298,13 +291,13 @@ def stand(flight, p, settings, work, start):
                 z * cosine + a * d[2] + x * d[1] - y * d[0],
             )
         )
-        keep3(flight.r, meets, select3(stays, r_I, add(r_I, scale(p.dt, v))))
+        keep3(flight.r, meets, select3(stays, r_I, p.dt * v + r_I))
         keep3(flight.v, meets, v)
         keep3(flight.w, meets, w)
         for i in range(4):
             flight.q[i] = select(meets, select(stays, q[i], turned[i]), flight.q[i])
         rate = 1.0 / p.dt
-        gained = scale(rate, sub(v, v_I)), scale(rate, sub(w, w_B))
+        gained = rate * (v - v_I), rate * (w - w_B)
         _feel(flight, p, quaternion_to_dcm(load4(flight.q)), gained, meets)
     else:
         zero = 0.0 * p.dt
@@ -313,12 +306,12 @@ def stand(flight, p, settings, work, start):
 
 @kernel
 def begin_on_ground(flight, p, settings, work, mask):
-    """Put a vehicle that starts on the ground onto it, and lift one that is in it, where `mask`."""
+    """Place a vehicle that starts on the ground, and lift one that is below it, where `mask`."""
     R_BI, height = quaternion_to_dcm(load4(flight.q)), flight.r[2] - p.ground_height
     lowest = height + math.inf
     for i in range(_POINTS):
         l_B = load3(p.feet_B[i]) if i < _FEET else load3(p.rotor_positions_B[i - _FEET])
-        lowest = minimum(lowest, height + apply_transposed(R_BI, l_B)[2])
+        lowest = minimum(lowest, height + (R_BI.T @ l_B)[2])
     given = flight.start_given[2]
     placed = (work.on_ground > 0.0) & logical_not(given == given)
     z = flight.r[2]
@@ -330,12 +323,12 @@ def begin_on_ground(flight, p, settings, work, mask):
     flight.crashed = select(mask, 0.0, flight.crashed)
     v_I, w_B, h = load3(flight.v), load3(flight.w), p.dt
     a_I, dw_B = _free_accelerations(flight, p, R_BI)
-    free = add(v_I, scale(h, a_I)), add(w_B, scale(h, dw_B))
+    free = h * a_I + v_I, h * dw_B + w_B
     pose = load3(flight.r), load4(flight.q)
-    ahead = scale(0.5 * h, sub(free[0], v_I))
+    ahead = 0.5 * h * (free[0] - v_I)
     v, w, meets, _, _, feet = carry(p, settings, work, pose, (v_I, w_B), free, ahead)
     before = load3(flight.ground_push)
-    gained = scale(1.0 / h, sub(v, v_I)), scale(1.0 / h, sub(w, w_B))
+    gained = (1.0 / h) * (v - v_I), (1.0 / h) * (w - w_B)
     _feel(flight, p, R_BI, gained, meets)
     keep3(flight.ground_push, logical_not(mask), before)
     flight.footing = select(mask, feet, flight.footing)
@@ -343,7 +336,7 @@ def begin_on_ground(flight, p, settings, work, mask):
 
 @kernel
 def judge_landing(flight, active):
-    """End the episodes of those who have crashed into the ground, where `active`."""
+    """Terminate the episodes of vehicles that have crashed into the ground, where `active`."""
     over, flying = active & (flight.crashed > 0.0), logical_not(flight.terminated > 0.0)
     flight.ending = select(over & flying, _ON_THE_GROUND, flight.ending)
     flight.terminated = select(over, 1.0, flight.terminated)
@@ -351,14 +344,14 @@ def judge_landing(flight, active):
 
 @stage
 def stand_stage(flight, world, model, settings, work, stages, flag):
-    """Let the ground carry a vehicle over the tick that has just been flown."""
+    """Apply the ground's contact forces to the tick that has just been flown."""
     scratch = lanes_of(work)
     stand(lanes_of(flight), lanes_of(world), settings, scratch, load_start(scratch))
 
 
 @stage
 def begin_ground_stage(flight, world, model, settings, work, stages, flag):
-    """Put vehicles that start on the ground onto it."""
+    """Place vehicles that start on the ground."""
     scratch = lanes_of(work)
     mask = scratch.mask > 0.0
     begin_on_ground(lanes_of(flight), lanes_of(world), settings, scratch, mask)
@@ -366,12 +359,12 @@ def begin_ground_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def feel_ground_stage(flight, world, model, settings, work, stages, flag):
-    """Add to the IMU's sample what the accelerometer feels of the ground."""
+    """Add the ground's contact force to the accelerometer's sample."""
     flying, mask = lanes_of(flight), lanes_of(work).mask > 0.0
-    keep3(flying.accel, mask, add(load3(flying.accel), load3(flying.ground_push)))
+    keep3(flying.accel, mask, load3(flying.accel) + load3(flying.ground_push))
 
 
 @stage
 def judge_landing_stage(flight, world, model, settings, work, stages, flag):
-    """End the episodes of those who have crashed into the ground."""
+    """Terminate the episodes of vehicles that have crashed into the ground."""
     judge_landing(lanes_of(flight), lanes_of(work).mask > 0.0)

@@ -1,23 +1,24 @@
 """Dryden gusts in the low-altitude form of MIL-F-8785C (3.7.3.4), discretized exactly.
 
-Along the mean wind the gust u has the spectrum of a first-order filter of white noise, across (v)
-and upward (w) that of `(1 + sqrt(3) T s) / (1 + T s)^2` with T = L / V. In the time h = V t / L all
-three are stationary whatever the airspeed V and the length L are, so V and L may change from tick
-to tick: the states below have fixed variances, and only the intensities are multiplied in.
+Along the mean wind, the gust u is white noise through a first-order filter; across (v) and upward
+(w), it is white noise through `(1 + sqrt(3) T s) / (1 + T s)^2` with T = L / V. In the time h = V t
+/ L all three are stationary at any airspeed V and length L, so V and L may change from tick to
+tick: the states below have fixed variances, and only the intensities are multiplied in.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import clip, exp, log, maximum
-from quad_gym.kernels.maths.linalg import load3, norm, sub
+from quad_gym.kernels.maths.linalg import load3, norm
 from quad_gym.kernels.maths.random import normal_pair, stream_of
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_GUST
 
 LEAST_AIRSPEED = 1.0
-"""Airspeed below which the gusts do not slow down further [m/s]: a turbulence frozen in the air, as
-Taylor's hypothesis has it, would stand still about a vehicle that drifts with the wind."""
+"""Least airspeed with which gusts change [m/s]: turbulence that is frozen in the air (Taylor's
+hypothesis) would be constant for a vehicle that drifts with the wind."""
 _FOOT = 0.3048
 _LOWEST, _HIGHEST = 10.0, 1000.0  # feet: where the low-altitude form holds
 _ROOT3, _ROOT_HALF, _ROOT_EIGHTH = math.sqrt(3.0), math.sqrt(0.5), math.sqrt(0.125)
@@ -31,7 +32,7 @@ def gust_scales(height, wind_speed):
     0.000823 h` and h in feet.
 
     Args:
-        height: Above ground [m]; held within 10 and 1,000 feet.
+        height: Above ground [m]; limited to between 10 and 1,000 feet.
         wind_speed: W20, 20 feet above ground [m/s].
     """
     h = clip(height / _FOOT, _LOWEST, _HIGHEST)
@@ -61,8 +62,8 @@ def first_order(x, h, n):
 def second_order(x, y, h, n, m):
     """Carry `x' = -x + noise`, `y' = -y + x` of unit noise density over the time h.
 
-    With e = exp(-h) the noise that comes in has the covariance [[e sinh h, c], [c, d]], c = e (sinh
-    h - h e) / 2, and d is such that its determinant is e^2 (sinh^2 h - h^2) / 4.
+    With e = exp(-h), the added noise has the covariance [[e sinh h, c], [c, d]], where c = e (sinh
+    h - h e) / 2, and d gives it the determinant e^2 (sinh^2 h - h^2) / 4.
 
     Args:
         x, y: The states, of stationary covariance [[1/2, 1/4], [1/4, 1/4]].
@@ -97,9 +98,9 @@ def draw_gust(flight, stream, mask):
 
 @kernel
 def carry_gust(flight, p):
-    """Carry the gust over a tick, at the vehicle's height and airspeed of now."""
+    """Carry the gust over a tick, at the vehicle's present height and airspeed."""
     _, _, L_u, L_w = gust_scales(flight.r[2] - p.ground_height, p.gust_wind_speed)
-    airspeed = norm(sub(load3(flight.v), load3(p.wind_I)))
+    airspeed = norm(load3(flight.v) - load3(p.wind_I))
     way = p.dt * maximum(airspeed, LEAST_AIRSPEED)
     stream = stream_of(flight)
     n_u, n_v = normal_pair(stream, DRAW_GUST)
@@ -124,4 +125,4 @@ def gust_velocity(flight, p):
     blows = speed > 0.0
     along = select(blows, speed, 1.0)
     c, s = select(blows, x, 1.0) / along, y / along
-    return (c * u - s * v, s * u + c * v, w)
+    return vector(c * u - s * v, s * u + c * v, w)

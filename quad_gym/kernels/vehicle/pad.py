@@ -1,7 +1,7 @@
 """The launch pad: it carries a vehicle that starts on the ground until its thrust lifts it."""
 
 from quad_gym.kernels.compiling import kernel, stage
-from quad_gym.kernels.maths.linalg import add, keep3, load3, load4, sub
+from quad_gym.kernels.maths.linalg import keep3, load3, load4
 from quad_gym.kernels.maths.rotation import quaternion_to_dcm
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import any_of, select
@@ -10,16 +10,16 @@ from quad_gym.kernels.vehicle.dynamics import accelerations, load_start
 
 @kernel
 def rest_on_pad(flight, p, start):
-    """Undo the tick's motion of the vehicles on the pad, and let go of those that lift off.
+    """Undo the tick's motion of vehicles on the pad, and release those that lift off.
 
-    On the pad the rotors alone move: its normal force balances what thrust leaves of the weight,
-    and friction holds place and attitude. It can push, not pull: where the other forces accelerate
-    the vehicle upward, it has lifted off. The pad does no work, as nothing moves on it.
+    On the pad only the rotors move: its normal force balances weight less thrust, and friction
+    holds position and attitude. It can push, not pull: a vehicle that the other forces accelerate
+    upward has lifted off. The pad does no work, as nothing moves on it.
 
     Args:
         flight: Record, after the tick's motion.
-        p: Parameters as they are.
-        start: The true state at the tick's start, as of `load_start`.
+        p: True parameters.
+        start: The true state at the tick's start, from `load_start`.
     """
     on_pad = flight.on_pad > 0.0
     r_I, v_I, q, w_B, _ = start
@@ -28,8 +28,8 @@ def rest_on_pad(flight, p, start):
     keep3(flight.w, on_pad, w_B)
     for i in range(4):
         flight.q[i] = select(on_pad, q[i], flight.q[i])
-    v_air_I = sub(v_I, load3(flight.wind))
-    d_I = add(load3(flight.disturbance), load3(flight.air_force))
+    v_air_I = v_I - load3(flight.wind)
+    d_I = load3(flight.disturbance) + load3(flight.air_force)
     W = load4(flight.rotor_speeds)
     a_I, _ = accelerations(quaternion_to_dcm(q), v_air_I, w_B, W, d_I, p)
     flight.on_pad = select(on_pad & (a_I[2] <= 0.0), 1.0, 0.0)
