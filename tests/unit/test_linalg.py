@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from quad_gym.kernels.maths import linalg
 from quad_gym.kernels.maths.factors import cholesky, solve_left_vector, solve_right
 from quad_gym.kernels.maths.linalg import load3, load33, store3, store33
+from quad_gym.kernels.maths.vectors import outer
 from tests.unit.compiled import Compiled
 
 LARGEST, ROWS = 18, 9
@@ -28,7 +29,7 @@ def small(f, option):
     store3(f.vectors[3], linalg.unit_or(u, v))
     store3(f.vectors[4], linalg.sub(linalg.add(u, v), linalg.scale(2.0, v)))
     store33(f.matrices[0], linalg.multiply(m, linalg.transpose(m)))
-    store33(f.matrices[1], linalg.subtract_outer(linalg.outer(u, v), v, u))
+    store33(f.matrices[1], outer(u, v) - outer(v, u))
     store33(f.matrices[2], linalg.add_to_diagonal(linalg.scale33(2.0, m), 3.0))
     store33(f.matrices[3], linalg.add33(m, linalg.add_outer(m, u, u)))
     f.dot, f.norm = linalg.dot(u, v), linalg.norm(u)

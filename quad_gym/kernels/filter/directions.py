@@ -3,17 +3,15 @@
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.linalg import add, add_outer, add_scaled, add_to_diagonal, dot, scale
+from quad_gym.kernels.maths.linalg import add_to_diagonal, dot
+from quad_gym.kernels.maths.vectors import outer
 from quad_gym.kernels.simd.lanes import any_of, select
 
 
 @kernel
 def direction_noise(direction, variance, floor):
-    """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 but for the floor."""
-    negative = scale(-variance, direction)
-    zero = 0.0 * variance
-    empty = ((zero, zero, zero), (zero, zero, zero), (zero, zero, zero))
-    return add_to_diagonal(add_outer(empty, negative, direction), variance + floor)
+    """Variance (I - u u^T) + floor I: noise of a direction u, of rank 2 except for the floor."""
+    return add_to_diagonal(outer(-variance * direction, direction), variance + floor)
 
 
 @kernel
@@ -46,16 +44,16 @@ def _shrinkage(d):
 
 @kernel
 def direction_pair(v, inverse_norm, v_even, v_odd):
-    """Half-difference, and half-sum less unit(v), of the pair unit(v + v_even +- v_odd).
+    """Half-difference, and half-sum minus unit(v), of the pair unit(v + v_even +- v_odd).
 
     |v + v_even +- v_odd|^2 = |v|^2 (1 + d): the small d gives the lengths without cancellation.
     """
-    centre = add(v, v_even)
+    center = v + v_even
     inverse_square = inverse_norm * inverse_norm
-    d_even = inverse_square * (dot(v_even, add(v, centre)) + dot(v_odd, v_odd))
-    d_odd = inverse_square * (2.0 * dot(centre, v_odd))
+    d_even = inverse_square * (dot(v_even, v + center) + dot(v_odd, v_odd))
+    d_odd = inverse_square * (2.0 * dot(center, v_odd))
     plus, minus = _shrinkage(d_even + d_odd), _shrinkage(d_even - d_odd)
     both, gap = 0.5 * (plus + minus), 0.5 * (plus - minus)
-    difference = add_scaled(add_scaled(v_odd, both, v_odd), gap, centre)
-    half_sum = add_scaled(add_scaled(v_even, both, centre), gap, v_odd)
-    return scale(inverse_norm, difference), scale(inverse_norm, half_sum)
+    difference = v_odd + both * v_odd + gap * center
+    half_sum = v_even + both * center + gap * v_odd
+    return inverse_norm * difference, inverse_norm * half_sum

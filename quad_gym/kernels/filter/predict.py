@@ -1,14 +1,14 @@
 """The unscented Kalman filter of the report, with its structure used and its result unchanged.
 
 State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The
-filter stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are those of
-the augmented filter (27 columns in the prediction, 15 + n_z in the update), but
+filter stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are the same
+as in the augmented filter (27 columns in the prediction, 15 + n_z in the update), but
 
 * the augmented factor is block diagonal, so that noise which enters linearly contributes in closed
   form, and so do the columns for states on which a model does not depend: 9 pairs of points remain;
-* a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and its half-sum less the
-  center s, for the rotation is split into the parts even and odd in e. With c^2 = n + lambda the
-  moments are
+* a pair f(x0 + c l), f(x0 - c l) is evaluated as its half-difference a and s, its half-sum minus
+  f(x0), since the rotation is split into parts even and odd in e. With c^2 = n + lambda the moments
+  are
       mean = f(x0) + mu,  mu = sum s / c^2
       cov  = sum (a a^T + s s^T) / c^2 + (beta - alpha^2) mu mu^T + noise
   in which nothing cancels, unlike in the usual weights near -1e6;
@@ -34,14 +34,7 @@ from quad_gym.kernels.filter.slow import decay_slow, keep_slow_factor, predict_s
 from quad_gym.kernels.maths.elementary import is_finite
 from quad_gym.kernels.maths.factors import cholesky
 from quad_gym.kernels.maths.linalg import (
-    add,
-    add33,
-    add_outer,
-    add_scaled,
-    add_scaled33,
     add_to_diagonal,
-    apply,
-    apply_transposed,
     cross,
     keep3,
     keep33,
@@ -49,11 +42,8 @@ from quad_gym.kernels.maths.linalg import (
     load33,
     load_block,
     load_column3,
-    multiply,
-    scale,
-    scale33,
     store_block,
-    sub,
+    store_column3,
     sum_of_outers,
     sum_of_squares,
 )
@@ -63,6 +53,7 @@ from quad_gym.kernels.maths.rotation import (
     turn_pair_back,
     vector_to_dcm,
 )
+from quad_gym.kernels.maths.vectors import outer
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import FilterForm, FilterStatus
@@ -73,9 +64,9 @@ _PREDICTION_FAILED = np.uint64(FilterStatus.PREDICTION_FAILED)
 
 @kernel
 def _euler_rate_parts(parts, w_B, dg):
-    """The parts odd and even in the sigma offset of S(e) (w_B - dg), the even one less w_B.
+    """The odd and even parts, in the sigma offset, of S(e) (w_B - dg) - w_B.
 
-    S(e) turns body rates into rates of the error Euler angles; e and dg change sign together.
+    S(e) maps body rates to rates of the error Euler angles; e and dg change sign together.
     """
     s_phi, m_phi, s_th, m_th = parts
     c_phi, c_th = 1.0 + m_phi, 1.0 + m_th
@@ -96,26 +87,26 @@ def _euler_rate_parts(parts, w_B, dg):
 
 @kernel
 def _force_offset(L, j, c, f_B, half, half_dt, midpoint):
-    """Offset of the measured force along c times column j of L, in the frame of the tick's start.
+    """Offset of the measured force along c times column j of L, in B at the tick's start.
 
-    Halfway through the tick, an offset of the gyro's bias has turned the force by half its angle.
+    Halfway through the tick, an offset of the gyro's bias has rotated the force by half its angle.
     """
-    df = scale(c, load_column3(L, BA, j))
+    df = c * load_column3(L, BA, j)
     if midpoint:
-        dg = scale(c, load_column3(L, BG, j))
-        df = apply_transposed(half, add_scaled(df, half_dt, cross(dg, f_B)))
+        dg = c * load_column3(L, BG, j)
+        df = half.T @ (df + half_dt * cross(dg, f_B))
     return df
 
 
 @kernel
 def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
-    """Fill work.F and work.S with the propagated pairs; return their mean less the center's.
+    """Fill work.F and work.S with the propagated pairs.
 
-    Position and velocity share the half-sums of the acceleration, so that S has these, and those of
+    Position and velocity share the half-sums of the acceleration: S has these and the half-sums of
     the error angles.
 
     Returns:
-        The mean's share of acceleration and of error angles.
+        Mean acceleration and mean error angles of the sigma points, minus the center's.
     """
     L, F, S = flight.L, work.F, work.S
     R_BI = load33(flight.R_hat)
@@ -129,7 +120,7 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
     mean_a, mean_e = nothing, nothing
     f_start, full = f_B, half
     if midpoint:
-        f_start, full = apply_transposed(half, f_B), multiply(half, half)
+        f_start, full = half.T @ f_B, half @ half
 
     for j in range(9):
         if extended:
@@ -137,95 +128,91 @@ def _propagate_columns(flight, p, work, f_B, w_B, half, form, augmented):
             a_odd, a_even = acceleration_column(L, j, R_BI, f_start, df), nothing
             e_odd, e_even = angle_column(L, j, w_B, dt), nothing
         else:
-            d, dg = scale(c, load_column3(L, E, j)), scale(c, load_column3(L, BG, j))
+            d, dg = c * load_column3(L, E, j), c * load_column3(L, BG, j)
             df = _force_offset(L, j, c, f_B, half, half_dt, midpoint)
             even, odd, parts = split_rotation(d)
-            # a_I = R^T R(e)^T (f - b_a) - g: its odd part in the offset, its even less the center
+            # a_I = R^T R(e)^T (f - b_a) - g: parts odd and even in the offset, minus the center
             odd_B, even_B = turn_pair_back(even, odd, f_start, df)
-            a_odd = scale(inverse_c, apply_transposed(R_BI, odd_B))
-            a_even = scale(inverse_c, apply_transposed(R_BI, even_B))
+            a_odd = inverse_c * (R_BI.T @ odd_B)
+            a_even = inverse_c * (R_BI.T @ even_B)
             e_odd, e_even = nothing, nothing
             if not midpoint:
                 rate_odd, rate_even = _euler_rate_parts(parts, w_B, dg)
-                e_odd = scale(inverse_c, add_scaled(d, dt, rate_odd))
-                e_even = scale(dt * inverse_c, rate_even)
+                e_odd = inverse_c * (d + dt * rate_odd)
+                e_even = dt * inverse_c * rate_even
         if midpoint:
             e_odd = _turned_angles(L, j, full, half, dt)
 
         v_j = load_column3(L, V, j)
-        r_j = add_scaled(load_column3(L, R, j), dt, v_j)
-        for i in range(3):
-            F[R + i, j] = r_j[i] + half_dt2 * a_odd[i]
-            F[V + i, j] = v_j[i] + dt * a_odd[i]
-            F[E + i, j] = e_odd[i]
-            S[i, j], S[3 + i, j] = a_even[i], e_even[i]
-        mean_a, mean_e = add(mean_a, a_even), add(mean_e, e_even)
+        store_column3(F, R, j, load_column3(L, R, j) + dt * v_j + half_dt2 * a_odd)
+        store_column3(F, V, j, v_j + dt * a_odd)
+        store_column3(F, E, j, e_odd)
+        store_column3(S, 0, j, a_even)
+        store_column3(S, 3, j, e_even)
+        mean_a, mean_e = mean_a + a_even, mean_e + e_even
 
     for j in range(9, 15):  # offsets of the biases alone: linear
         df = _force_offset(L, j, -1.0, f_B, half, half_dt, midpoint)
-        a_odd, e_odd = apply_transposed(R_BI, df), scale(-dt, load_column3(L, BG, j))
+        a_odd, e_odd = R_BI.T @ df, -dt * load_column3(L, BG, j)
         if midpoint:
-            e_odd = apply(half, e_odd)
-        for i in range(3):
-            F[R + i, j] = half_dt2 * a_odd[i]
-            F[V + i, j] = dt * a_odd[i]
-            F[E + i, j] = e_odd[i]
+            e_odd = half @ e_odd
+        store_column3(F, R, j, half_dt2 * a_odd)
+        store_column3(F, V, j, dt * a_odd)
+        store_column3(F, E, j, e_odd)
 
-    return scale(inverse_c, mean_a), scale(inverse_c, mean_e)
+    return inverse_c * mean_a, inverse_c * mean_e
 
 
 @kernel
 def _turned_angles(L, j, full, half, dt):
     """Column j of the error angles about the new R_hat, R_half (R_half e - dt b_g)."""
-    turned = apply(full, load_column3(L, E, j))
-    return add_scaled(turned, -dt, apply(half, load_column3(L, BG, j)))
+    return full @ load_column3(L, E, j) - dt * (half @ load_column3(L, BG, j))
 
 
 @kernel
 def _add_gyro_noise(P, p, R_BI, f_B, half):
-    """Add the gyro's white noise to P; half of the angle by which it errs turns the force."""
+    """Add the gyro's white noise to P; half of its angle error rotates the force."""
     dt, sigma = p.dt, gyro_sigma(p, f_B)
     zero = 0.0 * dt
     axes = ((sigma, zero, zero), (zero, sigma, zero), (zero, zero, sigma))
     for axis in axes:
-        dv = apply_transposed(R_BI, apply_transposed(half, cross(f_B, axis)))
-        dv = scale(0.5 * dt * dt, dv)
-        dr, de = scale(0.5 * dt, dv), scale(-dt, apply(half, axis))
-        store_block(P, R, R, add_outer(load_block(P, R, R), dr, dr))
-        store_block(P, V, R, add_outer(load_block(P, V, R), dv, dr))
-        store_block(P, V, V, add_outer(load_block(P, V, V), dv, dv))
-        store_block(P, E, R, add_outer(load_block(P, E, R), de, dr))
-        store_block(P, E, V, add_outer(load_block(P, E, V), de, dv))
-        store_block(P, E, E, add_outer(load_block(P, E, E), de, de))
+        dv = 0.5 * dt * dt * (R_BI.T @ (half.T @ cross(f_B, axis)))
+        dr, de = 0.5 * dt * dv, -dt * (half @ axis)
+        store_block(P, R, R, load_block(P, R, R) + outer(dr, dr))
+        store_block(P, V, R, load_block(P, V, R) + outer(dv, dr))
+        store_block(P, V, V, load_block(P, V, V) + outer(dv, dv))
+        store_block(P, E, R, load_block(P, E, R) + outer(de, dr))
+        store_block(P, E, V, load_block(P, E, V) + outer(de, dv))
+        store_block(P, E, E, load_block(P, E, E) + outer(de, de))
 
 
 @kernel
 def _add_second_order(work, p, mean_a, mean_e, midpoint):
-    """Add the half-sums' share to work.P: of a common acceleration, and of the error angles.
+    """Add the half-sums of acceleration and error angles to work.P.
 
-    With MIDPOINT the error angles have none.
+    With MIDPOINT, the error angles have none.
     """
     S, P = work.S, work.P
     dt = p.dt
     half_dt2 = 0.5 * dt * dt
     excess = p.sigma_beta - p.sigma_spread * p.sigma_spread
-    aa = add_outer(sum_of_squares(S, 0, 9), scale(excess, mean_a), mean_a)
-    store_block(P, R, R, add_scaled33(load_block(P, R, R), half_dt2 * half_dt2, aa))
-    store_block(P, V, R, add_scaled33(load_block(P, V, R), dt * half_dt2, aa))
-    store_block(P, V, V, add_scaled33(load_block(P, V, V), dt * dt, aa))
+    aa = sum_of_squares(S, 0, 9) + outer(excess * mean_a, mean_a)
+    store_block(P, R, R, load_block(P, R, R) + half_dt2 * half_dt2 * aa)
+    store_block(P, V, R, load_block(P, V, R) + dt * half_dt2 * aa)
+    store_block(P, V, V, load_block(P, V, V) + dt * dt * aa)
     if not midpoint:
-        ea = add_outer(sum_of_outers(S, 3, S, 0, 9), scale(excess, mean_e), mean_a)
-        ee = add_outer(sum_of_squares(S, 3, 9), scale(excess, mean_e), mean_e)
-        store_block(P, E, R, add_scaled33(load_block(P, E, R), half_dt2, ea))
-        store_block(P, E, V, add_scaled33(load_block(P, E, V), dt, ea))
-        store_block(P, E, E, add33(load_block(P, E, E), ee))
+        ea = sum_of_outers(S, 3, S, 0, 9) + outer(excess * mean_e, mean_a)
+        ee = sum_of_squares(S, 3, 9) + outer(excess * mean_e, mean_e)
+        store_block(P, E, R, load_block(P, E, R) + half_dt2 * ea)
+        store_block(P, E, V, load_block(P, E, V) + dt * ea)
+        store_block(P, E, E, load_block(P, E, E) + ee)
 
 
 @kernel
 def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
     """Fill the lower triangle of work.P from the propagated pairs and the process noise.
 
-    The gyro's noise is added here only where it enters through the tick's start.
+    The gyro's noise is added here only if the sample counts as of the tick's start.
     """
     L, F, P = flight.L, work.F, work.P
     dt = p.dt
@@ -248,57 +235,57 @@ def _sum_moments(flight, p, work, mean_a, mean_e, f_B, form):
         P[V + i, V + i] += dt * dt * variance
         P[E + i, E + i] += gyro_variance
 
-    # the biases are linear: their rows of the propagated columns are those of L times the decay
+    # the biases are linear: their propagated rows are the rows of L times the decay
     for j in range(0, 9, 3):
-        store_block(P, BA, j, scale33(decay_a, sum_of_outers(L, BA, F, j, 12)))
-        store_block(P, BG, j, scale33(decay_g, sum_of_outers(L, BG, F, j, 15)))
+        store_block(P, BA, j, decay_a * sum_of_outers(L, BA, F, j, 12))
+        store_block(P, BG, j, decay_g * sum_of_outers(L, BG, F, j, 15))
     aa, ga, gg = (
         sum_of_squares(L, BA, 12),
         sum_of_outers(L, BG, L, BA, 12),
         sum_of_squares(L, BG, 15),
     )
     drive_a, drive_g = p.accel_bias_drive, p.gyro_bias_drive
-    store_block(P, BA, BA, add_to_diagonal(scale33(decay_a * decay_a, aa), drive_a * drive_a))
-    store_block(P, BG, BA, scale33(decay_g * decay_a, ga))
-    store_block(P, BG, BG, add_to_diagonal(scale33(decay_g * decay_g, gg), drive_g * drive_g))
+    store_block(P, BA, BA, add_to_diagonal(decay_a * decay_a * aa, drive_a * drive_a))
+    store_block(P, BG, BA, decay_g * decay_a * ga)
+    store_block(P, BG, BG, add_to_diagonal(decay_g * decay_g * gg, drive_g * drive_g))
 
 
 @kernel
 def predict(flight, p, work, form=0, slow=None):
-    """Carry the estimate over one tick with its IMU sample.
+    """Predict over one tick with its IMU sample.
 
-    The report's form, with the sample as of the tick's start:
+    In the report's form, the sample is taken at the tick's start:
     `a = R^T (f_meas - b_a - v_a) - g e3`, `r+ = r + v dt + a dt^2/2`, `v+ = v + a dt`,
-    `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`, where R_hat turns by R(mean e+).
+    `e+ = e + dt S(e) (w_meas - b_g - v_g)`, `b+ = alpha b + v_2`, and R_hat+ = R(mean e+) R_hat.
 
-    With MIDPOINT, the sample as of the whole tick: R_hat turns by exp(-[dt w x]), and R in `a` is
-    the attitude halfway. The error angles count from the new R_hat at once: with R_half =
-    exp(-[dt w x] / 2), `e+ = R_half (R_half e - dt (b_g + v_g))`, and the force turns by half of
-    what the gyro's error turns the attitude.
+    With MIDPOINT, the sample applies to the whole tick: R_hat+ = exp(-[dt w x]) R_hat, and R in `a`
+    is the attitude halfway. The error angles refer to the new R_hat at once: with R_half =
+    exp(-[dt w x] / 2), `e+ = R_half (R_half e - dt (b_g + v_g))`, and the gyro's error rotates the
+    force by half the angle by which it rotates the attitude.
 
-    With TURN, the covariance turns with the reset of e, see `error_state.py`; with EKF, derivatives
-    take the place of sigma points, see `ekf.py`.
+    With TURN, the covariance is transformed with the reset of e, see `error_state.py`; with EKF,
+    derivatives replace sigma points, see `ekf.py`.
 
-    A lane whose predicted covariance is not positive definite keeps its state and sets
-    PREDICTION_FAILED, and counts it.
+    A lane whose predicted covariance is not positive definite keeps its state, sets
+    PREDICTION_FAILED, and counts the failure.
 
     Args:
         flight: Record; reads gyro and accel, changes the estimate.
-        p: Parameters as the filter believes them.
+        p: Parameters that the filter assumes.
         work: Workspace.
         form: A `FilterForm`.
-        slow: The settings, where sensors have slow errors, see `slow.py`, or None.
+        slow: The settings if sensors have slow errors (`slow.py`), else None.
     """
     dt = p.dt
     midpoint = (form & _MIDPOINT) != 0
-    w_B = sub(load3(flight.gyro), load3(flight.b_g_hat))
-    f_B = sub(load3(flight.accel), load3(flight.b_a_hat))
+    w_B = load3(flight.gyro) - load3(flight.b_g_hat)
+    f_B = load3(flight.accel) - load3(flight.b_a_hat)
     R_BI = load33(flight.R_hat)
-    half = R_BI  # not read but with MIDPOINT
+    half = R_BI  # read with MIDPOINT only
     if midpoint:
-        half = vector_to_dcm(scale(0.5 * dt, w_B))
+        half = vector_to_dcm(0.5 * dt * w_B)
     if (form & LEVER_ARM) != 0:
-        f_B = sub(f_B, lever_force(flight, p, form, half))
+        f_B = f_B - lever_force(flight, p, form, half)
     states, augmented = 15, 27.0  # the latter with the noise
     if slow is not None:
         states, augmented = 15 + slow.slow_states, 27.0 + 2.0 * slow.slow_errors
@@ -306,30 +293,29 @@ def predict(flight, p, work, form=0, slow=None):
     _sum_moments(flight, p, work, mean_a, mean_e, f_B, form)
     if slow is not None:
         predict_slow(flight, slow, p, work)
-    turn = add_scaled(mean_e, dt, w_B)
+    turn = mean_e + dt * w_B
     if midpoint:
         _add_gyro_noise(work.P, p, R_BI, f_B, half)
-        R_pred, f_B = multiply(half, multiply(half, R_BI)), apply_transposed(half, f_B)
+        R_pred, f_B = half @ (half @ R_BI), half.T @ f_B
     else:
-        R_pred = multiply(euler_to_dcm(turn), R_BI)
+        R_pred = euler_to_dcm(turn) @ R_BI
         if (form & _TURN) != 0:
             turn_covariance(work.P, reset_matrix(turn))
             if slow is not None:
                 turn_slow(slow, work.P, reset_matrix(turn))
     ok = cholesky(work.P, states, work.inverse_diagonal) > 0.0
 
-    a_I = apply_transposed(R_BI, f_B)
-    a_I = add((a_I[0], a_I[1], a_I[2] - p.gravity), mean_a)
+    a_I = R_BI.T @ f_B - (0.0, 0.0, p.gravity) + mean_a
     r, v = load3(flight.r_hat), load3(flight.v_hat)
-    r_pred = add_scaled(add_scaled(r, dt, v), 0.5 * dt * dt, a_I)
-    v_pred = add_scaled(v, dt, a_I)
+    r_pred = r + dt * v + 0.5 * dt * dt * a_I
+    v_pred = v + dt * a_I
     ok = ok & is_finite(r_pred[0] + r_pred[1] + r_pred[2] + v_pred[0] + v_pred[1] + v_pred[2])
 
     keep3(flight.r_hat, ok, r_pred)
     keep3(flight.v_hat, ok, v_pred)
     keep33(flight.R_hat, ok, R_pred)
-    keep3(flight.b_a_hat, ok, scale(p.accel_bias_decay, load3(flight.b_a_hat)))
-    keep3(flight.b_g_hat, ok, scale(p.gyro_bias_decay, load3(flight.b_g_hat)))
+    keep3(flight.b_a_hat, ok, p.accel_bias_decay * load3(flight.b_a_hat))
+    keep3(flight.b_g_hat, ok, p.gyro_bias_decay * load3(flight.b_g_hat))
     for i in range(15):
         for j in range(i + 1):
             flight.L[i, j] = select(ok, work.P[i, j], flight.L[i, j])
@@ -344,11 +330,11 @@ def predict(flight, p, work, form=0, slow=None):
 
 @stage
 def predict_stage(flight, world, model, settings, work, stages, flag):
-    """Carry the estimate over a tick."""
+    """Predict over a tick."""
     predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form)
 
 
 @stage
 def predict_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """The same by a filter that estimates slow errors of sensors."""
+    """Predict over a tick with slow errors of sensors in the state."""
     predict(lanes_of(flight), lanes_of(model), lanes_of(work), settings.form, settings)

@@ -1,46 +1,41 @@
-"""Slow errors d of sensors as more states of the filter, behind the other fifteen.
+"""Slow errors d of sensors as additional states of the filter, after the other fifteen.
 
 A measurement with a slow error is `z = h(x) + d + white noise`, where each d is a Gauss-Markov
 process of first order,
 
     d+ = alpha d + v,  alpha = exp(-dt / tau),  var(v) = sigma^2 (1 - alpha^2),
 
-or a constant (alpha = 1, v = 0). With d as a state the filter knows that measurements share their
-error: what else tells the position or the heading tells d, and the measurement tells these only as
-far as it is better than that. White noise in its place would have to be so strong that measurements
-counted for nothing. (R. G. Brown and P. Y. C. Hwang, Introduction to Random Signals and Applied
-Kalman Filtering, section on colored measurement noise.)
+or a constant (alpha = 1, v = 0). With d as a state, the filter models the error that successive
+measurements share: other information about position or heading determines d, and the measurement
+improves these only if it is more accurate. White noise instead would have to be so strong that
+measurements had almost no weight. (R. G. Brown and P. Y. C. Hwang, Introduction to Random Signals
+and Applied Kalman Filtering, section on colored measurement noise.)
 
-There can be the drift of GNSS positions (three states in I, the first three of d), and what other
-sensors have (`kernels/sensors/`): three numbers each, then one number each. As blocks are 3 x
-3, their number is a multiple of three; the states that fill it up are constant, of variance one,
-and never measured.
+The states are the drift of GNSS positions (three states in I, the first three of d), and the slow
+errors of other sensors (`kernels/sensors/`): vectors first, then scalars. As blocks are 3 x
+3, their number is a multiple of three; the states that pad it are constant, with variance one, and
+never measured.
 
-The factor of the joint covariance has the rows of `flight.L` and below them those of
+The factor of the joint covariance has the rows of `flight.L`, and below them the rows of
 `flight.L_slow`. As d comes last, the first fifteen rows are the factor of the covariance of the
 fifteen states, as without d, and their prediction does not depend on d. Kernels of the filter take
-`slow`, which is the settings record, or None where no sensor has a slow error: what is under `slow
-is None` is decided as they are compiled, so that a filter without d has none of this.
+`slow`, which is the settings record, or None if no sensor has a slow error: the compiler evaluates
+`slow is None`, so that a filter without d has none of this code.
 """
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.filter.error_state import BA, BG, D, E
 from quad_gym.kernels.filter.jumps import forget_drift_corrections
 from quad_gym.kernels.maths.linalg import (
-    add,
-    apply,
     cross,
     load3,
     load33,
     load_block,
     load_column3,
-    multiply,
-    scale,
     store_block,
-    sub,
+    store_column3,
     sum_of_outers,
     sum_of_squares,
-    transpose,
 )
 from quad_gym.kernels.maths.rotation import euler_to_dcm
 from quad_gym.kernels.simd.lanes import select
@@ -51,7 +46,7 @@ _MAGNETOMETER = int(Aid.MAGNETOMETER)
 
 @kernel
 def begin_slow(flight, p, slow, mask):
-    """Begin an episode, where `mask`: slow errors are estimated as zero, with their deviations."""
+    """Begin an episode, where `mask`: estimates of zero with initial standard deviations."""
     for i in range(slow.slow_states):
         flight.slow_hat[i] = select(mask, 0.0, flight.slow_hat[i])
         for j in range(D + slow.slow_states):
@@ -73,7 +68,7 @@ def add_diagonal(m, d):
 @kernel
 def _scale_rows(a, m):
     """Diag(a) M."""
-    return (scale(a[0], m[0]), scale(a[1], m[1]), scale(a[2], m[2]))
+    return (a[0] * m[0], a[1] * m[1], a[2] * m[2])
 
 
 @kernel
@@ -88,7 +83,7 @@ def _scale_both(a, b, m):
 
 @kernel
 def keep_slow_factor(flight, slow, work, ok):
-    """Take over the rows of d of the factor in work.P, where `ok`."""
+    """Store the rows of d of the factor in work.P, where `ok`."""
     for i in range(slow.slow_states):
         for j in range(D + i + 1):
             flight.L_slow[i, j] = select(ok, work.P[D + i, j], flight.L_slow[i, j])
@@ -99,15 +94,15 @@ def keep_slow_factor(flight, slow, work, ok):
 
 @kernel
 def predict_slow(flight, slow, p, work):
-    """Fill the rows of d in work.P, as of the end of a tick; d does not act on other states."""
+    """Predict the rows of d in work.P; d does not act on other states."""
     L, F, P, M = flight.L, work.F, work.P, flight.L_slow
     for i in range(0, slow.slow_states, 3):
         a, s = load3(p.slow_decay[i : i + 3]), load3(p.slow_drive[i : i + 3])
         for j in range(0, BA, 3):
             store_block(P, D + i, j, _scale_rows(a, sum_of_outers(M, i, F, j, 15)))
         with_a, with_g = sum_of_outers(M, i, L, BA, 12), sum_of_outers(M, i, L, BG, 15)
-        store_block(P, D + i, BA, _scale_rows(scale(p.accel_bias_decay, a), with_a))
-        store_block(P, D + i, BG, _scale_rows(scale(p.gyro_bias_decay, a), with_g))
+        store_block(P, D + i, BA, _scale_rows(p.accel_bias_decay * a, with_a))
+        store_block(P, D + i, BG, _scale_rows(p.gyro_bias_decay * a, with_g))
         for j in range(0, i, 3):
             b = load3(p.slow_decay[j : j + 3])
             other = sum_of_outers(M, i, M, j, D + j + 3)
@@ -118,7 +113,7 @@ def predict_slow(flight, slow, p, work):
 
 @kernel
 def decay_slow(flight, slow, p, ok):
-    """Carry the estimates of d over a tick, where `ok`."""
+    """Predict the estimates of d over a tick, where `ok`."""
     for i in range(slow.slow_states):
         d = flight.slow_hat[i]
         flight.slow_hat[i] = select(ok, p.slow_decay[i] * d, d)
@@ -126,9 +121,9 @@ def decay_slow(flight, slow, p, ok):
 
 @kernel
 def turn_slow(slow, P, T):
-    """What `turn_covariance` is for the correlation of d with the error angles."""
+    """Transform the correlation of d with the error angles, as `turn_covariance` the other ones."""
     for i in range(0, slow.slow_states, 3):
-        store_block(P, D + i, E, multiply(load_block(P, D + i, E), transpose(T)))
+        store_block(P, D + i, E, load_block(P, D + i, E) @ T.T)
 
 
 # ---- update ----------------------------------------------------------------------------------
@@ -136,7 +131,7 @@ def turn_slow(slow, P, T):
 
 @kernel
 def load_slow(flight, slow, columns):
-    """Complete the factor in `columns`, last first, that has those of fifteen states."""
+    """Add the columns of d to the factor of fifteen states in `columns`, last column first."""
     last = D + slow.slow_states - 1
     for i in range(D):
         for j in range(D, last + 1):
@@ -150,50 +145,49 @@ def load_slow(flight, slow, columns):
 def turn_iron(flight, slow, p, L9, T, correction, columns):
     """Correct the covariance of hard iron when an update rotates the attitude.
 
-    The field tells the sum b + f x e, with hard iron b, error angles e and the expected field f in
-    B, much better than either. An update that rotates the attitude by degrees rotates f, and
-    another sum takes the place of this one. If that one counted as known, the next field, from
-    another tilt, would seem to tell the heading. To keep the covariance of the sum unchanged, the
-    rows of b take up the difference.
+    The field measures the sum b + f x e, with hard iron b, error angles e and the expected field f
+    in B, much better than either term. An update that rotates the attitude by degrees rotates f,
+    and another sum takes its place. With the variance of the former sum, the next field, from
+    another tilt, would seem to measure the heading. To keep the covariance of the sum unchanged,
+    the rows of b absorb the difference.
 
-    The share of the declination's error, delta g with g = R_BI (m_I x e3), rotates as well; that is
-    neglected, as is the correction of delta in f: 0.35 degrees matter little. Hard iron that is
-    known much better than a field's noise becomes less certain by up to |f x m| times the deviation
-    of the attitude, m being the rotation.
+    The effect of the declination's error, delta g with g = R_BI (m_I x e3), rotates as well; this
+    is neglected, as is the correction of delta in f: 0.35 degrees matter little. The standard
+    deviation of hard iron, if much smaller than the field's noise, grows by up to |f x m| times the
+    standard deviation of the attitude, where m is the rotation.
 
     Args:
-        flight: Record; R_hat is that before the update.
+        flight: Record; R_hat is the attitude before the update.
         slow: The settings.
-        p: Parameters as the filter believes them.
-        L9: The factor that the update has made, its columns last first.
-        T: By which the errors of the attitude turn, as of `reset_matrix`.
-        correction: Of the attitude, as error angles.
-        columns: How many columns there are.
+        p: Parameters that the filter assumes.
+        L9: The factor after the update, last column first.
+        T: Transformation of the attitude errors, from `reset_matrix`.
+        correction: Correction of the attitude, as error angles.
+        columns: Number of columns.
     """
     first = slow.aid_vector[_MAGNETOMETER]
     if first >= 0:
         m, delta = load3(p.aid_numbers[_MAGNETOMETER]), slow.aid_scalar[_MAGNETOMETER]
         turned = (m[1], -m[0], 0.0 * m[2])
-        field_I = add(m, scale(flight.slow_hat[delta], turned))
-        before = apply(load33(flight.R_hat), field_I)
-        after = apply(euler_to_dcm(correction), before)
+        field_I = flight.slow_hat[delta] * turned + m
+        before = load33(flight.R_hat) @ field_I
+        after = euler_to_dcm(correction) @ before
         for j in range(columns - 9, columns):
             e = load_column3(L9, E, j)
-            more = sub(cross(apply(T, e), after), cross(e, before))
-            for i in range(3):
-                L9[D + first + i, j] = L9[D + first + i, j] + more[i]
+            more = cross(T @ e, after) - cross(e, before)
+            store_column3(L9, D + first, j, load_column3(L9, D + first, j) + more)
 
 
 @kernel
 def shift_slow(flight, slow, columns, ok, shift):
-    """Take over what an update has made of d and its rows, where `ok`.
+    """Store d and its rows after an update, where `ok`.
 
     Args:
         flight: Record.
         slow: The settings.
-        columns: The factor, columns last first.
-        ok: Which lanes.
-        shift: Of all states.
+        columns: The factor, last column first.
+        ok: Mask of lanes.
+        shift: Correction of all states.
     """
     last = D + slow.slow_states - 1
     for i in range(slow.slow_states):
@@ -223,7 +217,7 @@ def fill_slow(flight, slow, P):
 
 @kernel
 def begin_to_carry_slow(slow, p, work, ticks):
-    """Fill work.slow_decay with alpha over a number of ticks, one where nothing is late."""
+    """Fill work.slow_decay with alpha over a number of ticks; one where nothing is delayed."""
     for i in range(slow.slow_states):
         decay = 1.0 + 0.0 * p.dt
         for _ in range(ticks):
@@ -233,7 +227,7 @@ def begin_to_carry_slow(slow, p, work, ticks):
 
 @kernel
 def _gained(p, work, i, noise):
-    """Variances that three slow errors have gained over the time, counted `noise` times."""
+    """Variances that three slow errors have gained over the time, times `noise`."""
     decay, one = load3(work.slow_decay[i : i + 3]), load3(p.slow_decay[i : i + 3])
     s = load3(p.slow_drive[i : i + 3])
     fall = (
@@ -255,7 +249,7 @@ def _gained(p, work, i, noise):
 
 @kernel
 def _factors(work, i, back):
-    """By which three slow errors change over the time, or on the way back."""
+    """Factors by which three slow errors change over the time, or back over it."""
     a = load3(work.slow_decay[i : i + 3])
     if back:
         return (1.0 / a[0], 1.0 / a[1], 1.0 / a[2])
@@ -264,17 +258,17 @@ def _factors(work, i, back):
 
 @kernel
 def carry_slow(flight, slow, p, work, noise, back):
-    """Fill the rows of d in work.P for a filter that goes back in time by work.slow_decay, or on.
+    """Propagate the rows of d in work.P back in time by work.slow_decay, or forward.
 
-    What d has gained since then counts `noise` times, as the noise of the IMU does.
+    The variance that d has gained since then is multiplied by `noise`, as the noise of the IMU is.
 
     Args:
         flight: Record.
         slow: The settings.
-        p: Parameters as the filter believes them.
-        work: Workspace; work.columns has the fifteen columns of the other states, as taken.
-        noise: -1 or 0 on the way back, 1 or 0 on the way on.
-        back: Whether the filter goes back.
+        p: Parameters that the filter assumes.
+        work: Workspace; work.columns has the fifteen propagated columns of the other states.
+        noise: -1 or 0 when propagating back, 1 or 0 when propagating forward.
+        back: Whether to propagate back.
     """
     M, P, rows = work.columns, work.P, flight.L_slow
     for i in range(0, slow.slow_states, 3):
@@ -294,7 +288,7 @@ def carry_slow(flight, slow, p, work, noise, back):
 
 @kernel
 def shift_carried_slow(flight, slow, work, back):
-    """Carry the estimates of d back or on."""
+    """Propagate the estimates of d back or forward."""
     for i in range(slow.slow_states):
         d, decay = flight.slow_hat[i], work.slow_decay[i]
         flight.slow_hat[i] = (1.0 / decay) * d if back else decay * d
@@ -302,7 +296,7 @@ def shift_carried_slow(flight, slow, work, back):
 
 @kernel
 def set_slow_aside(flight, slow, work):
-    """Copy the slow errors, for lanes in which nothing arrives or an update fails."""
+    """Save the slow errors, for lanes in which nothing arrives or an update fails."""
     for i in range(slow.slow_states):
         work.kept_slow[i] = flight.slow_hat[i]
         for j in range(D + slow.slow_states):
@@ -311,7 +305,7 @@ def set_slow_aside(flight, slow, work):
 
 @kernel
 def restore_slow(flight, slow, work, old):
-    """Undo what has happened to them, where `old`."""
+    """Restore the saved slow errors, where `old`."""
     for i in range(slow.slow_states):
         flight.slow_hat[i] = select(old, work.kept_slow[i], flight.slow_hat[i])
         for j in range(D + slow.slow_states):

@@ -1,6 +1,6 @@
 """Wahba's problem: the rotation that best turns one set of vectors into another.
 
-Minimise sum_i a_i |v_B,i - R_BI v_I,i|^2 over rotations R_BI. With B = sum a_i v_B,i v_I,i^T = U S
+Minimize sum_i a_i |v_B,i - R_BI v_I,i|^2 over rotations R_BI. With B = sum a_i v_B,i v_I,i^T = U S
 V^T the solution is R_BI = U diag(1, 1, det U det V) V^T (G. Wahba, SIAM Review 7(3), 1965; F. L.
 Markley, J. Astronautical Sciences 36(3), 1988).
 """
@@ -9,7 +9,8 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import maximum
-from quad_gym.kernels.maths.linalg import add, cross, dot, scale, select3, sub, transpose, unit_or
+from quad_gym.kernels.maths.linalg import cross, dot, select3, unit_or
+from quad_gym.kernels.maths.vectors import outer, rounded
 from quad_gym.kernels.simd.lanes import select
 
 _SWEEPS = 10
@@ -17,7 +18,7 @@ _SWEEPS = 10
 
 @kernel
 def _rotate_pair(a, b, v, w):
-    """Rotate columns a and b of B (and v and w of V alike) until a . b = 0."""
+    """Rotate columns a and b of B, and v and w of V with them, so that a . b = 0."""
     gamma = dot(a, b)
     orthogonal = gamma == 0.0
     zeta = (dot(b, b) - dot(a, a)) / (2.0 * select(orthogonal, 1.0, gamma))
@@ -26,10 +27,10 @@ def _rotate_pair(a, b, v, w):
     cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
     sine = cosine * tangent
     return (
-        sub(scale(cosine, a), scale(sine, b)),
-        add(scale(sine, a), scale(cosine, b)),
-        sub(scale(cosine, v), scale(sine, w)),
-        add(scale(sine, v), scale(cosine, w)),
+        cosine * a - rounded(sine * b),
+        sine * a + rounded(cosine * b),
+        cosine * v - rounded(sine * w),
+        sine * v + rounded(cosine * w),
     )
 
 
@@ -43,8 +44,8 @@ def _perpendicular(a):
 def _perpendicular_unit(candidate, a):
     """The direction of `candidate` made perpendicular to a, or another if it has none."""
     fallback = unit_or(_perpendicular(a), a)
-    once = unit_or(sub(candidate, scale(dot(candidate, a), a)), fallback)
-    return unit_or(sub(once, scale(dot(once, a), a)), fallback)
+    once = unit_or(candidate - rounded(dot(candidate, a) * a), fallback)
+    return unit_or(once - rounded(dot(once, a) * a), fallback)
 
 
 @kernel
@@ -59,7 +60,7 @@ def wahba(B):
         det V; where it is zero, a whole family of rotations is equally good and R_BI is one of
         them.
     """
-    a0, a1, a2 = transpose(B)
+    a0, a1, a2 = B.T
     one, zero = 1.0 + 0.0 * B[0][0], 0.0 * B[0][0]
     v0, v1, v2 = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for _ in range(_SWEEPS):
@@ -83,11 +84,7 @@ def wahba(B):
     # the third columns as cross products: the factor det U det V is then in them
     u2 = cross(u0, u1)
     v2_right = cross(v0, v1)
-    R_IB = (
-        add(add(scale(v0[0], u0), scale(v1[0], u1)), scale(v2_right[0], u2)),
-        add(add(scale(v0[1], u0), scale(v1[1], u1)), scale(v2_right[1], u2)),
-        add(add(scale(v0[2], u0), scale(v1[2], u1)), scale(v2_right[2], u2)),
-    )
+    R_IB = outer(v0, u0) + rounded(outer(v1, u1)) + rounded(outer(v2_right, u2))
     s0, s1 = math.sqrt(dot(a0, a0)), math.sqrt(dot(a1, a1))
     signed_s2 = dot(a2, u2) * dot(v2, v2_right)
-    return transpose(R_IB), (s1 + signed_s2) / maximum(s0, 1e-300)
+    return R_IB.T, (s1 + signed_s2) / maximum(s0, 1e-300)

@@ -1,7 +1,7 @@
 """Elementary functions on any number type, within a few units in the last place of the C library.
 
-The polynomials are those of fdlibm (Sun Microsystems, 1993), the public-domain ancestor of most C
-libraries; here without branches, so that eight lanes can take them together.
+The polynomials come from fdlibm (Sun Microsystems, 1993), the public-domain ancestor of most C
+libraries; here they have no branches, so that all lanes evaluate them together.
 """
 
 import math
@@ -44,13 +44,13 @@ def maximum(a, b):
 
 @kernel
 def clip(x, low, high):
-    """`x` held within [low, high]."""
+    """`x` limited to [low, high]."""
     return minimum(maximum(x, low), high)
 
 
 @kernel
 def is_finite(x):
-    """Whether x is neither infinite nor NaN."""
+    """True where x is neither infinite nor NaN."""
     return abs(x) <= 1.7976931348623157e308
 
 
@@ -100,7 +100,7 @@ def cos_near_zero_minus_one(x):
 
 @kernel
 def quarter_turns(sine, cosine, quadrant):
-    """(sin, cos) of an angle, from those of the angle less `quadrant` (0 to 4) quarter turns."""
+    """(sin, cos) of an angle, from sine and cosine `quadrant` (0 to 4) quarter turns before it."""
     odd = (quadrant == 1.0) | (quadrant == 3.0)
     turned_sine, turned_cosine = select(odd, cosine, sine), select(odd, sine, cosine)
     return (

@@ -4,7 +4,8 @@ import math
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import minimum
-from quad_gym.kernels.maths.linalg import load_block, load_column3, store_block, subtract_outer
+from quad_gym.kernels.maths.linalg import load_block, load_column3, store_block
+from quad_gym.kernels.maths.vectors import outer
 from quad_gym.kernels.simd.lanes import select
 
 
@@ -12,8 +13,8 @@ from quad_gym.kernels.simd.lanes import select
 def cholesky33(m):
     """The lower Cholesky factor with its diagonal inverted, the diagonal, and the least pivot.
 
-    Each pivot needs the one before it. They are those of L D L^T, whose chain has divisions alone;
-    the roots, which take as long, are taken side by side.
+    Each pivot needs the one before it. The pivots are computed as in L D L^T, a chain of divisions
+    alone, so that the roots, which take as long, are computed in parallel.
     """
     p0 = m[0][0]
     r0 = 1.0 / p0
@@ -31,7 +32,7 @@ def cholesky33(m):
 
 @kernel
 def lower33(factor, diagonal):
-    """The lower Cholesky factor itself, of what `cholesky33` returns."""
+    """The lower Cholesky factor itself, from the results of `cholesky33`."""
     zero = 0.0 * diagonal[0]
     return (
         (diagonal[0], zero, zero),
@@ -74,7 +75,7 @@ def cholesky(a, n, inverse_diagonal):
         block = load_block(a, j, j)
         for k in range(j):
             column = load_column3(a, j, k)
-            block = subtract_outer(block, column, column)
+            block = block - outer(column, column)
         factor, diagonal, pivot = cholesky33(block)
         least = select(pivot < least, pivot, select(pivot == pivot, least, pivot))
         a[j, j] = diagonal[0]
@@ -89,7 +90,7 @@ def cholesky(a, n, inverse_diagonal):
         for i in range(j + 3, n, 3):
             block = load_block(a, i, j)
             for k in range(j):
-                block = subtract_outer(block, load_column3(a, i, k), load_column3(a, j, k))
+                block = block - outer(load_column3(a, i, k), load_column3(a, j, k))
             store_block(a, i, j, solve_right33(block, factor))
     return least
 
@@ -102,8 +103,8 @@ def solve_right(x, rows, factor, n, inverse_diagonal, staircase):
         x: (rows, n).
         rows: A multiple of three.
         factor, n, inverse_diagonal: As left by `cholesky`.
-        staircase: Rows 0 to 2 of x are zero before this column, rows 3 to 5 before the column three
-            less, and so on, and so are those of y; 0: x is full.
+        staircase: Rows 0 to 2 of x and y are zero before this column, rows 3 to 5 before the column
+            three less, and so on; 0: x is full.
     """
     for j in range(0, n, 3):
         d = (
@@ -114,7 +115,7 @@ def solve_right(x, rows, factor, n, inverse_diagonal, staircase):
         for i in range(max(0, staircase - j), rows, 3):
             block = load_block(x, i, j)
             for k in range(max(0, staircase - i), j):
-                block = subtract_outer(block, load_column3(x, i, k), load_column3(factor, j, k))
+                block = block - outer(load_column3(x, i, k), load_column3(factor, j, k))
             store_block(x, i, j, solve_right33(block, d))
 
 

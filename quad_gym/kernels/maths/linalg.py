@@ -1,15 +1,14 @@
-"""Small linear algebra on any number type.
+"""Loading, storing and products of vectors and matrices, which `vectors.py` gives operators.
 
-A vector is a tuple of three numbers, a matrix a tuple of three rows; they live in registers. Larger
-matrices are arrays in a workspace and are handled in blocks of 3 x 3, since the filter's states and
-its measurements all come in threes: nine sums run side by side and hide the latency of the
+Larger matrices are arrays in a workspace and are handled in blocks of 3 x 3, since the filter's
+states and measurements come in threes: nine sums run in parallel, which hides the latency of the
 multiply-adds.
 """
 
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.vectors import matrix, vector
+from quad_gym.kernels.maths.vectors import matrix, outer, vector
 from quad_gym.kernels.simd.lanes import select
 
 # ---- vectors of three -------------------------------------------------------------------------
@@ -45,19 +44,19 @@ def add(a, b):
 @kernel
 def sub(a, b):
     """A - b."""
-    return vector(a[0] - b[0], a[1] - b[1], a[2] - b[2])
+    return a - b
 
 
 @kernel
 def scale(s, a):
     """S a."""
-    return vector(s * a[0], s * a[1], s * a[2])
+    return s * a
 
 
 @kernel
 def add_scaled(a, s, b):
     """A + s b, in one multiply-add for each number."""
-    return vector(a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
+    return a + s * b
 
 
 @kernel
@@ -158,37 +157,25 @@ def keep33(a, mask, m):
 @kernel
 def transpose(m):
     """m^T."""
-    return matrix(
-        (m[0][0], m[1][0], m[2][0]),
-        (m[0][1], m[1][1], m[2][1]),
-        (m[0][2], m[1][2], m[2][2]),
-    )
+    return m.T
 
 
 @kernel
 def apply(m, v):
     """M v."""
-    return vector(dot(m[0], v), dot(m[1], v), dot(m[2], v))
+    return m @ v
 
 
 @kernel
 def apply_transposed(m, v):
     """m^T v."""
-    return vector(
-        m[0][0] * v[0] + m[1][0] * v[1] + m[2][0] * v[2],
-        m[0][1] * v[0] + m[1][1] * v[1] + m[2][1] * v[2],
-        m[0][2] * v[0] + m[1][2] * v[1] + m[2][2] * v[2],
-    )
+    return m.T @ v
 
 
 @kernel
 def multiply(a, b):
     """A b."""
-    return matrix(
-        apply_transposed(b, a[0]),
-        apply_transposed(b, a[1]),
-        apply_transposed(b, a[2]),
-    )
+    return a @ b
 
 
 # ---- blocks of larger arrays -----------------------------------------------------------------
@@ -221,29 +208,9 @@ def keep_block(a, i, j, mask, m):
 
 
 @kernel
-def outer(a, b):
-    """A b^T."""
-    return matrix(scale(a[0], b), scale(a[1], b), scale(a[2], b))
-
-
-@kernel
 def add_outer(m, a, b):
     """M + a b^T."""
-    return matrix(
-        (m[0][0] + a[0] * b[0], m[0][1] + a[0] * b[1], m[0][2] + a[0] * b[2]),
-        (m[1][0] + a[1] * b[0], m[1][1] + a[1] * b[1], m[1][2] + a[1] * b[2]),
-        (m[2][0] + a[2] * b[0], m[2][1] + a[2] * b[1], m[2][2] + a[2] * b[2]),
-    )
-
-
-@kernel
-def subtract_outer(m, a, b):
-    """M - a b^T."""
-    return matrix(
-        (m[0][0] - a[0] * b[0], m[0][1] - a[0] * b[1], m[0][2] - a[0] * b[2]),
-        (m[1][0] - a[1] * b[0], m[1][1] - a[1] * b[1], m[1][2] - a[1] * b[2]),
-        (m[2][0] - a[2] * b[0], m[2][1] - a[2] * b[1], m[2][2] - a[2] * b[2]),
-    )
+    return m + outer(a, b)
 
 
 @kernel
@@ -251,7 +218,7 @@ def sum_of_outers(a, i, b, k, columns):
     """The sum over the first columns j of a[i : i + 3, j] b[k : k + 3, j]^T."""
     total = outer(load_column3(a, i, 0), load_column3(b, k, 0))
     for j in range(1, columns):
-        total = add_outer(total, load_column3(a, i, j), load_column3(b, k, j))
+        total = total + outer(load_column3(a, i, j), load_column3(b, k, j))
     return total
 
 
@@ -270,12 +237,15 @@ def sum_of_squares(a, i, columns):
 @kernel
 def sum_of_outers_of_rows(a, b, i, k, rows):
     """The sum over the first rows j of a[j, i : i + 3]^T b[j, k : k + 3]."""
-    total = outer((a[0, i], a[0, i + 1], a[0, i + 2]), (b[0, k], b[0, k + 1], b[0, k + 2]))
+    total = outer(_load_row3(a, 0, i), _load_row3(b, 0, k))
     for j in range(1, rows):
-        total = add_outer(
-            total, (a[j, i], a[j, i + 1], a[j, i + 2]), (b[j, k], b[j, k + 1], b[j, k + 2])
-        )
+        total = total + outer(_load_row3(a, j, i), _load_row3(b, j, k))
     return total
+
+
+@kernel
+def _load_row3(a, i, j):
+    return vector(a[i, j], a[i, j + 1], a[i, j + 2])
 
 
 @kernel
@@ -285,15 +255,9 @@ def add33(a, b):
 
 
 @kernel
-def add_scaled33(a, s, b):
-    """A + s b."""
-    return matrix(add_scaled(a[0], s, b[0]), add_scaled(a[1], s, b[1]), add_scaled(a[2], s, b[2]))
-
-
-@kernel
 def scale33(s, a):
     """S a."""
-    return matrix(scale(s, a[0]), scale(s, a[1]), scale(s, a[2]))
+    return s * a
 
 
 @kernel
@@ -310,3 +274,10 @@ def add_to_diagonal(m, s):
 def load_column3(a, i, j):
     """Rows i to i + 2 of column j."""
     return vector(a[i, j], a[i + 1, j], a[i + 2, j])
+
+
+@kernel
+def store_column3(a, i, j, v):
+    """Write a vector into rows i to i + 2 of column j."""
+    for k in range(3):
+        a[i + k, j] = v[k]

@@ -1,10 +1,9 @@
 """A random stream per flight, counter-based: draw n of flight k is a function of (k, n).
 
 Threefry-2x64 with 13 rounds (J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC
-2011): additions, rotations and exclusive-ors of 64-bit words, which lanes do eight at a time. The
-key is drawn when a flight is seeded. The first counter word counts the flight's instants, the
-second names the draw within the instant, so that no result depends on who else draws, or on what
-was skipped.
+2011): additions, rotations and exclusive-ors of 64-bit words, one word per lane. The key is drawn
+when a flight is seeded. The first counter word counts the flight's instants, the second names the
+draw within the instant, so that no result depends on other draws, made or skipped.
 """
 
 import math

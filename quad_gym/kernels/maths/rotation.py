@@ -29,12 +29,11 @@ def euler_to_dcm(e):
 def split_rotation(e):
     """R(e) = I + even(e) + odd(e), which keep and change sign with e, free of cancellation.
 
-    A pair of sigma points sits at +e and -e, so its sum and difference need one evaluation of
-    these.
+    A pair of sigma points is at +e and -e, so its sum and difference need one evaluation of these.
 
     Returns:
-        (even, odd), and the sines and cosines less one of roll and pitch
-        (s_phi, c_phi - 1, s_th, c_th - 1), which the Euler-rate matrix needs again.
+        (even, odd), and (s_phi, c_phi - 1, s_th, c_th - 1) of roll and pitch, which the Euler-rate
+        matrix needs, too.
     """
     (s_phi, m_phi), (s_th, m_th), (s_psi, m_psi) = sin_cos_minus_one(e)
     c_phi, c_th, c_psi = 1.0 + m_phi, 1.0 + m_th, 1.0 + m_psi
@@ -53,9 +52,9 @@ def split_rotation(e):
 
 @kernel
 def turn_pair(even, odd, x, d):
-    """The parts odd and even of (I + even +- odd) (x -+ d), less x; of what `split_rotation` gives.
+    """The odd and even parts of (I + even +- odd) (x -+ d) - x, with the parts of `split_rotation`.
 
-    They are `odd x - d - even d` and `even x - odd d`, written out to leave out the zeros.
+    They are `odd x - d - even d` and `even x - odd d`, written out to omit the zeros.
     """
     (e00, e01, _), (_, e11, _), (e20, e21, e22) = even
     (o00, o01, o02), (o10, _, o12), (o20, o21, _) = odd
@@ -77,7 +76,7 @@ def turn_pair(even, odd, x, d):
 
 @kernel
 def turn_pair_back(even, odd, x, d):
-    """The same of (I + even +- odd)^T (x -+ d)."""
+    """The odd and even parts of (I + even +- odd)^T (x -+ d) - x."""
     (e00, e01, _), (_, e11, _), (e20, e21, e22) = even
     (o00, o01, o02), (o10, _, o12), (o20, o21, _) = odd
     x0, x1, x2 = x
@@ -109,7 +108,7 @@ def quaternion_to_dcm(q):
 
 @kernel
 def vector_to_dcm(phi):
-    """exp(-[phi x]), the R_BI of a body that has turned by the rotation vector phi [rad] from I."""
+    """exp(-[phi x]), the R_BI of a body rotated from I by the rotation vector phi [rad]."""
     angle = math.sqrt(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     sine, cosine = sin_cos(0.5 * angle)
     turned = angle > 1e-100
@@ -167,7 +166,7 @@ def normalize_quaternion(q):
 @kernel
 def mean_quaternion(a, b):
     """The attitude halfway from a to b, two attitudes less than half a turn apart."""
-    # b and -b are the same attitude; halfway is meant along the shorter way
+    # b and -b are the same attitude; of the two rotations, halve the shorter one
     near = select(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0.0, -1.0, 1.0)
     return normalize_quaternion(
         (a[0] + near * b[0], a[1] + near * b[1], a[2] + near * b[2], a[3] + near * b[3])
@@ -176,7 +175,7 @@ def mean_quaternion(a, b):
 
 @kernel
 def rotation_between(a, b):
-    """The rotation vector [rad] in B of the turn from attitude a to attitude b, quaternions.
+    """The rotation vector [rad] in B from attitude a to attitude b, both quaternions.
 
     It is phi with b = a (cos |phi|/2, sin |phi|/2 phi/|phi|), less than half a turn.
     """

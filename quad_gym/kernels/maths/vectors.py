@@ -10,12 +10,12 @@ registers. One operand may mix lanes and floats: `inverse_mass * force_I - (0.0,
 | `M @ a`, `M.T`, `outer(a, b)` | a matrix and a vector or a matrix; its transpose; `a b^T`   |
 
 **A sum fuses the product on its right.** `a + s * b`, `a - s * b` and `M + outer(a, b)` are one
-multiply-add for each number, if the same branch of the same function computes the product. The
+multiply-add for each number, if the product is computed in the branch in which it is added. The
 product on the left of a sum is rounded first; `a + rounded(s * b)` rounds one on the right, too.
 
-Tuples of lanes are Numba's own. The instance of a kernel for floats has a type of its own, as `+`
-concatenates tuples of floats: arithmetic returns it, and so do `vector`, `matrix` and whatever
-loads from arrays, so that a sum needs one operand that comes from these. It fuses nothing.
+With lanes these are ordinary tuples. The instance of a kernel for floats has a separate type, as
+`+` concatenates tuples of floats: arithmetic returns it, and so do `vector`, `matrix` and all that
+loads from arrays, so that a sum needs one operand that comes from these. Nothing is fused there.
 """
 
 import itertools
@@ -74,7 +74,7 @@ def _type(shape: tuple[int, ...], number: Any) -> Any:
 
 
 def _parts(builder: ir.IRBuilder, value: Any) -> list[Any]:
-    """The parts of a vector or matrix: those that it was made of, so that products show."""
+    """The parts of a vector or matrix, as the products that they are where it was just computed."""
     parts: dict[int, Any] = {}
     made = value
     while isinstance(made, ir.instructions.InsertValue) and len(made.indices) == 1:
@@ -155,7 +155,7 @@ def _operator(operation: Any, shape_of: Callable[..., Any], emit: Callable[..., 
 
     Args:
         operation: A function of `operator`.
-        shape_of: The result's shape, given those of the operands; None where there is none.
+        shape_of: The result's shape, given the operands' shapes; None for undefined results.
         emit: The result, given the operands' values.
     """
 
@@ -208,7 +208,7 @@ _operator(operator.neg, lambda a: a, _number_by_number(ir.IRBuilder.fneg))
 
 @infer_getattr
 class _MatrixAttributes(AttributeTemplate):
-    key = types.UniTuple
+    key = types.BaseTuple
 
     def generic_resolve(self, kind: Any, name: str) -> Any:
         shape = _shape(kind)
@@ -217,9 +217,10 @@ class _MatrixAttributes(AttributeTemplate):
         return None
 
 
-@lower_getattr(types.UniTuple, "T")
+@lower_getattr(types.BaseTuple, "T")
 def _transpose(context, builder, kind, value):  # type: ignore[no-untyped-def]
-    return _transposed(builder, value)
+    square = _type(_shape(kind), _number_of(kind))  # type: ignore[arg-type]
+    return _transposed(builder, context.cast(builder, value, kind, square))
 
 
 # ---- functions -------------------------------------------------------------------------------
