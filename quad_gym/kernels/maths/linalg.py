@@ -8,7 +8,8 @@ multiply-adds.
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.vectors import matrix, outer, vector
+from quad_gym.kernels.maths.vectors import matrix, vector
+from quad_gym.kernels.maths.vectors import outer as outer
 from quad_gym.kernels.simd.lanes import select
 
 # ---- vectors of three -------------------------------------------------------------------------

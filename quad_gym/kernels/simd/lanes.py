@@ -166,9 +166,9 @@ def is_product(value: Any) -> bool:
     return isinstance(value, ir.Instruction) and value.opname == "fmul"
 
 
-def fuse(builder: ir.IRBuilder, factor: Any, other: Any, summand: Any) -> Any:
-    """Multiply-add: factor * other + summand, rounded once."""
-    return call_llvm(builder, "llvm.fma", factor, other, summand)
+def fuse(builder: ir.IRBuilder, *numbers: Any) -> Any:
+    """Multiply-add of three numbers: a * b + c, rounded once."""
+    return call_llvm(builder, "llvm.fma", *numbers)
 
 
 def add_numbers(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
