@@ -15,7 +15,7 @@ from quad_gym.kernels.maths.linalg import (
     store33,
     store_column3,
 )
-from quad_gym.kernels.maths.vectors import matrix, outer, rounded, vector
+from quad_gym.kernels.maths.vectors import outer, rounded, vector
 from tests.unit.compiled import Compiled
 
 INSTANCES = ("on_floats", "on_lanes")
@@ -32,7 +32,8 @@ def combine(f, option):
         x, y, z = axis
         store3(f.vectors[5], load3(f.vectors[5]) + vector(x, y, axis[2] + 0.0 * z))
     store33(f.matrices[0], m @ m.T - f.s * m)
-    store33(f.matrices[1], outer(u, v) + matrix(u, v, (0.0, 1.0, f.s)))
+    rows = (u, v, (0.0, 1.0, f.s))
+    store33(f.matrices[1], outer(u, v) + rows)
     store33(f.matrices[2], -m)
     store_column3(f.matrices[2], 0, option, u)
     q, w = load4(f.q), load44(f.w)
@@ -42,7 +43,7 @@ def combine(f, option):
 
 def add_products(f, option):
     a, b, s = load3(f.a), load3(f.b), f.s
-    m = matrix(a, b, a)
+    m = (a, b, a)
     store3(f.sums[0], a + s * b)
     store3(f.sums[1], a - s * b)
     store3(f.sums[2], s * b + a)

@@ -17,7 +17,6 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import sin_cos
 from quad_gym.kernels.maths.linalg import load_block, load_column3, store_block, store_column3
-from quad_gym.kernels.maths.vectors import matrix
 
 R, V, E, BA, BG, D = 0, 3, 6, 9, 12, 15
 """First rows of position, velocity, attitude error, accelerometer and gyro bias in the state, and
@@ -30,7 +29,7 @@ def reset_matrix(m):
     s_phi, c_phi = sin_cos(m[0])
     s_th, c_th = sin_cos(m[1])
     zero = 0.0 * c_th
-    return matrix(
+    return (
         (c_th, zero, -c_phi * s_th),
         (zero, zero + 1.0, s_phi),
         (s_th, zero, c_phi * c_th),

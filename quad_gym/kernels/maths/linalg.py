@@ -8,8 +8,8 @@ multiply-adds.
 import math
 
 from quad_gym.kernels.compiling import kernel
-from quad_gym.kernels.maths.vectors import matrix, vector
 from quad_gym.kernels.maths.vectors import outer as outer
+from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.lanes import select
 
 # ---- vectors of three -------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def select3(mask, a, b):
 @kernel
 def select33(mask, a, b):
     """The matrix `a` where `mask`, else `b`."""
-    return matrix(select3(mask, a[0], b[0]), select3(mask, a[1], b[1]), select3(mask, a[2], b[2]))
+    return (select3(mask, a[0], b[0]), select3(mask, a[1], b[1]), select3(mask, a[2], b[2]))
 
 
 @kernel
@@ -126,7 +126,7 @@ def store4(a, v):
 @kernel
 def load33(a):
     """A 3 x 3 array as a matrix."""
-    return matrix(
+    return (
         (a[0, 0], a[0, 1], a[0, 2]),
         (a[1, 0], a[1, 1], a[1, 2]),
         (a[2, 0], a[2, 1], a[2, 2]),
@@ -136,7 +136,7 @@ def load33(a):
 @kernel
 def load44(a):
     """A 4 x 4 array as a matrix."""
-    return matrix(load4(a[0]), load4(a[1]), load4(a[2]), load4(a[3]))
+    return (load4(a[0]), load4(a[1]), load4(a[2]), load4(a[3]))
 
 
 @kernel
@@ -185,7 +185,7 @@ def multiply(a, b):
 @kernel
 def load_block(a, i, j):
     """The 3 x 3 block of an array whose corner is at row i, column j."""
-    return matrix(
+    return (
         (a[i, j], a[i, j + 1], a[i, j + 2]),
         (a[i + 1, j], a[i + 1, j + 1], a[i + 1, j + 2]),
         (a[i + 2, j], a[i + 2, j + 1], a[i + 2, j + 2]),
@@ -232,7 +232,7 @@ def sum_of_squares(a, i, columns):
         x, y, z = load_column3(a, i, j)
         xx, yx, yy = xx + x * x, yx + y * x, yy + y * y
         zx, zy, zz = zx + z * x, zy + z * y, zz + z * z
-    return matrix((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
+    return ((xx, yx, zx), (yx, yy, zy), (zx, zy, zz))
 
 
 @kernel
@@ -252,7 +252,7 @@ def _load_row3(a, i, j):
 @kernel
 def add33(a, b):
     """A + b."""
-    return matrix(add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
+    return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
 
 
 @kernel
@@ -264,7 +264,7 @@ def scale33(s, a):
 @kernel
 def add_to_diagonal(m, s):
     """M + s I."""
-    return matrix(
+    return (
         (m[0][0] + s, m[0][1], m[0][2]),
         (m[1][0], m[1][1] + s, m[1][2]),
         (m[2][0], m[2][1], m[2][2] + s),

@@ -8,7 +8,6 @@ import math
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import atan2, sin_cos, sin_cos_minus_one
 from quad_gym.kernels.maths.linalg import unit_or
-from quad_gym.kernels.maths.vectors import matrix, vector
 from quad_gym.kernels.simd.lanes import select
 
 
@@ -18,7 +17,7 @@ def euler_to_dcm(e):
     s_phi, c_phi = sin_cos(e[0])
     s_th, c_th = sin_cos(e[1])
     s_psi, c_psi = sin_cos(e[2])
-    return matrix(
+    return (
         (c_psi * c_th - s_phi * s_psi * s_th, c_th * s_psi + c_psi * s_phi * s_th, -c_phi * s_th),
         (-c_phi * s_psi, c_phi * c_psi, s_phi),
         (c_psi * s_th + c_th * s_phi * s_psi, s_psi * s_th - c_psi * c_th * s_phi, c_phi * c_th),
@@ -99,7 +98,7 @@ def turn_pair_back(even, odd, x, d):
 def quaternion_to_dcm(q):
     """R_BI of the unit quaternion q (w, x, y, z)."""
     w, x, y, z = q
-    return matrix(
+    return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
         (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
         (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
@@ -160,7 +159,7 @@ def dcm_to_quaternion(R_BI):
 def normalize_quaternion(q):
     """Q / |q|."""
     inverse = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return vector(inverse * q[0], inverse * q[1], inverse * q[2], inverse * q[3])
+    return (inverse * q[0], inverse * q[1], inverse * q[2], inverse * q[3])
 
 
 @kernel
@@ -187,14 +186,14 @@ def rotation_between(a, b):
     sine = math.sqrt(x * x + y * y + z * z)
     turned = sine > 1e-100
     per_sine = near * select(turned, atan2(sine, near * w) / select(turned, sine, 1.0), 1.0)
-    return vector(2.0 * per_sine * x, 2.0 * per_sine * y, 2.0 * per_sine * z)
+    return (2.0 * per_sine * x, 2.0 * per_sine * y, 2.0 * per_sine * z)
 
 
 @kernel
 def quaternion_rate(q, w_B):
     """dq/dt = 1/2 q (0, w_B)."""
     w, x, y, z = q
-    return vector(
+    return (
         0.5 * (-x * w_B[0] - y * w_B[1] - z * w_B[2]),
         0.5 * (w * w_B[0] + y * w_B[2] - z * w_B[1]),
         0.5 * (w * w_B[1] + z * w_B[0] - x * w_B[2]),
@@ -210,4 +209,4 @@ def level_attitude(v_B, v_I):
     b = unit_or((v_B[0], v_B[1], zero), east)
     i = unit_or((v_I[0], v_I[1], zero), east)
     c, s = b[0] * i[0] + b[1] * i[1], b[0] * i[1] - b[1] * i[0]
-    return matrix((c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0))
+    return ((c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0))

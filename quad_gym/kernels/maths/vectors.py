@@ -14,8 +14,8 @@ multiply-add for each number, if the product is computed in the branch in which 
 product on the left of a sum is rounded first; `a + rounded(s * b)` rounds one on the right, too.
 
 With lanes these are ordinary tuples. The instance of a kernel for floats has a separate type, as
-`+` concatenates tuples of floats: arithmetic returns it, and so do `vector`, `matrix` and all that
-loads from arrays, so that a sum needs one operand that comes from these. Nothing is fused there.
+`+` concatenates tuples of floats: arithmetic returns it, and so do `vector` and all that loads from
+arrays, so that a sum needs one operand that comes from these. Nothing is fused there.
 """
 
 import itertools
@@ -29,7 +29,7 @@ from numba.core.datamodel import models
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_global, signature
 from numba.extending import infer_getattr, intrinsic, lower_builtin, lower_getattr, register_model
 
-from quad_gym.kernels.simd.lanes import ASKED_FIRST, add_numbers, fuse, is_product, lanes
+from quad_gym.kernels.simd.lanes import ASKED_FIRST, Lanes, add_numbers, fuse, is_product, lanes
 
 # ---- types -----------------------------------------------------------------------------------
 
@@ -55,13 +55,15 @@ def _shape(kind: Any) -> tuple[int, ...] | None:
     return None
 
 
-def _has_lanes(kind: Any) -> bool:
-    return kind == lanes or (isinstance(kind, types.BaseTuple) and any(map(_has_lanes, kind)))
+def _contains(kind: Any, sought: type) -> bool:
+    if isinstance(kind, types.BaseTuple) and any(_contains(part, sought) for part in kind):
+        return True
+    return isinstance(kind, sought)
 
 
 def _number_of(*kinds: Any) -> Any:
     """The type of the numbers that result from an operation on these types."""
-    return lanes if any(map(_has_lanes, kinds)) else types.float64
+    return lanes if any(_contains(kind, Lanes) for kind in kinds) else types.float64
 
 
 def _type(shape: tuple[int, ...], number: Any) -> Any:
@@ -167,8 +169,8 @@ def _operator(operation: Any, shape_of: Callable[..., Any], emit: Callable[..., 
             shapes = [_shape(kind) for kind in args]
             shape = None if None in shapes else shape_of(*shapes)
             number = _number_of(*args)
-            numbas = number != lanes and not any(isinstance(kind, Floats) for kind in args)
-            if not shape or (operation is operator.add and numbas):
+            plain = number != lanes and not any(_contains(kind, Floats) for kind in args)
+            if not shape or (plain and operation is operator.add):
                 return None
             return signature(_type(shape, number), *(_type(each, number) for each in shapes))
 
@@ -227,35 +229,22 @@ def _transpose(context, builder, kind, value):  # type: ignore[no-untyped-def]
 
 
 def vector(*numbers: Any) -> Any:
-    """The vector of these numbers, for sums in the instance for floats."""
+    """The vector of these numbers, for a sum in the instance for floats."""
     raise NotImplementedError("vector is available inside kernels only")
 
 
-def matrix(*rows: Any) -> Any:
-    """The matrix of these rows, for sums in the instance for floats."""
-    raise NotImplementedError("matrix is available inside kernels only")
+@infer_global(vector)
+class _VectorTyping(AbstractTemplate):
+    metadata = ASKED_FIRST
+
+    def generic(self, args, kws):  # type: ignore[no-untyped-def]
+        number = _number_of(*args)
+        return signature(_type((len(args),), number), *(number for _ in args))
 
 
-def _constructor(function: Callable[..., Any], rank: int) -> None:
-    @infer_global(function)
-    class _Typing(AbstractTemplate):
-        metadata = ASKED_FIRST
-
-        def generic(self, args, kws):  # type: ignore[no-untyped-def]
-            shapes = {_shape(part) for part in args}
-            shape = shapes.pop() if len(shapes) == 1 else None
-            if shape is None or len(shape) != rank:
-                return None
-            whole = _type((len(args), *shape), _number_of(*args))
-            return signature(whole, *whole.types)
-
-    @lower_builtin(function, types.VarArg(types.Any))
-    def _lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        return _made_of(builder, args)
-
-
-_constructor(vector, 0)
-_constructor(matrix, 1)
+@lower_builtin(vector, types.VarArg(types.Any))
+def _vector(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    return _made_of(builder, args)
 
 
 @intrinsic

@@ -5,7 +5,6 @@ import math
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import keep3, load3, select3
 from quad_gym.kernels.maths.random import stream_of, uniform_pair
-from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.obstacles.shapes import distance_from
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import logical_not, select
@@ -23,7 +22,7 @@ def place_obstacles(flight, settings, mask):
         u, v = uniform_pair(stream, DRAW_OBSTACLES + 2 * k)
         w, _ = uniform_pair(stream, DRAW_OBSTACLES + 2 * k + 1)
         reach, center = load3(settings.obstacle_shift[k]), load3(settings.obstacle_center[k])
-        shift = vector(
+        shift = (
             reach[0] * (2.0 * u - 1.0),
             reach[1] * (2.0 * v - 1.0),
             reach[2] * (2.0 * w - 1.0),

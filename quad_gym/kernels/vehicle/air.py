@@ -10,7 +10,6 @@ from quad_gym.kernels.maths.elementary import maximum, minimum
 from quad_gym.kernels.maths.linalg import dot, keep3, load3, load4, load33
 from quad_gym.kernels.maths.random import stream_of
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
-from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.vehicle.dynamics import (
@@ -52,11 +51,11 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
     """
     W = rotor_speeds
     zero = 0.0 * r_I[0]
-    force_I, torque_B = vector(zero, zero, zero), vector(zero, zero, zero)
+    force_I, torque_B = (zero, zero, zero), (zero, zero, zero)
     if settings.linear_drag:
         v_B = R_BI @ v_air_I
         D = load3(p.linear_drag_B) + (W[0] + W[1] + W[2] + W[3]) * load3(p.rotor_drag_B)
-        force_I = force_I - R_BI.T @ vector(D[0] * v_B[0], D[1] * v_B[1], D[2] * v_B[2])
+        force_I = force_I - R_BI.T @ (D[0] * v_B[0], D[1] * v_B[1], D[2] * v_B[2])
     if settings.ground_effect:
         up_B = (R_BI[0][2], R_BI[1][2], R_BI[2][2])
         level = maximum(up_B[2], 0.0)
@@ -70,7 +69,7 @@ def air_wrench(r_I, R_BI, v_air_I, rotor_speeds, p, settings):
             torque_x = torque_x + p.effectiveness[1, i] * gained
             torque_y = torque_y + p.effectiveness[2, i] * gained
         force_I = thrust * R_BI[2] + force_I
-        torque_B = vector(torque_x, torque_y, zero)
+        torque_B = (torque_x, torque_y, zero)
     return force_I, torque_B
 
 

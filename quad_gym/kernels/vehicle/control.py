@@ -17,7 +17,7 @@ from quad_gym.kernels.maths.linalg import (
     store4,
     unit_or,
 )
-from quad_gym.kernels.maths.vectors import matrix, rounded, vector
+from quad_gym.kernels.maths.vectors import rounded
 from quad_gym.kernels.simd.blocks import lanes_of
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.kernels.task.reference import evaluate_reference
@@ -35,8 +35,8 @@ def allocate(thrust, torque, p):
     """
     limit = p.max_rotor_force
     zero = 0.0 * thrust
-    base = load44(p.allocation) @ vector(minimum(thrust, 3.6 * limit), zero, zero, zero)
-    turn = load44(p.allocation) @ vector(zero, torque[0], torque[1], torque[2])
+    base = load44(p.allocation) @ (minimum(thrust, 3.6 * limit), zero, zero, zero)
+    turn = load44(p.allocation) @ (zero, torque[0], torque[1], torque[2])
     alpha = zero + 1.0
     for i in range(4):
         loaded = turn[i] > 0.0
@@ -75,12 +75,12 @@ def pd_wrench(r, v, R_BI, w_B, reference, p):
     F_I = (
         p.gain_position * (r_ref - r)
         + rounded(p.gain_velocity * (v_ref - v))
-        + rounded(p.mass * vector(a_ref[0], a_ref[1], a_ref[2] + p.gravity))
+        + rounded(p.mass * (a_ref[0], a_ref[1], a_ref[2] + p.gravity))
     )
     z_I = R_BI[2]
     z_ref = unit_or(F_I, z_I)
     b = unit_or(cross(z_ref, x_ref), R_BI[1])
-    R_ref = matrix(cross(b, z_ref), b, z_ref)
+    R_ref = (cross(b, z_ref), b, z_ref)
     R_E = R_ref @ R_BI.T
     e = (R_E[1][2] - R_E[2][1], R_E[2][0] - R_E[0][2], R_E[0][1] - R_E[1][0])
     K, Kd = p.gain_attitude, p.gain_body_rates
@@ -106,7 +106,7 @@ def level_axes(R_BI):
     x_B_I = R_BI[0]
     zero = 0.0 * x_B_I[0]
     ahead = unit_or((x_B_I[0], x_B_I[1], zero), (1.0, 0.0, 0.0))
-    return matrix(ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
+    return (ahead, (-ahead[1], ahead[0], zero), (zero, zero, zero + 1.0))
 
 
 @kernel
@@ -114,7 +114,7 @@ def tilt_rates(z_desired_I, R_BI, yaw_rate, p):
     """Body rates that turn the thrust axis toward a direction: k_a (e3 x R z*), and a yaw rate."""
     z_desired_B = R_BI @ z_desired_I
     k = p.attitude_bandwidth
-    return vector(-k * z_desired_B[1], k * z_desired_B[0], yaw_rate)
+    return (-k * z_desired_B[1], k * z_desired_B[0], yaw_rate)
 
 
 @kernel
@@ -146,7 +146,7 @@ def act(flight, a, p, mode, reference):
             torque = (scales[0] * a[1], scales[1] * a[2], scales[2] * a[3])
         elif mode == Control.CTBR:
             rates = p.rate_scale
-            w_desired = vector(rates[0] * a[1], rates[1] * a[2], rates[2] * a[3])
+            w_desired = (rates[0] * a[1], rates[1] * a[2], rates[2] * a[3])
             torque = rate_torque(w_desired, w_B, p)
         elif mode == Control.ATTITUDE:
             s_roll, c_roll = sin_cos(p.tilt_scale * a[1])

@@ -6,7 +6,6 @@ A state is (r_I, v_I, q, w_B, rotor_speeds), a tuple of tuples; its derivative h
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import cross, dot, load3, load4, load33, load44, store3, store4
 from quad_gym.kernels.maths.rotation import normalize_quaternion, quaternion_rate, quaternion_to_dcm
-from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.blocks import lanes_of
 
 
@@ -19,7 +18,7 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     is the velocity relative to it.
     """
     W = rotor_speeds
-    forces = vector(
+    forces = (
         p.thrust_coefficient * W[0] * W[0],
         p.thrust_coefficient * W[1] * W[1],
         p.thrust_coefficient * W[2] * W[2],
@@ -29,9 +28,9 @@ def accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, p):
     z_I = R_BI[2]
     drag = p.half_drag * abs(dot(z_I, v_I))
     force_I = thrust * z_I - drag * v_I + d_I
-    a_I = (1.0 / p.mass) * force_I - vector(0.0, 0.0, p.gravity)
+    a_I = (1.0 / p.mass) * force_I - (0.0, 0.0, p.gravity)
 
-    torque_B = vector(torque_x, torque_y, torque_z)
+    torque_B = (torque_x, torque_y, torque_z)
     dw_B = load33(p.inertia_inverse) @ (torque_B - cross(w_B, load33(p.inertia) @ w_B))
     return a_I, dw_B
 

@@ -12,7 +12,6 @@ from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import clip, exp, log, maximum
 from quad_gym.kernels.maths.linalg import load3, norm
 from quad_gym.kernels.maths.random import normal_pair, stream_of
-from quad_gym.kernels.maths.vectors import vector
 from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_GUST
 
@@ -125,4 +124,4 @@ def gust_velocity(flight, p):
     blows = speed > 0.0
     along = select(blows, speed, 1.0)
     c, s = select(blows, x, 1.0) / along, y / along
-    return vector(c * u - s * v, s * u + c * v, w)
+    return (c * u - s * v, s * u + c * v, w)
