@@ -335,10 +335,11 @@ def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     flight.update_failures = flight.update_failures + select(failed, 1.0, 0.0)
     if (form & _WATCH) != 0 and any_of(failed):
         mark_failed(flight, settings, failed)
+    updated = mask & (work.measured > 0.0)
     if (form & _GATE) != 0:
-        inflate(flight, p, work, settings, mask & logical_not(failed), slow, stages)
+        inflate(flight, p, work, settings, updated & logical_not(failed), slow, stages)
     elif (form & _WATCH) != 0:
-        flag_drifts(flight, p, mask)
+        flag_drifts(flight, p, updated)
 
 
 @stage
