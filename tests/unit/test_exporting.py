@@ -294,7 +294,8 @@ def test_a_filters_numbers_hold_those_of_aiding_sensors():
     found = filter_numbers(suite)
     numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
     assert len(numbers["slow_sigma"]) == 3 + 1 + 4  # drift; bias; hard iron and declination
-    assert numbers["aid_sigma"] == [suite.barometer.noise_sigma, suite.magnetometer.noise_sigma]
+    sigmas = [suite.barometer.noise_sigma, suite.magnetometer.noise_sigma]
+    assert numbers["aid_sigma"] == [*sigmas, 0.0, 0.0]
     np.testing.assert_allclose(numbers["aid_numbers"][1], suite.magnetometer.field_I)
     assert found["rates"]["magnetometer"] == suite.magnetometer.rate
     assert "aid_numbers" in filter_header(suite, "aided")
