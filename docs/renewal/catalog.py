@@ -123,7 +123,14 @@ CATALOG = {
             flights=("LookAround", "LookAround, truth"),
             texts=texts.study(
                 "look_around",
-                *("pd_features_when_uncertain", "truth", "noisy", "noisier", "std", "std_certainty"),
+                *(
+                    "pd_features_when_uncertain",
+                    "truth",
+                    "noisy",
+                    "noisier",
+                    "std",
+                    "std_certainty",
+                ),
                 "std_certainty_privileged",
             ),
             figures=texts.film_and_figures("look_around", "glance"),
