@@ -19,7 +19,9 @@ from quad_gym.params.ground import GroundParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
 from quad_gym.params.obstacles import Cylinder, Wall
+from quad_gym.params.optical_flow import OpticalFlowParams
 from quad_gym.params.randomization import Randomization
+from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.reward import RewardParams
 from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
 from quad_gym.params.suites import sensor_suite
@@ -97,10 +99,12 @@ __all__ = [
     "NoisyObservationParams",
     "Normal",
     "ObservationSpec",
+    "OpticalFlowParams",
     "PDGains",
     "QuadEnv",
     "QuadVectorEnv",
     "Randomization",
+    "RangeFinderParams",
     "RewardParams",
     "SensorSuite",
     "Task",

@@ -17,6 +17,8 @@ _SENSORS = {
     "features": "NIS of features",
     "barometer": "NIS of the barometer",
     "magnetometer": "NIS of the magnetometer",
+    "optical_flow": "NIS of the optical flow",
+    "range_finder": "NIS of the range finder",
 }
 
 

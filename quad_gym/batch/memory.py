@@ -226,7 +226,7 @@ class FlightMemory:
         Args:
             gnss: True: GNSS measures; False: it is off; None: as at present.
             camera: True: the camera measures; False: it is off; None: as at present.
-            aids: The same for `barometer` and `magnetometer`, if the suite has them.
+            aids: The same for other sensors of the suite, such as `barometer`.
 
         Raises:
             ValueError: If an aiding sensor is unknown, or the suite lacks it.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from quad_gym.params import checks as check
 from quad_gym.records import (
     AID_BLOCKS,
+    AID_FREEDOMS,
     BASELINE_BLOCK,
     FEATURE_SLICE,
     HEADING_ALONG,
@@ -172,12 +173,13 @@ def _pixels(batch: "FlightBatch", flights: Flights) -> Floats:
 
 
 def _aid(aid: Aid) -> Computed:
-    """The measurement of an aiding sensor."""
+    """The measurement of a sensor other than GNSS and camera."""
 
     def of(batch: "FlightBatch", flights: Flights) -> Floats:
         measured = _measured(batch, flights)[:, AID_BLOCKS + aid, np.newaxis]
         found = np.where(measured, batch.record("aid_measurement", flights)[:, aid], np.nan)
-        return found[:, 0] if aid == Aid.BAROMETER else found
+        numbers = AID_FREEDOMS[aid]
+        return found[:, 0] if numbers == 1 else found[:, :numbers]
 
     return of
 
@@ -227,6 +229,8 @@ QUANTITIES = {
     "pixels": Quantity(_pixels, ("features", 2), "pixels", "C", "features, from the image's center", filtered=True),
     "barometer": Quantity(_aid(Aid.BAROMETER), (), "m", "-", "altitude", filtered=True),
     "magnetometer": Quantity(_aid(Aid.MAGNETOMETER), (3,), "T", "B", "magnetic field", filtered=True),
+    "optical_flow": Quantity(_aid(Aid.OPTICAL_FLOW), (2,), "rad/s", "B", "angular rate of the ground below", filtered=True),
+    "range_finder": Quantity(_aid(Aid.RANGE_FINDER), (), "m", "B", "distance to the ground", filtered=True),
     # the task
     "action": Quantity("action", (4,), "-", "-", "the present action, in [-1, 1]"),
     "last_action": Quantity("last_action", (4,), "-", "-", "the action before it"),

@@ -17,7 +17,7 @@ class SensorLoss(Fault):
     """
 
     sensor: str
-    """name of the lost sensor: "barometer" or "magnetometer\""""
+    """name of the lost sensor: "barometer", "magnetometer", "optical_flow" or "range_finder\""""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -18,14 +18,18 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MagnetometerParams
+from quad_gym.params.optical_flow import OpticalFlowParams
+from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.suite_files import SUFFIX, text_of
 from quad_gym.records import MAX_UNDER_WAY, Aid
 
 AID_PARAMS: dict[str, type[AidParams]] = {
     "barometer": BarometerParams,
     "magnetometer": MagnetometerParams,
+    "optical_flow": OpticalFlowParams,
+    "range_finder": RangeFinderParams,
 }
-"""Parameters of aiding sensors by their fields in `SensorSuite`."""
+"""Parameters of other sensors by their fields in `SensorSuite`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +102,10 @@ class SensorSuite(Checked):
     """barometer; None: no barometer"""
     magnetometer: MagnetometerParams | None = None
     """magnetometer; None: no magnetometer"""
+    optical_flow: OpticalFlowParams | None = None
+    """optical flow of the ground below; None: not measured"""
+    range_finder: RangeFinderParams | None = None
+    """range finder that looks down; None: no range finder"""
     initial_pose: InitialPoseParams = field(default_factory=InitialPoseParams)
     """accuracy of the initial pose where GNSS does not measure it"""
     estimator: FilterParams = field(default_factory=FilterParams)

@@ -9,10 +9,11 @@
 | `indoor` | none: starts from a mark | 25 Hz, sixteen markers on the walls | good MEMS |
 | `one_wall` | none: starts from a mark | 25 Hz, eight markers on one wall | cheap MEMS |
 | `stale` | as `rtk`, 40 ms late, uncompensated | as `rtk`, 10 ms late, uncompensated | as `rtk` |
+| `crazyflie` | none: starts from a mark; optical flow, range finder | none | as `indoor` |
 
-The last two were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in one
-direction only, and a filter that ignores time stamps. They are not among SUITES, on which results
-for all tasks are based.
+`one_wall` and `stale` were made for `QuadGym/LookAround-v0` and `QuadGym/StaleRace-v0`: markers in
+one direction only, and a filter that ignores time stamps. They and `crazyflie` are not among
+SUITES, on which results for all tasks are based.
 
 The IMU runs at 200 Hz, so cameras of 30 Hz run at 25 Hz, which divides that rate. Except in `lab`,
 the phases of GNSS and camera are drawn in each episode, the fix that starts the filter is used
@@ -43,6 +44,8 @@ from quad_gym.params.filter import FilterParams
 from quad_gym.params.gnss import GnssParams
 from quad_gym.params.imu import ImuParams
 from quad_gym.params.magnetometer import MICROTESLA, MagnetometerParams
+from quad_gym.params.optical_flow import OpticalFlowParams
+from quad_gym.params.range_finder import RangeFinderParams
 from quad_gym.params.sensors import InitialPoseParams, NoisyObservationParams, SensorSuite
 from quad_gym.params.suite_files import SUFFIX, read_suite
 
@@ -264,6 +267,22 @@ STANDARD = SensorSuite(
 )
 """The environments' default: the laboratory's sensors with a consistent filter."""
 
+CRAZYFLIE = SensorSuite(
+    imu=INDOOR.imu,  # the BMI088 of the Crazyflie 2.1
+    gnss=None,
+    camera=None,
+    # the Flow deck v2: PMW3901 and VL53L1X
+    optical_flow=OpticalFlowParams(phase=None),
+    range_finder=RangeFinderParams(phase=None),
+    initial_pose=InitialPoseParams(position_sigma=0.05, heading_sigma=0.05),
+    estimator=FIELD_FILTER,
+    noisy=NoisyObservationParams(
+        position=0.2, velocity=0.08, attitude=0.031, body_rates=0.0061
+    ),  # measured, see above
+)
+"""A small vehicle indoors that navigates by optical flow and a range finder: nothing observes its
+heading and horizontal position, whose errors grow."""
+
 _SUITES = {
     "standard": STANDARD,
     "lab": SensorSuite(),
@@ -279,10 +298,11 @@ _ALL = {
     **_SUITES,
     "one_wall": ONE_WALL,
     "stale": STALE,
+    "crazyflie": CRAZYFLIE,
 }
 
 ALL_SUITES = tuple(_ALL)
-"""Names of all sensor suites, with those made for one task."""
+"""Names of all sensor suites."""
 
 
 def sensor_suite(name: str | Path) -> SensorSuite:

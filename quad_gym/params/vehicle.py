@@ -210,9 +210,30 @@ def check_lag(name: str, time_constant: float, clocks: Clocks) -> None:
         )
 
 
-_VEHICLES = {"lab": VehicleParams()}
+CRAZYFLIE = VehicleParams(
+    # Bitcraze: Crazyflie 2.1, 27 g, and Flow deck v2, 1.6 g; 92 mm from motor to motor diagonally
+    mass=0.0286,
+    rotor_positions_B=(
+        (0.0325, -0.0325, 0.0),
+        (0.0325, 0.0325, 0.0),
+        (-0.0325, 0.0325, 0.0),
+        (-0.0325, -0.0325, 0.0),
+    ),
+    # the model cf2x of gym-pybullet-drones (J. Panerati and others, IROS 2021), after C. Luis and
+    # J. Le Ny, arXiv 1608.05786, 2016: coefficients per rpm^2, thrust 2.25 times the weight of 27 g
+    inertia=((1.4e-5, 0.0, 0.0), (0.0, 1.4e-5, 0.0), (0.0, 0.0, 2.17e-5)),
+    thrust_coefficient=3.16e-10 / 0.104719755**2,
+    torque_coefficient=7.94e-12 / 0.104719755**2,
+    max_voltage=4.2,  # of a full cell
+    motor_speed_per_volt=541.0,
+    motor_time_constant=0.05,  # brushed motors; engineering judgment
+    disc_area=0.0066,  # a disc of 92 mm; engineering judgment
+)
+"""A Crazyflie 2.1 with a Flow deck."""
+
+_VEHICLES = {"lab": VehicleParams(), "crazyflie": CRAZYFLIE}
 
 
 def vehicle_params(name: str) -> VehicleParams:
-    """Return the vehicle called `name`: "lab", the vehicle of the laboratory report."""
+    """Return the vehicle called `name`: "lab", of the laboratory report, or "crazyflie"."""
     return _VEHICLES[check.choice("vehicle", name, tuple(_VEHICLES))]

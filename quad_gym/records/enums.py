@@ -88,6 +88,8 @@ class Sensor(IntEnum):
     CAMERA = 1
     BAROMETER = 2
     MAGNETOMETER = 3
+    OPTICAL_FLOW = 4
+    RANGE_FINDER = 5
 
 
 class Block(IntEnum):
@@ -115,9 +117,11 @@ class Aid(IntEnum):
 
     BAROMETER = 0
     MAGNETOMETER = 1
+    OPTICAL_FLOW = 2
+    RANGE_FINDER = 3
 
 
-AID_FREEDOMS = (1, 3)
+AID_FREEDOMS = (1, 3, 2, 1)
 """Numbers that each of them measures, in the order of `Aid`."""
 
 

@@ -211,7 +211,7 @@ _SLOW_FIELDS = (
 )
 _AID_FIELDS = (
     # sensors other than GNSS and camera, in the order of Aid
-    Field("aid_measurement", (AIDS, 3), "m; T", "altitude, then zeros; magnetic field in B"),
+    Field("aid_measurement", (AIDS, 3), "m; T; rad/s", "altitude, then zeros; magnetic field in B; flow, then zero; distance, then zeros"),
     Field("aid_vector", (AIDS, 3), "T", "true slow error in B, if it has one of three numbers: hard iron"),
     Field("aid_scalar", (AIDS,), "m; rad", "true slow error of one number: bias of the altitude; declination less the believed one"),
     Field("aid_matrix", (AIDS, 3, 3), "-", "true errors of scale and alignment: soft iron"),

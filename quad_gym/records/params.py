@@ -91,7 +91,7 @@ PARAMS_FIELDS = (
     Field("aid_matrix_sigma", (AIDS,), "-", "of each error of scale and alignment"),
     Field("aid_scale", (AIDS,), "m; T", "one in observations"),
     Field("aid_gate", (AIDS,), "-", "largest accepted NIS"),
-    Field("aid_numbers", (AIDS, 3), "mixed", "further ones; of the magnetometer: the field in I [T]"),
+    Field("aid_numbers", (AIDS, 3), "mixed", "further ones; of the magnetometer: the field in I [T]; of optical flow and range finder: their limits"),
     # slow errors among the filter's states
     Field("slow_sigma", (MAX_SLOW,), "mixed", "of each at the start"),
     Field("slow_decay", (MAX_SLOW,), "-", "over a tick"),

@@ -99,6 +99,7 @@ def cases():
     for fault in PRESETS:
         suite = "indoor" if "camera" in fault else "rtk"
         suite = AIDED if "meter" in fault else suite
+        suite = "crazyflie" if fault in ("optical_flow_loss", "range_finder_loss") else suite
         found[f"fault {fault}"] = {"sensors": suite, "faults": _early(fault), "start": "hover"}
     for task in ("LookAround", "StaleRace", "OutageDash"):
         found[task] = {"id": task}
@@ -120,6 +121,14 @@ def cases():
             ),
             "estimator": "ekf",
             "observation": "measurements",
+        },
+        "crazyflie": {"sensors": "crazyflie", "vehicle": "crazyflie", "innovations": True},
+        "crazyflie, late, ekf, warm, raw": {
+            "sensors": quad_gym.sensor_suite("crazyflie").replace(
+                optical_flow=quad_gym.OpticalFlowParams(latency=0.01),
+                range_finder=quad_gym.RangeFinderParams(latency=0.04),
+            ),
+            **{"estimator": "ekf", "filter_start": "warm", "observation": "measurements"},
         },
         "ekf": {"estimator": "ekf", "sensors": "rtk"},
         "innovations": rtk | {"innovations": True},

@@ -269,8 +269,8 @@ def test_names_that_are_no_identifiers_are_refused():
 def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
     found = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
     source = "".join(file.read_text(encoding="utf-8") for file in KERNELS.rglob("*.py"))
-    for block in ("position", "baseline", "velocity", "features"):
-        text = (KERNELS.parent / "measurements" / f"{block}.py").read_text(encoding="utf-8")
+    for name in ("gnss_position", "gnss_baseline", "gnss_velocity", "camera"):
+        text = (KERNELS.parent / "sensors" / f"{name}.py").read_text(encoding="utf-8")
         source += text.partition("# ---- update")[2]  # before it is what sensors do
     read = set(re.findall(r"(?<![\w.])(?:p|params|model)\.(\w+)", source)) & set(PARAMS.names)
     camera = {"camera", "R_CB", "focal_length", "features", "pixel_sigma", "blur"}
@@ -294,7 +294,8 @@ def test_a_filters_numbers_hold_those_of_aiding_sensors():
     found = filter_numbers(suite)
     numbers = {name: entry["value"] for name, entry in found["numbers"].items()}
     assert len(numbers["slow_sigma"]) == 3 + 1 + 4  # drift; bias; hard iron and declination
-    assert numbers["aid_sigma"] == [suite.barometer.noise_sigma, suite.magnetometer.noise_sigma]
+    sigmas = [suite.barometer.noise_sigma, suite.magnetometer.noise_sigma]
+    assert numbers["aid_sigma"] == [*sigmas, 0.0, 0.0]
     np.testing.assert_allclose(numbers["aid_numbers"][1], suite.magnetometer.field_I)
     assert found["rates"]["magnetometer"] == suite.magnetometer.rate
     assert "aid_numbers" in filter_header(suite, "aided")

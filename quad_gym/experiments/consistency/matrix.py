@@ -36,6 +36,8 @@ FREEDOMS = {name: part.stop - part.start for name, part in PARTS.items()} | {
     "nis_feature": 2,
     "nis_barometer": 1,
     "nis_magnetometer": 3,
+    "nis_optical_flow": 2,
+    "nis_range_finder": 1,
 }
 """Degrees of freedom, by column: the means of a consistent filter."""
 

@@ -1,0 +1,141 @@
+"""Optical flow of the ground below: the angular rate at which it passes.
+
+It measures `z = g (V_x, V_y) + (-w_y, w_x) + n` with white noise n, the velocity V = R_BI v in B,
+the body rates w, and g = u / h, one over the distance of the ground along the body z axis: h is the
+height, u the cosine of the tilt. The filter takes w from the gyro, whose noise adds to n; what the
+error of the gyro bias adds is neglected.
+
+With a pair of sigma points, R(+-e) R_hat = (I + even +- odd) R_hat, v +- dv, h +- dh:
+
+    V = W + V_e +- V_o,   V_e = even W + odd dV,   V_o = odd W + (I + even) dV,
+    g = G + g_e +- g_o,   g_e = (even_u h^2 - odd_u dh h + u dh^2) / (h D),
+                          g_o = (odd_u h - (u + even_u) dh) / D,
+
+W = R_hat v, dV = R_hat dv, G = u / h and D = h^2 - dh^2, that is
+
+    odd:   V_o (G + g_e) + (W + V_e) g_o,   even:   V_e (G + g_e) + W g_e + V_o g_o,
+
+and the derivative along an offset is (dV + W x de) G + W (du / h - u dh / h^2).
+"""
+
+import math
+
+from quad_gym.kernels.compiling import kernel
+from quad_gym.kernels.filter.error_state import E, R, V
+from quad_gym.kernels.filter.recovery import inflate_accel_bias, raise_diagonal, time_of
+from quad_gym.kernels.filter.rows import clear_slow_columns, columns_of, put_noise, put_three
+from quad_gym.kernels.maths.elementary import maximum
+from quad_gym.kernels.maths.linalg import (
+    add,
+    apply,
+    cross,
+    load3,
+    load4,
+    load33,
+    load_column3,
+    scale,
+    sub,
+)
+from quad_gym.kernels.maths.random import normal_pair, stream_of
+from quad_gym.kernels.maths.rotation import quaternion_to_dcm
+from quad_gym.kernels.sensors.aid import aid_due, begin_aid, deliver, gate_aid
+from quad_gym.kernels.sensors.range_finder import LEAST_COSINE, ground_range
+from quad_gym.kernels.sensors.stage import sensor_stage
+from quad_gym.kernels.simd.lanes import select
+from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm, Sensor
+
+_S = int(Aid.OPTICAL_FLOW)
+_BLOCK, _EKF = AID_BLOCKS + _S, int(FilterForm.EKF)
+
+
+@kernel
+def _begin(flight, p, settings, mask):
+    begin_aid(flight, p, settings, _S, mask)
+
+
+@kernel
+def _sample(flight, p, settings, work, stages, mask, starting):
+    """Measure when due, and within the limits of height, tilt and rate."""
+    due = aid_due(flight, p, settings, _S, mask, starting)
+    n_x, n_y = normal_pair(stream_of(flight), DRAW_AID + 2 * _S)
+    R_BI, w = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
+    h, u = ground_range(p, flight.r, R_BI)
+    within = (h >= p.aid_numbers[_S, 0]) & (u >= LEAST_COSINE)
+    g = u / select(within, h, 1.0)
+    v_B = apply(R_BI, load3(flight.v))
+    x, y = g * v_B[0] - w[1], g * v_B[1] + w[0]
+    most = p.aid_numbers[_S, 1]
+    within = within & (abs(x) <= most) & (abs(y) <= most)
+    values = (x + p.aid_sigma[_S] * n_x, y + p.aid_sigma[_S] * n_y, 0.0 * x)
+    deliver(flight, work, settings, _S, mask, due & within, values)
+
+
+@kernel
+def _flow(g, v_B):
+    """Share of a velocity in the flow; its third number is masked."""
+    return (g * v_B[0], g * v_B[1], 0.0 * g)
+
+
+@kernel
+def _put_center(flight, p, work, k, valid, G, W):
+    """Fill the rows of predicted measurement, measurement and noise."""
+    w = sub(load3(flight.w_meas), load3(flight.b_g_hat))
+    rotation = (-w[1], w[0], 0.0 * G)
+    put_three(work.z_hat, k, valid, add(_flow(G, W), rotation))
+    put_three(work.z, k, valid, load3(flight.aid_measurement[_S]))
+    variance = p.aid_sigma[_S] * p.aid_sigma[_S] + p.gyro_noise * p.gyro_noise
+    zero, one = 0.0 * G, 1.0 + 0.0 * G
+    put_noise(work, k, valid, ((variance, zero, zero), (zero, variance, zero), (zero, zero, one)))
+
+
+@kernel
+def _expect(flight, p, work, settings, k):
+    """Fill rows k to k + 2: two rates, and a masked row."""
+    valid, last = flight.block_valid[_BLOCK] > 0.0, columns_of(settings) - 1
+    L, R_BI, inverse_c, c = flight.L, load33(flight.R_hat), work.inverse_spread, work.spread
+    h, u = ground_range(p, flight.r_hat, R_BI)
+    h, W = maximum(h, 0.5 * p.aid_numbers[_S, 0]), apply(R_BI, load3(flight.v_hat))
+    G, z_B, zero = u / h, (R_BI[0][2], R_BI[1][2], R_BI[2][2]), 0.0 * h
+    _put_center(flight, p, work, k, valid, G, W)
+    clear_slow_columns(work, k, settings)
+    for j in range(9):
+        dV, dh = apply(R_BI, load_column3(L, V, j)), L[R + 2, j] if j <= R + 2 else zero
+        if (settings.form & _EKF) != 0:
+            e = load_column3(L, E, j)
+            du = cross(z_B, e)[2]
+            straight = _flow(G, add(dV, cross(W, e)))
+            straight = add(straight, _flow((du - G * dh) / h, W))
+            bent = (zero, zero, zero)
+        else:
+            odd, even = load33(work.odd[j]), load33(work.even[j])
+            dV, dh = scale(c, dV), c * dh
+            V_e = add(apply(even, W), apply(odd, dV))
+            V_o = add(add(apply(odd, W), dV), apply(even, dV))
+            odd_u, even_u = apply(odd, z_B)[2], apply(even, z_B)[2]
+            divisor = 1.0 / (h * h - dh * dh)
+            g_e = (even_u * h * h - odd_u * dh * h + u * dh * dh) * divisor / h
+            g_o = (odd_u * h - (u + even_u) * dh) * divisor
+            straight = scale(inverse_c, add(_flow(G + g_e, V_o), _flow(g_o, add(W, V_e))))
+            bent = add(add(_flow(G + g_e, V_e), _flow(g_e, W)), _flow(g_o, V_o))
+            bent = scale(inverse_c, bent)
+        put_three(work.A[last - j], k, valid, straight)
+        put_three(work.E[8 - j], k, valid, bent)
+
+
+@kernel
+def _gate(flight, p, work, settings, k):
+    gate_aid(flight, p, work, settings, _S, k, 2.0)
+
+
+@kernel
+def _inflate(flight, p, work, settings):
+    """Inflate the velocity by a rejected innovation, accelerometer biases and tilt."""
+    alarm, nu = work.alarm[AID_GROUPS + _S], flight.innovation[_BLOCK]
+    h, _ = ground_range(p, flight.r_hat, load33(flight.R_hat))
+    square = h * h * (nu[0] * nu[0] + nu[1] * nu[1])
+    raise_diagonal(work.P, V, select(alarm > 0.0, square, 0.0))
+    T = time_of(flight, p, AID_GROUPS + _S)
+    inflate_accel_bias(p, work.P, math.sqrt(square) / T, alarm)
+
+
+optical_flow_stage = sensor_stage(Sensor.OPTICAL_FLOW, _begin, _sample, _expect, _gate, _inflate)

@@ -1,0 +1,53 @@
+"""The range finder: distance to the ground along the body z axis, and its errors."""
+
+from dataclasses import dataclass
+
+from quad_gym.params import checks as check
+from quad_gym.params.aids import AidParams
+from quad_gym.records import Aid
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeFinderParams(AidParams):
+    """A time-of-flight sensor that looks down, such as a VL53L1X.
+
+    It measures `h / u + noise` with the height h above a level ground (`WorldParams.ground_height`)
+    and the cosine u of the tilt. Nothing is measured outside of `min_range` and `max_range`, and at
+    a tilt above 60 degrees.
+    """
+
+    rate: float = 25.0
+    """measurement rate [Hz]; ST VL53L1X user manual: a timing budget of 33 ms, plus 4 ms"""
+    noise_sigma: float = 0.01
+    """standard deviation of the white noise [m]; ST VL53L1X user manual: ranging error +-20 mm, two
+    sigma"""
+    min_range: float = 0.04
+    """shortest distance [m]; ST VL53L1X user manual"""
+    max_range: float = 3.6
+    """longest distance [m]; ST VL53L1X user manual: in the dark, over a light floor"""
+
+    aid = Aid.RANGE_FINDER
+    raw = ("m", "B", 100.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(check.positive, "noise_sigma", "min_range", "max_range")
+        if self.max_range <= self.min_range:
+            raise ValueError(
+                "RangeFinderParams.max_range must be more than min_range, got "
+                f"{self.max_range:g} m and {self.min_range:g} m"
+            )
+
+    @property
+    def white_sigma(self) -> float:
+        """Standard deviation of the white noise [m]."""
+        return self.noise_sigma
+
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Shortest and longest distance [m], 0."""
+        return (self.min_range, self.max_range, 0.0)
+
+    def scaled_noise(self, factor: float) -> "RangeFinderParams":
+        """Return a copy with the white noise multiplied by `factor`."""
+        return self.replace(noise_sigma=factor * self.noise_sigma)  # type: ignore[no-any-return]

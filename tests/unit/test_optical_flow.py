@@ -1,0 +1,161 @@
+"""Optical flow and range finder: measurements by formula, updates by numerical derivatives."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.estimation import ExtendedKalmanFilter, UnscentedKalmanFilter
+from quad_gym.packing.flight import params_record
+from quad_gym.params.portable import euler_dcm
+from quad_gym.params.vehicle import vehicle_params
+from quad_gym.records import AID_BLOCKS, Aid, Control, GateDecision
+from quad_gym.rotations import quaternion_to_dcm
+from tests.field_flights import fly, nees, steps
+
+CRAZYFLIE = quad_gym.sensor_suite("crazyflie").simplified()
+FLOW, RANGE = int(Aid.OPTICAL_FLOW), int(Aid.RANGE_FINDER)
+GROUND = quad_gym.WorldParams().ground_height
+
+
+def expected(r, v, R_BI, w):
+    """(4,) flow, distance and cosine of the tilt of a state, without noise."""
+    cosine = R_BI[2, 2]
+    distance = (r[2] - GROUND) / cosine
+    x, y, _ = R_BI @ v / distance
+    return np.array([x - w[1], y + w[0], distance, cosine])
+
+
+def test_measurements_have_the_closed_form_and_the_noise_of_the_parameters():
+    suite = CRAZYFLIE.replace(
+        optical_flow=CRAZYFLIE.optical_flow.replace(rate=200.0),
+        range_finder=CRAZYFLIE.range_finder.replace(rate=200.0),
+    )
+    batch, noise = fly(suite, 100, task="circle", start="hover"), []
+    for _ in range(50):
+        batch.step()
+        names = ("r", "v", "w")
+        states = [batch.record(name) for name in names]
+        R_BI = quaternion_to_dcm(batch.record("q"))
+        truth = np.array(
+            [expected(r, v, R, w)[:3] for r, v, w, R in zip(*states, R_BI, strict=True)]
+        )
+        measured = batch.record("aid_measurement")
+        valid = batch.record("block_valid")[:, AID_BLOCKS + FLOW :].all(axis=1)  # not too fast
+        error = np.column_stack([measured[:, FLOW, :2], measured[:, RANGE, :1]]) - truth
+        noise.append(error[valid])
+    sigma = np.sqrt(np.mean(np.concatenate(noise) ** 2, axis=0))
+    np.testing.assert_allclose(sigma, (0.2, 0.2, 0.01), rtol=0.06)  # 4 sigma of 2,500
+
+
+@pytest.mark.parametrize(("height", "flow", "distance"), [(0.0, True, True), (-0.07, False, False)])
+def test_nothing_is_measured_below_the_least_height(height, flow, distance):
+    batch = fly(CRAZYFLIE, 8, task="hover", start="hover")
+    snapshot = batch.snapshot()
+    snapshot["r"][:, 2], snapshot["v"], snapshot["wait"] = height, 0.0, 0.0
+    batch.restore(snapshot)
+    batch.step()
+    valid = batch.record("block_valid")[0, AID_BLOCKS:] > 0.0
+    assert (valid[FLOW], valid[RANGE]) == (flow, distance)
+
+
+def filter_in_flight(kind):
+    """A filter of GNSS, flow and range finder that moves, and is tilted and turned."""
+    suite = quad_gym.sensor_suite("rtk").simplified()
+    suite = suite.replace(
+        optical_flow=quad_gym.OpticalFlowParams(), range_finder=quad_gym.RangeFinderParams()
+    )
+    kf = kind(suite)
+    kf.initialize((0.0, 0.0, 0.0), suite.gnss.baseline_B, heading=0.3)
+    kf._engine.fill("r_hat", np.array([1.0, -2.0, 1.3]))
+    kf._engine.fill("v_hat", np.array([0.8, -0.5, 0.3]))
+    kf.predict((0.1, -0.2, 0.3), (0.5, 1.0, 9.5), 0.005)
+    return kf, suite
+
+
+def numerical_update(kf, suite, flow, distance):
+    """The linear update by the same measurements, with numerical derivatives."""
+    state = [kf._engine.read(name)[0] for name in ("r_hat", "v_hat", "R_hat")]
+    P = kf.covariance.copy()
+    w = kf._engine.read("w_meas")[0] - kf._engine.read("b_g_hat")[0]
+
+    def predicted(dx):
+        R_BI = euler_dcm(dx[6:9]) @ state[2]
+        return expected(state[0] + dx[:3], state[1] + dx[3:6], R_BI, w)[:3]
+
+    H = np.zeros((3, 15))
+    for i in range(9):
+        step = np.zeros(15)
+        step[i] = 1e-5
+        H[:, i] = (predicted(step) - predicted(-step)) / 2e-5
+    gyro = params_record(quad_gym.VehicleParams(), suite)["gyro_noise"][0]
+    rate = 0.2**2 + gyro**2
+    S = H @ P @ H.T + np.diag([rate, rate, 0.01**2])
+    K = P @ H.T @ np.linalg.inv(S)
+    mean = predicted(np.zeros(15))
+    if kf._kind == "ukf":  # the mean of the sigma points, to second order
+        for column in 1e-2 * np.linalg.cholesky(P).T:
+            curved = predicted(column) + predicted(-column) - 2.0 * predicted(np.zeros(15))
+            mean = mean + 0.5 * curved / 1e-4
+    dx = K @ (np.array([*flow, distance]) - mean)
+    return state, dx, P - K @ S @ K.T
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_an_update_is_the_linear_one_with_numerical_derivatives(kind):
+    kf, suite = filter_in_flight(kind)
+    flow, distance = (0.6, -0.2), 1.43
+    (r, v, _), dx, P = numerical_update(kf, suite, flow, distance)
+    kf.update(optical_flow=flow, range_finder=distance)
+    tolerance = 1e-6 if kind is ExtendedKalmanFilter else 3e-2  # higher orders
+    scale = np.sqrt(np.diag(P))
+    np.testing.assert_allclose((kf.position - r - dx[:3]) / scale[:3], 0.0, atol=tolerance)
+    np.testing.assert_allclose((kf.velocity - v - dx[3:6]) / scale[3:6], 0.0, atol=tolerance)
+    np.testing.assert_allclose(
+        (kf.covariance - P)[:6, :6] / np.outer(scale, scale)[:6, :6], 0.0, atol=tolerance
+    )
+    assert abs(dx[:6]).max() > 1e-3  # there was something to correct
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, ExtendedKalmanFilter])
+def test_wrong_measurements_are_rejected(kind):
+    kf, _ = filter_in_flight(kind)
+    before = kf.position
+    kf.update(optical_flow=(6.0, 0.0), range_finder=3.0)
+    np.testing.assert_array_equal(kf.position, before)
+    gates = kf._engine.read("gate")[0, AID_BLOCKS + FLOW :]
+    np.testing.assert_array_equal(gates, GateDecision.REJECTED)
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
+@pytest.mark.parametrize("start", ["cold", "warm"])
+@pytest.mark.parametrize("kind", ["ukf", "ekf"])
+def test_filters_are_consistent(kind, start, late):
+    """Mean NEES of 150 flights, of deviation 0.45, and NIS of their last measurements."""
+    suite = CRAZYFLIE.replace(estimator=CRAZYFLIE.estimator.replace(kind=kind))
+    if late:
+        suite = suite.replace(
+            optical_flow=suite.optical_flow.replace(latency=0.02),
+            range_finder=suite.range_finder.replace(latency=0.04),
+        )
+    batch = fly(suite, 150, task="circle", filter_start=start)
+    steps(batch, 4.0)
+    assert not batch.record("filter_status").any()
+    assert nees(batch).mean() == pytest.approx(15.0, abs=1.8)
+    nis = batch.record("block_nis")[:, AID_BLOCKS:].mean(axis=0)
+    assert nis[FLOW] == pytest.approx(2.0, abs=0.7)
+    assert nis[RANGE] == pytest.approx(1.0, abs=0.5)
+
+
+def test_a_crazyflie_hovers_on_its_estimate():
+    batch = quad_gym.FlightBatch(
+        16,
+        vehicle=vehicle_params("crazyflie"),
+        sensors="crazyflie",
+        task=quad_gym.TaskParams(kind="hover", start="hover"),
+        control=Control.VELOCITY,
+    )
+    batch.reset(seeds=range(16))
+    for _ in range(400):
+        batch.step(np.zeros((16, 4)))
+    assert (np.linalg.norm(batch.record("v"), axis=1) < 0.3).all()
+    assert (quaternion_to_dcm(batch.record("q"))[:, 2, 2] > 0.99).all()
