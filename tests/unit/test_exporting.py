@@ -269,8 +269,8 @@ def test_names_that_are_no_identifiers_are_refused():
 def test_a_filters_numbers_hold_all_that_its_kernels_read(suite):
     found = filter_numbers(quad_gym.sensor_suite(suite))["numbers"]
     source = "".join(file.read_text(encoding="utf-8") for file in KERNELS.rglob("*.py"))
-    for block in ("position", "baseline", "velocity", "features"):
-        text = (KERNELS.parent / "measurements" / f"{block}.py").read_text(encoding="utf-8")
+    for name in ("gnss_position", "gnss_baseline", "gnss_velocity", "camera"):
+        text = (KERNELS.parent / "sensors" / f"{name}.py").read_text(encoding="utf-8")
         source += text.partition("# ---- update")[2]  # before it is what sensors do
     read = set(re.findall(r"(?<![\w.])(?:p|params|model)\.(\w+)", source)) & set(PARAMS.names)
     camera = {"camera", "R_CB", "focal_length", "features", "pixel_sigma", "blur"}

@@ -19,7 +19,10 @@ from quad_gym.records import Aid, FaultKind
 
 LAB, RTK = quad_gym.sensor_suite("lab"), quad_gym.sensor_suite("rtk").simplified()
 AIDED = RTK.replace(
-    barometer=quad_gym.BarometerParams(), magnetometer=quad_gym.MagnetometerParams()
+    barometer=quad_gym.BarometerParams(),
+    magnetometer=quad_gym.MagnetometerParams(),
+    optical_flow=quad_gym.OpticalFlowParams(),
+    range_finder=quad_gym.RangeFinderParams(),
 )
 BLIND = LAB.replace(camera=None)
 
