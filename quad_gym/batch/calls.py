@@ -21,7 +21,8 @@ class Calls:
         room: The fields that they have.
         shared: Arrays that all threads see.
         numbers: Words that are not addresses.
-        own, believed, work: Arrays of each thread: true parameters, assumed parameters, workspace.
+        own, believed, work, gathered: Arrays of each thread: true parameters, assumed parameters,
+            workspace, lanes of several blocks.
         kept: Arrays whose addresses others hold.
     """
 
@@ -34,9 +35,10 @@ class Calls:
         own: Sequence[NDArray[Any]],
         believed: Sequence[NDArray[Any]],
         work: Sequence[NDArray[Any]],
+        gathered: Sequence[NDArray[Any]],
         kept: Sequence[NDArray[Any]] = (),
     ) -> None:
-        self._memory = (blocks, dict(shared), own, believed, work, kept)
+        self._memory = (blocks, dict(shared), own, believed, work, gathered, kept)
         self._words = np.zeros((len(own), len(Call)), np.int64)
         self._words[:, Call.BLOCKS] = address_of(blocks) - room.skipped
         self._words[:, Call.PITCH] = room.dtype.itemsize
@@ -47,6 +49,7 @@ class Calls:
         self._words[:, Call.OWN] = [address_of(array) for array in own]
         self._words[:, Call.BELIEVED] = [address_of(array) for array in believed]
         self._words[:, Call.WORK] = [address_of(array) for array in work]
+        self._words[:, Call.GATHERED] = [address_of(array) for array in gathered]
         self._rows = list(self._words)
 
     @property

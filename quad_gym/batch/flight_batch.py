@@ -44,6 +44,7 @@ from quad_gym.params.vehicle import VehicleParams, vehicle_params
 from quad_gym.params.world import WorldParams, world_params
 from quad_gym.records import (
     COLUMNS,
+    FLIGHT_BLOCK,
     MAX_ACTION_DELAY,
     RESULTS,
     WIDTH,
@@ -56,10 +57,14 @@ from quad_gym.records import (
     Source,
     aligned_zeros,
     room_of,
+    words_of_update,
 )
 
 MOST_FLIGHTS = 10**7
 """Largest number of flights in a batch."""
+_GROUP_MEMORY = 1 << 22
+"""Memory of the blocks that a thread flies side by side [bytes]: less leaves gathered blocks half
+empty."""
 _NO_BOUNDS = np.zeros(0)
 _WORTH_NO_COPY = 1 << 16
 """Size of observations [bytes] above which each step allocates memory, instead of copying."""
@@ -256,7 +261,13 @@ class FlightBatch(FlightMemory):
         self._stages = needed_stages(self._settings[0])
         self._low, self._high = (_NO_BOUNDS, _NO_BOUNDS) if bounds is None else bounds
         configuration = configuration_digest(self._settings, model, true, *self._paths)
-        self._allocate(room_of(used_parts(self._settings[0])), draws.low, configuration)
+        used = used_parts(self._settings[0])
+        self._allocate(room_of(used), draws.low, configuration)
+        self._group = self._group_of_blocks()
+        self._words, self._written = words_of_update(self._settings[0], used)
+        self._gathered = [aligned_zeros(1, FLIGHT_BLOCK) for _ in range(self.threads)]
+        for block in self._gathered:
+            block["stamps"] = np.nan  # nothing arrives in the other slots
         self._work = [aligned_zeros(1, WORK_BLOCK) for _ in range(self.threads)]
         padded = len(self._blocks) * WIDTH
         self._actions = np.zeros((padded, 4))
@@ -360,7 +371,7 @@ class FlightBatch(FlightMemory):
     def _run(self, command: Command) -> NDArray[np.float32]:
         if self._crew is None or self._crew.process != os.getpid():
             self._calls = self._calls_of_threads()
-            self._crew = Crew(self._calls, len(self._blocks), self.threads)
+            self._crew = Crew(self._calls, len(self._blocks), self.threads, self._group)
         self._crew.gather()
         if self._observations.nbytes < _WORTH_NO_COPY:
             self._crew.run(int(command))
@@ -370,6 +381,14 @@ class FlightBatch(FlightMemory):
         self._crew.run(int(command))
         return self._observations
 
+    def _group_of_blocks(self) -> int:
+        """Return how many blocks a thread flies side by side, see `kernels/gathering.py`."""
+        s = self._settings[0]
+        own = s["randomized"] or s["faults"] or s["features_drawn"]
+        if own or not s["run_filter"] or s["sensor_ticks"].max() <= 1:
+            return 1
+        return max(1, _GROUP_MEMORY // self._room.dtype.itemsize)
+
     def _calls_of_threads(self) -> Calls:
         """Return the arguments with which the threads call the compiled code."""
         shared = {
@@ -377,6 +396,7 @@ class FlightBatch(FlightMemory):
             Call.WORLD: self._world,
             Call.MODEL: self._model,
             Call.SETTINGS: self._settings,
+            Call.WORDS: self._words,
             Call.STAGES: linked_table(self._stages),
             Call.ACTIONS: self._actions,
             Call.LOW: self._low,
@@ -387,11 +407,14 @@ class FlightBatch(FlightMemory):
         }
         numbers = {
             Call.COUNT: self.count,
+            Call.GROUP: self._group,
+            Call.WORD_COUNT: len(self._words),
+            Call.WRITTEN_COUNT: self._written,
             Call.SIZE: self._low.size,
             Call.RESULT_PITCH: self._results.strides[0],
         }
         self._settings["paths"], self._settings["pieces"] = map(address_of, self._paths)
-        threads = (self._own, self._believed, self._work)
+        threads = (self._own, self._believed, self._work, self._gathered)
         return Calls(self._blocks, self._room, shared, numbers, *threads, self._paths)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -57,13 +57,14 @@ class Crew:
         fly: Flies blocks, see `Fly`.
         blocks: Number of blocks.
         threads: Largest number of threads to fly them.
+        group: Blocks that a thread flies side by side.
     """
 
-    def __init__(self, fly: Fly, blocks: int, threads: int) -> None:
+    def __init__(self, fly: Fly, blocks: int, threads: int, group: int = 1) -> None:
         parts = max(1, min(threads, blocks // MIN_BLOCKS_PER_THREAD))
         self.process = os.getpid()
         self._fly = fly
-        self._board = board_of(blocks, parts)
+        self._board = board_of(blocks, parts, group)
         places = board.RANGES + board.WORDS_OF_RANGE * np.arange(1, parts) + board.PRESENT
         self._alarms = [(int(place), threading.Semaphore(0)) for place in places]
         self._errors: list[BaseException] = []
@@ -113,15 +114,19 @@ class Crew:
             time.sleep(0.0)
 
 
-def board_of(blocks: int, parts: int) -> NDArray[np.int64]:
-    """A board with the blocks cut into ranges, and nothing posted."""
+def board_of(blocks: int, parts: int, group: int = 1) -> NDArray[np.int64]:
+    """A board with the blocks cut into ranges, and nothing posted.
+
+    A chunk is a group of blocks, unless that is more than a quarter of a range.
+    """
     words = np.zeros(board.RANGES + parts * board.WORDS_OF_RANGE, np.int64)
     ranges = words[board.RANGES :].reshape(parts, board.WORDS_OF_RANGE)
     cuts = [blocks * part // parts for part in range(parts + 1)]
     ranges[:, board.FIRST], ranges[:, board.LAST] = cuts[:-1], cuts[1:]
     ranges[:, board.NEXT] = cuts[1:]
     words[board.FINISHED] = blocks
-    words[board.CHUNK] = 1 + blocks // (CHUNKS_OF_RANGE * parts) if parts > 1 else blocks
+    chunk = max(1 + blocks // (CHUNKS_OF_RANGE * parts), min(group, blocks // (4 * parts)))
+    words[board.CHUNK] = chunk if parts > 1 else blocks
     return words
 
 

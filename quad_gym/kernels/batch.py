@@ -1,11 +1,13 @@
 """The compiled entry that steps or resets the blocks of a batch."""
 
+import numpy as np
 from numba import types
 
 from quad_gym.kernels.board import COMMAND, FINISHED, TICKET, comes, finished, post, take
 from quad_gym.kernels.compiling import Stage, call_stage, entry, kernel
 from quad_gym.kernels.compiling.stages import STAGE_TABLE
-from quad_gym.kernels.flight import begin_episode, run, tick
+from quad_gym.kernels.flight import begin_episode, look, move_and_measure, run, update
+from quad_gym.kernels.gathering import update_group
 from quad_gym.kernels.simd.addresses import (
     array_at,
     lanes_at,
@@ -52,7 +54,7 @@ _TERMS, _REWARD_TERMS = len(RewardTerm), len(Result)
 _BLOCKS, _PITCH, _COUNT = int(Call.BLOCKS), int(Call.PITCH), int(Call.COUNT)
 _RESETS, _ACTIONS = int(Call.RESETS), int(Call.ACTIONS)
 _WORLD, _OWN, _MODEL = int(Call.WORLD), int(Call.OWN), int(Call.MODEL)
-_BELIEVED = int(Call.BELIEVED)
+_BELIEVED, _GROUP = int(Call.BELIEVED), int(Call.GROUP)
 _SETTINGS, _WORK, _STAGES = int(Call.SETTINGS), int(Call.WORK), int(Call.STAGES)
 _SIZE, _LOW, _HIGH = int(Call.SIZE), int(Call.LOW), int(Call.HIGH)
 _OBSERVATIONS, _FINALS = int(Call.OBSERVATIONS), int(Call.FINAL_OBSERVATIONS)
@@ -162,21 +164,52 @@ def _fetch_ahead(call, index, settings, left):
 
 
 @kernel
-def _fly_step(call, index, flight, world, model, settings, work, stages):
-    """Fly a control period and judge it; return which lanes begin and which ended an episode."""
-    resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
+def _begin_step(call, index, settings):
+    """Load the actions of a step, and forget what was measured in the last one."""
+    flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+    _load_actions(call, flight, index)
     for sensor in range(SENSORS):
         for k in range(settings.sensor_blocks[sensor]):
             flight.block_fresh[FIRST_BLOCK[sensor] + k] = 0.0
     if settings.run_filter and settings.layout == Layout.MEASUREMENTS:
         for i in range(3):
             flight.gyro_sum[i] = flight.accel_sum[i] = 0.0
-    instant = flight.instant
+
+
+@kernel
+def _fly_ticks(call, first, last, world, model, settings, work, stages):
+    """Fly the ticks of a step, the blocks from `first` to before `last` side by side."""
     for left in range(settings.ticks_per_step - 1, -1, -1):
-        _fetch_ahead(call, index, settings, left)
-        tick(flight, world, model, settings, work, stages, min(left, 1))
+        within = min(left, 1)
+        for index in range(first, last):
+            flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+            _fetch_ahead(call, index, settings, left)
+            move_and_measure(flight, world, model, settings, work, stages, within)
+        if call[_GROUP] > 1:
+            update_group(call, first, last, model, settings, work, stages)
+        elif settings.run_filter:
+            update(
+                (
+                    _flight_at(call[_BLOCKS] + first * call[_PITCH]),
+                    world,
+                    model,
+                    settings,
+                    work,
+                    stages,
+                )
+            )
+        for index in range(first, last):
+            flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+            look(flight, world, model, settings, work, stages, within)
+
+
+@kernel
+def _judge_step(flight, world, model, settings, work, stages):
+    """Judge a step; return which lanes begin and which ended an episode."""
+    resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
     # a step that begins an episode draws nothing before it
-    flight.instant = select(resetting, instant, flight.instant)
+    before = flight.instant + np.uint64(-settings.ticks_per_step)
+    flight.instant = select(resetting, before, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)
     here = (flight, world, model, settings, work, stages)
     run(Stage.JUDGE, here)
@@ -189,13 +222,10 @@ def _fly_step(call, index, flight, world, model, settings, work, stages):
 
 
 @kernel
-def _fly_block(call, index, command, nominal, true, believed, settings, work, stages):
-    """Step or reset the flights of one block."""
+def _end_block(call, index, command, nominal, true, believed, settings, work, stages):
+    """Reset the flights of one block, or judge the step that they have flown."""
     flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
     observing, written = call[_SIZE] > 0, False
-    run(Stage.IMPOSE, (flight, true, nominal, settings, work, stages))
-    run(Stage.PLACE_FEATURES, (flight, true, believed, settings, work, stages))
-    run(Stage.MEET_ROTORS, (flight, true, believed, settings, work, stages))
     if command == Command.RESET:
         resets, plain = _bytes_at(call[_RESETS], call[_COUNT]), _plain_work_at(call[_WORK])
         for lane in range(WIDTH):
@@ -203,8 +233,7 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
             plain.begins[lane] = resets[index * WIDTH + lane] if known else 1.0
         begins = work.begins > 0.0
     else:
-        _load_actions(call, flight, index)
-        begins, done = _fly_step(call, index, flight, true, believed, settings, work, stages)
+        begins, done = _judge_step(flight, true, believed, settings, work, stages)
         if settings.autoreset == Autoreset.SAME_STEP and any_of(begins):
             _write_results(call, flight, work, index)  # of the episodes that end
             written = True
@@ -220,6 +249,25 @@ def _fly_block(call, index, command, nominal, true, believed, settings, work, st
         _write_rows(call, call[_OBSERVATIONS], index, work, flight.tick >= 0.0)
     if settings.shown:
         _show(call, index, flight, true, believed, settings, work, stages)
+
+
+@kernel
+def _fly_group(call, first, last, command, nominal, true, believed, settings, work, stages):
+    """Step or reset the flights of the blocks from `first` to before `last`.
+
+    Where they have parameters of their own, that is one block.
+    """
+    for index in range(first, last):
+        flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
+        run(Stage.IMPOSE, (flight, true, nominal, settings, work, stages))
+        run(Stage.PLACE_FEATURES, (flight, true, believed, settings, work, stages))
+        run(Stage.MEET_ROTORS, (flight, true, believed, settings, work, stages))
+        if command != Command.RESET:
+            _begin_step(call, index, settings)
+    if command != Command.RESET:
+        _fly_ticks(call, first, last, true, believed, settings, work, stages)
+    for index in range(first, last):
+        _end_block(call, index, command, nominal, true, believed, settings, work, stages)
 
 
 _WORDS = types.Array(types.int64, 1, "C")
@@ -255,8 +303,9 @@ def fly(call, board, number, command, serving):
             if first == last:
                 break
             posted = read_shared(board, COMMAND)
-            for index in range(first, last):
-                _fly_block(call, index, posted, nominal, true, believed, settings, work, stages)
+            for one in range(first, last, call[_GROUP]):
+                end = min(one + call[_GROUP], last)
+                _fly_group(call, one, end, posted, nominal, true, believed, settings, work, stages)
             add_shared(board, FINISHED, last - first)
         if not serving:
             return finished(board)

@@ -28,8 +28,8 @@ def run(stage, here, flag=0):
 
 
 @kernel
-def tick(flight, world, model, settings, work, stages, within):
-    """Fly one tick.
+def move_and_measure(flight, world, model, settings, work, stages, within):
+    """Fly a tick until its measurements: its update and `look` follow.
 
     Args:
         flight: Record.
@@ -51,19 +51,34 @@ def tick(flight, world, model, settings, work, stages, within):
     run(Stage.REST_ON_PAD, here)
     run(Stage.STAND, here)
     run(Stage.TOUCH, here)
-    run(Stage.AVERAGE_IMU, here)
-    run(Stage.PREDICT, here)
-    run(Stage.INCREMENT, here)
-    run(Stage.DRIFT_BIASES, here)
+    if settings.run_filter:
+        run(Stage.AVERAGE_IMU, here)
+        run(Stage.PREDICT, here)
+        run(Stage.INCREMENT, here)
+        run(Stage.DRIFT_BIASES, here)
     flight.tick = flight.tick + 1.0
     run(Stage.FOLLOW, here, within)
     run(Stage.ADVANCE_FAULTS, here)
-    run(Stage.SAMPLE, here)
-    call_sensors(flight, world, model, settings, work, stages, Act.SAMPLE, 0)
+    if settings.run_filter:
+        run(Stage.SAMPLE, here)
+        call_sensors(flight, world, model, settings, work, stages, Act.SAMPLE, 0)
+
+
+@kernel
+def update(here):
+    """Update the filter with the measurements of a tick, where `work.mask`."""
+    _, _, _, settings, _, _ = here
     if settings.late and settings.rewinds:
         run(Stage.LATE_UPDATE, here)
     else:
         run(Stage.UPDATE, here)
+
+
+@kernel
+def look(flight, world, model, settings, work, stages, within):
+    """Observe at the end of a tick; `within` as for `move_and_measure`."""
+    here = (flight, world, model, settings, work, stages)
+    work.mask = 1.0
     run(Stage.LOOK, here, within)
     run(Stage.SUM_IMU, here)
 

@@ -43,6 +43,9 @@ from quad_gym.records.flight import (
     FLIGHT_FIELDS,
     PARTS,
 )
+from quad_gym.records.gathered import (
+    words_of_update,
+)
 from quad_gym.records.layout import (
     FLIGHT,
     FLIGHT_BLOCK,
@@ -101,6 +104,7 @@ from quad_gym.records.sizes import (
     HEADING_GIVEN,
     HEADING_TOWARD,
     HEADING_VELOCITY,
+    KINDS,
     MAX_ACTION_DELAY,
     MAX_BLOCKS,
     MAX_FEATURES,
@@ -230,6 +234,7 @@ __all__ = [
     "HEADING_GIVEN",
     "HEADING_TOWARD",
     "HEADING_VELOCITY",
+    "KINDS",
     "LOG_UNIFORM",
     "MAX_ACTION_DELAY",
     "MAX_BLOCKS",
@@ -303,4 +308,5 @@ __all__ = [
     "offset_of",
     "room_of",
     "scalar_dtype",
+    "words_of_update",
 ]

@@ -28,6 +28,16 @@ class Call(IntEnum):
     """SETTINGS."""
     WORK = auto()
     """WORK_BLOCK of this thread."""
+    GROUP = auto()
+    """Blocks that a thread flies side by side, tick by tick; see `kernels/gathering.py`."""
+    GATHERED = auto()
+    """FLIGHT_BLOCK of this thread: lanes of several blocks."""
+    WORDS = auto()
+    """(WORD_COUNT,) uint64: places of the words that are copied to it; see `gathered.py`."""
+    WORD_COUNT = auto()
+    """Their number."""
+    WRITTEN_COUNT = auto()
+    """Number of the first ones that are copied back."""
     STAGES = auto()
     """STAGE_TABLE, which has the stages that the settings need."""
     ACTIONS = auto()

@@ -29,6 +29,8 @@ MAX_ACTION_DELAY = 10
 """Longest delay of an action, in control steps."""
 SENSORS = len(Sensor)
 """Sensors other than the IMU."""
+KINDS = 1 << SENSORS
+"""Sets of sensors that can measure at an instant."""
 AIDS = len(Aid)
 """Those with parameters in the fields `aid_...`, which come last."""
 FIRST_AID = SENSORS - AIDS

@@ -3,6 +3,7 @@
 from quad_gym.records.enums import RewardTerm
 from quad_gym.records.sizes import (
     DELAY_SLOTS,
+    KINDS,
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_MEASUREMENTS,
@@ -69,6 +70,10 @@ WORK_FIELDS = (
     # the batch
     Field("reward_term", (len(RewardTerm),), "-", "terms of the reward of a step"),
     Field("begins", (), "0 or 1", "lanes that begin an episode"),
+    Field("kind", (), "bits", "sensors of which a measurement reaches the filter"),
+    Field("queued", (KINDS,), "-", "lanes of each kind that wait for an update, first number", "i8"),
+    Field("source", (KINDS,), "-", "their addresses", "i8"),
+    Field("source_block", (KINDS,), "-", "addresses of their blocks", "i8"),
     Field("observation", (MAX_OBSERVATION,), "mixed", "observation of the present instant"),
     # delayed measurements
     Field("arrives", (DELAY_SLOTS,), "0 or 1", "which of a sensor's measurements in transit arrives now"),

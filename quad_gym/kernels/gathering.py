@@ -1,0 +1,145 @@
+"""The filter's update of several blocks: only where there is a measurement.
+
+Sensors of different flights measure at different instants, so that in most ticks few lanes of a
+block have a measurement, while an update costs the same for one lane as for all. Lanes of several
+blocks are therefore gathered into one: the words that an update reads (`records/gathered.py`) are
+copied into a block of scratch memory, and those that it writes are copied back. Lanes do not affect
+each other, so the flights are the same.
+"""
+
+import numpy as np
+
+from quad_gym.kernels.compiling import kernel, routine
+from quad_gym.kernels.flight import update
+from quad_gym.kernels.simd.addresses import array_at, lanes_at, record_at
+from quad_gym.kernels.simd.lanes import any_of, select
+from quad_gym.records import (
+    DELAY_SLOTS,
+    FIRST_BLOCK,
+    FLIGHT_BLOCK,
+    KINDS,
+    MAX_BLOCKS,
+    SENSORS,
+    STAMP,
+    WIDTH,
+    WORK_BLOCK,
+    Call,
+)
+
+_BLOCKS, _PITCH, _WORK = int(Call.BLOCKS), int(Call.PITCH), int(Call.WORK)
+_GATHERED, _WORDS = int(Call.GATHERED), int(Call.WORDS)
+_WORD_COUNT, _WRITTEN_COUNT = int(Call.WORD_COUNT), int(Call.WRITTEN_COUNT)
+_SIZE = FLIGHT_BLOCK.itemsize // 8
+_MANY = 6 * WIDTH // 8
+"""Lanes of a block with a measurement from which on it is updated where it is."""
+
+_flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
+_plain_work_at = record_at(WORK_BLOCK)
+_numbers_at, _words_at = array_at("f8"), array_at("u8")
+
+
+@kernel
+def _kind(flight, settings):
+    """What is measured in each lane: a bit for each sensor, 0: nothing."""
+    kind, bit = 0.0 * flight.tick, 1.0
+    for sensor in range(SENSORS):
+        first, valid = FIRST_BLOCK[sensor], 0.0 * kind
+        for block in range(first, first + settings.sensor_blocks[sensor]):
+            valid = valid + flight.block_valid[block]
+        kind = kind + select(valid > 0.0, bit, 0.0)
+        bit = 2.0 * bit
+    return kind
+
+
+@kernel
+def _gather_stamps(gathered, k, flight, lane, settings):
+    """Copy the time stamps of what arrives, of one lane, to lane k."""
+    for sensor in range(SENSORS):
+        if settings.sensor_delay[sensor] > 0:
+            tick = flight.tick[lane] - settings.sensor_delay[sensor]
+            gathered.stamps[sensor, 0, 0, k] = np.nan
+            for slot in range(DELAY_SLOTS):
+                if flight.stamps[sensor, slot, 0, lane] == tick:
+                    for i in range(STAMP):
+                        value = flight.stamps[sensor, slot, i, lane]
+                        gathered.stamps[sensor, 0, i, k] = value
+
+
+@routine
+def _update_gathered(call, kind, model, settings, work, stages):
+    """Update the lanes of a queue, where they are if they are of one block; empty it."""
+    plain = _plain_work_at(call[_WORK])
+    source, block, count = plain.source[kind], plain.source_block[kind], plain.queued[kind, 0]
+    plain.queued[kind, 0] = 0
+    together = 0
+    for k in range(count):
+        together += int(block[k] == block[0])
+    if together == count:
+        work.mask = 0.0
+        for k in range(count):
+            plain.mask[(source[k] - block[0]) // 8] = 1.0
+        update((_flight_at(block[0]), model, model, settings, work, stages))
+        return
+    words = _words_at(call[_WORDS], call[_WORD_COUNT])
+    gathered = _plain_flight_at(call[_GATHERED])
+    for k in range(count):
+        inside, outside = _numbers_at(call[_GATHERED] + 8 * k, _SIZE), _numbers_at(source[k], _SIZE)
+        for i in range(call[_WORD_COUNT]):
+            inside[words[i]] = outside[words[i]]
+        if settings.late:
+            lane = (source[k] - block[k]) // 8
+            _gather_stamps(gathered, k, _plain_flight_at(block[k]), lane, settings)
+        plain.mask[k] = 1.0
+    for k in range(count, WIDTH):
+        plain.mask[k] = 0.0
+        for block in range(MAX_BLOCKS):
+            gathered.block_valid[block, k] = 0.0
+    update((_flight_at(call[_GATHERED]), model, model, settings, work, stages))
+    for k in range(count):
+        inside, outside = _numbers_at(call[_GATHERED] + 8 * k, _SIZE), _numbers_at(source[k], _SIZE)
+        for i in range(call[_WRITTEN_COUNT]):
+            outside[words[i]] = inside[words[i]]
+
+
+@kernel
+def _put(call, kind, address, block, model, settings, work, stages):
+    """Put a lane into a queue, which is updated when it is full."""
+    plain = _plain_work_at(call[_WORK])
+    count = plain.queued[kind, 0]
+    plain.source[kind, count], plain.source_block[kind, count] = address, block
+    plain.queued[kind, 0] = count + 1
+    if count + 1 == WIDTH:
+        _update_gathered(call, kind, model, settings, work, stages)
+
+
+@routine
+def update_group(call, first, last, model, settings, work, stages):
+    """Update the filters of the blocks from `first` to before `last`.
+
+    An update costs the more the more sensors any lane has measurements of: lanes with measurements
+    of the same sensors are gathered first, then what is left of them.
+    """
+    plain = _plain_work_at(call[_WORK])
+    for index in range(first, last):
+        block = call[_BLOCKS] + index * call[_PITCH]
+        flight = _flight_at(block)
+        work.kind = _kind(flight, settings)
+        if any_of(work.kind > 0.0):
+            same = 0
+            for lane in range(WIDTH):
+                same += int(plain.kind[lane] > 0.0)
+            if same >= _MANY:
+                work.mask = 1.0
+                update((flight, model, model, settings, work, stages))
+            else:
+                for lane in range(WIDTH):
+                    kind = int(plain.kind[lane])
+                    if kind > 0:
+                        _put(call, kind, block + 8 * lane, block, model, settings, work, stages)
+    for kind in range(1, KINDS):
+        for k in range(plain.queued[kind, 0]):
+            source, block = plain.source[kind, k], plain.source_block[kind, k]
+            _put(call, 0, source, block, model, settings, work, stages)
+        plain.queued[kind, 0] = 0
+    if plain.queued[0, 0] > 0:
+        _update_gathered(call, 0, model, settings, work, stages)

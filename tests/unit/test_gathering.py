@@ -1,0 +1,66 @@
+"""Updates of gathered lanes: the flights of a batch are those of batches of one."""
+
+import numpy as np
+import pytest
+
+import quad_gym
+from quad_gym.batch.flight_batch import FlightBatch
+from quad_gym.envs.configuration import TASK_DEFAULTS
+from quad_gym.records import FLIGHT_BLOCK, WIDTH, Autoreset, offset_of, words_of_update
+from tests.golden.flights import AIDED
+
+COUNT = 5 * WIDTH + 3
+RTK = quad_gym.sensor_suite("rtk")
+SUITES = {
+    "GNSS and images, late": RTK,
+    "GNSS and images, prompt": RTK.replace(
+        gnss=RTK.gnss.replace(latency=0.0), camera=RTK.camera.replace(latency=0.0)
+    ),
+    "GNSS late, aiding sensors": quad_gym.sensor_suite("consumer"),
+    "all sensors, late": AIDED,
+    "time stamps ignored": RTK.replace(estimator=RTK.estimator.replace(delay_compensation="none")),
+    "images": quad_gym.sensor_suite("indoor"),
+}
+
+
+def flown(suite, seeds, **options):
+    task = TASK_DEFAULTS["circle"].replace(duration=1.0)
+    batch = FlightBatch(
+        len(seeds), sensors=suite, task=task, autoreset=Autoreset.SAME_STEP, threads=1, **options
+    )
+    batch.reset(seeds=seeds)
+    for _ in range(250):
+        batch.step()
+    return batch
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_flights_of_a_batch_equal_flights_alone(name):
+    together = flown(SUITES[name], range(COUNT))
+    assert together._group > COUNT // WIDTH
+    for seed in range(0, COUNT, 4):
+        alone = flown(SUITES[name], [seed])
+        for field in together.snapshot().dtype.names:
+            mine, its = together.record(field)[seed], alone.record(field)[0]
+            np.testing.assert_array_equal(mine, its, err_msg=f"{field}, flight {seed}")
+
+
+def test_blocks_with_equal_phases_or_parameters_of_their_own_are_not_gathered():
+    assert flown("standard", [0])._group == 1
+    drawn = {"mass": quad_gym.Uniform(0.9, 1.1, relative=True)}
+    assert flown("rtk", [0], randomization=drawn)._group == 1
+
+
+def test_words_of_an_update_are_those_of_the_sensors_in_use():
+    batch = flown("indoor", [0])
+    words, written = words_of_update(batch._settings[0], frozenset({"filter", "watch", "late"}))
+    assert len(set(words.tolist())) == len(words)
+    assert 0 < written < len(words)
+
+    def first(name):
+        return offset_of(FLIGHT_BLOCK, name) // 8
+
+    assert first("L") in words[:written]
+    assert first("L") + WIDTH not in words  # above the diagonal
+    assert first("pixels") in words[written:]
+    assert first("slow_hat") not in words
