@@ -301,7 +301,7 @@ def test_a_window_shows_the_flight_and_closes_twice():
     done = run_python(
         """
 import numpy as np, pygame
-from quad_gym.envs.single import QuadEnv
+from tests.builders import single_env
 env = single_env(seed=0, observation="truth", render_mode="human", render_size=(320, 240))
 for _ in range(3):
     env.step(np.zeros(4))
