@@ -4,6 +4,7 @@ import functools
 import json
 
 import gymnasium
+import numpy as np
 import pytest
 
 import quad_gym
@@ -11,7 +12,10 @@ from quad_gym.commands import benchmark as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
 from quad_gym.experiments.benchmark import interfaces, learning, rendering, stages
+from quad_gym.experiments.benchmark.filter import repeated
+from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.experiments.benchmark.timing import Effort, Timing, by_turns
+from quad_gym.kernels.compiling import Stage
 from quad_gym.kernels.compiling.stages import needed_stages
 from quad_gym.records import POSITION_BLOCK, WIDTH
 from tests.console import plain
@@ -172,3 +176,11 @@ def test_invalid_options_are_told_and_exit_code_2(options, capsys):
     printed = capsys.readouterr()
     assert printed.out == ""
     assert options[0] in plain(printed.err)
+
+
+def test_update_of_repeated_flights_shrinks_each_covariance():
+    batch = hovering(16)
+    blocks = repeated(batch, np.array([3, 5]), 32)
+    before = np.abs(blocks["L"]).sum(axis=(1, 2))
+    Staged(batch, Stage.UPDATE)(blocks)
+    assert (np.abs(blocks["L"]).sum(axis=(1, 2)) < before).all()

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import quad_gym
 from quad_gym.batch.flight_batch import FlightBatch
@@ -10,7 +11,7 @@ from quad_gym.experiments.benchmark import timing
 from quad_gym.experiments.benchmark.peers import Measured, peers
 from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.kernels.compiling import Stage
-from quad_gym.records import FEATURE_SLICE, FLIGHT_BLOCK, WIDTH, aligned_zeros
+from quad_gym.records import FEATURE_SLICE, WIDTH, aligned_zeros
 
 
 def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
@@ -23,6 +24,15 @@ def record_one(batch: FlightBatch, flight: int, ticks: int) -> list[Measured]:
         recorded.append(Measured(gyro, accel, position, baseline, pixels[:features]))
         batch.step()
     return recorded
+
+
+def repeated(batch: FlightBatch, flights: NDArray[np.intp], count: int) -> NDArray[Any]:
+    """Blocks of `count` flights: the given ones of a batch, again and again."""
+    blocks = aligned_zeros(count // WIDTH, batch._room.dtype)
+    for name in blocks.dtype.names or ():
+        values = batch.record(name)[np.resize(flights, count)]
+        blocks[name] = np.moveaxis(values.reshape(-1, WIDTH, *values.shape[1:]), 1, -1)
+    return blocks
 
 
 def time_filter(count: int, effort: timing.Effort, recorded_ticks: int) -> list[timing.Row]:
@@ -40,11 +50,7 @@ def time_filter(count: int, effort: timing.Effort, recorded_ticks: int) -> list[
         batch = hovering(count, sensors=sensors)
         seen = batch.record("block_valid")[:, FEATURE_SLICE].sum(axis=1)
         seeing = np.flatnonzero(seen == features)
-        blocks = aligned_zeros(count // WIDTH, FLIGHT_BLOCK)
-        for name in FLIGHT_BLOCK.names or ():  # repeats flights that see all features
-            values = batch.record(name)[np.resize(seeing, count)]
-            lanes = values.reshape(-1, WIDTH, *values.shape[1:])
-            blocks[name] = np.moveaxis(lanes, 1, -1)
+        blocks = repeated(batch, seeing, count)
         update, predict = Staged(batch, Stage.UPDATE), Staged(batch, Stage.PREDICT)
 
         def in_lanes(blocks: Any = blocks, update: Any = update, predict: Any = predict) -> None:
