@@ -227,8 +227,7 @@ def raise_diagonal(P, first, least):
 
 @kernel
 def inflate_accel_bias(p, P, acceleration, alarm):
-    """Raise the accelerometer biases' standard deviations to `acceleration`, the tilt's to 1/g of
-    it."""
+    """Raise the standard deviations of accelerometer biases, and of the tilt in proportion."""
     bounded = minimum(acceleration, MOST_ACCEL_BIAS)
     raise_diagonal(P, BA, select(alarm > 0.0, bounded * bounded, 0.0))
     tilt = minimum(acceleration / p.gravity, MOST_TILT)
