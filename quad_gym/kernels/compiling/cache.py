@@ -103,8 +103,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     @functools.cached_property
     def _folders(self) -> list[Path]:
-        """Folders in which files are looked up; another user may have put some next to the
-        kernels."""
+        """Folders in which files are looked up, including the kernels' own `__pycache__`."""
         beside = Path(inspect.getfile(self._function)).absolute().parent / "__pycache__"
         if self.folder is None:
             return [beside]

@@ -5,8 +5,8 @@ attributes any offset of a fix to the drift, however sudden: once the drift has 
 innovation is left. But corrections of the drift are white in a consistent filter, each with the
 variance that its update removes, like corrections of biases (`recovery.py`). Their sum over about a
 second has the standard deviation of the drift in that time, 0.1 m with `consumer`, and shows jumps.
-Then both position and drift are inflated. So they are when a barometer is rejected `max_rejections`
-times in a row, as it observes the vertical part of a jump.
+Then both position and drift are inflated. This also happens when a barometer is rejected
+`max_rejections` times in a row, as it observes the vertical part of a jump.
 
 Source: ours.
 """

@@ -31,8 +31,7 @@ from quad_gym.records import SENSOR_GROUPS
 DRIFT_ALARM = 0.55
 """Mean of the last innovations, in standard deviations, above which they drift."""
 _MEMORY = 0.02
-"""Weight of the latest innovation in the mean, whose standard deviation is sqrt(0.02 / 1.98) =
-0.1."""
+"""Weight of the latest innovation in the mean, of standard deviation sqrt(0.02 / 1.98) = 0.1."""
 _CORRECTION_TIME = 3.0
 """Time over which corrections of the biases are summed [s]."""
 _LONG_TIME = 12.0
