@@ -1,4 +1,4 @@
-"""How kernels are compiled: decorators, linking, the cache, processes that compile side by side."""
+"""Compilation of kernels: decorators, linking, the cache, processes that compile in parallel."""
 
 from quad_gym.kernels.compiling.decorators import entry, kernel, routine
 from quad_gym.kernels.compiling.stages import Stage, call_stage, stage

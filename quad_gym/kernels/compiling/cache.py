@@ -1,8 +1,8 @@
-"""Compiled code on disk: found by what it was compiled from, written by one process at a time.
+"""Compiled code on disk: identified by its sources, written by one process at a time.
 
 A file holds the code of one function for one signature, and a checksum. Its name ends in a digest
-of everything that shapes the code: the sources, what the function closes over, the signature,
-Numba, the processor. A stale file is therefore never found; a damaged one counts as none.
+of everything that shapes the code: the sources, the closure of the function, the signature, Numba,
+the processor. A stale file is therefore never found; a damaged one is ignored.
 """
 
 import contextlib
@@ -30,12 +30,12 @@ from quad_gym.kernels.compiling.locks import locked, say
 from quad_gym.records import WIDTH
 
 _FORM = 3
-"""Of what a file holds and how it is compiled; with another number, no older file is found."""
+"""Version of the files' contents and of the compilation; after a change, no older file is found."""
 KEPT = 8
-"""Files of a function that are kept: of other sources, processors or signatures, the latest."""
+"""Number of files kept for a function: the latest for other sources, processors or signatures."""
 _LOCATORS = (
     caching.UserProvidedCacheLocator,  # the folder that NUMBA_CACHE_DIR names
-    caching.InTreeCacheLocator,  # __pycache__ beside the kernels
+    caching.InTreeCacheLocator,  # __pycache__ next to the kernels
     caching.UserWideCacheLocator,  # the user's cache folder, where the package is read-only
 )
 
@@ -47,7 +47,7 @@ def cache_of(function: Callable[..., Any]) -> "CodeCache":
 
 @functools.lru_cache(maxsize=64)  # the records of a stage's arguments take milliseconds to write
 def _written(arguments: tuple[Any, ...]) -> str:
-    """The types of arguments in words."""
+    """The types of arguments as text."""
     return str(arguments)
 
 
@@ -61,7 +61,7 @@ def _compiler(context: Any) -> str:
 
 
 def _needed(module: Any) -> tuple[str, ...]:
-    """The names outside a module that its code calls or reads; LLVM aborts where one is missing."""
+    """Names of the external symbols that a module uses; LLVM aborts if one is missing."""
     return tuple(
         value.name
         for values in (module.functions, module.global_variables)
@@ -71,7 +71,7 @@ def _needed(module: Any) -> tuple[str, ...]:
 
 
 def where_cached(*folders: Path | None) -> str:
-    """Where the compiled code goes that is cached in these folders, for messages."""
+    """Describe where code is cached, for messages."""
     known = [str(folder) for folder in folders if folder is not None]
     if not known:
         return "not cached: no folder can be written; set NUMBA_CACHE_DIR to one that can"
@@ -79,21 +79,21 @@ def where_cached(*folders: Path | None) -> str:
 
 
 class CodeCache(caching._Cache):  # type: ignore[misc]
-    """The compiled code of one function, by signature; what Numba asks a dispatcher's cache for."""
+    """The compiled code of one function, by signature: a dispatcher's cache, as Numba calls it."""
 
     announcing = True
-    """whether to say that something is compiled; a process that compiles for another does not"""
+    """flag for announcing a compilation; off in a process that compiles for another one"""
     complaining = True
-    """whether to say that code cannot be cached; once is enough"""
+    """flag for reporting that code cannot be cached; once is enough"""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
         self._found: dict[str, bytes] = {}
-        """what was read and not yet loaded, by the name of its file: each is read once"""
+        """contents read but not yet loaded, by file name, so that each file is read once"""
 
     @functools.cached_property
     def folder(self) -> Path | None:
-        """Where files are written; None where no folder can be written."""
+        """Folder in which files are written; None if no folder is writable."""
         file = inspect.getfile(self._function)
         for kind in _LOCATORS:
             locator = kind.from_function(self._function, file)
@@ -103,7 +103,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     @functools.cached_property
     def _folders(self) -> list[Path]:
-        """Where files are looked for: also beside the kernels, where somebody else put them."""
+        """Folders in which files are looked up, including the kernels' own `__pycache__`."""
         beside = Path(inspect.getfile(self._function)).absolute().parent / "__pycache__"
         if self.folder is None:
             return [beside]
@@ -111,12 +111,12 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
 
     @property
     def cache_path(self) -> str | None:
-        """The folder, as Numba wants it."""
+        """The folder, in the form that Numba expects."""
         return None if self.folder is None else str(self.folder)
 
     @functools.cached_property
     def _stem(self) -> str:
-        """The beginning of the names of all files of this function, whatever its sources say."""
+        """Common prefix of the names of all files of this function, independent of its sources."""
         module = Path(inspect.getfile(self._function)).stem
         name = self._function.__qualname__.replace("<", "").replace(">", "")
         stem = f"{module}.{name}.py{sys.version_info[0]}{sys.version_info[1]}"
@@ -124,7 +124,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
             f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
             for value in closure_of(self._function)
         ]
-        if closed_over:  # functions of one piece of source keep their files apart
+        if closed_over:  # separate files for functions made from one piece of source
             stem += f".{hashlib.sha256(' '.join(closed_over).encode()).hexdigest()[:8]}"
         return stem
 
@@ -140,7 +140,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
         return f"{self._stem}.{digest[:32]}.code"
 
     def _content(self, signature: Any, context: Any) -> bytes | None:
-        """What the file of a signature holds; None where there is none, or a damaged one."""
+        """Content of the file of a signature; None if it is missing or damaged."""
         if not self._folders:
             return None
         name = self._name(signature, context)
@@ -167,11 +167,11 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
             if not all(map(llvm.address_of_symbol, needed)):
                 target_context.refresh()  # registers the rest of Numba, which takes 0.3 s
             return compiler.CompileResult._rebuild(target_context, *parts)
-        except Exception:  # whatever reading it raises, it is as good as none
+        except Exception:  # any error of reading counts as no file
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Write the compiled code of a signature; where that fails, say so and go on."""
+        """Write the compiled code of a signature; if this fails, report it and continue."""
         if self.folder is None:
             return
         path = self.folder / self._name(sig, data.target_context)
@@ -198,20 +198,20 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
             path.unlink(missing_ok=True)
 
     def enable(self) -> None:
-        """Nothing: the cache is always on."""
+        """Do nothing: the cache is always on."""
 
     def disable(self) -> None:
-        """Nothing: the cache is always on."""
+        """Do nothing: the cache is always on."""
 
     # ---- who compiles -----------------------------------------------------------------------
 
     def holds(self, signature: Any, context: Any) -> bool:
-        """Whether there is an undamaged file for a signature."""
+        """True if there is an undamaged file for a signature."""
         return self._content(signature, context) is not None
 
     @contextlib.contextmanager
     def compiling_alone(self, signature: Any, context: Any) -> Iterator[None]:
-        """Hold off other processes that want to compile the same; they load the result then."""
+        """Block other processes that would compile the same code; they load the result then."""
         if self.holds(signature, context):
             yield
             return
@@ -226,7 +226,7 @@ class CodeCache(caching._Cache):  # type: ignore[misc]
         return [] if self.folder is None else list(self.folder.glob(f"{self._stem}.*.{kind}"))
 
     def _tidy(self) -> None:
-        """Delete the oldest files of this function, and what killed processes left."""
+        """Delete the oldest files of this function, and the remains of killed processes."""
         with contextlib.suppress(OSError):
             files = self._files("code")
             files.sort(key=lambda path: path.stat().st_mtime, reverse=True)

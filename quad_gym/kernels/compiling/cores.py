@@ -1,10 +1,10 @@
-"""How many cores this process may use."""
+"""Number of cores that this process may use."""
 
 import os
 
 
 def available_cores() -> int:
-    """The cores that this process may use, by its affinity, quota and NUMBA_NUM_THREADS."""
+    """Number of cores that this process may use, by its affinity, quota and NUMBA_NUM_THREADS."""
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -16,7 +16,7 @@ def available_cores() -> int:
 
 
 def _cgroup_cores() -> int | None:
-    """The whole cores that a container's quota allows, if there is one."""
+    """Number of whole cores that a container's quota allows, if there is one."""
     try:
         with open("/sys/fs/cgroup/cpu.max", encoding="ascii") as file:
             quota, period = file.read().split()

@@ -1,7 +1,7 @@
 """The decorators `kernel`, `routine` and `entry`.
 
-No fast-math flag is set: what is fused into a multiply-add is fused where numbers are lowered, see
-`kernels/simd/lanes.py`, so that a result does not depend on what surrounds its computation.
+No fast-math flag is set: multiply-adds are fused only where numbers are lowered, see
+`kernels/simd/lanes.py`, so that a result does not depend on the code around its computation.
 """
 
 import functools
@@ -32,14 +32,14 @@ else:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile `function` into the compiled code that calls it, inlined: for small functions."""
+    """Compile `function` as part of the code that calls it, inlined: for small functions."""
     if LEAN:
         return _kernel(function, forceinline=True)
     return numba.njit(forceinline=True, error_model="numpy")(function)
 
 
 def routine(function: Callable[..., Any]) -> Any:
-    """Compile `function` into the compiled code that calls it, out of line: for large functions."""
+    """Compile `function` as part of the code that calls it, out of line: for large functions."""
     return _kernel(function) if LEAN else numba.njit(error_model="numpy")(function)
 
 
@@ -53,7 +53,7 @@ class EntryDispatcher(CPUDispatcher):  # type: ignore[misc]
     """Compiled code that Python calls: cached on disk, compiled by one process at a time."""
 
     signature: Any = None
-    """the only types of arguments that it takes, if there is only one"""
+    """the only signature that it accepts, if there is only one"""
 
     def compile(self, signature: Any) -> Any:
         """Load the compiled code for a signature, or compile it and keep it in the cache."""
@@ -64,7 +64,7 @@ class EntryDispatcher(CPUDispatcher):  # type: ignore[misc]
             return super().compile(signature)
 
     def is_cached(self) -> bool:
-        """Whether the code for its signature is loaded, or in the cache."""
+        """True if the code for its signature is loaded or in the cache."""
         return bool(self.overloads) or self._cache.holds(self.signature, self.targetctx)
 
 
@@ -74,7 +74,7 @@ def entry(function: Callable[..., Any] | None = None, signature: Any = None) -> 
     As a decorator: `@entry`, or `@entry(signature=...)`.
 
     Args:
-        function: What to compile.
+        function: The function to compile.
         signature: The Numba types of its arguments, so that it can be compiled ahead of a call.
     """
     if function is None:

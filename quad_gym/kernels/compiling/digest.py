@@ -1,7 +1,7 @@
-"""What compiled code depends on, as a digest that decides whether a cache is stale.
+"""Digests of everything that compiled code depends on, which show whether a cache is stale.
 
 The digest of a module follows its imports through the package, so that nothing has to be listed by
-hand. Comments, docstrings and layout do not count: what is hashed is the syntax tree.
+hand. Comments, docstrings and layout do not count, as the syntax tree is hashed.
 """
 
 import ast
@@ -24,19 +24,19 @@ from numba.core import config
 
 PACKAGE = __package__.partition(".")[0]
 _BASE = Path(__file__).resolve().parents[len(__package__.split("."))]
-"""The folder that the package lies in."""
+"""The folder that contains the package."""
 _NO_CODE = {f"{__package__}.{name}" for name in ("cache", "cores", "digest", "locks", "workers")}
-"""Modules that decide when code is compiled, not what."""
+"""Modules that determine when code is compiled, but do not change the code."""
 
 
 # ---- modules ---------------------------------------------------------------------------------
 
 
 def digest_of(path: Path) -> str:
-    """A digest of a source file and of everything of the package that it imports, directly or not.
+    """Digest of a source file and of all modules of the package that it imports, directly or not.
 
     Args:
-        path: The file of the compiled function; it may lie outside the package.
+        path: The file of the compiled function; it may be outside the package.
 
     Raises:
         SyntaxError, OSError: If a file cannot be read.
@@ -48,7 +48,7 @@ def digest_of(path: Path) -> str:
             seen[file], imported = _read(file, file.stat().st_mtime_ns)
             todo += imported
     digest = hashlib.sha256(sys.version.encode())
-    # with names, as two files may exchange what they hold; relative, as a package may be moved
+    # with names, as two files may swap their contents; relative, as a package may be moved
     for line in sorted(f"{os.path.relpath(file, _BASE)} {seen[file]}\n" for file in seen):
         digest.update(line.encode())
     return digest.hexdigest()
@@ -56,10 +56,10 @@ def digest_of(path: Path) -> str:
 
 @functools.cache
 def flights_digest() -> str:
-    """A digest of all sources that flights and what is found of them depend on.
+    """Digest of all sources on which flights and their results depend.
 
-    Results on disk are kept beside it: with other code they are measured anew. What commands and
-    pictures look like does not count.
+    Results on disk are stored with it: after a change of code they are measured again. The layout
+    of commands and pictures does not count.
     """
     apart = {"commands", "experiments", "rendering", "compiling"}
     names = sorted(name for name in _sources_of(_BASE / PACKAGE) if not apart & {*name.split("/")})
@@ -71,7 +71,7 @@ def flights_digest() -> str:
 
 @functools.lru_cache(maxsize=1024)
 def _read(file: Path, changed: int) -> tuple[str, tuple[Path, ...]]:
-    """The digest of one file, and the files of the package that it imports."""
+    """Digest of one file, and the files of the package that it imports."""
     content = file.read_bytes()
     place = "/".join(file.relative_to(_BASE).parts[:-1]) if _BASE in file.parents else ""
     key = hashlib.sha256(place.encode() + b"\n" + content).hexdigest()
@@ -85,7 +85,7 @@ def _read(file: Path, changed: int) -> tuple[str, tuple[Path, ...]]:
 
 
 def _parsed(content: bytes, file: Path) -> tuple[str, list[str]]:
-    """The digest of a source, and the names that it imports."""
+    """Digest of a source, and the names that it imports."""
     tree = ast.parse(content)
     imported = {name for node in ast.walk(tree) for name in _imports(node, file)}
     for node in ast.walk(tree):
@@ -93,11 +93,11 @@ def _parsed(content: bytes, file: Path) -> tuple[str, list[str]]:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), sorted(imported)
 
 
-# what was parsed before, by the hash of the source: parsing takes longer than loading the code
+# earlier results of parsing, by the hash of the source: parsing takes longer than loading code
 
 
 def _memory() -> Path:
-    """The file that remembers it; another one for each version of Python, whose trees differ."""
+    """The file that stores them, one for each version of Python, as syntax trees differ."""
     folder = config.CACHE_DIR or Path(__file__).with_name("__pycache__")
     return Path(folder) / f"quad_gym_digests.{sys.implementation.cache_tag}.json"
 
@@ -113,7 +113,7 @@ def _known() -> dict[str, tuple[str, list[str]]]:
 
 @functools.cache
 def _save_at_exit() -> None:
-    """Write what is known when this process ends, once; where that fails, nothing is lost."""
+    """Write the known digests once, when this process ends; a failure is harmless."""
     atexit.register(_save)
 
 
@@ -130,7 +130,7 @@ def _save() -> None:
 
 
 def _imports(node: ast.AST, file: Path) -> list[str]:
-    """Names of modules, and of what may be modules, that a statement imports."""
+    """Names of modules, and of possible modules, that a statement imports."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     if not isinstance(node, ast.ImportFrom):
@@ -145,7 +145,7 @@ def _imports(node: ast.AST, file: Path) -> list[str]:
 
 
 def _path_of(name: str) -> Path | None:
-    """The file of a module of the package, or of one beside it such as a test's helpers."""
+    """The file of a module of the package, or of one next to it, such as a test's helpers."""
     root = name.partition(".")[0]
     base = _BASE
     if root != PACKAGE:
@@ -160,9 +160,9 @@ def _path_of(name: str) -> Path | None:
     return None
 
 
-@functools.cache  # one look at the folders instead of two for each of a thousand names
+@functools.cache  # one scan of the folders instead of two look-ups for each of a thousand names
 def _sources_of(package: Path) -> frozenset[str]:
-    """The source files of a package, relative to the folder that it lies in."""
+    """The source files of a package, relative to the folder that contains it."""
     return frozenset(
         os.path.relpath(os.path.join(folder, file), package.parent).replace(os.sep, "/")
         for folder, _, files in os.walk(package)
@@ -172,7 +172,7 @@ def _sources_of(package: Path) -> frozenset[str]:
 
 
 def _drop_docstring(node: ast.AST) -> None:
-    """Remove the strings that stand alone as statements: docstrings, also those of attributes."""
+    """Remove the strings that are statements: docstrings, also of attributes."""
     body = getattr(node, "body", None)
     if isinstance(body, list):
         kept = [
@@ -191,30 +191,30 @@ def _drop_docstring(node: ast.AST) -> None:
 
 
 def digest_of_function(function: Callable[..., Any]) -> str:
-    """A digest of a function: its module with all that it imports, and what the function holds.
+    """Digest of a function: its module with all imports, its instructions, defaults and closure.
 
-    Functions that one piece of source makes differ in what they close over and in their defaults.
-    Functions among these count with their own modules, other values as they are.
+    Functions made from one piece of source differ in their closures and defaults. Functions among
+    these values count with their own modules, other values as they are.
 
     Raises:
-        TypeError: If it closes over something that has no lasting identity.
+        TypeError: If it closes over a value that has no lasting identity.
     """
     return hashlib.sha256("\n".join(_function(function, ())).encode()).hexdigest()
 
 
 def closure_of(function: Callable[..., Any]) -> list[Any]:
-    """What a function closes over, functions in the place of what was compiled from them."""
+    """Values that a function closes over, with plain functions in place of compiled ones."""
     return [_plain(cell.cell_contents) for cell in function.__closure__ or ()]  # type: ignore[attr-defined]
 
 
 def _plain(value: Any) -> Any:
-    """The function that a dispatcher or an intrinsic was made of; else the value itself."""
+    """The function from which a dispatcher or an intrinsic was made; else the value itself."""
     return getattr(value, "py_func", None) or getattr(value, "__wrapped__", value)
 
 
 def _function(function: Any, above: tuple[Any, ...]) -> Iterator[str]:
     yield f"{function.__module__}:{function.__qualname__}"
-    if function in above:  # a function that calls itself
+    if function in above:  # recursion
         return
     yield digest_of(Path(inspect.getfile(function)))
     yield from _code(function.__code__)
@@ -223,7 +223,7 @@ def _function(function: Any, above: tuple[Any, ...]) -> Iterator[str]:
 
 
 def _code(code: CodeType) -> Iterator[str]:
-    """Instructions: what tells functions of one name and module apart, wherever they stand."""
+    """Instructions, independent of their lines: functions of a module may share a name."""
     for instruction in dis.get_instructions(code):
         if isinstance(instruction.argval, CodeType):
             yield from _code(instruction.argval)

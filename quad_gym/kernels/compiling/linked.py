@@ -28,10 +28,10 @@ def names_of(needed: Collection[str], entries: Sequence[str] = (FLY,)) -> list[s
 
 
 def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (FLY,)) -> NDArray[Any]:
-    """The table of addresses, (1,) STAGE_TABLE, of the stages that are needed and no others.
+    """Table of addresses, (1,) STAGE_TABLE, of only the stages that are needed.
 
-    A batch has memory for what these stages use, see `used_parts`: other slots stay empty, whatever
-    another batch has linked.
+    A batch has memory only for the parts that these stages use, see `used_parts`: other slots stay
+    empty, even if another batch has linked their stages.
 
     Args:
         needed: The stages, and the names of their functions.
@@ -49,7 +49,7 @@ def linked_table(needed: Mapping[Stage, str], entries: Sequence[str] = (FLY,)) -
 
 
 def _address(name: str) -> int:
-    """Where the machine code of a stage begins."""
+    """Address of the machine code of a stage."""
     dispatcher = dispatcher_of(name)
     arguments = tuple(SIGNATURE.args)
     compiled = dispatcher.overloads[arguments]

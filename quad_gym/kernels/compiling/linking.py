@@ -1,13 +1,13 @@
-"""What relies on Numba's internals: kernels that stay LLVM IR until compiled code links them.
+"""Kernels that stay LLVM IR until compiled code links them, by means of Numba's internals.
 
-Numba makes a library of every jitted function: it links what the function calls, optimizes the
-whole, and emits machine code and two wrappers for it, even if nothing but other jitted functions
-ever calls it. So nested kernels are optimized and emitted once for every level above them. Here the
-library of a kernel is its unoptimized IR. An entry, the only thing that Python calls, links each
-kernel that it reaches once, and is the only thing that is optimized and emitted.
+Numba makes a library of every jitted function: it links the functions that this one calls,
+optimizes the whole, and emits machine code and two wrappers for it, even if only other jitted
+functions ever call it. So nested kernels are optimized and emitted once for every level above them.
+Here the library of a kernel is its unoptimized IR. An entry, the only kind of function that Python
+calls, links each kernel that it reaches once, and is the only kind that is optimized and emitted.
 
 A kernel's code therefore exists inside entries only, as a symbol that is internal to the entry's
-module: a large kernel can stand out of line without a second copy that another process might call.
+module: a large kernel can be out of line without a second copy for other callers.
 
 Where Numba lacks the internals that this file needs, importing it fails, and `decorators.py` uses
 ordinary `numba.njit`: slower to compile, the same flights.
@@ -29,8 +29,8 @@ _LANES_BYTES = 8 * WIDTH
 class _AlignedLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     """A library whose functions keep vectors of lanes on the stack within cache lines.
 
-    LLVM aligns the stack for what it knows to lie there when it begins to allocate registers, not
-    for registers that it spills later on; these would straddle lines, and some straddle pages.
+    LLVM aligns the stack for the variables known when it begins to allocate registers, not for
+    registers that it spills later; these would straddle cache lines, and some would straddle pages.
     """
 
     def add_ir_module(self, ir_module: Any) -> None:
@@ -38,7 +38,7 @@ class _AlignedLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
         for function in ir_module.functions:
             if not function.is_declaration:
                 function.attributes.alignstack = _LANES_BYTES
-                function.attributes.add("uwtable")  # llvmlite leaves out an alignment alone
+                function.attributes.add("uwtable")  # llvmlite omits an alignment without it
         super().add_ir_module(ir_module)
 
 
@@ -51,7 +51,7 @@ class KernelLibrary(_AlignedLibrary):
         self._final_module.link_in(ll_module)
 
     def finalize(self) -> None:
-        """Close the library; there is nothing to optimize or to emit."""
+        """Close the library, without optimizing or emitting code."""
         self._raise_if_finalized()
         for library in self._linking_libraries:
             self._reload_init.update(library._reload_init)
@@ -79,7 +79,7 @@ class EntryLibrary(_AlignedLibrary):
             if isinstance(library, KernelLibrary):
                 library.reached(seen)
             seen[library] = None
-        # callers first: LLVM links a function that may exist elsewhere only if it is wanted already
+        # callers first: LLVM links a function that may exist elsewhere only if it is needed already
         self._linking_libraries = list(seen)[::-1]
         self._kernels = {
             function.name
@@ -94,7 +94,7 @@ class EntryLibrary(_AlignedLibrary):
         for function in self._final_module.functions:
             if function.name in self._kernels and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
-        # one run: the cheap one before it, which Numba makes to prune reference counts, has nothing
+        # one run: the cheap one before it, by which Numba prunes reference counts, has nothing
         # to prune in kernels
         passes, builder = self._codegen._module_pass_manager()
         passes.run(self._final_module, builder)
@@ -115,9 +115,7 @@ class KernelLowering(typed_passes.NativeLowering):  # type: ignore[misc]
         super().run_pass(state)
         lowered = state["cr"]
         state.library._ensure_finalized()
-        handle = list[
-            Any
-        ]().append  # a callable like no other: Numba finds the overload by its identity
+        handle = list[Any]().append  # a unique callable: Numba finds the overload by its identity
         state.targetctx.insert_user_function(handle, lowered.fndesc, [state.library])
         state["cr"] = compiler._LowerResult(
             lowered.fndesc, lowered.call_helper, cfunc=handle, env=lowered.env
@@ -156,8 +154,8 @@ _NOT_FOR_KERNELS = frozenset(
         "DumpParforDiagnostics",
     }
 )
-"""Passes that find nothing to do in kernels, which have no closures, `with`, `literally`, or
-exceptions with arguments that vary; together a tenth of the time that kernels take to compile."""
+"""Passes that have no effect on kernels, which have no closures, `with`, `literally`, or exceptions
+with arguments that vary; together a tenth of the time that kernels take to compile."""
 
 
 def _compiler_with(lowering: type, left_out: frozenset[str] = frozenset()) -> type:
@@ -180,10 +178,10 @@ EntryCompiler = _compiler_with(EntryLowering)
 
 
 class KernelDispatcher(CPUDispatcher):  # type: ignore[misc]
-    """A kernel: other compiled code calls it, Python must not."""
+    """A kernel: other compiled code may call it, Python may not."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Refuse: a kernel has no machine code of its own.
+        """Refuse the call, as a kernel has no separate machine code.
 
         Raises:
             TypeError: Always.

@@ -16,13 +16,13 @@ fcntl: Any = _fcntl
 
 @contextlib.contextmanager
 def locked(path: Path | None, waiting: str = "") -> Iterator[None]:
-    """Hold a lock between processes; a process that dies gives it back.
+    """Hold a lock between processes; a process that dies releases it.
 
-    Without a lock where the system or the folder has none: two processes may do the same work then.
+    Where the system or the folder supports no locks, two processes may do the same work.
 
     Args:
-        path: The file that stands for the lock; None: no lock.
-        waiting: What to say on standard error if another process holds it.
+        path: The file that represents the lock; None: no lock.
+        waiting: Message on standard error if another process holds it.
     """
     file = None if path is None or fcntl is None else _held(path, waiting)
     if file is None:
@@ -39,7 +39,7 @@ def locked(path: Path | None, waiting: str = "") -> Iterator[None]:
 
 
 def _held(path: Path, waiting: str) -> IO[bytes] | None:
-    """The file, locked; None where that cannot be."""
+    """The locked file; None if it cannot be locked."""
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def _held(path: Path, waiting: str) -> IO[bytes] | None:
         except BaseException:  # Ctrl-C while it waits
             file.close()
             raise
-        file.close()  # who held it has deleted it: others lock a new file
+        file.close()  # its former holder has deleted it: others lock a new file
 
 
 def _lock(file: IO[bytes], waiting: str) -> None:

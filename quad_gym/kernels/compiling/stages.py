@@ -1,14 +1,15 @@
-"""Stages: what a flight is made of, each compiled by itself and only where a flight needs it.
+"""Stages, the parts of a flight, each compiled separately and only where a flight needs it.
 
 A stage is a compiled function of fixed arguments that other compiled code calls through a table of
-addresses. What follows from it:
+addresses. Consequences:
 
-* What a configuration lacks - faults, late measurements, moving air, the filter - is not compiled.
+* Stages that a configuration lacks - faults, late measurements, moving air, the filter - are not
+  compiled.
 * A slot that a configuration does not need is empty, and skipped. Some slots have a choice: MOVE in
   calm or in moving air, PREDICT with or without slow errors of sensors.
-* A function is the same machine code whatever it is combined with, so a flight has the same bits in
-  every configuration that does not change it.
-* Stages compile side by side, and an edit of a kernel compiles the stages again that reach it.
+* A function has the same machine code in every combination, so a flight has the same bits in every
+  configuration that does not change it.
+* Stages compile in parallel; after an edit of a kernel, only those that reach it compile again.
 
 A call costs a few nanoseconds for all flights of a block together.
 """
@@ -39,7 +40,7 @@ from quad_gym.records import (
 
 
 class Stage(IntEnum):
-    """The slots of the table, in the order of a flight as far as it has one."""
+    """Slots of the table, in the order of a flight where there is one."""
 
     # an episode begins
     DRAW = 0
@@ -105,7 +106,7 @@ class Source(NamedTuple):
     """its module in `quad_gym.kernels`, and its name"""
     needed: Callable[[Any], bool]
     parts: tuple[str, ...] = ()
-    """parts of a flight's record that it uses beside the core, see `records.PARTS`"""
+    """parts of a flight's record that it uses in addition to the core, see `records.PARTS`"""
 
     @property
     def name(self) -> str:
@@ -285,8 +286,8 @@ SOURCES = (
     Source(Stage.SUM_IMU, "sensors.imu:sum_imu_stage", _raw, ("raw",)),
     Source(Stage.FORGET_INNOVATIONS, "filter.align:forget_innovations_stage", _watches, ("watch",)),
 )
-"""Every function of a stage; those that take longest to compile come first. Where a slot has
-several, it gets the first that is needed."""
+"""Every function of a stage, the longest to compile first. A slot with several functions gets the
+first one that is needed."""
 
 STAGE_TABLE = np.dtype([("address", "u8", (len(Stage),))], align=True)
 """The addresses of the stages, 0 where a slot is empty."""
@@ -301,27 +302,27 @@ def _chosen(settings: Any) -> dict[Stage, Source]:
 
 
 def needed_stages(settings: Any) -> dict[Stage, str]:
-    """The stages that a batch of these settings (a SETTINGS record) flies through: their names."""
+    """Names of the stages that a batch with these settings (a SETTINGS record) flies through."""
     return {stage: source.name for stage, source in _chosen(settings).items()}
 
 
 def used_parts(settings: Any) -> frozenset[str]:
-    """The parts of a flight's record that a batch of these settings uses; see `records.PARTS`."""
+    """Parts of a flight's record that a batch with these settings uses, see `records.PARTS`."""
     return frozenset(part for source in _chosen(settings).values() for part in source.parts)
 
 
 _DTYPES = (FLIGHT_BLOCK, PARAMS_BLOCK, PARAMS_BLOCK, SETTINGS, WORK_BLOCK, STAGE_TABLE)
 _ARGUMENTS = (*map(from_dtype, _DTYPES), types.int64)
 SIGNATURE = types.none(*_ARGUMENTS)
-"""Of every stage: flight, world, model, settings, work, stages, flag."""
+"""Signature of every stage: flight, world, model, settings, work, stages, flag."""
 
 
 def stage(function: Callable[..., Any]) -> Any:
     """Compile `function` as a stage.
 
-    Its arguments are a block of flights, the parameters as they are and as they are believed to be,
-    the settings, the workspace, the table of stages, and a number whose meaning is the stage's own.
-    `work.mask` holds the lanes that it is to work on.
+    Its arguments are a block of flights, the true parameters and the assumed ones, the settings,
+    the workspace, the table of stages, and a number whose meaning depends on the stage. `work.mask`
+    holds the lanes to work on.
     """
     return entry(function, SIGNATURE)
 

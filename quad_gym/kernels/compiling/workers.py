@@ -1,8 +1,8 @@
-"""Compiling side by side: what is missing in the cache, in processes of its own.
+"""Parallel compilation of functions that are not in the cache, in separate processes.
 
 A worker takes names of compiled functions from its standard input, compiles each into the cache,
-and says so on its standard output. It ends when its input closes, so that it never outlives its
-parent; what it was compiling is then not in the cache.
+and reports it on its standard output. It ends when its input closes, so that it never outlives its
+parent; a function that it was compiling is then not in the cache.
 """
 
 import gc
@@ -26,17 +26,17 @@ _COMPILED = "compiled"
 
 
 def dispatcher_of(name: str) -> Any:
-    """The compiled function of a name such as "quad_gym.kernels.batch:fly"."""
+    """The compiled function with a name such as "quad_gym.kernels.batch:fly"."""
     module, _, function = name.partition(":")
     return getattr(importlib.import_module(module), function)
 
 
 def prepare(names: Sequence[str], processes: int | None = None) -> None:
-    """Load compiled functions, and compile what is not in the cache.
+    """Load compiled functions, and compile those that are not in the cache.
 
     Args:
-        names: "module:function" of entries that have a signature; what takes longest comes first.
-        processes: Processes that compile; None: as many as there are cores.
+        names: "module:function" of entries that have a signature; the longest to compile first.
+        processes: Number of processes that compile; None: one for each core.
     """
     missing = _missing(names)
     if missing:
@@ -46,7 +46,7 @@ def prepare(names: Sequence[str], processes: int | None = None) -> None:
             missing = _missing(names)
             if missing:
                 _compile(missing, available_cores() if processes is None else processes)
-    for name in names:  # what a worker could not compile, is compiled here and raises here
+    for name in names:  # functions that a worker could not compile are compiled here and raise here
         dispatcher = dispatcher_of(name)
         dispatcher.compile(dispatcher.signature)
 
@@ -56,7 +56,7 @@ def _missing(names: Sequence[str]) -> list[str]:
 
 
 def _compile(names: Sequence[str], processes: int) -> None:
-    """Compile `names`: into the cache by processes, else here."""
+    """Compile `names`: into the cache by processes, or else in this one."""
     progress = _Progress(names)
     workers = min(processes, MOST_WORKERS, len(names))
     cached = all(dispatcher_of(name)._cache.folder is not None for name in names)
@@ -78,7 +78,7 @@ def _compile(names: Sequence[str], processes: int) -> None:
 
 
 def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progress") -> None:
-    """Compile `names` into the cache, in processes; what fails is left out."""
+    """Compile `names` into the cache, in processes; failures are skipped."""
     todo: queue.SimpleQueue[str] = queue.SimpleQueue()
     for name in names:
         todo.put(name)
@@ -88,7 +88,7 @@ def _compile_in_processes(names: Sequence[str], workers: int, progress: "_Progre
         for _ in range(workers):
             try:
                 processes.append(_started())
-            except OSError:  # no memory, or no processes left: fewer workers
+            except OSError:  # out of memory or of processes: fewer workers
                 break
             arguments = (processes[-1], todo, progress)
             threads.append(threading.Thread(target=_feed, args=arguments, daemon=True))
@@ -113,7 +113,7 @@ def _close(pipe: IO[str] | None) -> None:
     try:
         if pipe is not None:
             pipe.close()
-    except OSError:  # the process has gone before it read everything
+    except OSError:  # the process ended before it read everything
         pass
 
 
@@ -132,7 +132,7 @@ def _started() -> "subprocess.Popen[str]":
 def _feed(
     process: "subprocess.Popen[str]", todo: "queue.SimpleQueue[str]", progress: "_Progress"
 ) -> None:
-    """Hand names to one worker, one after the other, until there are none or it fails."""
+    """Send names to one worker, one after the other, until none is left or it fails."""
     assert process.stdin is not None
     assert process.stdout is not None
     while True:
@@ -153,9 +153,9 @@ def _feed(
 
 
 def work() -> None:
-    """What a worker does."""
+    """Run a worker."""
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what anything else prints is no answer
+    os.dup2(2, 1)  # other output is no answer
     gc.disable()  # compiling makes few cycles, and looking for them takes a tenth of the time
     CodeCache.announcing = CodeCache.complaining = False
     names: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -175,14 +175,14 @@ def work() -> None:
 
 
 def _listen(names: "queue.SimpleQueue[str]") -> None:
-    """Pass on what comes on standard input; where it ends, end at once, whatever is compiled."""
+    """Forward names from standard input; when it closes, exit at once, even while compiling."""
     for line in sys.stdin:
         names.put(line.strip())
     os._exit(0)
 
 
 class _Progress:
-    """One line on standard error that says what is being compiled, and for how long."""
+    """Progress line on standard error: the functions being compiled, and the elapsed time."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._count = len(names)
@@ -199,13 +199,13 @@ class _Progress:
         self._running.append(name)
 
     def ends(self, name: str, well: bool) -> None:
-        """Note that `name` is no longer being compiled, and whether it is in the cache."""
+        """Note that `name` is no longer being compiled; `well`: it is in the cache."""
         self._running.remove(name)
         if well:
             self._done.append(name)
 
     def show(self) -> None:
-        """Move the line on, where somebody looks at it."""
+        """Update the line, if standard error is a terminal."""
         if self._moves:
             running = ", ".join(
                 name.partition(":")[2].removesuffix("_stage") for name in list(self._running)
@@ -214,7 +214,7 @@ class _Progress:
             say(f"\r{text:<36} {running[:40]:<40}", end="")
 
     def finish(self) -> None:
-        """Say how it ended."""
+        """Report the result."""
         text = f"quad_gym: compiled {len(self._done)} of {self._count} parts"
         say(f"{chr(13) if self._moves else ''}{f'{text} in {self._seconds():.0f} s':<78}".rstrip())
 

@@ -1,4 +1,4 @@
-"""The filter's start from its first fix: alignment, as navigators call it.
+"""Alignment: initialization of the filter from its first fix.
 
 Source: report section 3.4.2; heading of the mark and level starts are ours.
 """
@@ -44,16 +44,16 @@ from quad_gym.kernels.simd.lanes import select
 from quad_gym.records import DRAW_MARK
 
 NOTHING = (0.0, 0.0, 0.0)
-_NO_HEADING = math.pi / math.sqrt(3.0)  # the deviation of an angle that may be any
-_STEEP = 0.2  # level share of a baseline, 12 degrees from the vertical, that tells no heading
+_NO_HEADING = math.pi / math.sqrt(3.0)  # standard deviation of an unknown angle
+_STEEP = 0.2  # level share of a baseline 12 degrees from the vertical: too small for a heading
 
 
 @kernel
 def _tie_position_to_attitude(L, R_BI, lever_B, mask):
-    """Put into L that the start's position depends on its attitude, where `mask`.
+    """Add to L the dependence of the start's position on its attitude, in the lanes `mask`.
 
     The antenna was measured, and r = antenna - R^T l: with R = R(e) R_hat the error of the position
-    is that of the fix and J e, J = R_hat^T [l x].
+    is the error of the fix plus J e, with J = R_hat^T [l x].
     """
     zero = 0.0 * lever_B[0]
     x, y, z = lever_B
@@ -73,24 +73,25 @@ def _tie_position_to_attitude(L, R_BI, lever_B, mask):
 
 @kernel
 def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_variance=NOTHING):
-    """Start the filter from the first fix, where `mask`.
+    """Start the filter from the first fix, in the lanes `mask`.
 
     Attitude by Wahba's problem from the measured baseline and the body z axis taken as vertical,
-    with equal weights, or level with the baseline's heading (one antenna has a vertical baseline,
-    so to speak); position from the antenna; velocity and biases zero. A level start knows that its
-    position depends on its attitude. The heading is the less certain the steeper the baseline.
-    Where that tells none to speak of, the body x axis joins in Wahba's problem, or gives the
-    heading; where nobody knows it either, the heading may be any.
+    with equal weights, or level with the baseline's heading (a single antenna counts as a vertical
+    baseline); position from the antenna; velocity and biases zero. For a level start, the
+    covariance includes the dependence of the position on the attitude. The steeper the baseline,
+    the less certain the heading. Where the baseline is too steep for a heading, the body x axis is
+    added to Wahba's problem, or gives the heading alone; where it is unknown, too, so is the
+    heading.
 
     Args:
         flight: Record; reads gnss_position and gnss_baseline, sets the estimate.
-        p: Parameters as the filter believes them.
-        mask: Which lanes.
-        x_I: Level direction in I of the body x axis, as the place of the start tells it; zero where
-            it tells none.
-        v_I: Velocity in I with which the vehicle is known to start [m/s].
-        v_variance: Per axis, added to that of a start at rest [m^2/s^2].
-        tilt_variance: Of roll and pitch, likewise [rad^2]; the third counts nothing.
+        p: Parameters assumed by the filter.
+        mask: Lanes to work on.
+        x_I: Level direction in I of the body x axis, if the place of the start determines it; else
+            zero.
+        v_I: Known velocity of the start, in I [m/s].
+        v_variance: Variance per axis, added to the variance of a start at rest [m^2/s^2].
+        tilt_variance: Variances added for roll and pitch [rad^2]; the third element is not used.
     """
     inflation = math.sqrt(p.initial_covariance_scale)
     attitude = inflation * p.first_baseline_sigma
@@ -141,9 +142,9 @@ def initialize(flight, p, mask, x_I, v_I=NOTHING, v_variance=NOTHING, tilt_varia
 
 @kernel
 def known_velocity(flight, settings):
-    """The velocity in I that the filter is told of its start, and what is drawn on top of it.
+    """Velocity of the start in I that the filter receives, and the variance of its random part.
 
-    A velocity that the caller of a reset gives is known; nothing is drawn then.
+    A velocity given by the caller of a reset is known; its variance is zero.
     """
     given = (flight.start_given[3], flight.start_given[4], flight.start_given[5])
     drawn = load3(settings.start_velocity_variance)
@@ -164,7 +165,7 @@ def known_velocity(flight, settings):
 
 @kernel
 def look_along_mark(flight, p):
-    """Level direction in I of the body x axis, as well as the place of the start tells it."""
+    """Level direction in I of the body x axis, as accurate as the place of the start gives it."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     zero = 0.0 * p.dt
     x_I = unit_or((R_BI[0][0], R_BI[0][1], zero), (zero + 1.0, zero, zero))
@@ -188,5 +189,5 @@ def align_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def forget_innovations_stage(flight, world, model, settings, work, stages, flag):
-    """Forget the innovations of the episode before."""
+    """Forget the innovations of the previous episode."""
     forget_innovations(lanes_of(flight), settings.feature_count, lanes_of(work).mask > 0.0)

@@ -89,9 +89,9 @@ def _matrix_of(row, k):
 
 @kernel
 def _find_stamp(flight, p, work, sensor, delay, arrived):
-    """Fill work.since_* with the IMU's sums of the measurement that arrives, else of the present.
+    """Fill work.since_* with the IMU's sums at the arrival's time stamp, or with the present ones.
 
-    Where one arrives, w_meas becomes the rates at that instant, for lever arms.
+    Where a measurement arrives, w_meas becomes the rates at that instant, for lever arms.
     """
     store33(work.since_turn, load33(flight.imu_turn))
     store33(work.since_bias_gain, load33(flight.imu_bias_gain))
@@ -115,7 +115,7 @@ def _find_stamp(flight, p, work, sensor, delay, arrived):
 
 @kernel
 def _factor_columns(flight, p, work, noise, slow, back):
-    """L of the covariance of work.columns, whose noise counts `noise` times; its least pivot."""
+    """Factor the covariance of work.columns, noise scaled by `noise`; return the least pivot."""
     M, P = work.columns, work.P
     for i in range(0, 15, 3):
         for j in range(0, i + 3, 3):
@@ -145,20 +145,20 @@ def _load_factor(flight, work):
 
 @kernel
 def _carry(flight, p, work, back, ticks, slow):
-    """Take the estimate to the time stamp of what arrives, or from there to the present.
+    """Propagate the estimate to the time stamp of the arrival, or from there to the present.
 
-    Where more noise than uncertainty would be left out on the way back, the noise is left in.
+    Where the noise to be removed on the way back exceeds the uncertainty, none is removed.
 
     Args:
         flight: Record.
-        p: Parameters as the filter believes them.
+        p: Parameters assumed by the filter.
         work: Workspace.
-        back: Whether it goes back.
-        ticks: How far.
+        back: True to propagate back in time.
+        ticks: Ticks between the time stamp and the present.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
 
     Returns:
-        Where the covariance stays positive definite.
+        Lanes in which the covariance stays positive definite.
     """
     _load_factor(flight, work)
     R_s, dR, dv, dr = take_mean(flight, p, work, back)
@@ -183,9 +183,9 @@ def _carry(flight, p, work, back, ticks, slow):
 
 @kernel
 def _restore_estimate(flight, work, settings, arrived, good, slow):
-    """Undo what has happened but where something arrived and all went well.
+    """Restore the saved estimate, except where a measurement arrived and its update succeeded.
 
-    What has been corrected is added up anew: the last correction is no more.
+    Where it failed, the sums of corrections are reset, as the last correction is undone.
     """
     old = logical_not(arrived & good)
     keep3(flight.r_hat, old, load3(work.kept_r))
@@ -212,7 +212,7 @@ def _restore_estimate(flight, work, settings, arrived, good, slow):
 
 @kernel
 def update_by_sensor(flight, p, work, settings, stages, mask, slow=None):
-    """Update with each delayed sensor in turn, then with all that are not, in the lanes `mask`.
+    """Update with each delayed sensor in turn, then with all prompt ones, in the lanes `mask`.
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.

@@ -2,7 +2,7 @@
 
 It shares everything else with the UKF: state, error angles, models, noise, and the factor L of the
 covariance. Where the UKF puts the half-differences of a pair of sigma points into a column, the EKF
-puts the derivative of the model times the column of L; the half-sums less the center, which carry
+puts the derivative of the model times the column of L; the half-sums minus the center, which carry
 the second order, are zero. With `R(e) = I - [e x] + ...`:
 
 * `a = R_hat^T R(e)^T (f - b_a) - g e3`:  da = R_hat^T (de x f - db_a)

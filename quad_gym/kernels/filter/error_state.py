@@ -6,7 +6,7 @@ Since `de = S(e) w` maps body rates to Euler rates and S(0) is the identity,
 
     e_new = S(m)^-1 (e - m) + O(e - m)^2,
 
-so that the covariance is transformed, too: P_e <- S^-1 P_e S^-T, and the correlations with e
+so the covariance is transformed, too: P_e <- S^-1 P_e S^-T, and the correlations with e
 accordingly. The report leaves the covariance unchanged.
 
 Source: F. L. Markley, J. Guidance, Control, and Dynamics 26(2), 2003, for the reset in general.

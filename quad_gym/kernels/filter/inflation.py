@@ -1,26 +1,27 @@
 """Covariance inflation after the filter detects that it is inconsistent.
 
-The error need not be in what the sensor measures. An innovation that has grown for a time T since
-the last acceptance may come from biases, so their standard deviations become: nu / T of an angle
-for the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g of
-that for the tilt. Each sensor inflates the states that it may have misled (`kernels/sensors/`).
+The error need not be in the measured quantity. An innovation that has grown for a time T since the
+last acceptance may come from biases, so their standard deviations become: nu / T of an angle for
+the gyro; nu / T of a velocity, or 2 nu / T^2 of a position, for the accelerometer, and 1/g times
+this for the tilt. Each sensor inflates the states that it may have corrupted (`kernels/sensors/`).
 Variances are raised to the square of these numbers, not increased by it, so repeated alarms do not
 add up. Where GNSS positions drift, position and drift are raised to the square of three times an
 innovation or a sum of corrections, as the drift may have followed the error in part.
 
 Where innovations drift, or corrections of the biases go one way, the covariance of the fifteen
 states is multiplied by `_FACTOR`: the error of the biases has reached attitude, velocity and
-position, too, and correlations say how. So is the variance of the drift of GNSS positions, which
-may have absorbed an error of the position, up to its stationary value. Slow errors of other sensors
-keep theirs: a constant one that has become uncertain may stay so, such as hard iron, and with it
-the heading. The biases get more: sixteen times their standard deviation for a drift, three times
-the corrections that go one way, at most `MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
+position, too, as the correlations describe. The variance of the drift of GNSS positions, which may
+have absorbed an error of the position, is also multiplied, up to its stationary value. Slow errors
+of other sensors keep their variances: a constant one, such as hard iron, might remain uncertain
+after an inflation, and with it the heading. The biases are inflated more: sixteen times their
+standard deviation for a drift, three times the corrections that go one way, at most
+`MOST_ACCEL_BIAS` and `MOST_GYRO_BIAS`.
 
-No alarm inflates a standard deviation beyond `MOST_POSITION` and its like. States that are not
-observed for a time, such as the heading in hover without a baseline, or the position in an outage
-of GNSS, would otherwise grow fourfold with each alarm, until sigma points mean nothing. The bounds
-act as a congruence P -> M P M with M diagonal in the position, velocity and biases, and in tilt and
-heading, so that P stays positive definite.
+No alarm inflates a standard deviation beyond its bound, such as `MOST_POSITION`. States that are
+not observed for a time, such as the heading in hover without a baseline, or the position in an
+outage of GNSS, would otherwise grow fourfold with each alarm, until sigma points are meaningless.
+The bounds act as a congruence P -> M P M with M diagonal in the position, velocity and biases, and
+in tilt and heading, so that P stays positive definite.
 
 Source: ours.
 """
@@ -89,14 +90,14 @@ _BAROMETER_GROUP = AID_GROUPS + int(Aid.BAROMETER)
 
 @kernel
 def _mean_variance(flight, row):
-    """Mean variance of the three states from a row of the covariance on."""
+    """Mean variance of the three states that begin at a row of the covariance."""
     total = variance_of(flight, row) + variance_of(flight, row + 1)
     return (total + variance_of(flight, row + 2)) / 3.0
 
 
 @kernel
 def _inflate_biases(flight, P, row, drifting, going, square, most):
-    """Add to the variances of three biases from a row on, up to `most`."""
+    """Add to the variances of the three biases that begin at a row, up to `most`."""
     more = select(drifting, minimum(_BIAS_FACTOR * _mean_variance(flight, row), most * most), 0.0)
     more = more + select(going, enlarge(square, most), 0.0)
     for i in range(row, row + 3):
@@ -105,7 +106,7 @@ def _inflate_biases(flight, P, row, drifting, going, square, most):
 
 @kernel
 def _share(variance, most, inflated):
-    """What an inflated deviation keeps so as not to exceed `most`; at least that of before."""
+    """Factor that limits an inflated standard deviation to `most`, or to its former value."""
     return select(inflated, math.sqrt(clip(most * most / variance, 1.0 / _FACTOR, 1.0)), 1.0)
 
 
@@ -121,7 +122,7 @@ def _shrink_block(P, row, M, states):
 
 @kernel
 def _shrink_axes(P, row, most, inflated, states):
-    """Bound the inflation of three states, each by itself."""
+    """Bound the inflation of three states, each separately."""
     a = _share(P[row, row], most, inflated)
     b = _share(P[row + 1, row + 1], most, inflated)
     c = _share(P[row + 2, row + 2], most, inflated)
@@ -131,11 +132,11 @@ def _shrink_axes(P, row, most, inflated, states):
 
 @kernel
 def _inflate_drift(p, P, inflated):
-    """Inflate the drift of GNSS positions, to no more than its stationary deviation.
+    """Inflate the drift of GNSS positions, at most to its stationary standard deviation.
 
-    Its covariances with the other states stay as they are, so that correlations become weaker:
-    with the same ones, a fix, which observes the sum of position and drift, would separate them
-    where they are inflated unequally.
+    Its covariances with the other states stay as they are, so that correlations become weaker: with
+    unchanged ones, a fix, which observes the sum of position and drift, would separate them where
+    they are inflated unequally.
     """
     for i in range(3):
         a, s = p.slow_decay[i], p.slow_drive[i]
@@ -146,13 +147,13 @@ def _inflate_drift(p, P, inflated):
 
 @kernel
 def bound_inflation(flight, P, inflated, states):
-    """Take back from P what inflation by `_FACTOR` has put beyond the largest deviations.
+    """Reduce P where inflation by `_FACTOR` has exceeded the largest standard deviations.
 
     Args:
         flight: Record; reads R_hat, for the vertical.
         P: The inflated covariance, its lower triangle by blocks.
-        inflated: Which lanes are.
-        states: How many states there are, slow errors included.
+        inflated: Lanes in which P was inflated.
+        states: Number of states, slow errors included.
     """
     R_BI, P_ee = load33(flight.R_hat), load_block(P, E, E)
     k = (R_BI[0][2], R_BI[1][2], R_BI[2][2])

@@ -27,9 +27,9 @@ def gate_innovations(flight, p, work, settings, stages, mask, again):
         work: Workspace, with `nu` the innovation and `Rz` the measurement noise; on return,
             `left_out` is how many numbers were masked in each lane.
         settings: Configuration of the batch.
-        stages: Table of stages, with those of the sensors.
+        stages: Table of stages, with the sensors' stages.
         mask: Lanes to be updated.
-        again: Lanes in a later step of the same measurements.
+        again: Lanes that process these measurements in a later step.
     """
     zero = 0.0 * p.sigma_beta
     work.taking, work.again = select(mask, 1.0, 0.0), select(again, 1.0, 0.0)

@@ -3,9 +3,9 @@
 Where GNSS positions drift (`slow.py`), the filter predicts the motion better than the drift, so it
 attributes any offset of a fix to the drift, however sudden: once the drift has followed, no
 innovation is left. But corrections of the drift are white in a consistent filter, each with the
-variance that its update removes, like those of biases (`recovery.py`). Their sum over about a
+variance that its update removes, like corrections of biases (`recovery.py`). Their sum over about a
 second has the standard deviation of the drift in that time, 0.1 m with `consumer`, and shows jumps.
-Then position and drift are inflated alike. The same happens when a barometer is rejected
+Then both position and drift are inflated. This also happens when a barometer is rejected
 `max_rejections` times in a row, as it observes the vertical part of a jump.
 
 Source: ours.
@@ -21,9 +21,10 @@ _TIME = 1.5
 """Time over which corrections of the drift are summed [s]; the drift follows fixes within 0.6 s, or
 later while the gate rejects some."""
 _SUDDEN, _LIKELY = 24.0, 12.0
-"""Normalized square of their sum, chi-square with three degrees of freedom, beyond which it is a
-jump: exceeded with a probability of 2e-5 in a consistent filter. Less, 0.7 %, where the filter is
-flagged as diverged: a barometer may have seen the vertical part of the jump."""
+"""Normalized square of their sum, chi-square with three degrees of freedom, beyond which it counts
+as a jump: exceeded with a probability of 2e-5 in a consistent filter. The second threshold,
+exceeded with 0.7 %, applies where the filter is flagged as diverged: a barometer may have observed
+the vertical part of the jump."""
 
 
 @kernel
@@ -31,12 +32,12 @@ def follow_drift_corrections(flight, p, L9, dx, columns, ok):
     """Add up an update's corrections of the drift, and their variances, where `ok`.
 
     Args:
-        flight: Record; its factor is that before the update.
-        p: Parameters as the filter believes them.
-        L9: The factor that the update has made, its columns last first.
+        flight: Record, with the factor before the update.
+        p: Parameters assumed by the filter.
+        L9: The updated factor, last column first.
         dx: The correction of the state.
-        columns: How many columns there are.
-        ok: Which lanes.
+        columns: Number of columns.
+        ok: Lanes to work on.
     """
     kept = maximum(1.0 - (flight.tick - flight.corrected_tick) * p.dt / _TIME, 0.0)
     for i in range(3):
@@ -55,7 +56,7 @@ def follow_drift_corrections(flight, p, L9, dx, columns, ok):
 def drifts_suddenly(flight):
     """Lanes whose corrections exceed the drift and the standard deviation of the position.
 
-    Less than the latter does no harm.
+    Corrections below that standard deviation are harmless.
     """
     square, limit = 0.0 * flight.tick, select(flight.diverged > 0.0, _LIKELY, _SUDDEN)
     for i in range(3):
@@ -69,7 +70,7 @@ def drifts_suddenly(flight):
 def inflate_position_and_drift(flight, P, moved):
     """Inflate position and drift to the square of the likely jump.
 
-    Some axes follow it later than others, so none is inflated by less than the mean.
+    The axes do not follow it at the same time, so none is inflated by less than the mean.
     """
     mean = 0.0 * flight.tick
     for i in range(3):

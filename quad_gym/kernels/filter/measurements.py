@@ -2,7 +2,7 @@
 
 The stacked measurement has three rows for each block that any lane has measured, in the order of
 `Sensor`; each sensor fills its own rows (`kernels/sensors/`). A sensor is a stage that is called
-with an `Act` and an argument. The filter knows sensors by these calls only.
+with an `Act` and an argument. The filter accesses sensors by these calls only.
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel
@@ -48,7 +48,7 @@ def call_sensors(flight, world, model, settings, work, stages, act, argument):
 
 @kernel
 def call_measured(flight, p, work, settings, stages, act):
-    """Call the sensors that any lane has a measurement of, each with its first row."""
+    """Call the sensors with a measurement in any lane, each with its first row."""
     k = 0
     for sensor in range(SENSORS):
         rows = _rows_of(flight, settings, sensor)
@@ -72,7 +72,7 @@ def _rows_of(flight, settings, sensor):
 
 @kernel
 def count_measured(flight, work, settings):
-    """Fill work.measured with how many numbers each lane has; return the rows of all sensors."""
+    """Count the measured numbers of each lane in work.measured; return the rows of all sensors."""
     work.measured = 0.0 * flight.tick
     k = 0
     for sensor in range(SENSORS):
@@ -87,7 +87,7 @@ def count_measured(flight, work, settings):
 
 @kernel
 def store_valid(flight, work, settings):
-    """Store which blocks are valid, to update by one delayed sensor after the other."""
+    """Store the validity of all blocks, to update with one delayed sensor after the other."""
     for sensor in range(SENSORS):
         first = FIRST_BLOCK[sensor]
         for block in range(first, first + settings.sensor_blocks[sensor]):
@@ -96,7 +96,7 @@ def store_valid(flight, work, settings):
 
 @kernel
 def choose_valid(flight, work, settings, turn):
-    """Leave the blocks of one delayed sensor valid; if `turn` is SENSORS, all that are not delayed.
+    """Leave only one delayed sensor's blocks valid; if `turn` is SENSORS, all that are not delayed.
 
     Returns:
         Ticks of the sensor's delay.

@@ -1,4 +1,4 @@
-"""The unscented Kalman filter of the report, with its structure used and its result unchanged.
+"""The unscented Kalman filter of the report, with its structure exploited, its result unchanged.
 
 State (r_I, v_I, e, b_a, b_g) with the error Euler angles e about R_hat, as R_BI = R(e) R_hat. The
 filter stores the lower Cholesky factor L of its covariance P = L L^T. The sigma points are the same

@@ -1,6 +1,6 @@
-"""Consistency monitoring: alarms, and when the filter counts as diverged.
+"""Consistency monitoring: alarms, and the flag of a diverged filter.
 
-Four things show that the covariance does not explain the measurements; three are here.
+Four signs show that the covariance does not explain the measurements; three are detected here.
 
 * **Rejections.** A group of measurements was rejected `max_rejections` times in a row. Then the
   filter is more likely wrong than the sensor - unless GNSS is rejected while the camera's features
@@ -8,7 +8,7 @@ Four things show that the covariance does not explain the measurements; three ar
 * **Drifts.** Innovations of a consistent filter are white. Their mean over the last 50 or so, in
   standard deviations, exceeds `DRIFT_ALARM` in a consistent filter about once in a million times.
 * **Corrections that go one way.** Corrections of the IMU biases are white in a consistent filter,
-  too, each with the variance that its update removes, P- less P+. That is no more than the biases'
+  too, each with the variance that its update removes, P- minus P+. This is no more than the biases'
   driving noise adds, so their sum over some seconds shows a bias that has changed long before
   innovations do, in which attitude and position may compensate each other.
 * **Jumps of the drift** of GNSS positions, see `jumps.py`.
@@ -29,44 +29,44 @@ from quad_gym.kernels.simd.lanes import any_of, select
 from quad_gym.records import SENSOR_GROUPS
 
 DRIFT_ALARM = 0.55
-"""Mean of the last innovations, in deviations, from which on they drift."""
+"""Mean of the last innovations, in standard deviations, above which they drift."""
 _MEMORY = 0.02
-"""Weight of the latest innovation in the mean: it deviates by sqrt(0.02 / 1.98) = 0.1."""
+"""Weight of the latest innovation in the mean, of standard deviation sqrt(0.02 / 1.98) = 0.1."""
 _CORRECTION_TIME = 3.0
-"""How long corrections of the biases are added up [s]."""
+"""Time over which corrections of the biases are summed [s]."""
 _LONG_TIME = 12.0
-"""Likewise of errors that are small beside the noise: corrections of a bias make up for its error
-within P/Q, ten seconds and more, and show it all only by then [s]."""
+"""Time of the long sums, for errors that are small compared with the noise [s]: corrections of a
+bias compensate its error within P/Q, ten seconds or more, and show all of it only by then."""
 _ONE_WAY = 5.0
-"""Deviations of their sum from which on they go one way."""
+"""Standard deviations of their sum above which they go one way."""
 _ONE_WAY_LONG = 24.0
-"""Likewise the normalized square of three long sums, chi-square: beyond with a probability of 2e-5,
-and, as these sums last, once in many hours."""
+"""Normalized square of three long sums, chi-square, above which they go one way: exceeded with a
+probability of 2e-5, and, as these sums change slowly, once in many hours."""
 _HARMLESS = 1.0 / _ONE_WAY**2
-"""So that this sum is more than the bias's own deviation."""
+"""Share of the bias's variance in the test: the sum must also exceed its standard deviation."""
 LARGEST = 3.0
-"""Innovations count as no more deviations than that in the mean, for the sake of outliers."""
+"""Limit on each innovation in the mean, in standard deviations, because of outliers."""
 DIVERGED_RATIO, CONVERGED_RATIO = 2.1, 1.5
-"""Mean NIS over degrees of freedom at which a filter counts as diverged, and no longer does."""
+"""Mean NIS over degrees of freedom at which a filter is flagged as diverged, and no longer is."""
 _RATIO_MEMORY, _LARGEST_RATIO = 0.05, 10.0
 ALARM_TIME = 1.0
-"""Shortest time that a filter counts as diverged after an alarm [s]."""
+"""Shortest time for which a filter is flagged as diverged after an alarm [s]."""
 _LONGEST_MEMORY = 60.0
-"""How long it does at most where nothing is mended [s]: what a bias that hardly any measurement
-tells of does by then shows again."""
+"""Longest such time where no variance is inflated [s]: by then the effect of a bias that is barely
+observable shows again."""
 FITTING_FEATURES = 3
 """Fitting features of an image that support the estimate against GNSS."""
 _FIT_TIME = 1.0
-"""How long they support it [s]."""
+"""Time for which they support it [s]."""
 MOST_ACCEL_BIAS, MOST_GYRO_BIAS, MOST_TILT = 2.0, 0.1, 0.2
 """Largest standard deviations after an inflation [m/s^2], [rad/s], [rad]."""
 MOST_POSITION, MOST_VELOCITY = 100.0, 20.0
 """Largest standard deviations after an inflation [m], [m/s]. A rejected position counts in full."""
 _REMAINING = 9.0
-"""Square of how many times as large an error may be as what shows of it: corrections or drift of
-GNSS may have followed in part."""
+"""Square of the ratio of a possible error to its visible part: corrections or the drift of GNSS may
+have followed in part."""
 MOST_ANGLE = math.pi / math.sqrt(3.0)
-"""Largest deviation of an angle [rad]: of one that may be anything."""
+"""Largest standard deviation of an angle [rad], when it is unknown."""
 
 
 @kernel
@@ -86,12 +86,12 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
 
     Args:
         flight: Record.
-        p: Parameters as the filter believes them.
+        p: Parameters assumed by the filter.
         L: The factor before the update.
         L9: The columns of the factor that the update has changed.
         dx: The correction of the state.
-        columns: How many columns these are.
-        ok: Which lanes.
+        columns: Number of these columns.
+        ok: Lanes to work on.
     """
     passed = (flight.tick - flight.corrected_tick) * p.dt
     kept = maximum(1.0 - passed / _CORRECTION_TIME, 0.0)
@@ -115,7 +115,7 @@ def follow_corrections(flight, p, L, L9, dx, columns, ok):
 
 @kernel
 def variance_of(flight, row):
-    """Variance of a state, by its row of the factor."""
+    """Variance of a state, from its row of the factor."""
     variance = 0.0 * flight.tick
     for j in range(15):
         if j <= row:
@@ -125,10 +125,10 @@ def variance_of(flight, row):
 
 @kernel
 def one_way(flight, first):
-    """Where the corrections of three biases from `first` on go one way, and how far [squared].
+    """Lanes in which corrections of three biases from `first` on go one way; how far, squared.
 
-    They must add up to more than the deviation that the bias has: less does no harm, and may be
-    what rounding leaves of corrections by measurements that do not tell of biases yet.
+    Their sum must exceed the standard deviation of the bias: a smaller one is harmless, and may be
+    a rounding error of corrections by measurements that do not observe biases yet.
     """
     largest, square = -1.0 + 0.0 * flight.tick, 0.0 * flight.tick
     together = square
@@ -213,7 +213,7 @@ def time_of(flight, p, group):
 
 @kernel
 def enlarge(square, most):
-    """Variance of an error of which the `square` of a part shows, up to a deviation of `most`."""
+    """Variance of an error whose visible part has the `square`, at most `most` squared."""
     return minimum(_REMAINING * square, most * most)
 
 
@@ -226,7 +226,7 @@ def raise_diagonal(P, first, least):
 
 @kernel
 def inflate_accel_bias(p, P, acceleration, alarm):
-    """Raise the standard deviations of accelerometer biases, and 1/g of it of the tilt."""
+    """Raise the standard deviations of accelerometer biases, and of the tilt in proportion."""
     bounded = minimum(acceleration, MOST_ACCEL_BIAS)
     raise_diagonal(P, BA, select(alarm > 0.0, bounded * bounded, 0.0))
     tilt = minimum(acceleration / p.gravity, MOST_TILT)
@@ -252,12 +252,12 @@ def inflate_heading(P, vertical, square, alarm):
 
 @kernel
 def _memory(flight, p, i, drive):
-    """How long what is wrong with a bias takes to fall to a third by corrections [s].
+    """Time in which corrections reduce the error of a bias to a third [s].
 
-    Of its variance P updates take away what they have lately, so that an error falls at the rate of
-    that over P. In the long run that is the Q that drives the bias; where a start has left P
-    larger, it is more. Innovations show an error of n deviations as n over the root of two, by all
-    of them together: what is left when they no longer tell is up to some seven.
+    Updates reduce its variance P at the recent rate, so an error decays at this rate over P. In the
+    long run the rate is the Q that drives the bias; while P is still larger after a start, it is
+    higher. All innovations together show an error of n standard deviations as n over the root of
+    two: when they no longer show it, up to about seven may remain.
     """
     variance = variance_of(flight, BA + i)
     taken = flight.corrected_long_variance[i] / (0.5 * _LONG_TIME)
@@ -270,7 +270,7 @@ def flag_drifts(flight, p, mask):
     """Flag a filter without a gate as diverged while innovations drift, in the lanes `mask`.
 
     The mean of a sensor that no longer measures is outdated and does not count. As nothing is
-    inflated, the flag stays for as long as the biases take to be corrected.
+    inflated, the flag stays until the biases have been corrected.
     """
     drifting = flight.nis_ratio > DIVERGED_RATIO
     for group in range(SENSOR_GROUPS):

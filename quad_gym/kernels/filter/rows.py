@@ -1,4 +1,4 @@
-"""The rows of a block in the stacked measurement; zero, with noise one, where it is not measured.
+"""Rows of a block in the stacked measurement: zero, with noise one, where it is not measured.
 
 Column j of the factor L is row `last - j` of work.A, and row 8 - j of work.E.
 """

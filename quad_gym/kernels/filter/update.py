@@ -1,13 +1,13 @@
 """The measurement update of the filter, with all blocks of a measurement at once.
 
 See `predict.py` for the form of the unscented transform. Sensors (`kernels/sensors/`) fill three
-rows of the stacked measurement for each block. A block that a lane lacks is masked: its deviations
-and innovation are zero and its noise is one, which gives exactly the update without it. Blocks that
-no lane has are left out.
+rows of the stacked measurement for each block. A block that a lane lacks is masked: its columns and
+innovation are zero and its noise is one, which gives exactly the update without it. Blocks that no
+lane has are left out.
 
 The EKF shares everything with the UKF: where the UKF puts the half-differences of a pair of sigma
 points into a column, the EKF puts the derivative of the model times the column of L; the half-sums
-less the center, which carry the second order, are zero.
+minus the center, which carry the second order, are zero.
 """
 
 import math
@@ -78,7 +78,7 @@ def _split_turns(flight, work, c):
 
 @kernel
 def _innovate(work, n, c):
-    """Fill work.nu, the innovation: the measurement less the mean of the sigma points."""
+    """Fill work.nu, the innovation: the measurement minus the mean of the sigma points."""
     S, mu = work.E, work.mu
     for k in range(n):
         total = S[0, k]
@@ -123,17 +123,17 @@ def update(flight, p, work, settings, stages, mask, slow=None):
 
     With GRADUAL, lanes whose attitude is uncertain process images in steps: three updates by the
     same measurements with more noise, or seven where a direction is uncertain by `_VAGUE`, each
-    about the estimate that the one before has left. Their information adds up to that of the
-    measurements, so it makes no difference for a linear model; the derivatives of this one are
-    taken where they matter. (R. Zanetti, "Recursive Update Filtering for Nonlinear Estimation",
-    IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
+    about the estimate from the one before. The information of the steps adds up to the
+    measurements' own, so a linear model gives the same result as one step; the derivatives of this
+    nonlinear one are taken where they matter. (R. Zanetti, "Recursive Update Filtering for
+    Nonlinear Estimation", IEEE Trans. Automatic Control 57(6), 2012, on the idea.)
 
     Args:
         flight: Record; reads the measurements and their validity, changes the estimate.
         p: Parameters assumed by the filter.
         work: Workspace.
         settings: The filter's form and its sensors.
-        stages: Table of stages, with those of the sensors.
+        stages: Table of stages, with the sensors' stages.
         mask: Lanes to work on.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
@@ -162,11 +162,12 @@ def update(flight, p, work, settings, stages, mask, slow=None):
 
 @kernel
 def _are_loose(flight, p, work, feature_count):
-    """Lanes in which the direction of a visible feature is uncertain, and those by `_VAGUE`.
+    """Lanes in which a visible feature's direction is uncertain, and lanes where it is by `_VAGUE`.
 
-    Uncertain is more than `recursive_update_threshold`; features that are left out do not count as
-    vague. A direction is off by the errors of attitude and position, whose share is the larger the
-    nearer the feature is. Keeps where that is more than a linear model bears even in steps.
+    A direction is uncertain above `recursive_update_threshold`; features that are left out do not
+    count as vague. Its error comes from attitude and position; the position's share grows as the
+    feature gets nearer. Set work.hidden for features too uncertain for a linear model even in
+    steps.
     """
     P_rr, P_ee = sum_of_squares(flight.L, R, 3), sum_of_squares(flight.L, E, 9)
     position = P_rr[0][0] + P_rr[1][1] + P_rr[2][2]
@@ -187,7 +188,7 @@ def _are_loose(flight, p, work, feature_count):
 
 @kernel
 def _hide_unsure(flight, work, feature_count, mask):
-    """Hide features whose directions are too uncertain to make use of; return where there are any.
+    """Hide features whose directions are too uncertain to use; return the lanes that have any.
 
     Each step would infer a wrong distance from a wrong direction and make the filter overconfident.
     """
@@ -218,7 +219,7 @@ def _show_hidden(flight, work, settings, mask):
 
 @kernel
 def _whiten(work, n, columns):
-    """Solve the update: NIS, and where the noise is positive definite.
+    """Solve the update; return the NIS, and the lanes in which the noise is positive definite.
 
     On return, work.M is the factor K of I + C C^T = K K^T with C = A^T Rz^(-T/2), and work.t is
     K^-1 C Rz^(-1/2) nu.
@@ -297,7 +298,7 @@ def _keep(flight, p, work, form, columns, ok, slow):
 def _update_by(flight, p, work, settings, stages, mask, factor, again, slow):
     """Update with the measurements, their noise multiplied by `factor`, in the lanes `mask`.
 
-    `again`: lanes in a later step of the same measurements.
+    `again`: lanes that process these measurements in a later step.
     """
     n, form = count_measured(flight, work, settings), settings.form
     if n == 0:

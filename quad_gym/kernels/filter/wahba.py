@@ -36,7 +36,7 @@ def _rotate_pair(a, b, v, w):
 
 @kernel
 def _perpendicular(a):
-    """Some vector perpendicular to the unit vector a, not short."""
+    """A vector perpendicular to the unit vector a, with a length well above zero."""
     return select3(abs(a[0]) < 0.6, cross(a, (1.0, 0.0, 0.0)), cross(a, (0.0, 1.0, 0.0)))
 
 

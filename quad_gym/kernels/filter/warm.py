@@ -1,10 +1,10 @@
 """A warm start: the filter has been running before the episode begins, and has converged.
 
-Its covariance P is one that filters of the same configuration reach, turned to the heading of the
-start; its errors are drawn from exactly that covariance. They go with the true biases as those of a
-real filter do, whose estimate and error are independent: of P = W W^T, the last six columns of W
-belong to the standard normals that the true biases were drawn with. Where the filter estimates the
-slow errors of sensors, these go with the true ones likewise.
+Its covariance P is one that filters with this configuration reach, rotated to the heading of the
+start; its errors are drawn from exactly this covariance. They are correlated with the true biases
+as in a real filter, whose estimate and error are independent: with P = W W^T, the last six columns
+of W multiply the standard normals that the true biases were drawn with. Estimates of slow errors of
+sensors are correlated with the true ones in the same way.
 """
 
 from quad_gym.kernels.compiling import kernel, stage
@@ -42,7 +42,7 @@ from quad_gym.records import (
 
 @kernel
 def _heading(R_BI):
-    """The turn about the vertical that takes east to where the body x axis points: v_I = T v_0."""
+    """Rotation about the vertical from east to the direction of the body x axis: v_I = T v_0."""
     zero = 0.0 * R_BI[0][0]
     one = zero + 1.0
     c, s, _ = unit_or((R_BI[0][0], R_BI[0][1], zero), (one, zero, zero))
@@ -51,7 +51,7 @@ def _heading(R_BI):
 
 @kernel
 def _draw_errors(settings, stream, work, slow, T):
-    """Fill work.dx with the errors W u of a vehicle that looks east; return the normals of d."""
+    """Fill work.dx with the errors W u of a vehicle that faces east; return the normals of d."""
     states, draws = 15, WARM_DRAWS
     if slow is not None:
         states, draws = 15 + slow.slow_states, WARM_DRAWS + 2 * slow.slow_states
@@ -65,7 +65,7 @@ def _draw_errors(settings, stream, work, slow, T):
     if slow is not None:
         for i in range(slow.slow_states):
             k = WARM_DRAWS + i + i // 3 * 3
-            u[k], u[k + 3] = normal_pair(stream, DRAW_SLOW + i)  # the second made the true error
+            u[k], u[k + 3] = normal_pair(stream, DRAW_SLOW + i)  # the second gave the true error
         for s in range(AIDS):
             k = WARM_DRAWS + 2 * slow.aid_vector[s] + 3
             if slow.aid_vector[s] >= 0:  # as seen from I, as its errors are
@@ -84,10 +84,10 @@ def _draw_errors(settings, stream, work, slow, T):
 
 @kernel
 def _turn_of_slow(slow, i, T, other):
-    """The turn from a vehicle that looks east of the states from `i` on, slow ones among them.
+    """Rotation of three states from `i` on, slow errors included, of a vehicle that faces east.
 
-    The drift of positions is in I, as positions are. What aiding sensors have of three numbers is
-    in B, but goes with the heading as seen from I, see `batch/warm_start.py`.
+    The drift of positions is in I, as positions are. Vectors of aiding sensors are in B, but rotate
+    with the heading as seen from I, see `batch/warm_start.py`.
     """
     turn = other
     if slow.estimates_drift and i == D:
@@ -100,7 +100,7 @@ def _turn_of_slow(slow, i, T, other):
 
 @kernel
 def _start_aids(flight, slow, T, d, mask):
-    """Estimates of the slow errors of aiding sensors: the true ones less their errors."""
+    """Set the estimates of slow errors of aiding sensors: the true ones minus the drawn errors."""
     for s in range(AIDS):
         k = slow.aid_vector[s]
         if k >= 0:
@@ -119,10 +119,10 @@ def start_warm(flight, settings, stream, work, mask, slow=None):
 
     Args:
         flight: Record with the true state and biases; the estimate is set.
-        settings: Has the covariance P of a vehicle that looks east, and the root W of it.
+        settings: Has the covariance P of a vehicle that faces east, and its root W.
         stream: The random stream at the episode's first instant.
         work: Workspace.
-        mask: Which lanes.
+        mask: Lanes to work on.
         slow: The settings, where sensors have slow errors, see `slow.py`, or None.
     """
     states = 15
@@ -175,6 +175,6 @@ def warm_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def warm_with_slow_stage(flight, world, model, settings, work, stages, flag):
-    """The same of a filter that estimates slow errors of sensors."""
+    """Start a converged filter that estimates slow errors of sensors."""
     flying, scratch = lanes_of(flight), lanes_of(work)
     start_warm(flying, settings, stream_of(flying), scratch, scratch.mask > 0.0, settings)

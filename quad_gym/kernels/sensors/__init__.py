@@ -1,1 +1,1 @@
-"""What the sensors measure, and the faults that corrupt it. Imports maths and vehicle."""
+"""Measurements of the sensors, and faults that corrupt them. Imports maths and vehicle."""

@@ -1,4 +1,4 @@
-"""Shared by sensors with parameters in the fields `aid_...`: errors, delivery and gate.
+"""Errors, delivery and gate shared by the sensors with parameters in the fields `aid_...`.
 
 A sensor has one block of up to three numbers. It may have a slow error of three numbers, constant
 in an episode, a Gauss-Markov error of one number, and constant errors of scale and alignment.
@@ -94,7 +94,7 @@ def deliver_first(flight, s, mask, values):
 
 @kernel
 def deliver(flight, work, settings, s, mask, due, values):
-    """Deliver what sensor s measures in the lanes `due`, now or after its latency."""
+    """Deliver the measurement of sensor s in the lanes `due`, now or after its latency."""
     sensor, block, measurement = FIRST_AID + s, AID_BLOCKS + s, flight.aid_measurement[s]
     if settings.faults:
         due = due & (flight.fault_active[_LOSS + s] <= 0.0)

@@ -9,7 +9,7 @@ R_hat = (I + even +- odd) R_hat, the vector before normalization is odd and even
 X_B = R_hat (X - r_hat), dr_B = R_hat dr; the derivative along an offset of a feature seen at
 distance s along u is (I - u u^T) (X_B x de - dr_B) / s.
 
-Each feature is a block of its own; an image is one group of the gate.
+Each feature is a separate block; an image is one group of the gate.
 """
 
 import math
@@ -73,14 +73,14 @@ from quad_gym.records import DRAW_FEATURE, DRAW_PHASE, FEATURE_BLOCKS, FilterFor
 
 _CAMERA, _EKF, _GATE = int(Sensor.CAMERA), int(FilterForm.EKF), int(FilterForm.GATE)
 
-_PIXEL = 2e-6  # [m]; it cancels, and no parameter has it: the report writes rays in meters
+_PIXEL = 2e-6  # [m]; it cancels, so it is no parameter: the report writes rays in meters
 
 # ---- simulation ------------------------------------------------------------------------------
 
 
 @kernel
 def project(X_I, r_I, R_BI, p):
-    """Pixel of a point, and whether it is in front of the camera and inside the image."""
+    """Pixel of a point, and the lanes in which it is in front of the camera and in the image."""
     v_C = apply(load33(p.R_CB), sub(apply(R_BI, sub(X_I, r_I)), load3(p.camera)))
     in_front = v_C[2] > 1e-9
     per_depth = p.focal_length / select(in_front, v_C[2], 1.0)
@@ -175,7 +175,7 @@ def _center(flight, p, work, settings, k):
             predicted = scale(work.inverse_distance[i], to_feature)
             u_B = select3(p.noise_at_prediction > 0.0, predicted, u_B)
             noise = direction_noise(u_B, sigma * sigma, p.direction_floor)
-            # a pixel does not move along the optical axis c: less c c^T, across u
+            # a pixel does not move along the optical axis c: minus c c^T, across u
             across = add_scaled(R_CB[2], -dot(R_CB[2], u_B), u_B)
             less = scale(-p.noise_pinhole * sigma * sigma, across)
             put_noise(work, k, valid, add_outer(noise, less, across))
@@ -270,7 +270,7 @@ def _gate(flight, p, work, settings, k):
 def _inflate(flight, p, work, settings):
     """Inflate attitude, position and gyro biases after rejections of whole images.
 
-    The attitude is inflated by the largest innovation, the position by the offset that it means at
+    The attitude is inflated by the largest innovation, the position by the corresponding offset at
     the feature's distance.
     """
     angle, offset, P = 0.0 * flight.tick, 0.0 * flight.tick, work.P

@@ -1,4 +1,4 @@
-"""Clocks of sensors: when they measure first, and next."""
+"""Clocks of sensors: the ticks of their first and next measurements."""
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.sensors.latency import forget_stamps
@@ -21,7 +21,7 @@ def _first_wait(phase, period, share):
 def begin_clock(flight, settings, sensor, share, mask):
     """Begin an episode of a sensor, in the lanes `mask`: nothing is measured yet.
 
-    A random phase is the `share` of the period.
+    A random phase is a `share` of the period.
     """
     wait = _first_wait(settings.sensor_phase[sensor], settings.sensor_ticks[sensor], share)
     flight.wait[sensor] = select(mask, wait, flight.wait[sensor])

@@ -1,9 +1,9 @@
-"""Faults of sensors and rotors: when they come and go, and what they do.
+"""Faults of sensors and rotors: their times and their effects.
 
 A fault of kind k is active at the ticks from `fault_from[k]` until before `fault_until[k]`. Both
-are drawn when an episode begins, and again when a fault that comes at a rate has gone; its size and
-direction are drawn when it comes. Every draw has a number of its own within its instant, so that a
-fault changes no other draw. All branches are on settings, but for `any_of` to skip idle work.
+are drawn when an episode begins, and again when a fault that occurs at a rate has ended; its size
+and direction are drawn when it begins. Every draw has its own number within its instant, so that a
+fault changes no other draw. All branches are on settings, except `any_of` to skip idle work.
 """
 
 import math
@@ -37,7 +37,7 @@ from quad_gym.records import (
 _FIRST, _FIRST_HIDDEN = np.uint64(DRAW_FAULTS), np.uint64(DRAW_HIDDEN)
 _DRAWS = np.uint64(DRAWS_OF_FAULT)
 NEVER = 1e18
-"""A tick that no flight lives to see."""
+"""A tick that no flight reaches."""
 
 _ONE, _TWO = np.uint64(1), np.uint64(2)
 _THREE, _FOUR, _FIVE = np.uint64(3), np.uint64(4), np.uint64(5)
@@ -61,7 +61,7 @@ def _draw_of(k):
 
 @kernel
 def _draw_when(flight, settings, stream, k, mask):
-    """Draw when fault k comes, from the present instant on, and goes, where `mask`."""
+    """Draw when fault k begins, from the present instant on, and when it ends, where `mask`."""
     chance, u = uniform_pair(stream, _draw_of(k))
     length, _ = uniform_pair(stream, _draw_of(k) + _ONE)
     if settings.fault_rate[k] > 0.0:  # waits of a Poisson process
@@ -102,7 +102,7 @@ def _draw_what(flight, settings, stream, k, mask):
 
 @kernel
 def _step_bias(bias, vector, decay, news, active):
-    """Add a step to a bias that has just decayed, so that the step itself does not."""
+    """Add a step to a bias that has just decayed, so that the step itself does not decay."""
     for i in range(3):
         held = select(active > 0.0, (1.0 - decay) * vector[i], 0.0)
         step = select(news > 0.0, vector[i], select(news < 0.0, -decay * vector[i], held))
@@ -111,7 +111,7 @@ def _step_bias(bias, vector, decay, news, active):
 
 @kernel
 def _hide_features(flight, settings, stream, came):
-    """Draw which features an occlusion hides, where it has come."""
+    """Draw the features that an occlusion hides, where it has begun."""
     share = settings.fault_share[_OCCLUSION]
     for i in range(settings.feature_count):
         u, _ = uniform_pair(stream, _FIRST_HIDDEN + np.uint64(i))
@@ -121,7 +121,7 @@ def _hide_features(flight, settings, stream, came):
 
 @kernel
 def _weaken_rotors(flight, world, settings):
-    """Set the true effectiveness of the rotors as they are at the present instant."""
+    """Set the true effectiveness of the rotors at the present instant."""
     lost = flight.fault_active[_ROTOR_LOSS] > 0.0
     which = 4.0 * flight.fault_pick[_ROTOR_LOSS]
     for i in range(4):
@@ -134,12 +134,12 @@ def _weaken_rotors(flight, world, settings):
 
 @kernel
 def meet_rotors(flight, world, settings):
-    """Give the rotors of the flights at hand their faults, after `impose` has put `world` together.
+    """Apply the rotors' faults of the present flights, after `impose` has assembled `world`.
 
     Args:
         flight: Record.
-        world: Parameters as they are, this thread's own.
-        settings: What the batch does.
+        world: True parameters, this thread's own.
+        settings: Configuration of the batch.
     """
     if settings.fault_on[_ROTOR_LOSS]:
         if settings.randomized:
@@ -151,16 +151,16 @@ def meet_rotors(flight, world, settings):
 
 @kernel
 def advance_faults(flight, world, settings, mask):
-    """Let faults come and go at the present instant, where `mask`.
+    """Begin and end faults at the present instant, in the lanes `mask`.
 
-    A position jump displaces the vehicle; a bias step enters the true bias; a rotor loss the true
-    effectiveness. What faults do to measurements, the sensors' kernels below do.
+    A position jump displaces the vehicle; a bias step changes the true bias; a rotor loss the true
+    effectiveness. The kernels below apply the effects of faults on measurements.
 
     Args:
         flight: Record.
-        world: Parameters as they are; this thread's own where rotors can fail.
-        settings: What the batch does.
-        mask: Which lanes.
+        world: True parameters; this thread's own where rotors can fail.
+        settings: Configuration of the batch.
+        mask: Lanes to work on.
     """
     stream = stream_of(flight)
     bits, bit = 0.0 * flight.tick, 1.0
@@ -206,14 +206,14 @@ def advance_faults(flight, world, settings, mask):
 
 @kernel
 def begin_faults(flight, world, settings, stream, mask):
-    """Draw when the faults of a new episode come, where `mask`.
+    """Draw the times of the faults of a new episode, in the lanes `mask`.
 
     Args:
-        flight: Record, with the true state of the start.
-        world: Parameters as they are; this thread's own where rotors can fail.
-        settings: What the batch does.
+        flight: Record, with the true initial state.
+        world: True parameters; this thread's own where rotors can fail.
+        settings: Configuration of the batch.
         stream: The random stream at the episode's first instant.
-        mask: Which lanes.
+        mask: Lanes to work on.
     """
     for k in range(FAULT_KINDS):
         if settings.fault_on[k]:
@@ -231,12 +231,12 @@ def begin_faults(flight, world, settings, stream, mask):
     advance_faults(flight, world, settings, mask)
 
 
-# ---- what the sensors make of them ------------------------------------------------------------
+# ---- effects on measurements ------------------------------------------------------------------
 
 
 @kernel
 def saturate_imu(flight, settings, mask):
-    """Hold the IMU's samples within its ranges, where the fault is active and `mask`."""
+    """Limit the IMU's samples to its ranges, where the fault is active and `mask`."""
     if settings.fault_on[_SATURATION]:
         full = mask & (flight.fault_active[_SATURATION] > 0.0)
         a, w = settings.imu_range[0], settings.imu_range[1]
@@ -248,7 +248,7 @@ def saturate_imu(flight, settings, mask):
 
 @kernel
 def gnss_heard(flight, settings, due):
-    """Where GNSS has a position, and where a baseline, of those that are due."""
+    """Lanes in which GNSS has a position, and lanes in which it has a baseline, among those due."""
     heard = due
     if settings.fault_on[_GNSS_OUTAGE]:
         heard = heard & (flight.fault_active[_GNSS_OUTAGE] <= 0.0)
@@ -260,10 +260,10 @@ def gnss_heard(flight, settings, due):
 
 @kernel
 def _draw_outlier(flight, p, settings, mask):
-    """An outlier's offset in I, zero where this fix is none.
+    """Offset of an outlier in I; zero where this fix is not an outlier.
 
-    Its size counts in standard deviations of a fix, of which the slow error is a part: that has the
-    variance drive^2 / (1 - decay^2).
+    Its size is measured in standard deviations of a fix. These include the slow error, which has
+    the variance drive^2 / (1 - decay^2).
     """
     k = _OUTLIERS
     stream = stream_of(flight)
@@ -303,9 +303,9 @@ def corrupt_gnss(flight, p, settings, mask):
 
 @kernel
 def _mistake_features(flight, settings, mask):
-    """Take one seen feature for another in the image just taken, where `mask` and chance say so.
+    """Confuse two visible features in the image just taken, at random in the lanes `mask`.
 
-    The two are the `first`-th and the `second`-th of those seen, counted from zero.
+    The two are the `first`-th and the `second`-th visible ones, counted from zero.
     """
     k = _ASSOCIATIONS
     stream = stream_of(flight)
@@ -351,9 +351,9 @@ def _mistake_features(flight, settings, mask):
 
 @kernel
 def corrupt_features(flight, settings, mask):
-    """Hide features of the image just taken and mistake some for others, where `mask`.
+    """Hide features of the image just taken and confuse some with others, in the lanes `mask`.
 
-    A feature hidden now counts as not seen in the whole step.
+    A feature hidden now counts as not visible in the whole step.
     """
     if settings.fault_on[_OCCLUSION]:
         covered = mask & (flight.fault_active[_OCCLUSION] > 0.0)
@@ -370,7 +370,7 @@ def corrupt_features(flight, settings, mask):
 
 @stage
 def begin_faults_stage(flight, world, model, settings, work, stages, flag):
-    """Draw when the faults of a new episode come."""
+    """Draw the times of the faults of a new episode."""
     flying = lanes_of(flight)
     mask = lanes_of(work).mask > 0.0
     begin_faults(flying, lanes_of(world), settings, stream_of(flying), mask)
@@ -378,19 +378,19 @@ def begin_faults_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def advance_faults_stage(flight, world, model, settings, work, stages, flag):
-    """Let faults come and go at the present instant."""
+    """Begin and end faults at the present instant."""
     advance_faults(lanes_of(flight), lanes_of(world), settings, lanes_of(work).mask > 0.0)
 
 
 @stage
 def meet_rotors_stage(flight, world, model, settings, work, stages, flag):
-    """Give the rotors of the flights at hand their faults."""
+    """Apply the rotors' faults of the present flights."""
     meet_rotors(lanes_of(flight), lanes_of(world), settings)
 
 
 @stage
 def saturate_imu_stage(flight, world, model, settings, work, stages, flag):
-    """Hold the IMU's samples within its ranges."""
+    """Limit the IMU's samples to its ranges."""
     saturate_imu(lanes_of(flight), settings, lanes_of(work).mask > 0.0)
 
 

@@ -40,7 +40,7 @@ def _begin(flight, p, settings, mask):
 
 @kernel
 def measure_gnss(flight, p, paired, mask):
-    """Measure antenna position and, if `paired`, the baseline in G, in the lanes `mask`."""
+    """Measure the antenna's position and, if `paired`, the baseline, in G, in the lanes `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     n_p, n_b = six_normals(stream_of(flight), DRAW_GNSS)
     gnss_position.measure(flight, p, R_BI, n_p, mask)

@@ -54,14 +54,14 @@ from quad_gym.records import BASELINE_BLOCK, FilterForm
 
 _EKF = int(FilterForm.EKF)
 _COARSE = 0.05
-"""Noise up to which that is left out [rad], as of the laboratory: it makes no difference."""
+"""Noise up to which this term is left out [rad], as in the laboratory: it makes no difference."""
 
 # ---- simulation ------------------------------------------------------------------------------
 
 
 @kernel
 def noisy_baseline(r_b, normals, sigma_b, floor, length):
-    """A measured baseline: covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I, known length.
+    """Measured baseline of known length, covariance |r_b|^2 sigma_b^2 (I - u u^T) + floor I.
 
     The symmetric root of that covariance is a (I - u u^T) + b u u^T (report equation 1, section
     3.1).
@@ -138,7 +138,7 @@ def gate(flight, p, work, settings, k):
     )
     first = valid & logical_not(work.again > 0.0)
     follow_drift(flight, BASELINE_BLOCK, first, scaled[0], scaled[1], 0.0 * p.sigma_beta)
-    # as for positions, see there
+    # as for positions, see `gnss_position.py`
     add_nis(work, first & logical_not(rejected & camera_fits(flight, p)), nis, 2.0)
     mask_rejected(flight, work, settings, k, BASELINE_BLOCK, valid, rejected, 3.0)
     return k + 3
@@ -151,7 +151,7 @@ def gate(flight, p, work, settings, k):
 def inflate(flight, p, work, settings):
     """Inflate the attitude and the gyro biases.
 
-    The heading is inflated by the innovation to the side, roll and pitch by the one up.
+    The heading is inflated by the sideward innovation, roll and pitch by the upward one.
     """
     R_BI, P, alarm = load33(flight.R_hat), work.P, work.alarm[BASELINE_BLOCK]
     vertical = (R_BI[0][2], R_BI[1][2], R_BI[2][2])

@@ -165,10 +165,10 @@ def inflate(flight, p, work, settings):
 def _has_jumped(flight, p, work):
     """Lanes in which the vehicle, or GNSS, has likely jumped.
 
-    Positions raise an alarm; or another sensor does, while at least two consecutive fixes are
+    Positions raise an alarm; or another sensor does while at least two consecutive fixes are
     rejected, as a single one may be an outlier; or innovations of fixes drift. A jump shows in
-    these as often as in the sum of the drift's corrections (`filter/jumps.py`). A camera that fits
-    speaks against a jump.
+    these innovations as often as in the sum of the drift's corrections (`filter/jumps.py`). A
+    camera that fits is evidence against a jump.
     """
     alarm = work.drifting
     for group in range(SENSOR_GROUPS):

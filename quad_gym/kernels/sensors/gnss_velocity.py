@@ -2,9 +2,9 @@
 
 It measures `z = v + R^T (w x l_p) + v_noise` in I, with body rates w from the gyro. The lever arm's
 share depends on the attitude. Filters with slow errors take this into account (`filter/slow.py`):
-where a magnetometer gives the heading, it is off by some degrees, and the share of a vehicle that
-turns with 6 rad/s by 0.02 m/s. Where two antennas give the heading to half a degree, it is
-neglected, so that the model is linear: dz = dv.
+where a magnetometer gives the heading, it is off by a few degrees, and the share at 6 rad/s by 0.02
+m/s. Where two antennas give the heading to half a degree, this is neglected, so that the model is
+linear: dz = dv.
 """
 
 from quad_gym.kernels.compiling import kernel

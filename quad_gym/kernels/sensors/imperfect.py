@@ -1,6 +1,6 @@
-"""What real sensors do beside noise and bias: errors that last an episode, vibration, blur.
+"""Imperfections of real sensors besides noise and bias: constant errors, vibration, blur.
 
-Each acts on a measurement that has just been taken and has draws of its own, so that it changes
+Each acts on a measurement that has just been taken and has its own draws, so that it changes
 nothing else.
 """
 
@@ -36,12 +36,12 @@ from quad_gym.records import (
 )
 
 HIDDEN_BELOW = 1e-3
-"""A feature on the ground is not below it [m]."""
+"""Depth below the ground at which a feature is hidden [m]: one on the ground is visible."""
 
 
 @kernel
 def _errors(on, off, n, m, k):
-    """D of a sensor: scale errors on the diagonal, those of alignment off it."""
+    """Error matrix D of a sensor: scale errors on the diagonal, alignment errors off it."""
     return (
         (on * n[0], off * n[1], off * n[2]),
         (off * m[0], on * m[1], off * m[2]),
@@ -109,20 +109,20 @@ def turn_baseline(flight, p, mask):
 
 @kernel
 def limit_camera(flight, p, blurs, ground_hides, feature_count, mask):
-    """Blur the image just taken, and lose what is too far or behind the ground, where `mask`.
+    """Blur the image just taken; drop features too far or behind the ground, where `mask`.
 
     Args:
         flight: Record, with the image.
-        p: Parameters as they are.
-        blurs: Whether images are blurred.
-        ground_hides: Whether the ground hides features.
+        p: True parameters.
+        blurs: True if images are blurred.
+        ground_hides: True if the ground hides features.
         feature_count: Features in use.
-        mask: Which lanes.
+        mask: Lanes to work on.
     """
     stream = stream_of(flight)
     camera_I = apply_transposed(quaternion_to_dcm(load4(flight.q)), load3(p.camera))
     camera_I = add(load3(flight.r), camera_I)
-    # as far as the smear reaches either way, evenly: sqrt(3) standard deviations
+    # uniform over the smear in both directions: sqrt(3) standard deviations
     reach = 1.7320508075688772 * p.blur * norm(load3(flight.w))
     above = camera_I[2] >= p.ground_height
     for i in range(feature_count):
@@ -157,7 +157,7 @@ def begin_imperfect_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def disturb_imu_stage(flight, world, model, settings, work, stages, flag):
-    """Err and vibrate with the IMU's sample."""
+    """Add the IMU's constant errors and vibration to its sample."""
     flying, true, mask = lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0
     if settings.imu_errs:
         err_imu(flying, true, mask)
@@ -167,13 +167,13 @@ def disturb_imu_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def turn_baseline_stage(flight, world, model, settings, work, stages, flag):
-    """Give the baseline just measured its constant error."""
+    """Apply the constant error to the baseline just measured."""
     turn_baseline(lanes_of(flight), lanes_of(world), lanes_of(work).mask > 0.0)
 
 
 @stage
 def limit_camera_stage(flight, world, model, settings, work, stages, flag):
-    """Blur the image just taken, and lose what is too far or behind the ground."""
+    """Blur the image just taken; drop features too far or behind the ground."""
     mask, count = lanes_of(work).mask > 0.0, settings.feature_count
     blurs, hides = settings.camera_blurs, settings.ground_hides
     limit_camera(lanes_of(flight), lanes_of(world), blurs, hides, count, mask)

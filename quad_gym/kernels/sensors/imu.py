@@ -1,7 +1,7 @@
 """The IMU: its measurements, and the drift of its biases.
 
-Every draw has a fixed number within its instant, so that a measurement does not depend on which
-others are taken.
+Every draw has a fixed number within its instant, so that a measurement does not depend on other
+measurements.
 """
 
 from quad_gym.kernels.compiling import Stage, call_stage, kernel, stage
@@ -78,17 +78,17 @@ def measure_imu(flight, p, mask):
 def measure_imu_average(flight, p, start, mask):
     """Sample the means of body rates and specific force over the tick that ends now, where `mask`.
 
-    As an IMU that integrates faster than it reports: the mean rate is that of the turn from the
-    body frame at the start to that at the end (coning corrected), and the mean specific force is
-    R_mid (dv_I + g dt e3) / dt with the change of the accelerometer's velocity and the attitude
+    Model of an IMU that integrates faster than it reports: the mean rate is the rotation vector
+    from the initial to the final body frame over dt (coning corrected), and the mean specific force
+    is R_mid (dv_I + g dt e3) / dt with the change of the accelerometer's velocity and the attitude
     halfway (sculling corrected; P. G. Savage, J. Guidance, Control, and Dynamics 21, 1998). Density
     over sqrt(dt) is the standard deviation of white noise in a mean over dt.
 
     Args:
-        flight: Record, with the true state at the tick's end and the biases of its start.
-        p: Parameters as they are.
-        start: The true state at the tick's start, as of `load_state`.
-        mask: Which lanes.
+        flight: Record, with the true state at the tick's end and the biases at its start.
+        p: True parameters.
+        start: True state at the tick's start, from `load_state`.
+        mask: Lanes to work on.
     """
     _, v_start, q_start, w_start, _ = start
     q_end, rate, lever = load4(flight.q), 1.0 / p.dt, load3(p.imu_lever_arm)
@@ -106,7 +106,7 @@ def measure_imu_average(flight, p, start, mask):
 @stage
 def sample_stage(flight, world, model, settings, work, stages, flag):
     """Sample the IMU at the present instant; `flag`: 1 at the start of an episode."""
-    if flag == 0 and settings.imu_averages:  # at the start there is nothing to average
+    if flag == 0 and settings.imu_averages:  # at the start, no tick to average over
         return
     flying, scratch = lanes_of(flight), lanes_of(work)
     mask = scratch.mask > 0.0

@@ -1,6 +1,6 @@
 """Latency of sensors: measurements in transit wait in a flight's record until they arrive.
 
-With each waits its time stamp: the sums of the IMU when it was taken, with which
+Each is stored with its time stamp: the sums of the IMU when it was taken, with which
 `filter/delayed.py` retrodicts the estimate to that instant.
 """
 
@@ -58,7 +58,7 @@ def find_arrivals(flight, work, settings, sensor, mask):
 
 @kernel
 def stamp(flight, settings, sensor, mask):
-    """Stamp what has just been measured; return the lanes in which there is something."""
+    """Stamp the measurements just taken; return the lanes that have any."""
     first, valid = FIRST_BLOCK[sensor], 0.0 * flight.tick
     for block in range(first, first + settings.sensor_blocks[sensor]):
         valid = valid + flight.block_valid[block]
@@ -74,10 +74,10 @@ def exchange(flight, work, block, values, numbers, mask, taken):
 
     Args:
         flight: Record.
-        work: Workspace; reads what `keep_arrived` and `find_arrivals` have stored.
+        work: Workspace; reads the results of `keep_arrived` and `find_arrivals`.
         block: Number of the block.
         values: Its numbers in the record.
-        numbers: How many.
+        numbers: Count of these numbers.
         mask: Lanes to work on.
         taken: Lanes in which the sensor has measured.
     """

@@ -1,8 +1,8 @@
 """The magnetometer: the Earth's magnetic field in three axes of the body.
 
-It measures `z = (I + D) R(delta) m_I + b + v` in B with white noise v, where m_I is the field that
-a model of the Earth's field tells, delta the error of that model's declination, b hard iron and D
-soft iron. The filter has b and delta among its states (`filter/slow.py`) and knows nothing of D:
+It measures `z = (I + D) R(delta) m_I + b + v` in B with white noise v, where m_I is the field by a
+model of the Earth's field, delta the error of this model's declination, b hard iron and D soft
+iron. The filter has b and delta among its states (`filter/slow.py`) and does not model D:
 
     h = R_BI (m_I + delta m_I x e3) + b
 
@@ -13,10 +13,10 @@ With a pair of sigma points, R(+-e) = I + even +- odd, that is odd and even in i
 f = m_I + delta g and g = m_I x e3; and the derivative along an offset is (R f) x de + ddelta R g +
 db. No term of an offset that has no error angles is even.
 
-Where GNSS has one antenna, the field tells the heading of the filter's nearly level start: that at
-which the expected field has the measured direction. With the vertical k, the level direction h of
-the field and s = k x h, all in B, the field's level and vertical share m_h and m_z, nothing of the
-innovation is left along s, so that the derivative ties the error of the heading to others:
+Where GNSS has one antenna, the field determines the heading of the filter's nearly level start: the
+expected field gets the measured direction. With the vertical k, the level direction h of the field
+and s = k x h, all in B, the field's level and vertical share m_h and m_z, the innovation vanishes
+along s, so that the derivative relates the heading's error to others:
 
     m_h (k . e) = m_z (h . e) - m_h delta + s . b + s . v
 """
@@ -78,8 +78,8 @@ _S, _SENSOR = int(Aid.MAGNETOMETER), int(Sensor.MAGNETOMETER)
 _BLOCK = AID_BLOCKS + _S
 _EKF = int(FilterForm.EKF)
 _DRIFT_TIME = 0.5
-"""Within such a time the magnetometer pulls the heading back [s]: less than it takes, so that the
-bias may be more than a drift says."""
+"""Time within which the magnetometer pulls the heading back [s]: shorter than it really is, so that
+the bias may be larger than a drift implies."""
 
 
 @kernel
@@ -140,12 +140,12 @@ def _align(flight, p, work, settings, mask):
 
 @kernel
 def _tie_heading(p, P, m, R_BI, iron, delta):
-    """Replace the error of the heading in P by that of the field's heading, see above."""
+    """Replace the error of the heading in P by the error of the field's heading, see above."""
     zero = 0.0 * p.dt
     level = math.sqrt(m[0] * m[0] + m[1] * m[1])
     h, k = apply(R_BI, (m[0] / level, m[1] / level, zero)), apply(R_BI, (zero, zero, zero + 1.0))
     s, steep = cross(k, h), m[2] / level
-    F = outer(k, sub(scale(steep, h), k))  # e = F e + ..., of which the tilt is all that counts
+    F = outer(k, sub(scale(steep, h), k))  # e = F e + ..., where only the tilt counts
     F = add33(((zero + 1.0, zero, zero), (zero, zero + 1.0, zero), (zero, zero, zero + 1.0)), F)
     P_bb, P_dd = P[iron, iron], P[delta, delta]
     white = p.initial_covariance_scale * p.aid_sigma[_S] * p.aid_sigma[_S]
@@ -164,7 +164,7 @@ def _tie_heading(p, P, m, R_BI, iron, delta):
 
 @kernel
 def _tie_position(p, P, R_BI, iron, delta):
-    """Let the position go with the attitude in P, as an antenna was measured: see `align.py`."""
+    """Correlate the position with the attitude in P, as an antenna was measured: see `align.py`."""
     zero = 0.0 * p.dt
     x, y, z = load3(p.antenna)
     J = multiply(transpose(R_BI), ((zero, -z, y), (z, zero, -x), (-y, x, zero)))
@@ -186,7 +186,7 @@ def _tie_position(p, P, R_BI, iron, delta):
 
 @kernel
 def _full(P):
-    """The covariance of the error angles, of which P has the lower triangle."""
+    """Full covariance of the error angles, from the lower triangle in P."""
     return (
         (P[E, E], P[E + 1, E], P[E + 2, E]),
         (P[E + 1, E], P[E + 1, E + 1], P[E + 2, E + 1]),
@@ -254,7 +254,7 @@ def _inflate(flight, p, work, settings):
     The variances of hard iron and of the heading are raised to the square of a rejected innovation.
     Where innovations drift, a gyro bias rotates the attitude while the magnetometer pulls it back:
     the variances of the attitude are raised to the square of the mean innovation, as an angle, and
-    those of the gyro biases to the square of the rate that rotates as far in `_DRIFT_TIME`.
+    the variances of the gyro biases to the square of the rate that rotates as far in `_DRIFT_TIME`.
     """
     alarm, mask = work.alarm[AID_GROUPS + _S] > 0.0, work.taking > 0.0
     nu, k = load3(flight.innovation[_BLOCK]), D + settings.aid_vector[_S]

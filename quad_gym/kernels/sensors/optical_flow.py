@@ -2,8 +2,8 @@
 
 It measures `z = g (V_x, V_y) + (-w_y, w_x) + n` with white noise n, the velocity V = R_BI v in B,
 the body rates w, and g = u / h, one over the distance of the ground along the body z axis: h is the
-height, u the cosine of the tilt. The filter takes w from the gyro, whose noise adds to n; what the
-error of the gyro bias adds is neglected.
+height, u the cosine of the tilt. The filter takes w from the gyro, whose noise adds to n; the
+contribution of the gyro bias's error is neglected.
 
 With a pair of sigma points, R(+-e) R_hat = (I + even +- odd) R_hat, v +- dv, h +- dh:
 
@@ -72,7 +72,7 @@ def _sample(flight, p, settings, work, stages, mask, starting):
 
 @kernel
 def _flow(g, v_B):
-    """Share of a velocity in the flow; its third number is masked."""
+    """Contribution of a velocity to the flow; its third number is masked."""
     return (g * v_B[0], g * v_B[1], 0.0 * g)
 
 
@@ -129,7 +129,7 @@ def _gate(flight, p, work, settings, k):
 
 @kernel
 def _inflate(flight, p, work, settings):
-    """Inflate the velocity by a rejected innovation, accelerometer biases and tilt."""
+    """Inflate velocity, accelerometer biases and tilt by a rejected innovation."""
     alarm, nu = work.alarm[AID_GROUPS + _S], flight.innovation[_BLOCK]
     h, _ = ground_range(p, flight.r_hat, load33(flight.R_hat))
     square = h * h * (nu[0] * nu[0] + nu[1] * nu[1])

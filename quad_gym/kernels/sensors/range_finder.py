@@ -24,7 +24,7 @@ from quad_gym.records import AID_BLOCKS, AID_GROUPS, DRAW_AID, Aid, FilterForm, 
 _S = int(Aid.RANGE_FINDER)
 _BLOCK, _EKF = AID_BLOCKS + _S, int(FilterForm.EKF)
 LEAST_COSINE = 0.5
-"""Cosine of the tilt below which nothing is measured: 60 degrees."""
+"""Cosine of the tilt below which it does not measure: 60 degrees."""
 
 
 @kernel

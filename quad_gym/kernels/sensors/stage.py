@@ -1,4 +1,4 @@
-"""The stage of a sensor, made of the sensor's own kernels."""
+"""The stage of a sensor, composed of the sensor's kernels."""
 
 from typing import Any
 
