@@ -73,8 +73,8 @@ GNSS positions, the hard iron of a magnetometer, and one number for each other s
 MAX_STATES = 15 + MAX_SLOW
 """Number of states of a filter with all slow errors."""
 WARM_SLOW_DRAWS = 2 * MAX_SLOW
-"""Further standard normals for the slow errors of a warm start: in groups of three, first for the
-estimated errors and then for the true ones."""
+"""Further standard normals for the slow errors of a warm start: for every three
+errors, three for the estimate, then three for the true values."""
 STAMP = 28
 """Length of a time stamp: the tick; C, V, X and B of the IMU's sums; body rates."""
 FAULT_KINDS = len(FaultKind)

@@ -18,7 +18,7 @@ from quad_gym.records.sizes import (
 )
 
 DRAWS_OF_FAULT = 8
-"""Draws for a kind of fault: its times (2), its size (2), its effect on one sample (4)."""
+"""Draws for a kind of fault: its times (2), size and direction (2), effect on one sample (4)."""
 
 
 class DrawRange(NamedTuple):
