@@ -121,7 +121,8 @@ def _load_actions(call, flight, index):
 def _write_results(call, flight, work, index):
     """Write the results of a step for the caller.
 
-    If an episode ends and the next one begins in a step, results are written before the reset.
+    They belong to the episode that ends, if one ends and the next begins in this step; in a step
+    that only begins an episode, to its start.
     """
     here, pitch = call[_RESULTS] + index * (8 * WIDTH), call[_RESULT_PITCH]
     store_lanes(here + _REWARD * pitch, flight.reward)
@@ -205,7 +206,7 @@ def _fly_ticks(call, first, last, world, model, settings, work, stages):
 
 @kernel
 def _judge_step(flight, world, model, settings, work, stages):
-    """Set reward and endings of a step; return masks of lanes that begin and that end an episode."""
+    """Set reward and endings of a step; return masks of lanes that begin and end an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
     # a step that begins an episode draws nothing before it
     before = flight.instant + np.uint64(-settings.ticks_per_step)

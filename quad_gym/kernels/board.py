@@ -8,8 +8,8 @@ of one core. A step is over when all blocks are finished.
 Waking a thread takes longer than a step of some hundred flights. A helper without work therefore
 polls the board for a while before it sleeps; Python wakes it (`quad_gym.batch.threads`).
 
-COMMAND and the arguments of the step are written before NEXT, so that they are visible to any thread
-that takes a block.
+COMMAND and the arguments of the step are written before NEXT, so that any thread that takes a block
+sees them.
 """
 
 from quad_gym.kernels.compiling import kernel
@@ -39,7 +39,7 @@ def post(board, command):
 
 @kernel
 def take(board, number):
-    """Take the next blocks for a thread; return their first and end, which are equal if none is left."""
+    """Take the next blocks for a thread; return first and end, which are equal if none is left."""
     ranges = (len(board) - RANGES) // WORDS_OF_RANGE
     for k in range(ranges):
         place = RANGES + (number + k) % ranges * WORDS_OF_RANGE

@@ -98,7 +98,7 @@ def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
         kind = ir.FunctionType(ir.VoidType(), [_BYTES, word, word, word])
         function = builder.module.declare_intrinsic("llvm.prefetch", [_BYTES], kind)
         place = builder.inttoptr(args[0], _BYTES)
-        builder.call(function, [place, word(0), word(2), word(1)])  # for reading, into the second-level cache
+        builder.call(function, [place, word(0), word(2), word(1)])  # read, to the second level
         return context.get_dummy_value()
 
     return types.none(types.int64), lower

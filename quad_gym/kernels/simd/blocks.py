@@ -2,8 +2,8 @@
 
 A block is a NumPy structured record in which every field has a trailing axis of WIDTH (see
 `records/layout.py`). `lanes_of(block)` is a view of this memory for kernels: `block.mass` is a
-`Lanes`, `block.inertia` an array of `Lanes` of shape (3, 3). The scalar instance of a kernel takes a
-plain record with these field names, where `record.mass` is a float and `record.inertia` a float
+`Lanes`, `block.inertia` an array of `Lanes` of shape (3, 3). The scalar instance of a kernel takes
+a plain record with these field names, where `record.mass` is a float and `record.inertia` a float
 array.
 """
 

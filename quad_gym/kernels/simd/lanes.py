@@ -122,14 +122,14 @@ default_type_manager.set_compatible(types.boolean, mask, Conversion.safe)
 # ---- operators -------------------------------------------------------------------------------
 
 ASKED_FIRST = {"target": "cpu"}
-"""Metadata of templates that Numba tries before the dozen generic ones of an operator, which saves a
-tenth of the time that kernels take to compile."""
+"""Metadata of templates that Numba tries before the dozen generic ones of an operator, which saves
+a tenth of the time that kernels take to compile."""
 
 
 def _binary(
     operation: Any, operand: Any, result: Any, emit: Callable[[ir.IRBuilder, Any, Any], Any]
 ) -> None:
-    """Define `operation` for the vector type `operand` on one side, and it or a number on the other."""
+    """Define `operation` for operands of the vector type `operand`, one of which may be plain."""
 
     @infer_global(operation)
     class _Typing(AbstractTemplate):

@@ -114,7 +114,7 @@ def _derive_noise(own, nominal, settings):
 
 @kernel
 def _derive_sensors(own, nominal, settings):
-    """Derive the sensors' positions relative to the true center of mass, and the camera's attitude."""
+    """Derive sensor positions relative to the true center of mass, and the camera's attitude."""
     for i in range(3):
         center, antenna = own.center_of_mass_B[i], nominal.antenna[i]
         primary = own.primary_antenna_B[i] - antenna

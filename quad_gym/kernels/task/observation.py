@@ -89,7 +89,7 @@ def _put_reference(flight, p, settings, row, k):
 
 @kernel
 def _put_absolute(flight, p, settings, row):
-    """Write state and reference in I; biases are true, estimated or zero, as the source requires."""
+    """Write state and reference in I; biases are true, estimated or zero, by the source."""
     k = _put3(row, 0, load3(flight.r_seen))
     k = _put3(row, k, load3(flight.v_seen))
     for i in range(3):
