@@ -107,7 +107,7 @@ def _write_rows(call, address, index, work, chosen):
 
 @kernel
 def _load_actions(call, flight, index):
-    """Store the caller's actions as the present ones, after the present ones as the last ones."""
+    """Store the present actions as the last ones, and the caller's actions as the present ones."""
     block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
     rows = _floats_at(call[_ACTIONS] + index * (32 * WIDTH), 4 * WIDTH)
     for i in range(4):
@@ -208,7 +208,7 @@ def _fly_ticks(call, first, last, world, model, settings, work, stages):
 def _judge_step(flight, world, model, settings, work, stages):
     """Set reward and endings of a step; return masks of lanes that begin and end an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
-    # a step that begins an episode draws nothing before it
+    # a step that only begins an episode uses no earlier draws
     before = flight.instant + np.uint64(-settings.ticks_per_step)
     flight.instant = select(resetting, before, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)

@@ -8,7 +8,7 @@ from quad_gym.records.width import WIDTH as WIDTH
 MAX_HARMONICS = 6
 """Largest number of terms in the Fourier series of a reference."""
 FOLLOWED = -1
-"""Value of the number of terms that stands for a user's trajectory."""
+"""Number of terms that denotes a user's trajectory instead of a series."""
 TERMS = 8
 """Coefficients of a segment of a user's trajectory, a polynomial of degree 7."""
 HEADING_TOWARD, HEADING_ALONG, HEADING_VELOCITY, HEADING_GIVEN = 0.0, 1.0, 2.0, 3.0

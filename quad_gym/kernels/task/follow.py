@@ -32,7 +32,7 @@ _PATH_SIZE, _PIECE_SIZE = PATH.itemsize, PIECE.itemsize
 
 @kernel
 def draw_path(flight, settings, stream, mask):
-    """Draw the trajectory of a new episode, where `mask`; its phase and rotation, too, if set."""
+    """Draw the trajectory of a new episode, where `mask`; also its phase and rotation, if set."""
     u_path, u_share = uniform_pair(stream, DRAW_PATH)
     u_turn, _ = uniform_pair(stream, DRAW_PATH + 1)
     zero = 0.0 * u_path

@@ -43,7 +43,7 @@ def _given_or(given, drawn):
 
 @kernel
 def draw_start(flight, p, model, settings, work, stream, mask):
-    """Set the true state at the start of an episode, where `mask`, and the lanes on the ground."""
+    """Set the true state at the start of an episode, where `mask`; mark lanes on the ground."""
     (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     yaw = atan2(x_ref[1], x_ref[0])
     zero = 0.0 * yaw
