@@ -8,9 +8,8 @@ The archive (`.npz`, readable by `numpy.load` alone) holds
 | `columns/NAME` | one float64 array (n, ...) per column of `quad_gym.flights.record.COLUMNS` |
 | `scene/NAME` | one float64 array per array of `quad_gym.flights.flight_scene.FlightScene` |
 
-A table has these columns with one number each: vectors as `_x`, `_y`, `_z` (quaternions as `_w`,
-`_x`, `_y`, `_z`; without axes, `_1` ...), and the standard deviations of the covariance as
-`sigma_...` in place of the covariance.
+A table has one number per column: vectors as `_x`, `_y`, `_z` (quaternions as `_w`, `_x`, `_y`,
+`_z`; without axes, `_1` ...), and the standard deviations `sigma_...` instead of the covariance.
 """  # noqa: E501 - a table
 
 import csv
@@ -37,7 +36,7 @@ _STATES = ("position", "velocity", "attitude", "accel_bias", "gyro_bias")
 
 
 def save_flight(flight: Flight, path: Path) -> Path:
-    """Write the archive; a file appears only when it is complete.
+    """Write the archive; the file appears only when it is complete.
 
     Returns:
         The file.
@@ -119,7 +118,7 @@ def _scene(header: dict[str, Any], entries: dict[str, NDArray[Any]]) -> FlightSc
         if value is not None:
             found[field.name] = value
         elif field.default is field.default_factory is dataclasses.MISSING:
-            raise ValueError(f"it lacks {field.name}")  # others came later: older files lack them
+            raise ValueError(f"it lacks {field.name}")  # older files lack optional fields
     return FlightScene(**found)
 
 
@@ -142,7 +141,7 @@ def _rows(entries: dict[str, NDArray[Any]], features: int) -> NDArray[Any]:
 
 
 def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
-    """Return the columns of a flight with one number per row, by their names in a table."""
+    """Return the columns of a flight's table, with one number per row, by name."""
     found: dict[str, NDArray[np.float64]] = {}
     for column in COLUMNS:
         values = flight[column.name]
@@ -162,7 +161,7 @@ def table(flight: Flight) -> dict[str, NDArray[np.float64]]:
 
 
 def _parts(column: Column, count: int) -> Sequence[str]:
-    """Return the names of the numbers in a row of a column."""
+    """Return the suffixes of a column's names in a table, one per number."""
     if column.name == "gnss_decision":
         return "position", "baseline", "velocity"
     if column.name in ("action", "rotor_speeds", "feature_decision"):

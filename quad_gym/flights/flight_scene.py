@@ -1,4 +1,4 @@
-"""`FlightScene`: place and vehicle of a flight, which pictures need in addition to the rows."""
+"""`FlightScene`: surroundings and vehicle of a flight, which pictures need besides the rows."""
 
 import functools
 from dataclasses import dataclass, field
@@ -16,11 +16,11 @@ class FlightScene:
     """Constants of a flight: vehicle, sensors, reference and surroundings."""
 
     task: str
-    """kind of task"""
+    """kind of task, see `TaskParams`"""
     observation: str
     """source of the controller's observations: "truth", "estimate", "noisy" or "measurements\""""
     control_rate: float
-    """control rate, rows per second [Hz]"""
+    """control rate, and so rows per second [Hz]"""
     rotor_positions_B: Floats
     """(4, 3) positions of the rotor hubs in B [m]"""
     max_rotor_speed: float
@@ -88,7 +88,7 @@ class FlightScene:
 
     @property
     def reference_period(self) -> float:
-        """Time after which the reference repeats, or ends [s]; 0: it is a fixed point."""
+        """Time after which the reference repeats or ends [s]; 0: a fixed point."""
         if len(self.trajectory_times):
             return float(self.trajectory_times[-1])
         moves = bool(np.any(self.reference_cos) or np.any(self.reference_sin))
@@ -96,7 +96,7 @@ class FlightScene:
 
     @property
     def pieces(self) -> int:
-        """Number of straight lines that show the whole reference."""
+        """Number of line segments that draw the whole reference."""
         return max(160, min(8 * len(self.trajectory_times), 2000))
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""`Flight`: the record of one flight, instant by instant, to keep, export, inspect and replay.
+"""`Flight`: the record of one flight, step by step, to store, export, inspect and replay.
 
 A flight has one row per control step and one for the start; `COLUMNS` describes a row. Quantities
 that were not measured since the previous row, or not estimated, are NaN.
@@ -32,7 +32,7 @@ class Column(NamedTuple):
 
     name: str
     shape: tuple[int, ...]
-    """shape of one row; FEATURES stands for the number of the camera's features"""
+    """shape of one row; FEATURES stands for the camera's number of features"""
     unit: str
     frame: str
     """I: inertial (east, north, up), B: body, C: image; "-": none"""
@@ -70,7 +70,7 @@ COLUMNS = (
     # the state that the controller observed
     Column("observed_position", (3,), "m", "I", "position from the controller's source"),
     Column("observed_quaternion", (4,), "-", "B to I", "attitude from the controller's source"),
-    # the last measurements since the row before
+    # the latest measurements since the previous row
     Column("gyro", (3,), "rad/s", "B", "angular rate"),
     Column("accel", (3,), "m/s^2", "B", "specific force"),
     Column("gnss_position", (3,), "m", "I", "primary antenna"),
@@ -94,13 +94,13 @@ _READ = tuple(
     for column in COLUMNS
     if column.name in QUANTITIES and column.name != "reference_position"
 )
-"""Columns that are quantities of a batch without changes."""
+"""Columns that are quantities of a batch, copied unchanged."""
 
 _WITH_FILTER = (
     *(name for name in _READ if QUANTITIES[name].filtered),
     *("covariance", "nees", "gnss_decision", "feature_decision"),
 )
-"""Columns that hold NaN where no filter, and so no sensor, runs."""
+"""Columns that are NaN if no filter, and so no sensor, runs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class Flight:
 
     @classmethod
     def load(cls, path: Path | str) -> "Flight":
-        """Read a file that `save` has written; the result is bitwise identical.
+        """Read a file written by `save`; the result is bitwise identical.
 
         Raises:
             ValueError: If the file is damaged, of another kind, or of an unknown version.
@@ -212,13 +212,13 @@ class FlightRecorder:
         self._rows = np.zeros(256, row_dtype(features))
         self._count = 0
         self._copies: list[NDArray[np.uint64]] = []
-        """instants after the rows: copying a record takes a hundredth of the time of a row"""
+        """instants not yet converted to rows: a copy takes a hundredth of the time of a row"""
         self._scene: FlightScene | None = None
         self._model = params_record(batch.vehicle, batch.sensors)[0]
 
     @property
     def flight(self) -> Flight:
-        """The flight since the start of the present episode; it shares memory with the recorder.
+        """Flight since the start of the present episode; it shares memory with the recorder.
 
         Raises:
             ValueError: If nothing has been recorded yet.
@@ -229,10 +229,10 @@ class FlightRecorder:
         return Flight(self._rows[: self._count], self._scene, self._about)
 
     def keep(self) -> None:
-        """Record the present instant; the first instant of an episode begins a new flight."""
+        """Record the present instant; the first instant of an episode starts a new flight."""
         tick = self._batch.record("tick", self._which)[0]
         if tick == 0.0 or self._scene is None:
-            self._rows, self._count = np.zeros_like(self._rows), 0  # earlier flights live on
+            self._rows, self._count = np.zeros_like(self._rows), 0  # flights keep their rows
             self._scene = self._scene_of_episode()
             self._copies = []
         self._copies.append(self._batch.copied_record(int(self._which[0])))

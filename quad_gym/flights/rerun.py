@@ -2,17 +2,17 @@
 
 | entity | contents |
 |---|---|
-| `world/reference`, `world/gates`, `world/features` | the path, the course, the features |
+| `world/reference`, `world/gates`, `world/features` | the reference, the gates, the features |
 | `world/walls`, `world/cylinders`, `world/geofence` | the obstacles and the geofence |
 | `world/truth`, `world/estimate` | the vehicle at its true and at its estimated pose |
-| `world/truth/camera/image` | the image plane: features as measured, and as the estimate predicts |
+| `world/truth/camera/image` | the image plane: features as measured, and as predicted |
 | `world/ellipsoid` | the filter's 3-sigma ellipsoid of the position, at its true size |
 | `world/gnss`, `world/rays` | fixes as they arrive, features while the camera sees them |
 | `world/trail` | past positions of truth and estimate |
 | `plots` | errors, position errors with the filter's 3 sigma, NEES with its band, rotors, actions |
 
 Times are seconds since the start of the episode, lengths meters, in east, north, up. Rerun stores
-3D objects in single precision, and plots in double precision.
+3D objects in single precision and plots in double precision.
 """
 
 import json
@@ -34,8 +34,8 @@ TRAIL_SECONDS, FIX_SECONDS, AHEAD_SECONDS = 6.0, 1.5, 1.0
 ROTOR_RADIUS, FRUSTUM_DEPTH = 0.13, 0.55
 """[m]"""
 
-# those of Okabe and Ito, which people with a color vision deficiency can tell apart; the viewer's
-# ground is dark
+# colors by Okabe and Ito, which people with a color vision deficiency can distinguish, on the
+# viewer's dark background
 TRUTH, ESTIMATE, REFERENCE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 FIX, RAY, NEUTRAL = (204, 121, 167), (86, 180, 233), (130, 130, 130)
 
@@ -69,10 +69,10 @@ def rerun_recording(flight: Flight) -> Any:
 
 
 def load_rerun() -> Any:
-    """The module rerun.
+    """Return the module `rerun`.
 
     Raises:
-        ImportError: If it is missing; the message says how to install it.
+        ImportError: If it is missing; the message explains the installation.
     """
     try:
         import rerun
@@ -84,7 +84,7 @@ def load_rerun() -> Any:
 
 
 class _Log:
-    """Sends the columns of a flight, one entity after the other."""
+    """Sender of the columns of a flight to a recording, entity by entity."""
 
     def __init__(self, flight: Flight, rr: Any, recording: Any) -> None:
         self._flight, self._scene, self._rr, self._recording = flight, flight.scene, rr, recording
@@ -100,7 +100,7 @@ class _Log:
     # ---- the world ----------------------------------------------------------------------------
 
     def scene(self) -> None:
-        """What stays as it is."""
+        """Log the constant part of the scene."""
         rr, scene = self._rr, self._scene
         self._static("about", rr.TextDocument(self._about(), media_type=rr.MediaType.MARKDOWN))
         self._static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -130,7 +130,7 @@ class _Log:
             )
 
     def _obstacles(self) -> None:
-        """Walls as boxes, cylinders as such, and the geofence as edges."""
+        """Log walls as boxes, cylinders as cylinders, and the geofence as edges."""
         rr, scene = self._rr, self._scene
         is_wall = scene.obstacles[:, 0] == Shape.WALL
         walls, cylinders = scene.obstacles[is_wall], scene.obstacles[~is_wall]
@@ -169,7 +169,7 @@ class _Log:
         return "\n".join(["| | |", "|---|---|", *rows])
 
     def reference(self) -> None:
-        """Log the reference at present, and over the next second."""
+        """Log the present reference, and the reference over the next second."""
         rr, flight, scene = self._rr, self._flight, self._scene
         at = rr.Points3D.columns(positions=flight["reference_position"])
         self._static("world/reference/now", rr.Points3D.from_fields(radii=0.05, colors=[REFERENCE]))
@@ -181,7 +181,7 @@ class _Log:
             self._static("world/reference/next_second", style)
             self._send("world/reference/next_second", rr.LineStrips3D.columns(strips=strips))
 
-    # ---- what flies ---------------------------------------------------------------------------
+    # ---- the vehicle --------------------------------------------------------------------------
 
     def vehicles(self) -> None:
         """Log the vehicle at its true pose, with body axes."""
@@ -199,7 +199,7 @@ class _Log:
         good = np.isfinite(flight["covariance"]).all(axis=(1, 2))
         values, vectors = np.linalg.eigh(flight["covariance"][good, :3, :3])
         turns = vectors * np.sign(np.linalg.det(vectors))[:, np.newaxis, np.newaxis]
-        # the columns are the axes in I, so that this is the turn from the axes to I
+        # the columns are the axes in I, so this is the rotation from the axes to I
         quaternions = dcm_to_quaternion(np.swapaxes(turns, 1, 2))
         self._static("world/ellipsoid", rr.Ellipsoids3D.from_fields(colors=[ESTIMATE]))
         columns = rr.Ellipsoids3D.columns(
@@ -223,7 +223,7 @@ class _Log:
         self._static(f"{entity}/body", rr.LineStrips3D([*arms, *rings], radii=0.01, colors=[color]))
 
     def _trail(self, name: str, position: str, color: tuple[int, ...]) -> None:
-        """Log a piece per row; the view shows the pieces of the last seconds."""
+        """Log one segment per row; the view shows the segments of the last seconds."""
         rr, places = self._rr, self._flight[position]
         good = np.isfinite(places).all(axis=1)
         pieces = np.stack([np.concatenate([places[:1], places[:-1]]), places], axis=1)
@@ -235,7 +235,7 @@ class _Log:
     # ---- sensors ------------------------------------------------------------------------------
 
     def fixes(self) -> None:
-        """Log GNSS fixes when they arrive; gray if the filter's gate has rejected them."""
+        """Log GNSS fixes when they arrive; in gray if the filter's gate rejected them."""
         rr, fixes = self._rr, self._flight["gnss_position"]
         measured = np.isfinite(fixes).all(axis=1)
         if measured.any():
@@ -246,7 +246,7 @@ class _Log:
             self._send("world/gnss", points, measured)
 
     def camera(self) -> None:
-        """Log the image plane with measured and predicted features, and the rays."""
+        """Log the image plane with measured and predicted features, and rays to the features."""
         rr, flight, scene = self._rr, self._flight, self._scene
         turn = _xyzw(dcm_to_quaternion(scene.R_CB))
         camera = "world/truth/camera"
@@ -288,7 +288,7 @@ class _Log:
     # ---- plots --------------------------------------------------------------------------------
 
     def plots(self) -> None:
-        """Errors, the filter's consistency, rotors and actions over time."""
+        """Log errors, the filter's consistency, rotors and actions over time."""
         flight = self._flight
         self._plot("errors/tracking", flight["position_error"], TRUTH, "tracking error [m]")
         if self._scene.observation != "truth":

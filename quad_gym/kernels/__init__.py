@@ -1,1 +1,1 @@
-"""The compiled core: everything in a flight is computed here."""
+"""Compiled core, which computes every part of a flight."""

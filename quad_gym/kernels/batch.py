@@ -1,4 +1,4 @@
-"""The compiled entry that steps or resets the blocks of a batch."""
+"""Compiled entry that steps or resets the blocks of a batch."""
 
 import numpy as np
 from numba import types
@@ -63,7 +63,7 @@ _SHOWN, _SHOWN_PITCH = int(Call.SHOWN), int(Call.SHOWN_PITCH)
 
 _CORE = offset_of(FLIGHT_BLOCK, "r")
 _TICKED = offset_of(FLIGHT_BLOCK, "ref_cos") - _CORE
-"""Bytes of what every step needs, which come first in a record's core."""
+"""Bytes of the fields that every step needs, which come first in a record's core."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _params_at = lanes_at(PARAMS_BLOCK)
@@ -74,7 +74,7 @@ _floats_at, _singles_at, _bytes_at = array_at("f8"), array_at("f4"), array_at("u
 
 @kernel
 def _observe(call, flight, world, model, settings, work, stages):
-    """Observe the present instant, within the space's bounds."""
+    """Compute the observation of the present instant, clipped to the bounds of the space."""
     call_stage(stages, Stage.OBSERVE, flight, world, model, settings, work, 0)
     size = call[_SIZE]
     low, high, row = _floats_at(call[_LOW], size), _floats_at(call[_HIGH], size), work.observation
@@ -86,7 +86,7 @@ def _observe(call, flight, world, model, settings, work, stages):
 
 @kernel
 def _write_rows(call, address, index, work, chosen):
-    """Copy observations from lanes to the rows of an array, where `chosen`."""
+    """Copy observations from the workspace to the rows of an array, where `chosen`."""
     size, first = call[_SIZE], index * WIDTH
     pitch = 4 * size
     address = address + first * pitch
@@ -107,7 +107,7 @@ def _write_rows(call, address, index, work, chosen):
 
 @kernel
 def _load_actions(call, flight, index):
-    """Make the caller's actions the present ones, and the present ones the last."""
+    """Store the present actions as the last ones, and the caller's actions as the present ones."""
     block = _plain_flight_at(call[_BLOCKS] + index * call[_PITCH])
     rows = _floats_at(call[_ACTIONS] + index * (32 * WIDTH), 4 * WIDTH)
     for i in range(4):
@@ -119,9 +119,10 @@ def _load_actions(call, flight, index):
 
 @kernel
 def _write_results(call, flight, work, index):
-    """What the caller wants to know of a step.
+    """Write the results of a step for the caller.
 
-    Where an episode begins in the same step as one ends it is that of the end, else of the start.
+    They belong to the episode that ends, if one ends and the next begins in this step; in a step
+    that only begins an episode, to its start.
     """
     here, pitch = call[_RESULTS] + index * (8 * WIDTH), call[_RESULT_PITCH]
     store_lanes(here + _REWARD * pitch, flight.reward)
@@ -155,7 +156,7 @@ def _show(call, index, flight, world, model, settings, work, stages):
 
 @kernel
 def _fetch_ahead(call, index, settings, left):
-    """Ask for a tick's share of the next block's memory, which is far away in large batches."""
+    """Prefetch a tick's share of the next block, which is not in the cache in large batches."""
     ticks, line = settings.ticks_per_step, 8 * WIDTH
     share = (_TICKED // line + ticks) // ticks * line
     begin = call[_BLOCKS] + (index + 1) * call[_PITCH] + _CORE + left * share
@@ -165,7 +166,7 @@ def _fetch_ahead(call, index, settings, left):
 
 @kernel
 def _begin_step(call, index, settings):
-    """Load the actions of a step, and forget what was measured in the last one."""
+    """Load the actions of a step, and clear the flags and sums of the last step's measurements."""
     flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
     _load_actions(call, flight, index)
     for sensor in range(SENSORS):
@@ -178,7 +179,7 @@ def _begin_step(call, index, settings):
 
 @kernel
 def _fly_ticks(call, first, last, world, model, settings, work, stages):
-    """Fly the ticks of a step, the blocks from `first` to before `last` side by side."""
+    """Fly the ticks of a step, tick by tick for the blocks from `first` to before `last`."""
     for left in range(settings.ticks_per_step - 1, -1, -1):
         within = min(left, 1)
         for index in range(first, last):
@@ -205,9 +206,9 @@ def _fly_ticks(call, first, last, world, model, settings, work, stages):
 
 @kernel
 def _judge_step(flight, world, model, settings, work, stages):
-    """Judge a step; return which lanes begin and which ended an episode."""
+    """Set reward and endings of a step; return masks of lanes that begin and end an episode."""
     resetting = (flight.needs_reset > 0.0) & (settings.autoreset == Autoreset.NEXT_STEP)
-    # a step that begins an episode draws nothing before it
+    # a step that only begins an episode uses no earlier draws
     before = flight.instant + np.uint64(-settings.ticks_per_step)
     flight.instant = select(resetting, before, flight.instant)
     work.mask = select(resetting, 0.0, 1.0)
@@ -223,7 +224,7 @@ def _judge_step(flight, world, model, settings, work, stages):
 
 @kernel
 def _end_block(call, index, command, nominal, true, believed, settings, work, stages):
-    """Reset the flights of one block, or judge the step that they have flown."""
+    """Reset the flights of one block, or set the results of the step that they have flown."""
     flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
     observing, written = call[_SIZE] > 0, False
     if command == Command.RESET:
@@ -255,7 +256,7 @@ def _end_block(call, index, command, nominal, true, believed, settings, work, st
 def _fly_group(call, first, last, command, nominal, true, believed, settings, work, stages):
     """Step or reset the flights of the blocks from `first` to before `last`.
 
-    Where they have parameters of their own, that is one block.
+    If flights have their own parameters, this is a single block.
     """
     for index in range(first, last):
         flight = _flight_at(call[_BLOCKS] + index * call[_PITCH])
@@ -275,18 +276,18 @@ _WORDS = types.Array(types.int64, 1, "C")
 
 @entry(signature=types.boolean(_WORDS, _WORDS, types.int64, types.int64, types.boolean))
 def fly(call, board, number, command, serving):
-    """Step or reset the flights of a batch, together with the other threads at a board.
+    """Step or reset the flights of a batch, together with the other threads of a board.
 
     Args:
-        call: (len(Call),) of this thread; its memory lasts as long as the call does.
-        board: See `board.py`.
-        number: Of this thread; the one that posts steps is 0.
-        command: A `Command` to post, unless serving; a negative one posts nothing and waits for
-            what was posted before.
-        serving: Whether to fly what others post, until nothing comes for a while.
+        call: (len(Call),) arguments of this thread; their memory outlives the call.
+        board: Words that the threads share, see `board.py`.
+        number: Index of this thread; thread 0 posts steps.
+        command: A `Command` to post, unless `serving`; if negative, nothing is posted, and the
+            thread waits for the last command.
+        serving: True: fly the steps that thread 0 posts, until none comes for a while.
 
     Returns:
-        Whether all blocks are finished; where not, another thread still flies.
+        True if all blocks are finished; False if another thread is still flying.
     """
     settings, work = _settings_at(call[_SETTINGS]), _work_at(call[_WORK])
     stages, nominal = _stages_at(call[_STAGES]), _params_at(call[_WORLD])
@@ -296,7 +297,7 @@ def fly(call, board, number, command, serving):
     believed = true if settings.known else _params_at(model)
     if not serving and command >= 0:
         post(board, command)
-    while True:  # once, where nobody serves
+    while True:  # a single pass unless serving
         seen = read_shared(board, TICKET)
         while True:
             first, last = take(board, number)

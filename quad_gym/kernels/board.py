@@ -1,30 +1,30 @@
-"""How threads share the blocks of a batch among them, without Python and its lock.
+"""Distribution of a batch's blocks among threads, without Python and its lock.
 
-All look at one board of words. The caller cuts the blocks into ranges, one for each thread, and
-posts a step. A thread takes some blocks at a time, from its own range as long as there are any,
-then from the others': nobody waits for a thread that sleeps or that another process holds up, and
-blocks mostly stay in the cache of one core. A step is over when all blocks are finished.
+All threads share one board of words. The caller divides the blocks into ranges, one per thread, and
+posts a step. A thread takes a few blocks at a time, first from its own range, then from the others.
+No thread has to wait for one that sleeps or has been preempted, and blocks mostly stay in the cache
+of one core. A step is over when all blocks are finished.
 
-Waking a thread takes longer than a step of some hundred flights. So a helper without work watches
-the board for a while, and sleeps only then; Python wakes it (`quad_gym.batch.threads`).
+Waking a thread takes longer than a step of some hundred flights. A helper without work therefore
+polls the board for a while before it sleeps; Python wakes it (`quad_gym.batch.threads`).
 
-COMMAND and what the step is about are written before NEXT, so that whoever takes a block finds
-them.
+COMMAND and the arguments of the step are written before NEXT, so that any thread that takes a block
+sees them.
 """
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.simd.atomics import add_shared, pause, read_shared, write_shared
 
 LINE = 8
-"""Words of a cache line; what different threads write lies in different ones."""
+"""Words in a cache line; words that different threads write are in different lines."""
 TICKET, FINISHED, COMMAND, STOP, CHUNK = 0, LINE, 2 * LINE, 3 * LINE, 3 * LINE + 1
 RANGES, WORDS_OF_RANGE = 4 * LINE, 2 * LINE
 NEXT, FIRST, LAST, PRESENT = 0, 1, 2, LINE
-"""Words of a range: the next block to take; its first, and its end; whether its thread watches."""
+"""Words of a range: the next block to take, the first block, the end, and 1 if its thread polls."""
 WATCH = 4_000
-"""Looks at the board before a helper sleeps, some 100 us."""
+"""Polls of the board before a helper sleeps, about 100 us."""
 PATIENCE = 100 * WATCH
-"""Looks of the caller before it asks Python whether something went wrong."""
+"""Polls of the caller before Python checks the other threads for errors."""
 
 
 @kernel
@@ -39,7 +39,7 @@ def post(board, command):
 
 @kernel
 def take(board, number):
-    """The next blocks for a thread to fly: first and end; the same where there are none."""
+    """Take the next blocks for a thread; return first and end, which are equal if none is left."""
     ranges = (len(board) - RANGES) // WORDS_OF_RANGE
     for k in range(ranges):
         place = RANGES + (number + k) % ranges * WORDS_OF_RANGE
@@ -53,7 +53,7 @@ def take(board, number):
 
 @kernel
 def comes(board, number, seen):
-    """Watch for another step than the last `seen`; False where the helper is to leave."""
+    """Wait for a step after the last one `seen`; return False if the helper is to leave."""
     present = RANGES + number * WORDS_OF_RANGE + PRESENT
     while True:
         for _ in range(WATCH):
@@ -70,7 +70,7 @@ def comes(board, number, seen):
 
 @kernel
 def finished(board):
-    """Wait a while for the step; returns whether all blocks are finished."""
+    """Wait for the end of the step, for a limited time; return True if all blocks are finished."""
     blocks = board[len(board) - WORDS_OF_RANGE + LAST]
     for _ in range(PATIENCE):
         if read_shared(board, FINISHED) == blocks:

@@ -1,11 +1,11 @@
-"""One flight: the list of a tick, and the list of an episode's beginning.
+"""One flight: the stages of a tick, and the stages of an episode's beginning.
 
 A tick is one IMU sample: control on the observed state, motion of the true state, prediction with
-the tick's sample - the one taken at its start or, where samples are averages, the one over it -,
-drift of the biases, then measurements and the update at its end.
+the tick's sample (taken at its start or, if samples are averages, over the tick), drift of the
+biases, then measurements and the update at its end.
 
-A list names slots of the table of stages; which of them are empty, and what the others hold, is
-decided by the settings, see `SOURCES` in `kernels/compiling/stages.py`.
+The lists name slots of the table of stages. The settings determine the function in each slot, or
+leave it empty, see `SOURCES` in `kernels/compiling/stages.py`.
 """
 
 import numpy as np
@@ -22,14 +22,14 @@ _ONE, _TICKS_OF_EPISODE = np.uint64(1), np.uint64(2**32 - 1)
 
 @kernel
 def run(stage, here, flag=0):
-    """Run a stage on a flight: `here` is all that stages are called with."""
+    """Run a stage on a flight; `here` holds the arguments of all stages except `flag`."""
     flight, world, model, settings, work, stages = here
     call_stage(stages, stage, flight, world, model, settings, work, flag)
 
 
 @kernel
 def move_and_measure(flight, world, model, settings, work, stages, within):
-    """Fly a tick until its measurements: its update and `look` follow.
+    """Fly a tick up to its measurements, before `update` and `look`.
 
     Args:
         flight: Record.
@@ -38,7 +38,7 @@ def move_and_measure(flight, world, model, settings, work, stages, within):
         settings: Options of the batch.
         work: Workspace.
         stages: Table of stages.
-        within: 1 if the tick ends within a control period, where only inner loops observe, else 0.
+        within: 1 if the tick ends within a control period, where only inner loops observe; else 0.
     """
     here = (flight, world, model, settings, work, stages)
     work.mask = 1.0
@@ -76,7 +76,7 @@ def update(here):
 
 @kernel
 def look(flight, world, model, settings, work, stages, within):
-    """Observe at the end of a tick; `within` as for `move_and_measure`."""
+    """Set the observed state at the end of a tick; `within` as for `move_and_measure`."""
     here = (flight, world, model, settings, work, stages)
     work.mask = 1.0
     run(Stage.LOOK, here, within)
@@ -87,9 +87,9 @@ def look(flight, world, model, settings, work, stages, within):
 def begin_episode(flight, nominal, world, model, settings, work, stages, mask):
     """Begin a new episode, where `mask`: reference, true state, first measurements, filter.
 
-    The flights' own parameters, in `world`, are drawn as the `nominal` ones and the settings say.
-    Each episode has its own instants, so that its draws do not depend on the length of the one
-    before.
+    The flights' own parameters, in `world`, are drawn around the `nominal` ones according to the
+    settings. Each episode has its own instants, so that its draws do not depend on the length of
+    the previous one.
     """
     here = (flight, world, model, settings, work, stages)
     instant = (flight.instant | _TICKS_OF_EPISODE) + _ONE

@@ -1,10 +1,10 @@
-"""The filter's update of several blocks: only where there is a measurement.
+"""Filter updates of several blocks, only for lanes with a measurement.
 
-Sensors of different flights measure at different instants, so that in most ticks few lanes of a
+Sensors of different flights measure at different instants, so that at most ticks few lanes of a
 block have a measurement, while an update costs the same for one lane as for all. Lanes of several
 blocks are therefore gathered into one: the words that an update reads (`records/gathered.py`) are
-copied into a block of scratch memory, and those that it writes are copied back. Lanes do not affect
-each other, so the flights are the same.
+copied to a block of scratch memory, and the words that it writes are copied back. Lanes do not
+affect each other, so results are unchanged.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ _GATHERED, _WORDS = int(Call.GATHERED), int(Call.WORDS)
 _WORD_COUNT, _WRITTEN_COUNT = int(Call.WORD_COUNT), int(Call.WRITTEN_COUNT)
 _SIZE = FLIGHT_BLOCK.itemsize // 8
 _MANY = 6 * WIDTH // 8
-"""Lanes of a block with a measurement from which on it is updated where it is."""
+"""Smallest number of lanes with a measurement for which a block is updated in place."""
 
 _flight_at, _plain_flight_at = lanes_at(FLIGHT_BLOCK), record_at(FLIGHT_BLOCK)
 _plain_work_at = record_at(WORK_BLOCK)
@@ -40,7 +40,7 @@ _numbers_at, _words_at = array_at("f8"), array_at("u8")
 
 @kernel
 def _kind(flight, settings):
-    """What is measured in each lane: a bit for each sensor, 0: nothing."""
+    """Return the sensors with a measurement in each lane: a bit for each; 0: none."""
     kind, bit = 0.0 * flight.tick, 1.0
     for sensor in range(SENSORS):
         first, valid = FIRST_BLOCK[sensor], 0.0 * kind
@@ -53,7 +53,7 @@ def _kind(flight, settings):
 
 @kernel
 def _gather_stamps(gathered, k, flight, lane, settings):
-    """Copy the time stamps of what arrives, of one lane, to lane k."""
+    """Copy the time stamps of one lane's arriving measurements to lane k."""
     for sensor in range(SENSORS):
         if settings.sensor_delay[sensor] > 0:
             tick = flight.tick[lane] - settings.sensor_delay[sensor]
@@ -67,7 +67,7 @@ def _gather_stamps(gathered, k, flight, lane, settings):
 
 @routine
 def _update_gathered(call, kind, model, settings, work, stages):
-    """Update the lanes of a queue, where they are if they are of one block; empty it."""
+    """Update the lanes of a queue, in place if all are in one block, and empty the queue."""
     plain = _plain_work_at(call[_WORK])
     source, block, count = plain.source[kind], plain.source_block[kind], plain.queued[kind, 0]
     plain.queued[kind, 0] = 0
@@ -103,7 +103,7 @@ def _update_gathered(call, kind, model, settings, work, stages):
 
 @kernel
 def _put(call, kind, address, block, model, settings, work, stages):
-    """Put a lane into a queue, which is updated when it is full."""
+    """Append a lane to a queue, whose lanes are updated when it is full."""
     plain = _plain_work_at(call[_WORK])
     count = plain.queued[kind, 0]
     plain.source[kind, count], plain.source_block[kind, count] = address, block
@@ -116,8 +116,8 @@ def _put(call, kind, address, block, model, settings, work, stages):
 def update_group(call, first, last, model, settings, work, stages):
     """Update the filters of the blocks from `first` to before `last`.
 
-    An update costs the more the more sensors any lane has measurements of: lanes with measurements
-    of the same sensors are gathered first, then what is left of them.
+    The cost of an update grows with the number of sensors that any of its lanes has measurements
+    from. Lanes with equal sets of sensors are therefore gathered first, then the remaining lanes.
     """
     plain = _plain_work_at(call[_WORK])
     for index in range(first, last):

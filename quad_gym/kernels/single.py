@@ -1,10 +1,10 @@
 """Entries for the classes of one vehicle: scalar instances of the kernels of sensors and vehicle.
 
-A filter runs the stages of flights on a block of its own instead, as scalar instances of them would
+A filter instead runs the stages of flights on its own block, as scalar instances of these would
 take even longer to compile.
 
-Each entry has a signature, so that it can be compiled ahead; arrays in another order of memory are
-accepted, too, and compiled for on their first use.
+Each entry has a signature, so that it can be compiled in advance; arrays in another memory order
+are accepted, too, and cause a compilation on their first use.
 """
 
 import numpy as np
@@ -54,9 +54,9 @@ from quad_gym.records import (
 )
 
 FILTER_STAGES = (Stage.UPDATE, Stage.PREDICT, *(Stage[sensor.name] for sensor in Sensor))
-"""The stages that a filter runs, as far as it needs them."""
+"""Stages that a filter runs, as far as it needs them."""
 FILTER_ENTRIES = tuple(f"{__name__}:{name}" for name in ("start_filter", "run_stage"))
-"""Names of the entries that it calls, the longest to compile first."""
+"""Names of the entries that a filter calls, the slowest to compile first."""
 SENSORS_AND_VEHICLE = tuple(
     f"{__name__}:{name}"
     for name in (
@@ -76,7 +76,7 @@ SENSORS_AND_VEHICLE = tuple(
         "limit_features",
     )
 )
-"""Names of the other entries of this module, likewise."""
+"""Names of the other entries of this module, the slowest to compile first."""
 
 
 def _array(kind, dimensions=1):
@@ -97,7 +97,7 @@ def _entry(*arguments, returns=types.none):
 def start_filter(blocks, params, settings, work, x_I):
     """Start the filters of blocks[0] from their first fixes, where `work.mask`.
 
-    x_I is (3,), zero if it is not known.
+    x_I: (3,) known direction of body x in I, or zeros if unknown.
     """
     flight, mask = lanes_of(blocks[0]), lanes_of(work[0]).mask > 0.0
     forget_innovations(flight, settings[0].feature_count, mask)
@@ -111,14 +111,15 @@ def start_filter(blocks, params, settings, work, x_I):
     types.int64,
 )
 def run_stage(address, pitch, count, number, world, model, settings, work, table, flag):
-    """Run a stage that the table has once for every block, where `work.mask`.
+    """Run a stage of the table once for every block, where `work.mask`.
 
     Args:
-        address, pitch: Of the first block, as of `Call`; bytes from one block to the next.
-        count: How many blocks there are.
+        address: Address of the first block, as in `Call`.
+        pitch: Bytes from one block to the next.
+        count: Number of blocks.
         number: A `Stage`.
         world, model, settings, work, table: As for `fly`.
-        flag: What the stage is called with.
+        flag: The stage's flag.
     """
     true, believed = lanes_of(world[0]), lanes_of(model[0])
     scratch = lanes_of(work[0])
@@ -143,39 +144,39 @@ def sense_imu_average(flights, params, starts):
 
 @_entry(_FLIGHT, _PARAMS, types.boolean)
 def sense_gnss(flights, params, paired):
-    """Measure flights[0] by GNSS, its baseline, too, if it is `paired`."""
+    """Measure flights[0] by GNSS, including the baseline if `paired`."""
     measure_gnss(flights[0], params[0], paired, True)
 
 
 @_entry(_FLIGHT, _PARAMS)
 def draw_sensor_errors(flights, params):
-    """Draw the errors of flights[0]'s sensors that stay as they are."""
+    """Draw the constant errors of the sensors of flights[0]."""
     draw_imu_errors(flights[0], params[0], True)
     draw_heading_error(flights[0], params[0], True)
 
 
 @_entry(_FLIGHT, _PARAMS)
 def disturb_imu(flights, params):
-    """Err and vibrate with the sample just taken by the IMU of flights[0]."""
+    """Add errors and vibration to the last IMU sample of flights[0]."""
     err_imu(flights[0], params[0], True)
     vibrate_imu(flights[0], params[0], True)
 
 
 @_entry(_FLIGHT, _PARAMS)
 def turn_gnss_baseline(flights, params):
-    """Give the baseline just measured by flights[0] its constant error."""
+    """Add the constant error to the last measured baseline of flights[0]."""
     turn_baseline(flights[0], params[0], True)
 
 
 @_entry(_FLIGHT, _PARAMS, types.boolean, types.boolean, types.int64)
 def limit_features(flights, params, blurs, ground_hides, feature_count):
-    """Blur the image just taken by flights[0], and lose what is too far or behind the ground."""
+    """Blur the last image of flights[0], and drop features out of range or behind the ground."""
     limit_camera(flights[0], params[0], blurs, ground_hides, feature_count, True)
 
 
 @_entry(_FLIGHT, _PARAMS)
 def step_gnss_drift(flights, params):
-    """Step the slow position error of flights[0] to the next measurement."""
+    """Advance the slow position error of flights[0] to the next measurement."""
     drift_gnss(flights[0], params[0], True, 1.0)
 
 
@@ -187,13 +188,13 @@ def sense_features(flights, params, feature_count):
 
 @_entry(_FLIGHT, _PARAMS)
 def step_biases(flights, params):
-    """Step the IMU biases of flights[0] by one tick."""
+    """Advance the IMU biases of flights[0] by one tick."""
     drift_biases(flights[0], params[0])
 
 
 @_entry(_FLIGHT, _PARAMS, types.int64)
 def integrate_flight(flights, params, substeps):
-    """Carry the true state of flights[0] over one tick."""
+    """Integrate the true state of flights[0] over one tick."""
     integrate(flights[0], params[0], substeps)
 
 
@@ -209,7 +210,7 @@ def body_accelerations(R_BI, v_I, w_B, rotor_speeds, d_I, params, a_I, dw_B):
 
 @_entry(_VECTOR, _MATRIX, *[_VECTOR] * 4, _PARAMS, _SETTINGS, _VECTOR, _VECTOR)
 def body_accelerations_in_air(r_I, R_BI, v_I, w_B, rotor_speeds, d_I, params, settings, a_I, dw_B):
-    """Write the acceleration in I and the angular acceleration in B in a world that is not calm."""
+    """Write the acceleration in I and the angular acceleration in B in moving air."""
     a, dw = accelerations_in_air(
         load3(r_I),
         load33(R_BI),
@@ -232,7 +233,7 @@ def wahba_of_vectors(weights, v_I, v_B, R_BI):
     profile = (zeros, zeros, zeros)
     for i in range(len(weights)):
         profile = add_outer(profile, scale(weights[i], load3(v_B[i])), load3(v_I[i]))
-    # only ratios count: make the largest entry one, far from under- and overflow
+    # only ratios matter: scale the largest entry to one, to avoid under- and overflow
     largest = 0.0
     for i in range(3):
         for j in range(3):

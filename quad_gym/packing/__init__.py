@@ -1,1 +1,1 @@
-"""From parameters to the records that kernels read."""
+"""Conversion of parameters to the records that kernels read."""

@@ -23,18 +23,18 @@ from quad_gym.records import (
 
 
 class SlowStates(NamedTuple):
-    """The slow errors among the states of a suite's filter, in their order."""
+    """Slow errors among the states of a suite's filter, in the order of the states."""
 
     errors: tuple[SlowError, ...]
-    """a multiple of three; the last ones, which fill it up, are constant, of deviation one"""
+    """slow errors, padded to a multiple of three by constants with standard deviation one"""
     estimated: int
-    """how many of them are errors of sensors"""
+    """number of slow errors without the padding"""
     drifts: bool
-    """whether the first three are the drift of GNSS positions, which is zero at the start"""
+    """True if the first three are the drift of GNSS positions, which is zero at the start"""
     vectors: tuple[int, ...]
-    """the first of an aiding sensor's three, in the order of `Aid`; -1: it has none"""
+    """index of the first of an aiding sensor's three errors, in the order of `Aid`; -1: none"""
     scalars: tuple[int, ...]
-    """an aiding sensor's single one, likewise"""
+    """index of an aiding sensor's single error, in the order of `Aid`; -1: none"""
 
     @property
     def first_sigmas(self) -> NDArray[np.float64]:
@@ -45,7 +45,7 @@ class SlowStates(NamedTuple):
 
 
 def slow_states(sensors: SensorSuite) -> SlowStates:
-    """The slow errors that a filter which believes in these sensors estimates."""
+    """Return the slow errors that a filter estimates if it assumes these sensors."""
     errors: list[SlowError] = []
     vectors, scalars = [-1] * AIDS, [-1] * AIDS
     if sensors.gnss is not None and sensors.drifts:
@@ -65,19 +65,19 @@ def slow_states(sensors: SensorSuite) -> SlowStates:
 
 
 def blocks_of(sensors: SensorSuite) -> tuple[int, ...]:
-    """The blocks of innovations of a suite: position, baseline, velocity, features, aids."""
+    """Return the blocks of innovations of a suite: position, baseline, velocity, features, aids."""
     features = 0 if sensors.camera is None else len(sensors.camera.features_I)
     return (*range(FEATURE_BLOCKS + features), *(AID_BLOCKS + aid for aid in sensors.aids))
 
 
 def decay_and_drive(error: SlowError, time: float) -> tuple[float, float]:
-    """Decay of a slow error over a time [s], and standard deviation of what drives it."""
+    """Return the decay of a slow error over a time [s], and its driving noise's sigma."""
     decay = math.exp(-time / error.tau)
     return decay, error.sigma * math.sqrt(-math.expm1(-2.0 * time / error.tau))
 
 
 def pack_aids(p: Any, sensors: SensorSuite) -> None:
-    """Write the numbers of aiding sensors and slow errors into a parameter record."""
+    """Write the parameters of aiding sensors and slow errors into a parameter record."""
     p["slow_decay"] = p["slow_sigma"] = 1.0
     states = slow_states(sensors)
     p["slow_sigma"][: len(states.errors)] = states.first_sigmas
@@ -97,15 +97,15 @@ def pack_aids(p: Any, sensors: SensorSuite) -> None:
 
 
 def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuite) -> None:
-    """Write which sensors and slow errors there are, and the clocks of all but GNSS and camera.
+    """Write the available sensors and slow errors, and the clocks of the aiding sensors.
 
     Args:
         settings: One SETTINGS record.
-        measures: The sensors as they are.
-        believes: The sensors as the filter believes them to be.
+        measures: The true sensors.
+        believes: The sensors that the filter assumes.
 
     Raises:
-        ValueError: If a sensor is too late for its rate.
+        ValueError: If the latency of a sensor is too long for its rate.
     """
     states = slow_states(believes)
     assert len(states.errors) <= MAX_SLOW
@@ -128,5 +128,5 @@ def pack_aid_settings(settings: Any, measures: SensorSuite, believes: SensorSuit
 
 
 def phase_ticks(phase: float | None, period: int) -> int:
-    """Ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
+    """Return the ticks to the first measurement, fewer than `period`; -1: drawn in each episode."""
     return -1 if phase is None else min(round(phase * period), period - 1)

@@ -13,7 +13,7 @@ def pack_faults(s: Any, faults: Iterable[Fault], dt: float) -> None:
 
     Args:
         s: The settings.
-        faults: One of a kind at most.
+        faults: At most one fault of each kind.
         dt: The tick [s].
     """
     for fault in faults:
@@ -38,7 +38,7 @@ def _low_and_range(value: Span) -> tuple[float, float]:
 
 
 def _ticks(value: Span, dt: float, least: float = 0.0) -> tuple[float, float]:
-    """Time in ticks: a number in whole ones, of a range the lower end and the length."""
+    """Return the lower end and the length of a span of time [s] in ticks; a number is rounded."""
     low, high = ends(value)
     if math.isinf(high):
         return NEVER, 0.0

@@ -1,4 +1,4 @@
-"""Parameters as records: from the dataclasses that users write to the numbers that kernels read."""
+"""Parameters and settings as records: conversion of the dataclasses to numbers for kernels."""
 
 import math
 from dataclasses import fields
@@ -55,7 +55,7 @@ _NAMES = frozenset(field.name for field in PARAMS_FIELDS)
 
 
 def _copy(p: Any, part: Any, prefix: str = "") -> None:
-    """Copy those fields of parameters that a record has, under their names; None stays zero."""
+    """Copy the parameters that have a field with their name in the record; None stays zero."""
     for name in (field.name for field in fields(part)):
         if prefix + name in _NAMES and getattr(part, name) is not None:
             p[prefix + name] = getattr(part, name)
@@ -70,7 +70,7 @@ def params_record(
 ) -> NDArray[Any]:
     """Return a vehicle, its sensors, gains and world as one scalar record, shape (1,).
 
-    Fields have the names of the parameters that they are; the others follow from them.
+    A field that is a parameter has its name; the other fields are derived.
     """
     record = np.zeros(1, PARAMS)
     p = record[0]
@@ -109,7 +109,7 @@ def params_record(
 
 
 def _pack_vehicle(p: Any, vehicle: VehicleParams) -> None:
-    """Write the numbers that follow from the vehicle."""
+    """Write the numbers that are derived from the vehicle."""
     for name in ("effectiveness", "max_rotor_force", "hover_voltage"):
         p[name] = getattr(vehicle, name)
     p["sound_effectiveness"], p["torque_scale"] = vehicle.effectiveness, vehicle.hover_torques
@@ -120,7 +120,7 @@ def _pack_vehicle(p: Any, vehicle: VehicleParams) -> None:
 
 
 def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
-    """Write the noise of the IMU's samples, and of the rotors' vibration."""
+    """Write the noise of the IMU's samples, and the noise due to vibration of the rotors."""
     imu = sensors.imu
     p["imu_lever_arm"] = imu.lever_arm_B
     hover_speed = vehicle.motor_speed_per_volt * vehicle.hover_voltage
@@ -132,10 +132,10 @@ def _pack_imu(p: Any, sensors: SensorSuite, vehicle: VehicleParams) -> None:
 def pack_tick(p: Any, sensors: SensorSuite, dt: float) -> None:
     """Write the numbers that depend on the duration of a prediction.
 
-    White noise is a density: the mean of a longer time has less of it.
+    White noise is given as a density: the mean over a longer time has a smaller sigma.
 
     Args:
-        p: One record of parameters, or of a block of flights; it has the gravity of the vehicle.
+        p: One record of parameters, scalar or of a block; its gravity is already set.
         sensors: Sensors that the filter assumes.
         dt: Duration of the prediction [s]; of a tick, in flights.
     """
@@ -143,7 +143,7 @@ def pack_tick(p: Any, sensors: SensorSuite, dt: float) -> None:
     p["dt"], p["accel_error_noise"] = dt, imu.believed_accel_error * fewer
     for sensor in ("accel", "gyro"):
         p[f"{sensor}_noise"] = getattr(imu, f"believed_{sensor}_sigma") * fewer
-        # rotors that lift g shake it like this
+        # the vibration is given for rotors in hover, whose specific force is g
         p[f"{sensor}_thrust_noise"] = getattr(imu, f"{sensor}_vibration") / p["gravity"] * fewer
         error = SlowError(getattr(imu, f"{sensor}_bias_sigma"), getattr(imu, f"{sensor}_bias_tau"))
         p[f"{sensor}_bias_decay"], p[f"{sensor}_bias_drive"] = decay_and_drive(error, dt)
@@ -152,9 +152,9 @@ def pack_tick(p: Any, sensors: SensorSuite, dt: float) -> None:
 
 
 def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
-    """Write GNSS, or where there is none the pose at the start as if GNSS had measured it."""
+    """Write the GNSS; without one, write the initial pose as if GNSS had measured it."""
     gnss, pose = sensors.gnss, sensors.initial_pose
-    if gnss is None:  # center and x axis
+    if gnss is None:  # the antenna is at the center, the baseline along the x axis
         p["R_IG"], p["position_sigma_I"] = np.eye(3), pose.position_sigma
     else:
         _copy(p, gnss)
@@ -167,7 +167,7 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
         p["baseline"], p["baseline_length"] = gnss.baseline_B, portable.norm(gnss.baseline_B)
         p["first_baseline_sigma"] = gnss.first_baseline_sigma
         p["baseline_noise"] = gnss.believed_baseline_sigma
-    else:  # beside GNSS a vertical one, as that tells no heading either
+    else:  # with GNSS a vertical one, which does not observe the heading either
         p["baseline"] = (1.0, 0.0, 0.0) if gnss is None else (0.0, 0.0, 1.0)
         p["baseline_length"] = 1.0
         for name in ("baseline_sigma", "first_baseline_sigma", "baseline_noise"):
@@ -177,7 +177,7 @@ def _pack_gnss(p: Any, sensors: SensorSuite) -> None:
 
 
 def _pack_filter(p: Any, sensors: SensorSuite) -> None:
-    """Write form and gates of the filter."""
+    """Write the sigma points, noise models and gates of the filter."""
     estimator = sensors.estimator
     p["sigma_spread"], p["sigma_beta"] = estimator.alpha, estimator.beta
     p["sigma_kappa"] = estimator.kappa
@@ -191,12 +191,12 @@ def _pack_filter(p: Any, sensors: SensorSuite) -> None:
 
 
 def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int = 0) -> FilterForm:
-    """How a filter differs from the report's, and what it keeps, for the kernels.
+    """Return the options of a filter as flags for the kernels.
 
     Args:
         estimator: The filter.
-        innovations: Whether it keeps innovations.
-        lever_arm: How it takes the accelerometer's lever arm into account, see `lever_form`.
+        innovations: True if it stores innovations.
+        lever_arm: Flags for the accelerometer's lever arm, see `lever_form`.
     """
     form = FilterForm.INNOVATIONS if innovations else FilterForm(0)
     if estimator.kind == "ekf":
@@ -213,11 +213,11 @@ def form_of(estimator: FilterParams, innovations: bool = False, lever_arm: int =
 
 
 def lever_form(imu: ImuParams, drawn: bool = False) -> FilterForm:
-    """How a filter takes the accelerometer's lever arm into account, where there is one.
+    """Return the flags with which a filter models the accelerometer's lever arm; 0: none.
 
     Args:
-        imu: As the filter believes it.
-        drawn: Whether the filter knows a lever arm that each episode draws.
+        imu: The IMU that the filter assumes.
+        drawn: True if each episode draws a lever arm, which is available to the filter.
     """
     if not (drawn or any(imu.lever_arm_B)):
         return FilterForm(0)
@@ -232,22 +232,22 @@ _HARMONICS = {
     Task.WAYPOINTS: 0,
     Task.TRAJECTORY: FOLLOWED,
 }
-"""Terms of the series of a task's reference, where these are not all."""
+"""Terms in the series of a task's reference, for tasks that do not use all of them."""
 
 
 def pack_latency(
     settings: Any, measures: SensorSuite, clocks: Clocks, believes: SensorSuite
 ) -> None:
-    """Fill the settings' fields of which sensors there are, and of delayed measurements.
+    """Fill the settings' fields of available sensors and of delayed measurements.
 
     Args:
         settings: One SETTINGS record.
-        measures: The sensors as they are.
-        clocks: When they measure.
-        believes: What the filter makes of it.
+        measures: The true sensors.
+        clocks: Rates of the IMU, GNSS and camera.
+        believes: The sensors that the filter assumes.
 
     Raises:
-        ValueError: If a sensor is too late for its rate.
+        ValueError: If the latency of a sensor is too long for its rate.
     """
     pack_aid_settings(settings, measures, believes)
     for name in ("gnss", "camera"):
@@ -262,7 +262,7 @@ def pack_latency(
 
 
 def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
-    """Fill the settings' fields of what sensors as they are (`measures`) do wrong."""
+    """Fill the settings' fields of the errors of the true sensors, `measures`."""
     imu, gnss, camera = measures.imu, measures.gnss, measures.camera
     settings["imu_errs"], settings["imu_vibrates"] = imu.errs, imu.vibrates
     settings["heading_errs"] = gnss is not None and gnss.heading_errs
@@ -273,7 +273,7 @@ def pack_imperfections(settings: Any, measures: SensorSuite) -> None:
 
 
 def params_block(record: NDArray[Any]) -> NDArray[Any]:
-    """A scalar parameter record repeated for the eight flights of a block, shape (1,)."""
+    """Return a scalar parameter record repeated for the flights of a block, shape (1,)."""
     block = aligned_zeros(1, PARAMS_BLOCK)
     for name in PARAMS.names or ():
         block[name][...] = record[name][..., np.newaxis]
@@ -296,7 +296,7 @@ def settings_record(
     gnss_drifts: bool = False,
     lever_drawn: bool = False,
 ) -> NDArray[Any]:
-    """What a batch does, as one scalar record, shape (1,)."""
+    """Return the settings of a batch as one scalar record, shape (1,)."""
     record = np.zeros(1, SETTINGS)
     s = record[0]
     s["substeps"], s["ticks_per_step"] = clocks.substeps, clocks.ticks_between("control")

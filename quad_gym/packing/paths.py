@@ -1,4 +1,4 @@
-"""Trajectories as records: the table in which kernels look them up."""
+"""Trajectories as the records that kernels look up."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ _RULES = {"given": HEADING_GIVEN, "along": HEADING_VELOCITY, "toward": HEADING_T
 
 
 def pack_paths(trajectories: Sequence[Trajectory]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The paths (n,) of PATH and all their segments (m,) of PIECE."""
+    """Return the paths (n,) of PATH and all their segments (m,) of PIECE."""
     paths = aligned_zeros(len(trajectories), PATH)
     counts = [len(trajectory.times) - 1 for trajectory in trajectories]
     pieces = aligned_zeros(sum(counts), PIECE)

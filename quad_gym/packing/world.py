@@ -1,4 +1,4 @@
-"""The world and its randomization as numbers in the records that kernels read."""
+"""World and randomization as numbers in the records that kernels read."""
 
 import math
 from typing import Any
@@ -13,20 +13,20 @@ from quad_gym.params.world import WorldParams
 from quad_gym.records import COLUMNS, MAX_START_VELOCITY, SETTINGS, Start, Supply
 
 FALLEN_THROUGH = 0.5
-"""Below ground that carries vehicles, nothing flies at this depth [m]."""
+"""Depth below ground that supports vehicles at which an episode ends [m]."""
 
 
 def pack_options(
     s: Any, world: WorldParams, draws: DrawingTable, *, known: bool, limited: bool
 ) -> None:
-    """Write into a settings record which parts of a world there are, and what is drawn.
+    """Write the options of a world and its randomization into a settings record.
 
     Args:
         s: The settings.
         world: The world without draws.
-        draws: What is drawn.
-        known: Whether filter and controller know the world as it is.
-        limited: Whether the motors have a largest voltage that the controller does not know.
+        draws: The drawn parameters and their distributions.
+        known: True if filter and controller use the true parameters.
+        limited: True if the motors have a largest voltage that is unknown to the controller.
     """
 
     def present(name: str, *values: float) -> bool:
@@ -53,11 +53,11 @@ def pack_options(
 
 
 def pack_start(s: Any, draws: DrawingTable) -> None:
-    """Write into a settings record how much the velocity and the tilt of starts vary.
+    """Write the variance of the velocity and the tilt at the start into a settings record.
 
     Args:
-        s: The settings, which say already how episodes begin.
-        draws: What is drawn on top.
+        s: The settings, with `start` already set.
+        draws: The drawn parameters, which are added to the start.
     """
     if s["start"] == Start.MOVING:  # uniform on [-most, most]
         s["start_velocity_variance"] = MAX_START_VELOCITY**2 / 3.0
@@ -65,20 +65,20 @@ def pack_start(s: Any, draws: DrawingTable) -> None:
         s["start_velocity_variance"] += draws.mean_square("start_velocity_I")
     for i, name in enumerate(("start_roll", "start_pitch")):
         if name in draws.names:
-            # no angle is less known than one that may be any
+            # no angle is more uncertain than one uniform on the circle
             s["start_tilt_variance"][i] = min(draws.mean_square(name)[0], math.pi**2 / 3.0)
 
 
 def pack_places(
     s: Any, draws: DrawingTable, true_sensors: SensorSuite, sensors: SensorSuite
 ) -> None:
-    """Write into a settings record whether features are drawn, and where they are without draws.
+    """Write into a settings record if features are drawn, and their positions without draws.
 
     Args:
-        s: The settings, which say already whether the filter knows the world as it is.
-        draws: What is drawn.
-        true_sensors: As they are.
-        sensors: As the filter believes, unless it knows.
+        s: The settings, with `known` already set.
+        draws: The drawn parameters.
+        true_sensors: The true sensors.
+        sensors: The sensors that the filter assumes, unless `known` is set.
     """
     s["features_drawn"] = bool(set(FEATURE_DRAWS) & set(draws.names))
     if s["features_drawn"]:
@@ -89,7 +89,7 @@ def pack_places(
 
 
 def pack_obstacles(s: Any, world: WorldParams) -> None:
-    """Write into a settings record what stands in a world."""
+    """Write the obstacles, geofence and ground of a world into a settings record."""
     s["obstacle_count"] = len(world.obstacles)
     s["vehicle_radius"] = world.vehicle_radius
     for k, obstacle in enumerate(world.obstacles):
@@ -101,7 +101,7 @@ def pack_obstacles(s: Any, world: WorldParams) -> None:
         s["fenced"], s["fence"] = True, world.geofence
     if world.ground is not None:
         s["grounded"], s["friction"] = True, world.ground.friction
-        # the ground ends no episode but in a crash; only who has fallen through is far below it
+        # ground contact ends an episode by a crash only; a vehicle far below has fallen through
         s["min_height"] = min(s["min_height"], world.ground_height - FALLEN_THROUGH)
         s["hard_speed"] = world.ground.max_touchdown_speed
         s["hard_up"] = math.cos(world.ground.max_touchdown_tilt)
@@ -109,7 +109,7 @@ def pack_obstacles(s: Any, world: WorldParams) -> None:
 
 
 def world_settings(world: WorldParams) -> NDArray[Any]:
-    """A settings record that holds a world's options alone, shape (1,)."""
+    """Return a settings record that holds only the options of a world, shape (1,)."""
     settings = np.zeros(1, SETTINGS)
     draws = DrawingTable(Randomization({}), VehicleParams(), SensorSuite(), world)
     pack_options(settings[0], world, draws, known=False, limited=False)

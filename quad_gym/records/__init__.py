@@ -1,6 +1,7 @@
-"""The memory of flights: one table of fields for each record, sizes and enumerations. Imports NumPy.
+"""The memory of flights: a table of fields for each record, sizes and enumerations. Imports NumPy.
 
-As a flight is nothing but its record, snapshot, restore, pickling and copying are array copies.
+A record holds the complete state of a flight, so that snapshot, restore, pickling and copying are
+array copies.
 """
 
 from quad_gym.records.call import (

@@ -1,57 +1,57 @@
-"""What the compiled code that flies is called with: words, most of them addresses."""
+"""Arguments of a call of the compiled batch kernel: words, most of them addresses."""
 
 from enum import IntEnum, auto
 
 
 class Call(IntEnum):
-    """The words of a call, by their place; each thread has its own."""
+    """Words of a call, by their index; each thread has its own array of them."""
 
     BLOCKS = 0
     """Address of the first block, as if it had all fields; see `Room`."""
     PITCH = auto()
     """Bytes from one block to the next."""
     COUNT = auto()
-    """Flights."""
+    """Number of flights."""
     RESETS = auto()
-    """(COUNT,) uint8; for RESET, which flights begin an episode."""
+    """(COUNT,) uint8; for RESET: 1 for flights that begin an episode."""
     WORLD = auto()
-    """PARAMS_BLOCK: parameters as they are."""
+    """PARAMS_BLOCK: true parameters."""
     OWN = auto()
-    """PARAMS_BLOCK of this thread: a copy of WORLD, where the parameters of the flights at hand are
-    put together if they draw some, or if their rotors can fail."""
+    """PARAMS_BLOCK of this thread: a copy of WORLD, which receives the parameters of the current
+    flights if these draw some, or if their rotors can fail."""
     MODEL = auto()
-    """PARAMS_BLOCK: parameters as the filter and the controller believe them."""
+    """PARAMS_BLOCK: parameters that the filter and the controller assume."""
     BELIEVED = auto()
-    """PARAMS_BLOCK of this thread: a copy of MODEL, where the features of the flights at hand are
-    put if each episode has its own."""
+    """PARAMS_BLOCK of this thread: a copy of MODEL, which receives the features of the current
+    flights if each episode has its own."""
     SETTINGS = auto()
-    """SETTINGS."""
+    """SETTINGS of the batch."""
     WORK = auto()
     """WORK_BLOCK of this thread."""
     GROUP = auto()
-    """Blocks that a thread flies side by side, tick by tick; see `kernels/gathering.py`."""
+    """Number of blocks that a thread steps together, tick by tick; see `kernels/gathering.py`."""
     GATHERED = auto()
-    """FLIGHT_BLOCK of this thread: lanes of several blocks."""
+    """FLIGHT_BLOCK of this thread: lanes gathered from several blocks."""
     WORDS = auto()
-    """(WORD_COUNT,) uint64: places of the words that are copied to it; see `gathered.py`."""
+    """(WORD_COUNT,) uint64: offsets of the words copied to GATHERED; see `gathered.py`."""
     WORD_COUNT = auto()
-    """Their number."""
+    """Number of WORDS."""
     WRITTEN_COUNT = auto()
-    """Number of the first ones that are copied back."""
+    """Number of leading WORDS that are copied back."""
     STAGES = auto()
-    """STAGE_TABLE, which has the stages that the settings need."""
+    """STAGE_TABLE with the stages that the settings need."""
     ACTIONS = auto()
     """(blocks WIDTH, 4) float64; for STEP."""
     SIZE = auto()
-    """Numbers of an observation; 0: nothing is observed."""
+    """Length of an observation; 0: no observations."""
     LOW = auto()
-    """(SIZE,) float64: bounds of the observation space."""
+    """(SIZE,) float64: lower bounds of the observation space."""
     HIGH = auto()
-    """(SIZE,) float64, likewise."""
+    """(SIZE,) float64: upper bounds of the observation space."""
     OBSERVATIONS = auto()
-    """(COUNT, SIZE) float32, written."""
+    """(COUNT, SIZE) float32, written: observations."""
     FINAL_OBSERVATIONS = auto()
-    """Likewise, written where one episode ends and the next begins in this step."""
+    """(COUNT, SIZE) float32, written where one episode ends and the next begins in this step."""
     RESULTS = auto()
     """(len(RESULTS), at least blocks WIDTH) float64, written in a STEP."""
     RESULT_PITCH = auto()
@@ -59,4 +59,4 @@ class Call(IntEnum):
     SHOWN = auto()
     """(SHOWN_SIZE, blocks WIDTH) float64, written if the setting `shown` is on."""
     SHOWN_PITCH = auto()
-    """Bytes from one row of it to the next."""
+    """Bytes from one row of SHOWN to the next."""

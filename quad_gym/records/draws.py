@@ -6,7 +6,7 @@ from typing import NamedTuple
 from quad_gym.records.sizes import MAX_ACTION_DELAY, MAX_FEATURES
 
 FIXED, UNIFORM, LOG_UNIFORM, NORMAL = 0, 1, 2, 3
-"""Kinds of distributions in the kernels."""
+"""Codes of distributions in the kernels."""
 
 
 class Drawable(NamedTuple):
@@ -17,11 +17,11 @@ class Drawable(NamedTuple):
     unit: str
     meaning: str
     least: float = -math.inf
-    """smallest value that makes sense, where the parameter itself has no bounds"""
+    """smallest meaningful value, where the parameter itself has no bounds"""
     above: float = -math.inf
-    """value that it has to exceed"""
+    """exclusive lower bound"""
     most: float = math.inf
-    """largest value that makes sense"""
+    """largest meaningful value"""
 
 
 # fmt: off
@@ -65,7 +65,7 @@ DRAWABLES = (
     Drawable("camera_position_B", 3, "m", "position of the camera's projection center"),
     Drawable("camera_rotation", 3, "rad", "error e of the camera's attitude, R(e) R_CB"),
     Drawable("focal_length", 1, "pixels", "focal length of the camera"),
-    # the start, on top of the task's own; what a caller gives to a reset stays as it was given
+    # the start, added to the task's own; values that a caller gives to a reset stay unchanged
     Drawable("start_position_I", 3, "m", "added to the start's position", -1e6, most=1e6),
     Drawable("start_velocity_I", 3, "m/s", "added to the start's velocity", -1e4, most=1e4),
     Drawable("start_body_rates", 3, "rad/s", "body rates at the start", -1e3, most=1e3),
@@ -87,4 +87,4 @@ for _drawable in DRAWABLES:
     _first = max((columns.stop for columns in COLUMNS.values()), default=0)
     COLUMNS[_drawable.name] = slice(_first, _first + _drawable.size)
 DRAWN_SIZE = sum(drawable.size for drawable in DRAWABLES)
-"""Numbers that can be drawn."""
+"""Number of columns."""

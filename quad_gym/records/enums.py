@@ -1,10 +1,10 @@
-"""Every enumeration that records hold, once."""
+"""Enumerations of the values that records hold."""
 
 from enum import IntEnum, IntFlag
 
 
 class FilterStatus(IntFlag):
-    """Numerical failures of a filter since its start; 0: none."""
+    """Flags of a filter's numerical failures since its start; 0: none."""
 
     PREDICTION_FAILED = 1
     """The predicted covariance was not positive definite; the filter kept its last good state."""
@@ -13,24 +13,24 @@ class FilterStatus(IntFlag):
 
 
 class FilterForm(IntFlag):
-    """How a filter differs from the report's, and what it keeps; 0 is the report's UKF."""
+    """Options of a filter as flags; 0 is the UKF of the report."""
 
     EKF = 1
-    """derivatives of the models in place of sigma points"""
+    """extended Kalman filter: derivatives of the models instead of sigma points"""
     MIDPOINT = 2
-    """prediction turns the attitude exactly and the force with the attitude halfway"""
+    """midpoint rule: exact rotation over a tick, and force rotated by the attitude at mid-tick"""
     TURN = 4
-    """the covariance turns with the error angles when they are set to zero"""
+    """rotation of the covariance when the error angles are reset to zero"""
     INNOVATIONS = 8
-    """updates keep the innovations, their predicted deviations and their NIS, block by block"""
+    """innovations, their predicted standard deviations and their NIS are stored for each block"""
     GATE = 16
-    """updates leave out blocks whose NIS is beyond the gate, and keep all of these, too"""
+    """blocks whose NIS exceeds the gate are rejected; innovations are stored, too"""
     LEVER_AVERAGES = 64
-    """the accelerometer is not at the center of mass, and samples are means over the tick"""
+    """the accelerometer is off the center of mass, and a sample is the mean over a tick"""
     LEVER_SAMPLES = 128
-    """likewise, and samples are of the tick's start"""
+    """the accelerometer is off the center of mass, and a sample is the value at a tick's start"""
     GRADUAL = 32
-    """updates process images in steps while the attitude is uncertain"""
+    """images are processed in several steps while the attitude is uncertain"""
 
 
 class GateDecision(IntEnum):
@@ -41,11 +41,11 @@ class GateDecision(IntEnum):
     ACCEPTED = 1
     """used in the update"""
     REJECTED = 2
-    """left out of the update, with an innovation beyond the gate"""
+    """excluded from the update, as the innovation exceeds the gate"""
     FAILED = 3
     """part of an update that failed as a whole, see `FilterStatus`"""
     UNSURE = 4
-    """a feature that was left out, with a predicted direction too uncertain for a linear model"""
+    """excluded feature, with a predicted direction too uncertain for a linear model"""
 
 
 class Source(IntEnum):
@@ -75,13 +75,13 @@ class Control(IntEnum):
     VELOCITY = 4
     """Velocity ahead, to the left and up, and yaw rate."""
     PD = 5
-    """No action: the report's PD controller follows the reference at every tick."""
+    """None: the report's PD controller follows the reference at every tick."""
 
 
 class Sensor(IntEnum):
     """Sensors other than the IMU, each a stage with a clock and a latency.
 
-    This is the order of their rows in the stacked measurement, and of delayed updates.
+    Their rows in the stacked measurement, and delayed updates, are in this order.
     """
 
     GNSS = 0
@@ -95,7 +95,7 @@ class Sensor(IntEnum):
 class Block(IntEnum):
     """Measurements of GNSS and camera, each a file in `kernels/sensors/` and a group of the gate.
 
-    The features of an image are as many blocks of the measurement and come last.
+    Each feature of an image is a separate block of the measurement; features come last.
     """
 
     POSITION = 0
@@ -105,14 +105,15 @@ class Block(IntEnum):
 
 
 BLOCK_FREEDOMS = (3, 2, 3, 2)
-"""Degrees of freedom of one of each, in the order of `Block`: a direction has two."""
+"""Degrees of freedom of a block of each kind, in the order of `Block`: a direction has two."""
 
 
 class Aid(IntEnum):
-    """Sensors with parameters in the fields `aid_...`: the last of `Sensor`, in the same order.
+    """Sensors with parameters in the fields `aid_...`: the last members of `Sensor`, in this order.
 
     The name in lower case is the field of `SensorSuite`. The fault that silences a sensor
-    (`FaultKind`), its stage, its block of the measurement and its part of a raw observation follow.
+    (`FaultKind`), its stage, its block of the measurement and its part of a raw observation are
+    derived from it.
     """
 
     BAROMETER = 0
@@ -122,7 +123,7 @@ class Aid(IntEnum):
 
 
 AID_FREEDOMS = (1, 3, 2, 1)
-"""Numbers that each of them measures, in the order of `Aid`."""
+"""Numbers in a measurement of each aiding sensor, in the order of `Aid`."""
 
 
 class Act(IntEnum):
@@ -131,19 +132,19 @@ class Act(IntEnum):
     BEGIN = 0
     """begin an episode: draw constant errors, set the clock"""
     SAMPLE = 1
-    """measure when due, hold back delayed measurements, and deliver those that arrive"""
+    """measure when due, queue delayed measurements, and deliver the ones that arrive"""
     EXPECT = 2
-    """predict the measurement: its center, noise and columns"""
+    """predict the measurement: its value at the estimate, its noise and its columns"""
     GATE = 3
-    """store the innovation, and mask it beyond the gate"""
+    """store the innovation, and mask it if it exceeds the gate"""
     INFLATE = 4
     """inflate the variances of states that may be wrong after an alarm"""
     ALIGN = 5
-    """initialize the heading, if the sensor is `heading_sensor` of the settings"""
+    """initialize the heading, if the sensor is the `heading_sensor` of the settings"""
 
 
 class Task(IntEnum):
-    """What a flight is to do."""
+    """Kind of task."""
 
     HOVER = 1
     CIRCLE = 2
@@ -154,20 +155,21 @@ class Task(IntEnum):
 
 
 class Start(IntEnum):
-    """How an episode begins."""
+    """Kind of initial state of an episode."""
 
     GROUND = 0
-    """At rest below the reference at height 0, rotors stopped: the report's."""
+    """At rest below the reference at height 0, with the rotors stopped: the start of the report."""
     HOVER = 1
-    """Hovering, at rest, within some decimeters of the reference."""
+    """Hovering nearly at rest, within some decimeters of the reference."""
     MIXED = 2
-    """Either, with probability 0.5: for training, as a policy that has learned to hover learns to take off."""
+    """GROUND or HOVER, each with probability 0.5: a policy in training learns to hover and, once it
+    can, to take off."""
     MOVING = 3
-    """As HOVER, with a velocity and body rates, as after a disturbance."""
+    """HOVER with an additional velocity and body rates, as after a disturbance."""
 
 
 class Layout(IntEnum):
-    """What an observation holds."""
+    """Contents of an observation."""
 
     RELATIVE = 0
     ABSOLUTE = 1
@@ -175,7 +177,7 @@ class Layout(IntEnum):
 
 
 class Autoreset(IntEnum):
-    """When a flight whose episode is over begins the next one."""
+    """Time at which a flight whose episode is over begins the next one."""
 
     DISABLED = 0
     NEXT_STEP = 1
@@ -183,10 +185,10 @@ class Autoreset(IntEnum):
 
 
 class Ending(IntEnum):
-    """Reason of an episode's ending, in `info["ending"]`.
+    """Reason for the end of an episode, in `info["ending"]`.
 
-    A number, as libraries that store infos in tensors expect, which prints as its name in lower
-    case and equals it: `Ending.COLLISION == "collision"`.
+    The value is a number, as libraries that store infos in tensors expect. It prints as its name in
+    lower case and compares equal to it: `Ending.COLLISION == "collision"`.
     """
 
     NONE = 0
@@ -198,7 +200,7 @@ class Ending(IntEnum):
     TIPPED_OVER = 3
     """the vehicle was tilted too far"""
     BELOW_MIN_HEIGHT = 4
-    """the vehicle was too low, or crashed on ground that supports vehicles"""
+    """the vehicle was too low, or crashed into ground that supports vehicles"""
     LAST_GATE = 5
     """the last gate was passed"""
     FILTER_FAILED = 6
@@ -223,32 +225,32 @@ class Ending(IntEnum):
 
 
 class Shape(IntEnum):
-    """What an obstacle is."""
+    """Shape of an obstacle."""
 
     WALL = 0
     CYLINDER = 1
 
 
 class Command(IntEnum):
-    """What a call of the batch kernel does."""
+    """Operation of a call of the batch kernel."""
 
     STEP = 0
     RESET = 1
 
 
 class Supply(IntEnum):
-    """What limits the motor voltages beside the controller."""
+    """Limit of the motor voltages in addition to the controller's."""
 
     NOMINAL = 0
-    """nothing: the controller knows the largest voltage"""
+    """none: the controller assumes the true largest voltage"""
     LIMIT = 1
-    """a largest voltage that the controller does not know"""
+    """a largest voltage that is unknown to the controller"""
     BATTERY = 2
     """a battery, see `quad_gym.BatteryParams`"""
 
 
 class FaultKind(IntEnum):
-    """What can go wrong; a flight has one fault of each kind at most, which may come again."""
+    """Kinds of faults; a flight has at most one fault of each kind, which may recur."""
 
     GNSS_OUTAGE = 0
     GNSS_OUTLIERS = 1
@@ -269,7 +271,7 @@ class FaultKind(IntEnum):
 
 
 class RewardTerm(IntEnum):
-    """Terms of the built-in rewards; each has a weight in `RewardParams`, under its name."""
+    """Terms of the built-in rewards; each has a weight with its name in `RewardParams`."""
 
     NEAR = 0
     FINE = 1

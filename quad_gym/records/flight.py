@@ -1,4 +1,4 @@
-"""All that a flight is: its true state, measurements, filter, clocks, reference, task and faults."""
+"""Fields of a flight: true state, measurements, filter, clocks, reference, task and faults."""
 
 from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.sizes import (
@@ -21,7 +21,7 @@ from quad_gym.records.sizes import (
 
 # fmt: off
 _CONTACT_FIELDS = (
-    # what stands in the way
+    # obstacles and the geofence
     Field("obstacle_center", (MAX_OBSTACLES, 3), "m", "centers of the obstacles in I"),
     Field("obstacle_distance", (), "m", "from the center of mass to the nearest surface of an obstacle, negative inside; infinite: there is none"),
     Field("obstacle_vector", (3,), "m", "from the center of mass to that surface's nearest point, in I"),
@@ -35,7 +35,7 @@ _GROUND_FIELDS = (
     Field("crashed", (), "0 or 1", "whether the vehicle has crashed into the ground in this episode"),
 )
 _PATH_FIELDS = (
-    # the trajectory of this episode, and what it says of the present instant
+    # the trajectory of this episode, and its values at the present instant
     Field("path", (), "-", "which one, in the order in which they were given"),
     Field("path_share", (), "-", "share of the round at which the episode begins, if it is closed"),
     Field("path_turn", (2,), "-", "cosine and sine of the angle by which it is turned about the vertical"),
@@ -46,7 +46,7 @@ _PATH_FIELDS = (
     Field("path_ahead", (2, 3), "m", "reference position in I a little later: the preview"),
 )
 _FAULT_FIELDS = (
-    # what goes wrong
+    # faults
     Field("fault_active", (FAULT_KINDS,), "0 or 1", "the same, kind by kind"),
     Field("fault_count", (FAULT_KINDS,), "-", "times that a fault has come in this episode"),
     Field("fault_from", (FAULT_KINDS,), "ticks", "since the start of the episode, when it comes (next)"),
@@ -79,7 +79,7 @@ _RAW_FIELDS = (
     Field("accel_sum", (3,), "m/s^2", "accel, likewise"),
 )
 _CORE_FIELDS = (
-    # what every tick reads and writes: the truth, clocks, the random stream
+    # read and written at every tick: the truth, clocks, the random stream
     Field("r", (3,), "m", "position r_I of the center of mass"),
     Field("v", (3,), "m/s", "velocity v_I"),
     Field("q", (4,), "-", "attitude, unit quaternion (w, x, y, z), body to inertial"),
@@ -93,12 +93,12 @@ _CORE_FIELDS = (
     Field("key", (2,), "-", "key of the stream", "u8"),
     Field("action", (4,), "-", "the present action, in [-1, 1]"),
     Field("last_action", (4,), "-", "the action before it"),
-    # what the controller sees
+    # the state that the controller observes
     Field("w_seen", (3,), "rad/s", "body rates in B from the controller's source"),
     Field("R_seen", (3, 3), "-", "attitude R_BI from the controller's source"),
     Field("v_seen", (3,), "m/s", "velocity in I from the controller's source"),
     Field("r_seen", (3,), "m", "position in I from the controller's source"),
-    # what every step reads and writes: the task
+    # read and written at every step: the task
     Field("needs_reset", (), "0 or 1", "the episode is over; the next step begins a new one"),
     Field("idle", (), "0 or 1", "a lane that only pads the last block"),
     Field("step", (), "steps", "control steps since the start of the episode"),
@@ -132,13 +132,13 @@ _CORE_FIELDS = (
     Field("air_torque", (3,), "N m", "torque of the air in B, less that of the rotors' thrust far from the ground"),
     Field("gust", (5,), "-", "states of the Dryden gusts u, v, w, see `kernels.vehicle.gusts`"),
     Field("charge", (), "-", "charge of the battery, 1: full"),
-    # what the sensors are made of
+    # slow errors and clocks of the sensors
     Field("b_a", (3,), "m/s^2", "accelerometer bias"),
     Field("b_g", (3,), "rad/s", "gyro bias"),
     Field("gnss_drift", (3,), "m", "slow error of GNSS positions in I"),
     Field("wait", (SENSORS,), "ticks", "until each sensor measures next"),
     Field("block_fresh", (MAX_BLOCKS,), "0 or 1", "whether a block of the measurement has arrived since the last step"),
-    # to which batches a snapshot belongs
+    # the batches that a snapshot fits
     Field("configuration", (), "-", "digest of settings and parameters, see `quad_gym.batch.memory`", "u8"),
 )
 _FILTER_FIELDS = (
@@ -175,7 +175,7 @@ _FILTER_FIELDS = (
     Field("L", (15, 15), "mixed", "lower Cholesky factor of the covariance P = L L^T; order r, v, e, b_a, b_g"),
 )
 _ERROR_FIELDS = (
-    # errors of sensors that last an episode
+    # errors of sensors that are constant over an episode
     Field("accel_error", (3, 3), "-", "errors of scale and alignment of the accelerometer"),
     Field("gyro_error", (3, 3), "-", "likewise of the gyro"),
     Field("heading_error", (), "rad", "constant error of the baseline, a turn about body z"),
@@ -191,19 +191,19 @@ _WATCH_FIELDS = (
     Field("corrected_long_variance", (6,), "m^2/s^4, rad^2/s^2", "its variance in a filter that is right"),
 )
 _LATE_FIELDS = (
-    # what the IMU has summed up since the start of the episode, biases and gravity included
+    # sums of the IMU's samples since the start of the episode, biases and gravity included
     Field("imu_turn", (3, 3), "-", "C, from the body frame of the start to the present one"),
     Field("imu_velocity", (3,), "m/s", "V, sum of C^T f dt, in the body frame of the start"),
     Field("imu_position", (3,), "m", "X, sum of V dt, in the body frame of the start"),
     Field("imu_bias_gain", (3, 3), "s", "B, sum of C^T dt"),
-    # the same when the measurements in transit were taken, the latest first
+    # these sums at the time stamps of the measurements in transit, the latest first
     Field("stamps", (SENSORS, DELAY_SLOTS, STAMP), "mixed", "the tick (NaN: none), C, V, X, B, w_meas"),
     # the measurements in transit
     Field("waiting", (MAX_BLOCKS, DELAY_SLOTS, 3), "mixed", "measurements, block by block"),
     Field("waiting_valid", (MAX_BLOCKS, DELAY_SLOTS), "0 or 1", "whether these were measured"),
 )
 _SLOW_FIELDS = (
-    # the slow errors of sensors, where the filter estimates them
+    # slow errors of sensors, where the filter estimates them
     Field("slow_hat", (MAX_SLOW,), "mixed", "estimated slow errors d, see `kernels.filter.slow`"),
     Field("drift_corrected", (3,), "m", "sum of the last corrections of the drift of GNSS positions, where that is estimated"),
     Field("drift_corrected_variance", (3,), "m^2", "its variance in a filter that is right"),
@@ -234,8 +234,8 @@ PARTS = (
     ("slow", _SLOW_FIELDS),
     ("aids", _AID_FIELDS),
 )
-"""The parts of a record, in the order in which they lie in memory. All flights have the core; what
-a batch uses beside it is best close to it, as the memory of a flight has no gaps: see `Room`."""
+"""The parts of a record, in their order in memory. All flights have the core. Parts that batches
+often use are next to it, as the memory of a flight cannot have gaps: see `Room`."""
 
 FLIGHT_FIELDS = tuple(field for _, fields in PARTS for field in fields)
-"""Every field, in the order of the parts."""
+"""All fields, in the order of the parts."""

@@ -13,7 +13,7 @@ _OF_CORE = {"tick", "filter_status", "diverged"}
 _PARTS = {"filter", "watch", "late", "slow", "aids"}
 _NOT_READ = {
     *("prediction_failures", "waiting", "waiting_valid", "aid_vector", "aid_scalar", "aid_matrix"),
-    *("stamps",),  # only those of what arrives are gathered
+    *("stamps",),  # only the stamps of arriving measurements are gathered
 }
 _NOT_WRITTEN = {
     *("tick", "w_meas", "w_before", "gyro", "accel"),
@@ -30,14 +30,14 @@ _NOT_WRITTEN = {
 
 
 def words_of_update(settings: Any, used: frozenset[str]) -> tuple[NDArray[np.uint64], int]:
-    """The words, by the places of their first lane in a block, and how many an update writes.
+    """Return the words of an update as offsets of their first lane in a block.
 
     Args:
         settings: A SETTINGS record.
-        used: The parts of a flight's record in use.
+        used: Names of the parts of a flight's record that are in use.
 
     Returns:
-        Words, the written ones first, and their number.
+        Offsets, first of the words that an update writes, and the number of words it writes.
     """
     written: list[NDArray[np.int64]] = []
     read: list[NDArray[np.int64]] = []

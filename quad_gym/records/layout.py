@@ -1,7 +1,7 @@
-"""Records in memory: a flight by itself, and WIDTH flights side by side.
+"""Records in memory: of a single flight, and of WIDTH flights as a block.
 
 In a block of flights (`block_dtype`) every field has a trailing axis of WIDTH. The scalar form
-(`scalar_dtype`) has the same fields without it. Kernels read both by field name.
+(`scalar_dtype`) has these fields without that axis. Kernels read both by field name.
 """
 
 from typing import Any, NamedTuple
@@ -17,12 +17,12 @@ from quad_gym.records.work import WORK_FIELDS
 
 
 def scalar_dtype(fields: tuple[Field, ...]) -> np.dtype:
-    """The record of one flight."""
+    """Data type of the record of one flight."""
     return np.dtype([(f.name, f.kind, f.shape) for f in fields], align=True)
 
 
 def block_dtype(fields: tuple[Field, ...]) -> np.dtype:
-    """The record of WIDTH flights: every field with a trailing axis of WIDTH."""
+    """Data type of the record of WIDTH flights: every field with a trailing axis of WIDTH."""
     return np.dtype([(f.name, f.kind, (*f.shape, WIDTH)) for f in fields], align=True)
 
 
@@ -33,15 +33,15 @@ SETTINGS = scalar_dtype(SETTINGS_FIELDS)
 
 
 class Room(NamedTuple):
-    """The memory that a block of flights takes: parts of the full record, without a gap."""
+    """The memory of a block of flights: consecutive parts of the full record."""
 
     dtype: np.dtype
-    """of the blocks: the fields that there is room for"""
+    """data type of a block: the fields that are stored"""
     skipped: int
-    """bytes of the full record before the first of them"""
+    """bytes of the full record before the first stored field"""
 
     def holds(self, name: str) -> bool:
-        """Whether there is room for a field."""
+        """Return True if a field is stored."""
         return name in (self.dtype.names or ())
 
 
@@ -52,13 +52,14 @@ def offset_of(dtype: np.dtype, name: str) -> int:
 
 
 def room_of(used: frozenset[str]) -> Room:
-    """The least room for the core, and for the parts that are used.
+    """Return the smallest room that holds the core and the parts in use.
 
-    Kernels know the full record alone. A block in memory is a window of it, so that its address,
-    less what the window skips, is that of the full record, of which nothing else is touched.
+    Kernels address the fields of the full record. A block in memory is a window of it: its address
+    minus the skipped bytes is the address of the full record, and kernels access no field outside
+    the window.
 
     Args:
-        used: Names of `PARTS`.
+        used: Names of the parts in use, see `PARTS`.
     """
     chosen = [i for i, (name, _) in enumerate(PARTS) if name in used | {"core"}]
     fields = [field for _, part in PARTS[chosen[0] : chosen[-1] + 1] for field in part]
@@ -66,14 +67,14 @@ def room_of(used: frozenset[str]) -> Room:
 
 
 def aligned_zeros(count: int, dtype: np.dtype) -> NDArray[Any]:
-    """`count` zeroed records that begin on a cache line."""
+    """Return `count` zeroed records that begin on a cache line."""
     raw = np.zeros(count * dtype.itemsize + 64, np.uint8)
     start = -raw.ctypes.data % 64
     return raw[start : start + count * dtype.itemsize].view(dtype)
 
 
 def field_of_flights(blocks: NDArray[Any], name: str, count: int) -> NDArray[Any]:
-    """One field of the first `count` flights, as an array (count, ...): a copy."""
+    """Return a copy of one field of the first `count` flights, as an array (count, ...)."""
     values = blocks[name]
     lane = values.ndim - 1
     values = values.transpose(0, lane, *range(1, lane)).copy()

@@ -1,12 +1,12 @@
-"""The numbers of a vehicle, its sensors and its world, as they are or as they are believed to be."""
+"""Parameters of a vehicle, its sensors and its world, either the true or the assumed ones."""
 
 from quad_gym.records.draws import COLUMNS, DRAWABLES
 from quad_gym.records.sizes import AIDS, MAX_FEATURES, MAX_SLOW, Field
 
 PARAMETERS_DRAWN = COLUMNS["action_delay"].stop
-"""Columns of draws with which the parameters begin; features of the camera have the others."""
+"""Number of draws with which the parameters begin; the camera's features have the other draws."""
 _OTHER_NAMES = {"inertia": "moments"}
-"""Names of fields that differ from the names of draws."""
+"""Names of fields by the names of draws, where they differ."""
 
 # fmt: off
 PARAMS_FIELDS = (

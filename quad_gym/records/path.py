@@ -1,6 +1,6 @@
-"""Users' trajectories as records: one table, which all flights of a batch share.
+"""Users' trajectories as records, shared by all flights of a batch.
 
-A path is a row of PATH; its segments are rows of PIECE, one after the other.
+A path is a row of PATH; its segments are consecutive rows of PIECE.
 """
 
 from quad_gym.records.layout import scalar_dtype

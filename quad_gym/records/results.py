@@ -6,7 +6,7 @@ from quad_gym.records.enums import RewardTerm
 
 
 class Result(IntEnum):
-    """Rows of the results of a step, by their index."""
+    """Rows of the results of a step."""
 
     REWARD = 0
     TERMINATED = 1
@@ -27,4 +27,4 @@ RESULTS = (
     *(result.name.lower() for result in Result),
     *(f"reward_{term.name.lower()}" for term in RewardTerm),
 )
-"""Names of the columns of the results of a step, with the terms of the reward last."""
+"""Names of the rows of the results of a step, with the terms of the reward last."""

@@ -1,4 +1,4 @@
-"""What a batch does, the same for all its flights."""
+"""Settings of a batch, common to all its flights."""
 
 from quad_gym.records.draws import DRAWN_SIZE
 from quad_gym.records.enums import RewardTerm
@@ -78,7 +78,7 @@ SETTINGS_FIELDS = (
     # late measurements
     Field("late", (), "0 or 1", "whether any measurement reaches the filter late", "i8"),
     Field("rewinds", (), "0 or 1", "whether the filter goes back to time stamps", "i8"),
-    # what sensors do wrong
+    # errors of sensors
     Field("imu_errs", (), "0 or 1", "whether the IMU has errors of scale or alignment", "i8"),
     Field("imu_vibrates", (), "0 or 1", "whether the rotors' vibration reaches the IMU", "i8"),
     Field("heading_errs", (), "0 or 1", "whether baselines have a constant error", "i8"),
@@ -91,7 +91,7 @@ SETTINGS_FIELDS = (
     Field("linear_drag", (), "0 or 1", "whether there is linear drag", "i8"),
     Field("ground_effect", (), "0 or 1", "whether there is ground effect", "i8"),
     Field("supply", (), "-", "what limits the motor voltages, see Supply", "i8"),
-    # what stands in it
+    # obstacles, the geofence and the ground
     Field("contacts", (), "0 or 1", "whether there are obstacles or a geofence", "i8"),
     Field("obstacle_count", (), "-", "obstacles in use", "i8"),
     Field("obstacle_shape", (MAX_OBSTACLES,), "-", "what each is, see Shape", "i8"),
@@ -107,7 +107,7 @@ SETTINGS_FIELDS = (
     Field("friction", (), "-", "of the feet on the ground"),
     Field("hard_speed", (), "m/s", "of a vehicle toward the ground that it meets, beyond which it crashes"),
     Field("hard_up", (), "-", "least cosine of the tilt at which the ground may be touched"),
-    # what is drawn
+    # randomization
     Field("randomized", (), "0 or 1", "whether flights draw parameters of their own", "i8"),
     Field("observe_world", (), "0 or 1", "whether the truth in an observation ends with wind and draws", "i8"),
     Field("features_drawn", (), "0 or 1", "whether each episode has features at places of its own", "i8"),

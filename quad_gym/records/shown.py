@@ -1,4 +1,4 @@
-"""Numbers that only views of tasks need, computed by the kernels at the end of a step."""
+"""Fields that only the views of user-defined tasks need, computed at the end of a step."""
 
 from math import prod
 
@@ -23,11 +23,11 @@ SHOWN_FIELDS = (
 )
 
 SHOWN: dict[str, slice] = {}
-"""Rows of each field."""
+"""Rows of each field, by its name."""
 SHOWN_SIZE = 0
 """Number of rows."""
 for _field in SHOWN_FIELDS:
     SHOWN[_field.name] = slice(SHOWN_SIZE, SHOWN_SIZE + prod(_field.shape))
     SHOWN_SIZE = SHOWN[_field.name].stop
 SHOWN_SHAPES = {field.name: field.shape for field in SHOWN_FIELDS}
-"""Shape of each field."""
+"""Shape of each field, by its name."""

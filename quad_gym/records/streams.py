@@ -1,7 +1,7 @@
-"""The numbers of all random draws: one table, so that no two quantities share a draw.
+"""Indices of all random draws in one table, so that no two quantities share a draw.
 
 A flight's random stream is counter-based: draw n of an instant is a function of the flight's key,
-the instant and n. Each quantity owns a range of numbers. A draw gives two numbers.
+the instant and n. Each quantity has a range of indices. A draw yields two random numbers.
 """
 
 from typing import NamedTuple
@@ -18,11 +18,11 @@ from quad_gym.records.sizes import (
 )
 
 DRAWS_OF_FAULT = 8
-"""Draws of a kind of fault: when it comes (2), what it is (2), what it does to one sample (4)."""
+"""Draws for a kind of fault: its times (2), size and direction (2), effect on one sample (4)."""
 
 
 class DrawRange(NamedTuple):
-    """The draws of one quantity within an instant."""
+    """Range of one quantity's draws within an instant."""
 
     quantity: str
     first: int
@@ -30,14 +30,14 @@ class DrawRange(NamedTuple):
 
 
 DRAW_RANGES: list[DrawRange] = []
-"""Every range; no two overlap."""
+"""All ranges; no two overlap."""
 
 
 def _claim(quantity: str, first: int, count: int) -> int:
-    """Give a quantity its draws; returns the first.
+    """Reserve a range of draws for a quantity; return the first.
 
     Raises:
-        ValueError: If another quantity has one of them.
+        ValueError: If the range overlaps another quantity's.
     """
     for other in DRAW_RANGES:
         if first < other.first + other.draws and other.first < first + count:
@@ -46,7 +46,7 @@ def _claim(quantity: str, first: int, count: int) -> int:
     return first
 
 
-# of every instant
+# at every instant
 DRAW_BIAS = _claim("driving noise of the IMU biases", 0, 3)
 DRAW_IMU = _claim("white noise of the IMU", 3, 3)
 DRAW_GNSS = _claim("white noise of GNSS position and baseline", 6, 3)
@@ -61,7 +61,7 @@ DRAW_VIBRATION = _claim("vibration of the IMU", 576, 3)
 DRAW_BLUR = _claim("places in blurred images", 592, MAX_FEATURES)
 DRAW_AID = _claim("white noise of aiding sensors", 720, 2 * AIDS)
 DRAW_AID_DRIFT = _claim("slow errors of aiding sensors", 736, AIDS)
-# of an episode's first instant
+# at an episode's first instant
 DRAW_COURSE = _claim("phase, radius, period and sense of the reference", 64, 2)
 DRAW_START = _claim("start", 66, 5)
 DRAW_FIRST_BIASES = _claim("IMU biases at the start", 71, 3)

@@ -1,13 +1,13 @@
-"""How many flights fly side by side: as many float64 as a vector register of this machine holds."""
+"""Number of flights in a block: as many as the float64 in a vector register of this machine."""
 
 import os
 
 WIDTHS = (2, 4, 8)
-"""Numbers of lanes that there can be."""
+"""Supported numbers of lanes."""
 
 
 def lanes_of_machine() -> int:
-    """Lanes: 8 with AVX-512, 4 with AVX2, else 2; QUAD_GYM_LANES overrides it.
+    """Return the number of lanes: 8 with AVX-512, 4 with AVX2, else 2; QUAD_GYM_LANES overrides it.
 
     Raises:
         ValueError: If QUAD_GYM_LANES is not one of WIDTHS.
@@ -24,14 +24,14 @@ def lanes_of_machine() -> int:
 
 
 def _features() -> set[str]:
-    """The processor's features for which Numba compiles, as LLVM calls them.
+    """Return the features of the processor for which Numba compiles, in the names of LLVM.
 
-    As NumPy knows them: importing Numba for this takes a second.
+    NumPy provides them, because importing Numba takes a second.
     """
     if os.environ.get("NUMBA_CPU_FEATURES"):
         names = os.environ["NUMBA_CPU_FEATURES"].split(",")
         return {name[1:] for name in names if name.startswith("+")}
-    if os.environ.get("NUMBA_CPU_NAME"):  # compiled for another one: only what all of its kind have
+    if os.environ.get("NUMBA_CPU_NAME"):  # code for another processor: baseline features only
         return set()
     try:
         from numpy._core._multiarray_umath import (  # type: ignore[import-not-found]
@@ -45,4 +45,4 @@ def _features() -> set[str]:
 
 
 WIDTH = lanes_of_machine()
-"""Flights in a block. What a flight does depends on it in no bit."""
+"""Number of flights in a block. No result depends on it, not even in the last bit."""

@@ -1,4 +1,4 @@
-"""The workspace of a thread: nothing in it outlasts a step."""
+"""Fields of a thread's workspace, whose contents do not outlast a step."""
 
 from quad_gym.records.enums import RewardTerm
 from quad_gym.records.sizes import (
@@ -24,7 +24,7 @@ WORK_FIELDS = (
     Field("P", (MAX_STATES, MAX_STATES), "mixed", "lower triangle of the predicted covariance; then its factor"),
     Field("F", (9, 15), "mixed", "half-differences of the propagated sigma points / c; rows r, v, e"),
     Field("S", (6, 9), "mixed", "half-sums of the propagated sigma points less the center / c: of the acceleration, then e"),
-    # update; the nine columns of L that matter come last first; with slow errors, all columns
+    # update; the nine columns of L that matter, in reverse order; with slow errors, all columns
     Field("X_B", (MAX_FEATURES, 3), "m", "features relative to the center of mass, in B"),
     Field("inverse_distance", (MAX_FEATURES,), "1/m", "of the features from the camera"),
     Field("z_hat", (MAX_MEASUREMENTS,), "mixed", "measurement predicted at the center"),
@@ -41,7 +41,7 @@ WORK_FIELDS = (
     Field("L9", (MAX_STATES, MAX_STATES), "mixed", "the columns of L that matter; then of the updated factor"),
     Field("dx", (MAX_STATES,), "mixed", "correction of the state"),
     Field("inverse_diagonal", (MAX_MEASUREMENTS,), "mixed", "of a Cholesky factor"),
-    # shared by update and sensors
+    # shared by the update and the sensors
     Field("measured", (), "-", "numbers that each lane has"),
     Field("spread", (), "-", "c of the sigma points"),
     Field("inverse_spread", (), "-", "1 / c"),

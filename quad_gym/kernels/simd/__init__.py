@@ -1,1 +1,1 @@
-"""The number types of the kernels: lanes, bits, records of several flights. Imports records."""
+"""Number types of the kernels: lanes, bits, records of several flights. Imports records."""

@@ -1,6 +1,6 @@
-"""Memory behind addresses: records, arrays and rows, where compiled code is called with addresses.
+"""Access to records, arrays and rows of numbers by their addresses in compiled code.
 
-An address is a word (int64). Whoever hands it over keeps the memory alive.
+An address is a word (int64). The caller that passes one keeps the memory alive.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ _SINGLE = ir.FloatType()
 
 
 def record_at(dtype: np.dtype) -> Any:
-    """A function that returns the record of a type at an address."""
+    """Return a function that returns the record of a type at an address."""
     kind = from_dtype(dtype)
 
     @intrinsic
@@ -37,7 +37,7 @@ def record_at(dtype: np.dtype) -> Any:
 
 
 def lanes_at(dtype: np.dtype) -> Any:
-    """A function that returns the lanes of a block of a type at an address."""
+    """Return a function that returns the lanes of a block of a type at an address."""
     kind = LaneRecord(from_dtype(dtype))
 
     @intrinsic
@@ -51,7 +51,7 @@ def lanes_at(dtype: np.dtype) -> Any:
 
 
 def array_at(dtype: Any) -> Any:
-    """A function that returns the array of a type and length at an address."""
+    """Return a function that returns the array of a type, and of a given length, at an address."""
     kind = types.Array(from_dtype(np.dtype(dtype)), 1, "C", aligned=False)
 
     @intrinsic
@@ -78,7 +78,7 @@ def array_at(dtype: Any) -> Any:
 
 @intrinsic
 def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
-    """Write lanes to an address, one float64 after the other."""
+    """Write lanes to consecutive float64 at an address."""
     if value != lanes:
         return None
 
@@ -91,14 +91,14 @@ def store_lanes(typing_context, address, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
-    """Ask for the cache line at an address, which is needed soon; it may be no address at all."""
+    """Prefetch the cache line at an address, which may be invalid."""
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         word = ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [_BYTES, word, word, word])
         function = builder.module.declare_intrinsic("llvm.prefetch", [_BYTES], kind)
         place = builder.inttoptr(args[0], _BYTES)
-        builder.call(function, [place, word(0), word(2), word(1)])  # to read, into the second level
+        builder.call(function, [place, word(0), word(2), word(1)])  # read, to the second level
         return context.get_dummy_value()
 
     return types.none(types.int64), lower
@@ -106,13 +106,13 @@ def prefetch(typing_context, address):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store_tile(typing_context, address, pitch, source, first):  # type: ignore[no-untyped-def]
-    """Write WIDTH numbers of each lane as float32: those of a lane side by side.
+    """Write WIDTH elements of an array of lanes as float32, one row per lane.
 
     Args:
-        address: Where those of the first lane go.
-        pitch: Bytes from one lane's to the next one's.
+        address: Address of the first lane's row.
+        pitch: Bytes from one lane's row to the next.
         source: Array of lanes.
-        first: Its first element to write.
+        first: Index of the first element to write.
     """
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -134,10 +134,10 @@ def store_tile(typing_context, address, pitch, source, first):  # type: ignore[n
 
 
 def _transposed(builder: ir.IRBuilder, rows: list[Any]) -> list[Any]:
-    """The columns of a square of vectors: blocks off the diagonal change places, at every size."""
+    """Transpose a square matrix of vectors by swapping off-diagonal blocks of doubling size."""
     size = 1
     while size < WIDTH:
-        # of element k of rows i and i + size: where it comes from, in both rows end to end
+        # indices of the sources of rows i and i + size in the concatenation of both rows
         upper = [k if k & size == 0 else WIDTH + k - size for k in range(WIDTH)]
         lower = [k + size if k & size == 0 else WIDTH + k for k in range(WIDTH)]
         masks = [ir.Constant(ir.VectorType(_INDEX, WIDTH), chosen) for chosen in (upper, lower)]

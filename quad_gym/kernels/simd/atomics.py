@@ -1,4 +1,4 @@
-"""Words that two threads share: atomic reads and writes, and a pause while one waits."""
+"""Words shared by threads: atomic reads and writes, and a pause for waiting."""
 
 import platform
 
@@ -18,7 +18,7 @@ def _pointer(context, builder, signature, args):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def read_shared(typing_context, words, index):  # type: ignore[no-untyped-def]
-    """The word `words[index]` (int64), as another thread wrote it last."""
+    """Return the word `words[index]` (int64) that a thread wrote last."""
 
     def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
         pointer = _pointer(context, builder, signature, args)
@@ -29,7 +29,7 @@ def read_shared(typing_context, words, index):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def write_shared(typing_context, words, index, value):  # type: ignore[no-untyped-def]
-    """Write `words[index]` (int64), after everything that this thread wrote before."""
+    """Write `words[index]` (int64), after all earlier writes of this thread."""
 
     def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
         pointer = _pointer(context, builder, signature, args)
@@ -42,7 +42,7 @@ def write_shared(typing_context, words, index, value):  # type: ignore[no-untype
 
 @intrinsic
 def add_shared(typing_context, words, index, number):  # type: ignore[no-untyped-def]
-    """Add to `words[index]` (int64) in one go; returns what was there before."""
+    """Add to `words[index]` (int64) atomically; return the value before."""
 
     def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
         pointer = _pointer(context, builder, signature, args)
@@ -54,7 +54,7 @@ def add_shared(typing_context, words, index, number):  # type: ignore[no-untyped
 
 @intrinsic
 def pause(typing_context):  # type: ignore[no-untyped-def]
-    """Tell the processor that this thread waits for another."""
+    """Hint to the processor that this thread waits for another."""
 
     def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
         if _MACHINE in ("x86_64", "amd64"):

@@ -1,6 +1,6 @@
-"""What lies beneath the elementary functions: bit patterns, rounding and the C library.
+"""Primitives of the elementary functions: bit patterns, rounding and the C library.
 
-Each works on a plain number and on eight lanes alike, because LLVM's instructions do.
+Each accepts a plain number or lanes, because LLVM's instructions do.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ _INT = ir.IntType(64)
 
 
 def _like(value: ir.Value, scalar: ir.Type) -> ir.Type:
-    """`scalar`, or the vector of it where `value` is a vector."""
+    """Return `scalar`, or a vector of it if `value` is a vector."""
     return ir.VectorType(scalar, WIDTH) if isinstance(value.type, ir.VectorType) else scalar
 
 
@@ -36,7 +36,7 @@ def _is_word(numba_type: Any) -> bool:
 
 @intrinsic
 def round_to_even(typing_context, x):  # type: ignore[no-untyped-def]
-    """The nearest whole number, ties to even, as a float."""
+    """Return the nearest integer, ties to even, as a float."""
     if not _is_float(x):
         return None
     return x(x), lambda context, builder, sig, args: call_llvm(builder, "llvm.rint", args[0])
@@ -44,7 +44,7 @@ def round_to_even(typing_context, x):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def fused_multiply_add(typing_context, a, b, c):  # type: ignore[no-untyped-def]
-    """`a b + c`, rounded once."""
+    """Return `a b + c`, rounded once."""
     kind = lanes if lanes in (a, b, c) else types.float64
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -65,14 +65,14 @@ def _library_call(name: str) -> Any:
 
 
 library_sin = _library_call("llvm.sin")
-"""Sine by the C library, lane after lane: slow, for arguments too large to reduce."""
+"""Sine from the C library, lane by lane: slow, for arguments too large to reduce."""
 library_cos = _library_call("llvm.cos")
-"""Cosine by the C library, likewise."""
+"""Cosine from the C library, lane by lane: slow, for arguments too large to reduce."""
 
 
 @intrinsic
 def power_of_two(typing_context, exponent):  # type: ignore[no-untyped-def]
-    """2 ** exponent for a whole-numbered float in [-1022, 1023], exact."""
+    """Return 2 ** exponent, exact, for an integer-valued float in [-1022, 1023]."""
     if not _is_float(exponent):
         return None
 
@@ -89,7 +89,7 @@ def power_of_two(typing_context, exponent):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def exponent_of(typing_context, x):  # type: ignore[no-untyped-def]
-    """The e of x = m 2**e with m in [1, 2), as a float, for positive normal x."""
+    """Return e of x = m 2**e with m in [1, 2), as a float, for positive normal x."""
     if not _is_float(x):
         return None
 
@@ -105,7 +105,7 @@ def exponent_of(typing_context, x):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def mantissa_of(typing_context, x):  # type: ignore[no-untyped-def]
-    """The m of x = m 2**e with m in [1, 2), for positive normal x."""
+    """Return m of x = m 2**e with m in [1, 2), for positive normal x."""
     if not _is_float(x):
         return None
 
@@ -121,7 +121,7 @@ def mantissa_of(typing_context, x):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def one_to_two(typing_context, word):  # type: ignore[no-untyped-def]
-    """The top 52 bits of a word as a float in [1, 2)."""
+    """Return the top 52 bits of a word as a float in [1, 2)."""
     if not _is_word(word):
         return None
 

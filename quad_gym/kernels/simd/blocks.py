@@ -1,9 +1,10 @@
-"""Records of eight flights, read by field name inside kernels.
+"""Records of WIDTH flights, read by field name inside kernels.
 
-A block is a NumPy structured record whose every field ends in an axis of eight (`records.py`).
-`lanes_of(block)` is the same memory seen by a kernel: `block.mass` is a `Lanes`, `block.inertia` an
-array of `Lanes` of shape (3, 3). The scalar instance of a kernel gets a plain record of the same
-field names instead, where `record.mass` is a float and `record.inertia` a float array.
+A block is a NumPy structured record in which every field has a trailing axis of WIDTH (see
+`records/layout.py`). `lanes_of(block)` is a view of this memory for kernels: `block.mass` is a
+`Lanes`, `block.inertia` an array of `Lanes` of shape (3, 3). The scalar instance of a kernel takes
+a plain record with these field names, where `record.mass` is a float and `record.inertia` a float
+array.
 """
 
 import hashlib
@@ -28,23 +29,23 @@ from quad_gym.records import WIDTH
 
 
 class LaneRecord(types.Type):
-    """A pointer to a record of eight flights whose fields read as lanes."""
+    """Pointer to a record of WIDTH flights, whose fields are read as lanes."""
 
     def __init__(self, record: types.Record) -> None:
         self.record = record
-        # a digest, as the name of a record names all its fields and is part of every symbol
+        # a digest, as a record's name lists all its fields and is part of every symbol
         digest = hashlib.sha256(record.name.encode()).hexdigest()[:16]
         super().__init__(name=f"LaneRecord({digest})")
 
     def field(self, name: str) -> Any:
-        """The type of field `name`: lanes (or words), or an array of them."""
+        """Return the type of field `name`: lanes, words, or an array of them."""
         nested = self.record.typeof(name)
         if not isinstance(nested, types.NestedArray) or nested.shape[-1] != WIDTH:
             raise TypeError(f"field {name!r} of a block must end in an axis of {WIDTH}")
         element = words if nested.dtype == types.uint64 else lanes
         if nested.ndim == 1:
             return element
-        # aligned=False: copies of a block may lie anywhere, and unaligned loads cost the same
+        # aligned=False: copies of a block may be unaligned, and unaligned loads are as fast
         return types.Array(element, nested.ndim - 1, "C", aligned=False)
 
 
@@ -56,7 +57,7 @@ class _LaneRecordModel(models.PrimitiveModel):
 
 @intrinsic
 def lanes_of(typing_context, record):  # type: ignore[no-untyped-def]
-    """The lanes of a block: the same memory, every field read eight flights at a time."""
+    """Return a block as lanes, without copying: every field is read WIDTH flights at a time."""
     if not isinstance(record, types.Record):
         return None
 
@@ -93,7 +94,7 @@ def _get_field(context, builder, block, pointer, name):  # type: ignore[no-untyp
 
 
 def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: Any) -> Any:
-    """An array of lanes in memory."""
+    """Return an array of lanes in memory."""
     strides: list[int] = []
     size = WIDTH * 8
     for length in reversed(shape):
@@ -114,7 +115,7 @@ def _array_of(context: Any, builder: ir.IRBuilder, kind: Any, data: Any, shape: 
 
 @intrinsic
 def numbers_of(typing_context, block):  # type: ignore[no-untyped-def]
-    """All numbers of a block as one array of lanes, in the order of its fields."""
+    """Return all numbers of a block as one array of lanes, in the order of its fields."""
     if not isinstance(block, LaneRecord):
         return None
     kind = types.Array(lanes, 1, "C", aligned=False)
@@ -137,9 +138,9 @@ def _set_field(context, builder, sig, args, name):  # type: ignore[no-untyped-de
 
 @intrinsic(prefer_literal=True)
 def set_field(typing_context, block, name, value):  # type: ignore[no-untyped-def]
-    """Write a field of the lanes of a block, for functions made for fields of several names.
+    """Write a field of a block, for functions that are generated for several fields.
 
-    `getattr` reads such a field; as there, the name is a constant.
+    `getattr` reads such a field; for both, the name is a constant.
     """
     if not isinstance(block, LaneRecord) or not isinstance(name, types.StringLiteral):
         return None

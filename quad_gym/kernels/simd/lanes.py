@@ -1,22 +1,23 @@
-r"""The number type of the kernels: float64 of several flights that fly together.
+r"""Number type of the kernels: one float64 for each of several flights.
 
-A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats it
-serves the classes for one vehicle and the tests; compiled for `Lanes` the same source flies WIDTH
-flights on the SIMD unit. This file teaches Numba three value types and the operations on them:
+A kernel is written once, for one flight, as if its numbers were floats. Compiled for floats, it
+serves the classes for one vehicle and the tests; compiled for `Lanes`, it computes WIDTH flights on
+the SIMD unit. This file defines three value types for Numba, and the operations on them:
 
 | type      | WIDTH of | plain counterpart | operations                                           |
 |-----------|----------|-------------------|------------------------------------------------------|
 | `Lanes`   | float64  | `float64`         | `+ - * / neg abs`, comparisons, `math.sqrt`          |
 | `Mask`    | bool     | `boolean`         | `& \|`, `logical_not`, `any_of`, `all_of`            |
-| `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, and those of `bits.py`            |
+| `Words`   | uint64   | `uint64`          | `+ ^ & \\|`, `==`, operations of `bits.py`           |
 
-There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. A lane never
-sees its neighbors, so a flight does not depend on the flights in its block, NaN included.
+There are no branches on data in a kernel: `select(mask, a, b)` chooses lane by lane. Lanes do not
+affect each other, so a flight does not depend on the other flights in its block, even if they are
+NaN.
 
 Results are defined by the source alone. A product that is added or subtracted in the same
-expression is fused into a multiply-add, always, and nothing else is: no fast-math flag lets LLVM
-decide. They depend neither on WIDTH nor on what is inlined, nor on the processor, as long as it has
-fused multiply-adds (without, LLVM calls the C library's: the same bits, slowly).
+expression is always fused into a multiply-add, and no other operation is: no fast-math flag lets
+LLVM decide. Results depend neither on WIDTH nor on inlining, nor on the processor: if it has no
+fused multiply-add, LLVM calls the C library's, which is slow but bitwise identical.
 """
 
 import math
@@ -42,7 +43,7 @@ _BITS = ir.VectorType(ir.IntType(1), WIDTH)
 
 
 class _VectorType(types.Type):
-    """A Numba type that is one LLVM vector; every instance of a class is the same type."""
+    """Numba type of one LLVM vector; all instances of a class are equal."""
 
     llvm_type: ir.VectorType
 
@@ -51,19 +52,19 @@ class _VectorType(types.Type):
 
 
 class Lanes(_VectorType):
-    """Float64, one per flight of a block."""
+    """Vector of float64, one per flight of a block."""
 
     llvm_type = _FLOATS
 
 
 class Words(_VectorType):
-    """Uint64, one per flight of a block."""
+    """Vector of uint64, one per flight of a block."""
 
     llvm_type = _WORDS
 
 
 class Mask(_VectorType):
-    """Booleans, one per flight of a block."""
+    """Vector of booleans, one per flight of a block."""
 
     llvm_type = _BITS
 
@@ -80,7 +81,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    """The LLVM vector whose every lane is `scalar`."""
+    """Return the LLVM vector with `scalar` in every lane."""
     vector = ir.VectorType(scalar.type, WIDTH)
     first = builder.insert_element(
         ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0)
@@ -92,14 +93,14 @@ def splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
 def vector_of(
     context: Any, builder: ir.IRBuilder, value: ir.Value, source: Any, target: Any
 ) -> Any:
-    """`value` of Numba type `source` as the vector type `target`."""
+    """Return `value` of Numba type `source` as the vector type `target`."""
     if source == target:
         return value
     plain = {lanes: types.float64, words: types.uint64, mask: types.boolean}[target]
     return splat(builder, context.cast(builder, value, source, plain))
 
 
-# ---- conversions: a plain number is lanes that are equal ----------------------------------------
+# ---- conversions: a plain number has the same value in all lanes --------------------------------
 
 _PLAIN = {lanes: (types.Float, types.Integer), words: (types.Integer,), mask: (types.Boolean,)}
 
@@ -121,14 +122,14 @@ default_type_manager.set_compatible(types.boolean, mask, Conversion.safe)
 # ---- operators -------------------------------------------------------------------------------
 
 ASKED_FIRST = {"target": "cpu"}
-"""Numba tries templates of a target before generic ones, a dozen of which an operator has: this
-saves a tenth of the time that kernels take to compile."""
+"""Metadata of templates that Numba tries before the dozen generic ones of an operator, which saves
+a tenth of the time that kernels take to compile."""
 
 
 def _binary(
     operation: Any, operand: Any, result: Any, emit: Callable[[ir.IRBuilder, Any, Any], Any]
 ) -> None:
-    """Define `operation` where one side is the vector type `operand` and the other may be plain."""
+    """Define `operation` for operands of the vector type `operand`, one of which may be plain."""
 
     @infer_global(operation)
     class _Typing(AbstractTemplate):
@@ -167,12 +168,12 @@ def is_product(value: Any) -> bool:
 
 
 def fuse(builder: ir.IRBuilder, *numbers: Any) -> Any:
-    """Multiply-add of three numbers: a * b + c, rounded once."""
+    """Emit the multiply-add of three numbers: a * b + c, rounded once."""
     return call_llvm(builder, "llvm.fma", *numbers)
 
 
 def add_numbers(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
-    """Left + right; a product that is added is fused into the sum, the left one of two."""
+    """Emit left + right; a product is fused into the sum, the left one if both are products."""
     if is_product(left):
         return fuse(builder, *left.operands, right)
     if is_product(right):
@@ -181,7 +182,7 @@ def add_numbers(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
 
 
 def _subtract(builder: ir.IRBuilder, left: Any, right: Any) -> Any:
-    """Left - right, with the same rule."""
+    """Emit left - right, with products fused as in a sum."""
     if is_product(left):
         return fuse(builder, *left.operands, builder.fneg(right))
     if is_product(right):
@@ -238,7 +239,7 @@ def _unary(operation: Any, emit: Callable[[Any, ir.IRBuilder, Any], Any]) -> Non
 
 
 def call_llvm(builder: ir.IRBuilder, name: str, value: ir.Value, *others: ir.Value) -> ir.Value:
-    """Call the LLVM intrinsic `name` (such as `llvm.sqrt`) at the type of its first argument."""
+    """Call the LLVM intrinsic `name` (such as `llvm.sqrt`) for the type of its first argument."""
     kind = value.type
     scalar = "f64" if "double" in str(kind) else "i64"
     suffix = f"v{WIDTH}{scalar}" if isinstance(kind, ir.VectorType) else scalar
@@ -254,12 +255,12 @@ _unary(math.sqrt, lambda context, builder, value: call_llvm(builder, "llvm.sqrt"
 _unary(abs, lambda context, builder, value: call_llvm(builder, "llvm.fabs", value))
 
 
-# ---- choosing and asking ---------------------------------------------------------------------
+# ---- selection and tests of masks ------------------------------------------------------------
 
 
 @intrinsic
 def select(typing_context, chosen, if_true, if_false):  # type: ignore[no-untyped-def]
-    """`if_true` where `chosen`, else `if_false`, lane by lane (or for plain numbers)."""
+    """Return `if_true` where `chosen`, else `if_false`, lane by lane (or for plain numbers)."""
     vectors = [t for t in (if_true, if_false) if isinstance(t, _VectorType)]
     if chosen == mask:
         plain = {types.Boolean: mask, types.Float: lanes, types.Integer: lanes}
@@ -284,7 +285,7 @@ def select(typing_context, chosen, if_true, if_false):  # type: ignore[no-untype
 
 @intrinsic
 def logical_not(typing_context, asked):  # type: ignore[no-untyped-def]
-    """The other lanes."""
+    """Return the negation of a mask or boolean."""
 
     def lower(context, builder, sig, args):  # type: ignore[no-untyped-def]
         return builder.not_(args[0])
@@ -301,12 +302,12 @@ def _bits_of_mask(typing_context, asked):  # type: ignore[no-untyped-def]
 
 
 def any_of(asked: Any) -> bool:
-    """True if any lane is set: the only data that a kernel may branch on, to skip idle work."""
+    """Return True if any lane is set: the only branch on data in kernels, to skip idle work."""
     raise NotImplementedError("any_of is available inside kernels only")
 
 
 def all_of(asked: Any) -> bool:
-    """True if every lane is set."""
+    """Return True if all lanes are set."""
     raise NotImplementedError("all_of is available inside kernels only")
 
 

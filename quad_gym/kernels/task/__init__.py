@@ -1,1 +1,1 @@
-"""Episodes: starts, references, rewards, observations, draws. Imports all rooms below."""
+"""Episodes: starts, references, rewards, observations, draws. Imports all packages below."""

@@ -1,7 +1,7 @@
-"""Parameters that follow from drawn ones.
+"""Derivation of parameters from drawn ones.
 
-Formulas refer to the nominal values, which `quad_gym.packing` computes, and change nothing where
-nothing is drawn. Those that round differently are left out then.
+Formulas scale or shift the nominal values, which `quad_gym.packing` computes, so that these stay
+unchanged if nothing is drawn. Formulas that would round differently are skipped in this case.
 """
 
 import math
@@ -28,7 +28,7 @@ _ACCEL_NOISE, _ACCEL_BIAS, _ACCEL_TAU, _GYRO_NOISE, _GYRO_BIAS, _GYRO_TAU = (
 
 @kernel
 def _derive_body(own, nominal, settings):
-    """Inertia, rotors with effectiveness and allocation, and scales of actions."""
+    """Derive the inertia, rotors with effectiveness and allocation, and scales of actions."""
     for i in range(3):
         for j in range(3):
             # J' = S J S with S diagonal is positive definite as J is
@@ -71,7 +71,7 @@ def _derive_body(own, nominal, settings):
 
 @kernel
 def _derive_air(own, nominal, settings):
-    """Drag of the disc, and wind."""
+    """Derive the drag of the disc and the wind."""
     if settings.draw_kind[_DRAG] != FIXED:
         own.half_drag = own.drag_coefficient * nominal.half_disc
     own.wind_I[0], own.wind_I[1], own.wind_I[2] = own.wind_east, own.wind_north, own.wind_up
@@ -82,13 +82,13 @@ def _derive_air(own, nominal, settings):
 
 @kernel
 def _all_noise(drawn, white, all_of_it):
-    """A drawn white noise with all other noise that the filter assumes to be white."""
+    """Return a drawn white noise plus all other noise that the filter assumes to be white."""
     return math.sqrt(drawn * drawn + (all_of_it - white) * (all_of_it + white))
 
 
 @kernel
 def _derive_noise(own, nominal, settings):
-    """White noise, and decay and drive of biases."""
+    """Derive white noise, and decay and driving noise of biases."""
     kinds, root = settings.draw_kind, math.sqrt(nominal.dt)
     if kinds[_ACCEL_NOISE] != FIXED:
         own.accel_sigma = own.accel_noise_density / root
@@ -114,7 +114,7 @@ def _derive_noise(own, nominal, settings):
 
 @kernel
 def _derive_sensors(own, nominal, settings):
-    """Positions of sensors relative to the true center of mass, and the camera's attitude."""
+    """Derive sensor positions relative to the true center of mass, and the camera's attitude."""
     for i in range(3):
         center, antenna = own.center_of_mass_B[i], nominal.antenna[i]
         primary = own.primary_antenna_B[i] - antenna
@@ -135,10 +135,10 @@ def _derive_sensors(own, nominal, settings):
 
 @kernel
 def derive(own, nominal, settings):
-    """Derive the parameters of flights from those that are drawn.
+    """Derive the parameters of flights from the drawn ones.
 
     Args:
-        own: Parameters that begin with the drawn ones, and were a copy of `nominal` at first.
+        own: Parameters that begin with the drawn ones; the others are initially equal to `nominal`.
         nominal: Parameters without draws.
         settings: Kinds of draws; FIXED where nothing is drawn.
     """

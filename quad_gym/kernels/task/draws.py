@@ -1,8 +1,8 @@
-"""Domain randomization: a flight's own parameters, drawn when an episode begins.
+"""Domain randomization: parameters of a flight, drawn when an episode begins.
 
-`flight.drawn` holds the drawn numbers in the order of `DRAWABLES`, in which a record of parameters
-begins. The other parameters are derived from them whenever flights are stepped, so that a flight is
-nothing but its record.
+`flight.drawn` holds the drawn numbers in the order of `DRAWABLES`, which is also the order of the
+first fields of a record of parameters. The other parameters are derived from them whenever flights
+are stepped, so that the record alone defines a flight.
 """
 
 import math
@@ -30,7 +30,7 @@ _HALF_STEP = 2.0**-53  # moves a number on [0, 1) into (0, 1)
 
 @kernel
 def normal_quantile(p):
-    """The x with Phi(x) = p, for p in (0, 1), to 16 digits.
+    """Return the x with Phi(x) = p, for p in (0, 1), to 16 digits.
 
     M. J. Wichura, "Algorithm AS 241: The percentage points of the normal distribution", Applied
     Statistics 37, 1988 (PPND16).
@@ -70,8 +70,7 @@ def normal_quantile(p):
 def draw_parameters(flight, settings, stream, mask):
     """Draw the parameters of a new episode, where `mask`.
 
-    Each column has a draw of its own, so that a parameter does not depend on which others are
-    drawn.
+    Each column has its own draw, so that a parameter does not depend on the other drawn ones.
     """
     for k in range(DRAWN_SIZE):
         kind = settings.draw_kind[k]
@@ -85,14 +84,14 @@ def draw_parameters(flight, settings, stream, mask):
                 value = a * exp(b * u)
             else:
                 value = a + b * u
-            # the bounds hold to the last bit
+            # the bounds hold exactly
             value = clip(value, settings.draw_low[k], settings.draw_high[k])
             flight.drawn[k] = select(mask, value, flight.drawn[k])
 
 
 @kernel
 def _overwrite(flight, nominal, own, settings):
-    """Write draws over the first numbers of `own`; the nominal ones where nothing is drawn."""
+    """Overwrite the first numbers of `own` with draws, or with nominal values if not drawn."""
     numbers, plain = numbers_of(own), numbers_of(nominal)
     for k in range(PARAMETERS_DRAWN):
         numbers[k] = flight.drawn[k] if settings.draw_kind[k] != FIXED else plain[k]
@@ -107,7 +106,7 @@ def draw_stage(flight, world, model, settings, work, stages, flag):
 
 @stage
 def impose_stage(flight, world, model, settings, work, stages, flag):
-    """Put the parameters of the flights at hand together in `world`; `model`: the nominal ones."""
+    """Write the parameters of the current flights to `world`; `model`: the nominal ones."""
     nominal, own = lanes_of(model), lanes_of(world)
     _overwrite(lanes_of(flight), nominal, own, settings)
     derive(own, nominal, settings)

@@ -1,4 +1,4 @@
-"""The start of an episode: its reference, gates and counters."""
+"""Start of an episode: its reference, gates and counters."""
 
 import math
 
@@ -42,9 +42,9 @@ def _clear_reference(flight, mask, center, omega, rule, point):
 
 @kernel
 def _draw_series(flight, settings, stream, mask):
-    """A random flight: normal coefficients falling as 1/k^2, scaled to the bounds.
+    """Draw a random trajectory: normal coefficients, decreasing as 1/k^2, scaled to the bounds.
 
-    |r' | <= sum k w |c_k| and |r''| <= sum (k w)^2 |c_k|, so the bounds hold at every time.
+    |r'| <= sum k w |c_k| and |r''| <= sum (k w)^2 |c_k|, so the bounds hold at all times.
     """
     omega = 2.0 * math.pi / settings.period
     zero = 0.0 * flight.tick
@@ -73,7 +73,7 @@ def _draw_series(flight, settings, stream, mask):
 
 @kernel
 def _draw_gates(flight, settings, stream, mask):
-    """Gates around the origin, each at least sixty degrees further round than the one before."""
+    """Draw gates around the origin; azimuths of successive gates differ by at least 60 degrees."""
     azimuth, _ = uniform_pair(stream, DRAW_GATES)
     azimuth = 2.0 * math.pi * azimuth
     x, y, z = load3(flight.ref_center)
@@ -84,7 +84,7 @@ def _draw_gates(flight, settings, stream, mask):
         height = settings.height * (LOWEST_GATE + GATE_SPREAD * up)
         used = k < settings.gate_count
         s, c = sin_cos(azimuth)
-        # places beyond the last gate repeat it, so that the preview ends there
+        # entries after the last gate repeat it, so that the preview ends there
         x, y, z = (distance * c, distance * s, height) if used else (x, y, z)
         keep3(flight.gates[k], mask, (x, y, z))
         step = (1.0 / 3.0 + 2.0 / 3.0 * turn) * math.pi
@@ -95,7 +95,7 @@ def _draw_gates(flight, settings, stream, mask):
 
 @kernel
 def draw_reference(flight, settings, stream, mask):
-    """Set the reference of a new episode, where `mask`; at random where the settings say so."""
+    """Set the reference of a new episode, where `mask`; at random if the settings require it."""
     u_phase, u_radius = uniform_pair(stream, DRAW_COURSE)
     u_period, u_sense = uniform_pair(stream, DRAW_COURSE + 1)
     zero = 0.0 * u_phase
@@ -118,7 +118,7 @@ def draw_reference(flight, settings, stream, mask):
         keep3(flight.ref_cos[0], mask, (radius * c, radius * s, zero))
         keep3(flight.ref_sin[0], mask, (-sense * radius * s, sense * radius * c, zero))
     elif settings.task == Task.LEMNISCATE:
-        # r(t) = radius (sin wt, sin(2wt)/2) turned by the phase
+        # r(t) = radius (sin wt, sin(2wt)/2) rotated by the phase
         _clear_reference(flight, mask, over_origin, omega, HEADING_VELOCITY, origin)
         half = 0.5 * sense * radius
         keep3(flight.ref_sin[0], mask, (radius * c, radius * s, zero))
@@ -131,14 +131,14 @@ def draw_reference(flight, settings, stream, mask):
         _clear_reference(flight, mask, over_origin, zero, HEADING_TOWARD, origin)
         draw_path(flight, settings, stream, mask)
     else:
-        # a fixed heading: one that follows the gates would turn about from one to the next
+        # a fixed heading: one that follows the gates would jump from gate to gate
         _clear_reference(flight, mask, over_origin, zero, HEADING_ALONG, ahead)
         _draw_gates(flight, settings, stream, mask)
 
 
 @kernel
 def begin_counters(flight, mask):
-    """Set what counts steps, rewards and errors of an episode to its start, where `mask`."""
+    """Reset the counters and sums of an episode's steps, rewards and errors, where `mask`."""
     flight.step = select(mask, 0.0, flight.step)
     flight.episode = select(mask, flight.episode + 1.0, flight.episode)
     flight.gate_next = select(mask, 0.0, flight.gate_next)
@@ -153,7 +153,7 @@ def begin_counters(flight, mask):
 
 @stage
 def begin_stage(flight, world, model, settings, work, stages, flag):
-    """Set reference, true state and counters at the start of an episode."""
+    """Set the reference, true state and counters at the start of an episode."""
     flying, true, believed = lanes_of(flight), lanes_of(world), lanes_of(model)
     stream, mask = stream_of(flying), lanes_of(work).mask > 0.0
     draw_reference(flying, settings, stream, mask)

@@ -1,8 +1,8 @@
 """Users' trajectories: piecewise polynomials, looked up flight by flight.
 
-The stage sets the reference of the present instant: `reference.py` reads it from
-the flight's record. Each lane finds its own segment and copies its coefficients to the
-workspace; from there on the lanes are computed together.
+The stage stores the reference of the present instant in the flight's record, where `reference.py`
+reads it. Each lane searches for its segment and copies the coefficients to the workspace; all later
+steps compute the lanes together.
 """
 
 import math
@@ -32,7 +32,7 @@ _PATH_SIZE, _PIECE_SIZE = PATH.itemsize, PIECE.itemsize
 
 @kernel
 def draw_path(flight, settings, stream, mask):
-    """Choose the trajectory of a new episode, where `mask`; its phase and turn, if asked for."""
+    """Draw the trajectory of a new episode, where `mask`; also its phase and rotation, if set."""
     u_path, u_share = uniform_pair(stream, DRAW_PATH)
     u_turn, _ = uniform_pair(stream, DRAW_PATH + 1)
     zero = 0.0 * u_path
@@ -50,7 +50,7 @@ def draw_path(flight, settings, stream, mask):
 
 @kernel
 def _piece_of(settings, path, time):
-    """The last segment that begins at a time or before; the first before all."""
+    """Return the last segment that begins at or before a time; else the first one."""
     low, high = path.first, path.first + path.pieces - 1
     while low < high:
         middle = (low + high + 1) // 2
@@ -63,7 +63,7 @@ def _piece_of(settings, path, time):
 
 @kernel
 def _look_up(flight, work, settings):
-    """For each lane: what holds of its trajectory and of its segment at `path_time`."""
+    """Copy the segment of each lane's trajectory at `path_time` to the workspace."""
     for lane in range(WIDTH):
         path = _path_at(settings.paths + int(flight.path[lane]) * _PATH_SIZE)
         time, span = work.path_time[lane], path.duration
@@ -90,7 +90,7 @@ def _look_up(flight, work, settings):
 
 @kernel
 def _value(work, i):
-    """A polynomial and its first two derivatives, by Horner's rule."""
+    """Return a polynomial and its first two derivatives, by Horner's rule."""
     t = work.path_time
     value = work.path_terms[0, i]
     rate, bend = 0.0 * t, 0.0 * t
@@ -103,14 +103,14 @@ def _value(work, i):
 
 @kernel
 def _turned(flight, x, y, z):
-    """A vector turned about the vertical as the flight's trajectory is."""
+    """Return a vector, rotated about the vertical like the flight's trajectory."""
     c, s = flight.path_turn[0], flight.path_turn[1]
     return (c * x - s * y, s * x + c * y, z)
 
 
 @kernel
 def _heading(flight, work, r, v):
-    """The wanted direction of body x, turned with the trajectory."""
+    """Return the desired direction of body x, rotated like the trajectory."""
     zero = 0.0 * r[0]
     rule = work.path_heading
     yaw, _, _ = _value(work, 3)
@@ -126,7 +126,7 @@ def _heading(flight, work, r, v):
 def follow_stage(flight, world, model, settings, work, stages, flag):
     """Set the reference of the present instant, and its preview.
 
-    `flag`: whether the instant is within a control period, where PD control alone reads them.
+    `flag`: 1 if the instant is within a control period, where only PD control reads them.
     """
     if flag and settings.control != Control.PD:
         return

@@ -1,4 +1,4 @@
-"""What the controller sees of the state: the truth, the estimate, or the truth with noise."""
+"""Observed state of the controller: the truth, the estimate, or the truth with noise."""
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import (
@@ -23,7 +23,7 @@ from quad_gym.records import DRAW_NOISY, Control, Source
 
 @kernel
 def look(flight, model, settings, mask):
-    """Set what the controller sees from its source, where `mask`."""
+    """Set the state that the controller observes from its source, where `mask`."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     r, v, w_B = load3(flight.r), load3(flight.v), load3(flight.w)
     if settings.source == Source.ESTIMATE or settings.source == Source.MEASUREMENTS:
@@ -48,7 +48,7 @@ def look(flight, model, settings, mask):
 
 @kernel
 def look_within(flight, model, settings):
-    """As `look`, at an instant within a control period: what the inner loop of an action reads."""
+    """Set the body rates that an inner loop reads, at an instant within a control period."""
     control, source = settings.control, settings.source
     if control != Control.MOTOR and control != Control.WRENCH:
         w_B = load3(flight.w)
@@ -64,7 +64,7 @@ def look_within(flight, model, settings):
 
 @stage
 def look_stage(flight, world, model, settings, work, stages, flag):
-    """Set what the controller sees; `flag`: whether the instant is within a control period."""
+    """Set the state that the controller observes; `flag`: 1 within a control period."""
     flying, believed = lanes_of(flight), lanes_of(model)
     if flag and settings.control <= Control.CTBR:
         look_within(flying, believed, settings)

@@ -1,4 +1,4 @@
-"""Observations, from what the controller sees alone; `envs.spaces` has them as a table."""
+"""Observations of the controller; `envs.spaces` has a table of their layouts."""
 
 import math
 
@@ -37,7 +37,7 @@ def _put3(row, k, v):
 
 @kernel
 def _upcoming_gate(flight, ahead):
-    """The gate that is `ahead` gates after the present one; the last one is repeated."""
+    """Return the gate that is `ahead` gates after the present one; the last one is repeated."""
     x, y, z = load3(flight.gates[MAX_GATES - 1])
     for k in range(MAX_GATES):
         here = flight.gate_next + ahead == 1.0 * k
@@ -48,7 +48,7 @@ def _upcoming_gate(flight, ahead):
 
 @kernel
 def _previewed(flight, p, settings, i):
-    """The reference a little later: in time, or on a course the gates after the next."""
+    """Return preview i of the reference: a later time or, on a course, a gate after the next."""
     if settings.task == Task.WAYPOINTS:
         return _upcoming_gate(flight, 1.0 + i)
     if settings.harmonics == FOLLOWED:
@@ -59,7 +59,7 @@ def _previewed(flight, p, settings, i):
 
 @kernel
 def reference_shown(flight, p, settings):
-    """(r*, v*, a*, x*) of the present instant, and r* at the first and second preview."""
+    """Return (r*, v*, a*, x*) at the present instant, and r* at the first and second preview."""
     r_ref, v_ref, a_ref, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
     first, second = _previewed(flight, p, settings, 0), _previewed(flight, p, settings, 1)
     return r_ref, v_ref, a_ref, x_ref, first, second
@@ -67,7 +67,7 @@ def reference_shown(flight, p, settings):
 
 @kernel
 def put_relative(reference, row, k, r, v, R_BI, w_B):
-    """Write errors, directions and rates in the body frame from `k` on; return the next place."""
+    """Write errors, directions and rates in B from index k on; return the next index."""
     r_ref, v_ref, a_ref, x_ref, first, second = reference
     k = _put3(row, k, apply(R_BI, sub(r_ref, r)))
     k = _put3(row, k, apply(R_BI, sub(v_ref, v)))
@@ -81,7 +81,7 @@ def put_relative(reference, row, k, r, v, R_BI, w_B):
 
 @kernel
 def _put_reference(flight, p, settings, row, k):
-    """The reference in I."""
+    """Write the reference in I from index k on; return the next index."""
     for vector in reference_shown(flight, p, settings):
         k = _put3(row, k, vector)
     return k
@@ -89,7 +89,7 @@ def _put_reference(flight, p, settings, row, k):
 
 @kernel
 def _put_absolute(flight, p, settings, row):
-    """The state in I and the reference in I; biases as far as the source knows them."""
+    """Write state and reference in I; biases are true, estimated or zero, by the source."""
     k = _put3(row, 0, load3(flight.r_seen))
     k = _put3(row, k, load3(flight.v_seen))
     for i in range(3):
@@ -109,7 +109,7 @@ def _put_absolute(flight, p, settings, row):
 
 @kernel
 def _put_aids(flight, p, settings, row, k):
-    """Measurements of sensors other than GNSS and camera since the last step, else zeros."""
+    """Write measurements of aiding sensors since the last step, or zeros if there are none."""
     for s in range(AIDS):
         if settings.sensor_blocks[FIRST_AID + s] > 0:
             fresh = flight.block_fresh[AID_BLOCKS + s]
@@ -123,10 +123,10 @@ def _put_aids(flight, p, settings, row, k):
 
 @kernel
 def _put_sensors(flight, p, settings, row):
-    """The IMU; GNSS and camera where they measured since the last step, else zeros.
+    """Write raw measurements; entries of sensors without one since the last step are zero.
 
-    Of the IMU the last sample, and the mean of all samples since the last step (at the start of an
-    episode there is one).
+    The IMU contributes its last sample and the mean of all samples since the last step (a single
+    sample at the start of an episode).
     """
     R_IG = load33(p.R_IG)
     gyro, accel = load3(flight.gyro), load3(flight.accel)
@@ -161,7 +161,7 @@ def _put_sensors(flight, p, settings, row):
 
 @kernel
 def _put_privileged(flight, p, settings, row, k):
-    """The truth, for critics: relative state, biases and rotor speeds."""
+    """Write the truth, for critics: relative state, biases and rotor speeds."""
     R_BI = quaternion_to_dcm(load4(flight.q))
     r_ref, v_ref, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
     k = _put3(row, k, apply(R_BI, sub(r_ref, load3(flight.r))))
@@ -179,7 +179,7 @@ def _put_privileged(flight, p, settings, row, k):
 
 @kernel
 def _put_world(flight, settings, row, k):
-    """The air's velocity, and each draw as its deviation from the middle in units of its spread."""
+    """Write the air's velocity, and each draw minus its center, divided by its spread."""
     k = _put3(row, k, apply(quaternion_to_dcm(load4(flight.q)), load3(flight.wind)))
     for column in range(DRAWN_SIZE):
         if settings.draw_kind[column] != FIXED:
@@ -195,8 +195,8 @@ def observe(flight, p, settings, row):
     Args:
         flight: Record.
         p: Nominal parameters.
-        settings: What the batch does.
-        row: (MAX_OBSERVATION,), receives it.
+        settings: Settings of the batch.
+        row: (MAX_OBSERVATION,), receives the observation.
     """
     if settings.layout == Layout.MEASUREMENTS:
         k = _put_sensors(flight, p, settings, row)
@@ -224,5 +224,5 @@ def observe(flight, p, settings, row):
 
 @stage
 def observe_stage(flight, world, model, settings, work, stages, flag):
-    """Fill the workspace's observation."""
+    """Write the observation of the present instant to the workspace."""
     observe(lanes_of(flight), lanes_of(model), settings, lanes_of(work).observation)

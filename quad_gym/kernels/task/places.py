@@ -1,7 +1,7 @@
-"""Features of a camera that are at other places in each episode, as the filter knows.
+"""Features of a camera whose positions differ between episodes, and are known to the filter.
 
-Feature i, nominally at X_i, is at `R_z(yaw) (X_i + offset_i) + shift`: each has an offset of its
-own, and all turn about the vertical through the origin and shift together.
+Feature i, nominally at X_i, is at `R_z(yaw) (X_i + offset_i) + shift`: each feature has its own
+offset; all are rotated about the vertical through the origin and shifted together.
 """
 
 from quad_gym.kernels.compiling import kernel, stage
@@ -16,12 +16,12 @@ _OFFSETS = COLUMNS["feature_offsets_I"].start
 
 @kernel
 def place_of(flight, X_I, i):
-    """Where feature i is in this episode, by what has been drawn.
+    """Return the position of feature i in this episode in I [m].
 
     Args:
         flight: Record, with its draws.
-        X_I: Where it is nominally [m].
-        i: Its number.
+        X_I: Nominal position in I [m].
+        i: Index of the feature.
     """
     drawn, k = flight.drawn, _OFFSETS + 3 * i
     s, c = sin_cos(drawn[_YAW])
@@ -32,9 +32,9 @@ def place_of(flight, X_I, i):
 
 @stage
 def place_features_stage(flight, world, model, settings, work, stages, flag):
-    """Put the features of the flights at hand where they are, in truth and for the filter.
+    """Set the positions of the current flights' features, both true and assumed by the filter.
 
-    `flag`: whether episodes begin, whose places are kept for readers.
+    `flag`: 1 if episodes begin, whose positions are then stored in the flights.
     """
     flying, true, believed = lanes_of(flight), lanes_of(world), lanes_of(model)
     mask = lanes_of(work).mask > 0.0

@@ -1,8 +1,8 @@
 """References: a finite Fourier series per axis and a rule for the heading.
 
 `r*(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t)`: hover has no terms, a circle one, a lemniscate
-two, a random flight several. One kernel evaluates them all, with exact derivatives. A trajectory of
-a user's own is looked up by the stage of `follow.py`, and read here.
+two, a random trajectory several. One kernel evaluates them all, with exact derivatives. A user's
+trajectory is looked up by the stage of `follow.py`, and read here.
 """
 
 from quad_gym.kernels.compiling import kernel
@@ -13,7 +13,7 @@ from quad_gym.records import FOLLOWED, HEADING_ALONG, HEADING_VELOCITY, MAX_HARM
 
 @kernel
 def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
-    """r*(t) in I [m]."""
+    """Return r*(t) in I [m]."""
     x, y, z = load3(flight.ref_center)
     s1, c1 = 0.0 * x, 0.0 * x
     if harmonics > 0:
@@ -28,13 +28,13 @@ def position_on_reference(flight, t, harmonics=MAX_HARMONICS):
 
 @kernel
 def direction_of(v, zero):
-    """The horizontal unit vector along v; east where it has none. `zero`: its third component."""
+    """Return the horizontal unit vector along v, east if v is vertical; `zero`: its z component."""
     return unit_or((v[0], v[1], zero), (zero + 1.0, zero, zero))
 
 
 @kernel
 def heading(flight, r_ref, v_ref):
-    """x*: the horizontal unit direction that the body x axis is to point in."""
+    """Return x*, the desired direction of the body x axis: a horizontal unit vector in I."""
     point = load3(flight.ref_heading_point)
     toward = sub(point, r_ref)
     rule = flight.ref_heading_rule
@@ -45,7 +45,7 @@ def heading(flight, r_ref, v_ref):
 
 @kernel
 def _followed(flight):
-    """(r*, v*, a*, x*) of a user's trajectory at the present instant."""
+    """Return (r*, v*, a*, x*) of a user's trajectory at the present instant."""
     return (
         load3(flight.path_r),
         load3(flight.path_v),
@@ -56,10 +56,10 @@ def _followed(flight):
 
 @kernel
 def evaluate_reference(flight, t, harmonics=MAX_HARMONICS):
-    """(r*, v*, a*, x*) in I at the time t of the episode [s].
+    """Return (r*, v*, a*, x*) in I at the time t of the episode [s].
 
-    `harmonics`: how many terms of the series there are; the others are zero. FOLLOWED: it is a
-    trajectory, and t the present instant, for which `follow.py` has looked it up.
+    `harmonics`: number of nonzero terms of the series; FOLLOWED: the reference is a trajectory, and
+    t the present instant, for which `follow.py` has looked it up.
     """
     if harmonics == FOLLOWED:
         return _followed(flight)

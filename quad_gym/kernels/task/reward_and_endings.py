@@ -1,4 +1,4 @@
-"""Errors, reward and endings of a step, from the true state alone."""
+"""Errors, reward and endings of a step, computed from the true state."""
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.elementary import exp, is_finite
@@ -21,7 +21,7 @@ _OUT_OF_BOUNDS, _LAST_GATE = float(Ending.OUT_OF_BOUNDS), float(Ending.LAST_GATE
 
 @kernel
 def _pass_gate(flight, settings, active):
-    """Move on to the next gate where the present one is reached; return where, and progress."""
+    """Advance to the next gate where the present one is reached; return (passed, progress)."""
     target = load3(flight.ref_center)
     distance = norm(sub(target, load3(flight.r)))
     progress = flight.position_error - distance
@@ -38,10 +38,10 @@ def _pass_gate(flight, settings, active):
 
 @kernel
 def _reward(flight, p, settings, work, active, R_BI, w_B):
-    """Return reward and position error of a step, whether it passed the last gate, and is finite.
+    """Return (reward, position error, last gate passed, finite) of a step.
 
-    The reward is not the sum of its terms in `work`, but is computed from the same factors with
-    fewer roundings.
+    The reward is not the sum of its terms in `work`: it is computed from their factors, with fewer
+    roundings.
     """
     seconds, weight, term = p.dt * settings.ticks_per_step, settings.reward_weight, work.reward_term
     change, spin = 0.0 * seconds, dot(w_B, w_B)
@@ -50,7 +50,7 @@ def _reward(flight, p, settings, work, active, R_BI, w_B):
         change = change + gap * gap
     costs = weight[_ACTION_RATE] * change + weight[_BODY_RATES] * spin
     scale = settings.reward_scale
-    finished = active & (change < 0.0)  # nowhere, as yet
+    finished = active & (change < 0.0)  # false in all lanes so far
     if settings.task == Task.WAYPOINTS:
         passed, progress = _pass_gate(flight, settings, active)
         _, _, _, x_ref = evaluate_reference(flight, flight.tick * p.dt, settings.harmonics)
@@ -87,7 +87,7 @@ def judge(flight, p, settings, work, active):
         p: Parameters, for the tick.
         settings: Task, weights of the reward, and bounds.
         work: Workspace, for the terms of the reward.
-        active: Lanes that flew a step, not those that are about to begin an episode.
+        active: Lanes that have flown a step, as opposed to lanes about to begin an episode.
     """
     R_BI, w_B = quaternion_to_dcm(load4(flight.q)), load3(flight.w)
     flight.step = select(active, flight.step + 1.0, flight.step)

@@ -1,4 +1,4 @@
-"""Numbers that the views of user-defined tasks read, see `quad_gym.records.SHOWN`."""
+"""Numbers for the views of user-defined tasks, see `quad_gym.records.SHOWN`."""
 
 from quad_gym.kernels.compiling import kernel, stage
 from quad_gym.kernels.maths.linalg import load3, load4, load33
@@ -9,7 +9,7 @@ from quad_gym.kernels.task.observation import put_relative, reference_shown
 
 @kernel
 def _show(flight, p, settings, row):
-    """Write the fields of `SHOWN` in their order."""
+    """Write the fields of `SHOWN` in order."""
     reference = reference_shown(flight, p, settings)
     R_BI = quaternion_to_dcm(load4(flight.q))
     for i in range(3):
@@ -25,5 +25,5 @@ def _show(flight, p, settings, row):
 
 @stage
 def show_stage(flight, world, model, settings, work, stages, flag):
-    """Fill the workspace's observation with the numbers that a task's view reads."""
+    """Write the numbers for a task's view to the workspace's observation."""
     _show(lanes_of(flight), lanes_of(model), settings, lanes_of(work).observation)

@@ -1,4 +1,4 @@
-"""Where an episode starts: the true state, drawn around the start of the reference."""
+"""True state at the start of an episode, drawn around the start of the reference."""
 
 from quad_gym.kernels.compiling import kernel
 from quad_gym.kernels.maths.elementary import atan2, clip, maximum
@@ -20,9 +20,9 @@ from quad_gym.records import (
 )
 
 START_POSITION_SIGMA, START_YAW_SIGMA, START_TILT_SIGMA, START_VELOCITY_SIGMA = 0.3, 0.2, 0.03, 0.03
-"""Spread of a hovering start: [m], [rad], [rad], [m/s]."""
+"""Standard deviations of a hovering start: [m], [rad], [rad], [m/s]."""
 GROUND_SHARE = 0.5
-"""Share of the mixed starts that are on the ground."""
+"""Share of mixed starts that are on the ground."""
 _POSITION, _VELOCITY = COLUMNS["start_position_I"].start, COLUMNS["start_velocity_I"].start
 _RATES, _YAW = COLUMNS["start_body_rates"].start, COLUMNS["start_yaw"].start
 _ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start
@@ -30,20 +30,20 @@ _ROLL, _PITCH = COLUMNS["start_roll"].start, COLUMNS["start_pitch"].start
 
 @kernel
 def _signed_pair(stream, draw):
-    """Two independent numbers, uniform on [-1, 1)."""
+    """Return two independent numbers, uniform on [-1, 1)."""
     a, b = uniform_pair(stream, draw)
     return 2.0 * a - 1.0, 2.0 * b - 1.0
 
 
 @kernel
 def _given_or(given, drawn):
-    """A start value that the caller gave, or the drawn one where it is NaN."""
+    """Return a start value from the caller, or the drawn one where that is NaN."""
     return select(given == given, given, drawn)
 
 
 @kernel
 def draw_start(flight, p, model, settings, work, stream, mask):
-    """Set the true state at the start of an episode, where `mask`; keep who is on the ground."""
+    """Set the true state at the start of an episode, where `mask`; mark lanes on the ground."""
     (x, y, z), _, _, x_ref = evaluate_reference(flight, 0.0 * flight.tick, settings.harmonics)
     yaw = atan2(x_ref[1], x_ref[0])
     zero = 0.0 * yaw
