@@ -225,7 +225,9 @@ def test_links_lead_to_files_and_headings_of_the_repository(page):
 
 
 def test_functions_that_the_equations_name_exist():
-    text = " ".join((ROOT / "docs" / "filter-equations.md").read_text(encoding="utf-8").split())
+    pages = ("filter-equations", "measurement-equations", "recovery")
+    text = " ".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8") for page in pages)
+    text = " ".join(text.split())
     found = re.findall(r"((?:`\w+`(?:, | and )?)+) in `(quad_gym/[\w/]+\.py)`", text)
     assert len(found) > 15
     for names, path in found:
