@@ -6,7 +6,7 @@ import json
 import math
 import platform
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -89,6 +89,20 @@ def write_json(file: Path, value: Any) -> Path:
     text = json.dumps(as_json(value), indent=2, allow_nan=False, ensure_ascii=False)
     file.write_text(text + "\n", encoding="utf-8")
     return file
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Convert rows with the same names to columns by name."""
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def stacked(tables: Iterable[Mapping[str, Iterable[Any]]]) -> dict[str, list[Any]]:
+    """Stack tables with the same columns, one below the other."""
+    columns: dict[str, list[Any]] = {}
+    for table in tables:
+        for name, values in table.items():
+            columns.setdefault(name, []).extend(values)
+    return columns
 
 
 def write_csv(file: Path, columns: Mapping[str, Sequence[Any]]) -> Path:

@@ -1,4 +1,4 @@
-"""Measure the speed of all parts: filter, tick, options, environments, rendering, compilation.
+"""Measure the speed of all parts: filter, tick, options, environments, tasks, compilation.
 
     quad-gym benchmark
     quad-gym benchmark --only interfaces --n-envs 256
@@ -15,7 +15,6 @@ configuration, the versions and the processor. Run it on an idle machine.
 
 import dataclasses
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -30,10 +29,9 @@ from quad_gym.experiments.benchmark import (
     machine,
     options,
     own_task,
-    rendering,
     stages,
 )
-from quad_gym.experiments.benchmark.timing import Effort, Row
+from quad_gym.experiments.benchmark.timing import Effort, Row, Scope
 from quad_gym.kernels.compiling.cores import available_cores
 from quad_gym.records import WIDTH
 
@@ -52,8 +50,6 @@ class Args:
         "options",
         "interfaces",
         "tasks",
-        "memory",
-        "rendering",
         "compile",
         "learning",
     ] = "all"
@@ -86,40 +82,28 @@ class Args:
             raise ValueError(f"--seconds must be above 0, got {self.seconds}")
 
     @property
-    def effort(self) -> Effort:
-        """Number and length of the repeats."""
-        return Effort(2, 0.01) if self.quick else Effort(self.repeats, self.seconds)
+    def scope(self) -> Scope:
+        """Extent of the measurements."""
+        return Scope(
+            batch=self.batch,
+            envs=self.n_envs,
+            threads=available_cores() if self.threads is None else self.threads,
+            seeds=self.seeds,
+            steps=self.steps,
+            effort=Effort(2, 0.01) if self.quick else Effort(self.repeats, self.seconds),
+            quick=self.quick,
+        )
 
-    @property
-    def most_threads(self) -> int:
-        """Largest number of threads."""
-        return available_cores() if self.threads is None else self.threads
 
-
-SECTIONS: dict[str, tuple[Callable[[Args], list[Row]], Callable[[list[Row]], str]]] = {
-    "filter": (
-        lambda args: filter.time_filter(args.batch, args.effort, 5 if args.quick else 40),
-        filter.filter_table,
-    ),
-    "tick": (lambda args: stages.time_tick(args.batch, args.effort), stages.tick_table),
-    "options": (lambda args: options.time_options(args.batch, args.effort), options.options_table),
-    "interfaces": (
-        lambda args: interfaces.time_interfaces(args.n_envs, args.most_threads, args.effort),
-        interfaces.interfaces_table,
-    ),
-    "tasks": (
-        lambda args: own_task.time_own_task(args.effort, args.most_threads),
-        own_task.own_task_table,
-    ),
-    "memory": (lambda args: machine.measure_memory(args.quick), machine.memory_table),
-    "rendering": (lambda args: rendering.time_rendering(args.effort), rendering.rendering_table),
-    "compile": (lambda args: compiling.time_compile(args.quick), compiling.compile_table),
-    "learning": (
-        lambda args: learning.time_learning(args.seeds, args.steps, args.most_threads, args.quick),
-        learning.learning_table,
-    ),
+SECTIONS = {
+    "filter": filter.SECTION,
+    "tick": stages.SECTION,
+    "options": options.SECTION,
+    "interfaces": interfaces.SECTION,
+    "tasks": own_task.SECTION,
+    "compile": compiling.SECTION,
+    "learning": learning.SECTION,
 }
-"""Functions that measure the rows of each section and format them."""
 
 
 def chosen_sections(args: Args) -> list[str]:
@@ -137,9 +121,8 @@ def main(args: Args) -> None:
     sections: dict[str, list[Row]] = {}
     for name in chosen_sections(args):
         print(f"{name}:", file=sys.stderr, flush=True)
-        time_section, table = SECTIONS[name]
-        sections[name] = time_section(args)
-        print(table(sections[name]), end="\n\n", flush=True)
+        sections[name] = SECTIONS[name].measure(args.scope)
+        print(SECTIONS[name].table(sections[name]), end="\n\n", flush=True)
     found = {
         "sections": sections,
         "configuration": dataclasses.asdict(args),

@@ -33,7 +33,14 @@ from quad_gym.analysis.metrics import (
     spread,
 )
 from quad_gym.analysis.recording import Recording, record_flights
-from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import (
+    require_writable,
+    stacked,
+    text_table,
+    versions,
+    write_csv,
+    write_json,
+)
 from quad_gym.batch.flight_batch import FlightBatch
 from quad_gym.commands.options import require_at_least, usage_errors
 from quad_gym.records import Source
@@ -311,11 +318,11 @@ def write_figures(results: dict[str, Recording], setup: Setup) -> list[Path]:
 
 def write_numbers(results: dict[str, Recording], setup: Setup) -> Path:
     """Write one row per case and seed."""
-    columns: dict[str, list[Any]] = {}
+    tables = []
     for case, flights in results.items():
         nothing = np.full(len(setup.seeds), np.nan)
         estimation = flights.estimation or TrackingSummary(nothing, nothing)
-        block = {
+        table = {
             "case": [case] * len(setup.seeds),
             "seed": setup.seeds,
             "tracking_error_mean_m": flights.tracking.mean,
@@ -325,9 +332,8 @@ def write_numbers(results: dict[str, Recording], setup: Setup) -> Path:
             "ending": flights.ending_names(),
             "ended_at_s": flights.ended_at,
         }
-        for name, values in block.items():
-            columns.setdefault(name, []).extend(values)
-    return write_csv(setup.output / "flights.csv", columns)
+        tables.append(table)
+    return write_csv(setup.output / "flights.csv", stacked(tables))
 
 
 def summary_of(

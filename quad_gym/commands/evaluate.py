@@ -25,6 +25,7 @@ from quad_gym.analysis.recording import Tracer
 from quad_gym.analysis.reports import (
     require_writable,
     short_name,
+    stacked,
     text_table,
     versions,
     write_csv,
@@ -217,16 +218,15 @@ def write(
     results: dict[Case, Episodes], tracers: dict[Case, Tracer], args: Args, folder: Path
 ) -> list[Path]:
     """Write numbers and figures; return the files."""
-    columns: dict[str, list[Any]] = {}
-    for (name, observation), episodes in results.items():
-        block = {
+    tables = (
+        {
             "policy": [name] * args.episodes,
             "observation": [observation] * args.episodes,
             "seed": range(args.seed, args.seed + args.episodes),
-            **{name: getattr(episodes, name) for name in Episodes._fields},
+            **episodes._asdict(),
         }
-        for name, values in block.items():
-            columns.setdefault(name, []).extend(values)
+        for (name, observation), episodes in results.items()
+    )
     summary = {
         "cases": [
             {"policy": name, "observation": observation, **episodes.summary()}
@@ -238,7 +238,7 @@ def write(
         "versions": versions("numpy", "numba", "torch", "stable_baselines3"),
     }
     written = [
-        write_csv(folder / "episodes.csv", columns),
+        write_csv(folder / "episodes.csv", stacked(tables)),
         write_json(folder / "summary.json", summary),
     ]
     labels = {case: f"{short_name(case[0])} on {case[1]}" for case in results}

@@ -27,7 +27,14 @@ from baselines.pd import PDPolicy
 from baselines.seeds import first_seed
 from quad_gym import PDGains, pd_gains
 from quad_gym.analysis.intervals import paired_difference
-from quad_gym.analysis.reports import require_writable, text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import (
+    columns_of,
+    require_writable,
+    text_table,
+    versions,
+    write_csv,
+    write_json,
+)
 from quad_gym.commands.options import (
     TRACKING,
     Keywords,
@@ -290,10 +297,9 @@ def main(args: Args) -> None:
         "arguments": args,
         "versions": versions("numpy", "scipy", "numba"),
     }
-    columns = {name: [row[name] for row in found.rows] for name in found.rows[0]}
     written = [
         write_json(args.output / "gains.json", record),
-        write_csv(args.output / "search.csv", columns),
+        write_csv(args.output / "search.csv", columns_of(found.rows)),
     ]
     seconds = time.perf_counter() - began
     print(f"\nWrote {len(written)} files to {args.output} after {seconds:.0f} s; fly them with")

@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from baselines.plans import Plan
 from baselines.recipes import Recipe
-from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import (
     error_over_time_figure,
     learning_figure,
@@ -19,11 +18,11 @@ from quad_gym.analysis.comparison_plots import (
 )
 from quad_gym.analysis.intervals import mean_interval, paired_difference
 from quad_gym.analysis.metrics import Interval
-from quad_gym.analysis.reports import text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import columns_of, text_table, versions, write_csv, write_json
 from quad_gym.envs.effects import with_effect
-from quad_gym.experiments import pages
 from quad_gym.experiments.experiment import Experiment, Floats
 from quad_gym.experiments.flown import Flown, Trial, path_of
+from quad_gym.experiments.pages import Report
 from quad_gym.params.suites import contents_of_suite_files, suite_label
 
 NAMES = {
@@ -186,15 +185,17 @@ def conclusions(matrix: Matrix) -> list[str]:
     """Conclusions that the intervals allow."""
     comparison, sentences = matrix.comparison, []
     for suite in comparison.suites:
-        for first, second in _questions(comparison.sources):
-            cells = [matrix.cell(suite, way.source, way.observation) for way in (first, second)]
+        for pair in _QUESTIONS:
+            if any(source not in comparison.rows for _, source, _ in pair):
+                continue
+            cells = [matrix.cell(suite, source, on) for _, source, on in pair]
             if max(float(cell.crash_rates.max()) for cell in cells) > MANY_CRASHES:
                 continue  # errors of crashed episodes end early
             # PD has no training seed: its one number is repeated
             errors = [np.resize(cell.errors, len(comparison.seeds)) for cell in cells]
-            text = _sentence(first.name, second.name, *errors)
-            both = " Both flown on the estimate." if second.observation == "estimate" else ""
-            sentences.append(f"Sensors {suite}: {text}{both}")
+            (first, _, _), (second, _, flown_on) = pair
+            both = " Both flown on the estimate." if flown_on == "estimate" else ""
+            sentences.append(f"Sensors {suite}: {_sentence(first, second, *errors)}{both}")
         for source in comparison.rows:
             share = float(matrix.cell(suite, source, "estimate").crash_rates.max())
             if share > MANY_CRASHES:
@@ -205,28 +206,17 @@ def conclusions(matrix: Matrix) -> list[str]:
     return [*sentences, ONE_SEED] if len(comparison.seeds) == 1 else sentences
 
 
-class _Way(NamedTuple):
-    """Cell of the matrix, named for sentences."""
+_Way = tuple[str, str, str]
+"""Cell of the matrix: name for sentences, observations in training and in flight."""
 
-    name: str
-    source: str
-    observation: str
-
-
-def _questions(sources: Sequence[str]) -> list[tuple[_Way, _Way]]:
-    """Pairs of cells to compare."""
-    ours = _Way("training on the estimate", "estimate", "estimate")
-    pairs = [
-        (
-            _Way("flying on the estimate", "truth", "estimate"),
-            _Way("on the truth", "truth", "truth"),
-        ),
-        (ours, _Way("training on the truth", "truth", "estimate")),
-        (ours, _Way("training on the noisy truth", "noisy", "estimate")),
-        (ours, _Way("tuned PD control", "PD", "estimate")),
-    ]
-    known = {*sources, "PD"}
-    return [pair for pair in pairs if all(way.source in known for way in pair)]
+_OURS = ("training on the estimate", "estimate", "estimate")
+_QUESTIONS: tuple[tuple[_Way, _Way], ...] = (
+    (("flying on the estimate", "truth", "estimate"), ("on the truth", "truth", "truth")),
+    (_OURS, ("training on the truth", "truth", "estimate")),
+    (_OURS, ("training on the noisy truth", "noisy", "estimate")),
+    (_OURS, ("tuned PD control", "PD", "estimate")),
+)
+"""Pairs of cells to compare."""
 
 
 def _sentence(first: str, second: str, errors: Floats, others: Floats) -> str:
@@ -248,115 +238,101 @@ def _sentence(first: str, second: str, errors: Floats, others: Floats) -> str:
 
 def write_report(matrix: Matrix) -> list[Path]:
     """Write numbers, figures and the page; the last file is the page."""
-    folder, figures = matrix.comparison.folder, _figures(matrix)
-    files = {name: plots.save_figure(figure, folder / name) for name, figure in figures.items()}
-    return [
-        *_write_numbers(matrix),
-        *(file for pair in files.values() for file in pair),
-        _write_page(matrix, {name: pair[0] for name, pair in files.items()}),
-    ]
+    comparison, trainings = matrix.comparison, matrix.comparison.trainings
+    recipe, seconds = comparison.recipe, sum(t.record()["training_seconds"] for t in trainings)
+    report = Report(comparison.folder, f"{comparison.env_id}: what the estimate costs")
+    report.files += _write_numbers(matrix)
+    report.add(
+        "p",
+        f"{recipe.algorithm.upper()} ({_ENGINES[comparison.engine]}), {recipe.steps:,} "
+        f"steps for each of {len(trainings)} policies, training seeds "
+        f"{', '.join(map(str, comparison.seeds))}; {seconds / 60:.1f} minutes of training. "
+        f"Each policy flew {comparison.episodes:,} episodes on the truth and on the estimate.",
+    )
+    report.add_bullets(conclusions(matrix))
+    shown = ("error [mm]", "second half [mm]", "crashed")
+    headings = ["policy", *(f"{what}, on {on}" for what in shown for on in FLOWN_ON)]
+    for suite in comparison.suites:
+        report.add("h2", f"Sensors {suite}")
+        report.add_table(headings, matrix.texts(suite))
+        _add_figures(report, matrix, suite)
+    return report.write()
 
 
 def _write_numbers(matrix: Matrix) -> list[Path]:
     """Write all numbers as CSV, and the summary as JSON."""
-    comparison, rows = matrix.comparison, []
+    comparison, rows, cells = matrix.comparison, [], []
     for suite, source, observation in product(comparison.suites, comparison.rows, FLOWN_ON):
+        about = {"sensors": suite, "trained_on": source}
         trainings: list[Any] = comparison.trainings_of(case_of(suite, source)) or [None]
         flights = matrix.flown[case_of(suite, source, observation)]
         for training, flown in zip(trainings, flights, strict=True):
             rows.append(
                 {
-                    "sensors": suite,
-                    "trained_on": source,
+                    **about,
                     "training_seed": training and training.plan.seed,
                     "flown_on": observation,
                     **flown.episodes.summary(),
                     "training_seconds": training and training.record()["training_seconds"],
                 }
             )
+        cell = matrix.cell(suite, source, observation)
+        cells.append({**about, "flown_on": observation, **cell.description()})
     summary = {
         **comparison.description(),
-        "matrix": [
-            {
-                "sensors": suite,
-                "trained_on": source,
-                "flown_on": observation,
-                **matrix.cell(suite, source, observation).description(),
-            }
-            for suite, source, observation in product(comparison.suites, comparison.rows, FLOWN_ON)
-        ],
+        "matrix": cells,
         "conclusions": conclusions(matrix),
         "versions": versions("numpy", "numba", "scipy", "torch", "stable_baselines3"),
     }
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
     return [
-        write_csv(comparison.folder / "policies.csv", columns),
+        write_csv(comparison.folder / "policies.csv", columns_of(rows)),
         write_json(comparison.folder / "summary.json", summary),
     ]
 
 
-def _figures(matrix: Matrix) -> dict[str, Any]:
-    """Learning curves, matrices, errors over time, and paths, by name."""
-    comparison, figures = matrix.comparison, {}
-    for suite in comparison.suites:
-        cells, label = matrix.cells(suite), suite_label(suite)
-        curves = {}
-        for source in comparison.sources:
-            trainings = comparison.trainings_of(case_of(suite, source))
-            each = [training.curve("mean_error") for training in trainings]
-            curves[NAMES[source]] = [(steps[1:], errors[1:]) for steps, errors in each]
-        level = {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])}
-        title = f"Evaluated on what is trained on, sensors {suite}"
-        figures[f"learning_{label}"] = learning_figure(curves, level, title)
-        figures[f"matrix_{label}"] = matrix_figure(
+def _add_figures(report: Report, matrix: Matrix, suite: str) -> None:
+    """Draw learning curves, matrix, errors over time, and paths of a suite."""
+    comparison, cells, label = matrix.comparison, matrix.cells(suite), suite_label(suite)
+    curves = {}
+    for source in comparison.sources:
+        trainings = comparison.trainings_of(case_of(suite, source))
+        each = [training.curve("mean_error") for training in trainings]
+        curves[NAMES[source]] = [(steps[1:], errors[1:]) for steps, errors in each]
+    report.add_figure(
+        f"learning_{label}",
+        learning_figure(
+            curves,
+            {"PD, tuned, on the estimate": float(cells["PD"][1].errors[0])},
+            f"Evaluated on what is trained on, sensors {suite}",
+        ),
+        "Error during training; thin lines are single seeds, bold ones their median.",
+    )
+    report.add_figure(
+        f"matrix_{label}",
+        matrix_figure(
             np.array([[float(np.mean(cell.errors)) for cell in row] for row in cells.values()]),
             [[cell.texts()[0] for cell in row] for row in cells.values()],
             [NAMES[source] for source in cells],
             ["flown on truth", "flown on the estimate"],
             f"Mean position error [mm], sensors {suite}",
-        )
-        first = {NAMES[s]: matrix.flown[case_of(suite, s, "estimate")][0] for s in comparison.rows}
-        figures[f"errors_{label}"] = error_over_time_figure(
+        ),
+        "Mean error over whole episodes, with the 95 % interval over training seeds "
+        "(Student's t); for PD, over episodes.",
+    )
+    first = {NAMES[s]: matrix.flown[case_of(suite, s, "estimate")][0] for s in comparison.rows}
+    report.add_figure(
+        f"errors_{label}",
+        error_over_time_figure(
             {name: (f.recorded["time"], f.recorded["percentiles"]) for name, f in first.items()},
             f"Flown on the estimate, first training seed, sensors {suite}",
-        )
-        figures[f"paths_{label}"] = paths_figure(
+        ),
+        "Error over time: median and middle nine tenths of the episodes.",
+    )
+    report.add_figure(
+        f"paths_{label}",
+        paths_figure(
             {name: path_of(flown) for name, flown in first.items()},
             f"From above, flown on the estimate, sensors {suite}",
-        )
-    return figures
-
-
-_CAPTIONS = {
-    "learning": "Error during training; thin lines are single seeds, bold ones their median.",
-    "matrix": "Mean error over whole episodes, with the 95 % interval over training seeds "
-    "(Student's t); for PD, over episodes.",
-    "errors": "Error over time: median and middle nine tenths of the episodes.",
-    "paths": "The first episode of the first training seed.",
-}
-
-
-def _write_page(matrix: Matrix, figures: Mapping[str, Path]) -> Path:
-    """Write the page, with the pictures of all figures."""
-    comparison = matrix.comparison
-    recipe, trainings = comparison.recipe, comparison.trainings
-    seconds = sum(training.record()["training_seconds"] for training in trainings)
-    parts = [
-        pages.element(
-            "p",
-            f"{recipe.algorithm.upper()} ({_ENGINES[comparison.engine]}), {recipe.steps:,} "
-            f"steps for each of {len(trainings)} policies, training seeds "
-            f"{', '.join(map(str, comparison.seeds))}; {seconds / 60:.1f} minutes of training. "
-            f"Each policy flew {comparison.episodes:,} episodes on the truth and on the estimate.",
         ),
-        pages.bullets(conclusions(matrix)),
-    ]
-    shown = ("error [mm]", "second half [mm]", "crashed")
-    headings = ["policy", *(f"{what}, on {on}" for what in shown for on in FLOWN_ON)]
-    for suite in comparison.suites:
-        parts.append(pages.element("h2", f"Sensors {suite}"))
-        parts.append(pages.table(headings, matrix.texts(suite)))
-        for kind, caption in _CAPTIONS.items():
-            parts.append(pages.figure(figures[f"{kind}_{suite_label(suite)}"], caption))
-    title = f"{comparison.env_id}: what the estimate costs"
-    return pages.write_page(comparison.folder / "report.html", title, *parts)
+        "The first episode of the first training seed.",
+    )

@@ -78,15 +78,6 @@ def make_executor(
     return partial(_LocalJob, folder / "logs")
 
 
-def _optional(package: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise ImportError(
-            f'this executor needs {package}: pip install "quad-gym[sweep]" ({error})'
-        ) from None
-
-
 # ---- processes of this machine -------------------------------------------------------------------
 
 
@@ -132,7 +123,22 @@ def _in_process(plan: Plan, folder: Path, sender: Any, log: Path) -> None:
         sender.send(tuple(ended))
 
 
-# ---- Slurm ---------------------------------------------------------------------------------------
+# ---- Slurm and Ray -------------------------------------------------------------------------------
+
+
+class _RemoteJob:
+    """Job on another machine, with the functions of its library."""
+
+    def __init__(self, done: Callable[[], Any], result: Callable[[], Any], stop: Any) -> None:
+        self._done, self._result, self.stop = done, result, stop
+
+    def ended(self) -> Ended | None:
+        if not self._done():
+            return None
+        try:
+            return Ended(*self._result())
+        except Exception as error:  # job, worker or node lost
+            return Ended("died", (str(error).strip() or type(error).__name__).splitlines()[0])
 
 
 def _submitit(logs: Path, threads: int, options: Mapping[str, Any]) -> Executor:
@@ -145,27 +151,12 @@ def _submitit(logs: Path, threads: int, options: Mapping[str, Any]) -> Executor:
         executor.update_parameters(**given)
     except (NameError, RuntimeError, TypeError, ValueError) as error:  # as submitit has them
         raise ValueError(f"--options do not fit submitit: {error}") from None
-    return lambda training: _SubmititJob(
-        executor.submit(work, training.plan, training.folder.absolute())
-    )
 
+    def start(training: Training) -> Job:
+        job = executor.submit(work, training.plan, training.folder.absolute())
+        return _RemoteJob(job.done, job.result, partial(job.cancel, check=False))
 
-class _SubmititJob:
-    def __init__(self, job: Any) -> None:
-        self._job = job
-
-    def ended(self) -> Ended | None:
-        if not self._job.done():
-            return None
-        if (error := self._job.exception()) is None:
-            return Ended(*self._job.result())
-        return Ended("died", f"job {self._job.job_id}: {_first_line(error)}")
-
-    def stop(self) -> None:
-        self._job.cancel(check=False)
-
-
-# ---- Ray -----------------------------------------------------------------------------------------
+    return start
 
 
 def _ray(threads: int, options: Mapping[str, Any]) -> Executor:
@@ -175,26 +166,20 @@ def _ray(threads: int, options: Mapping[str, Any]) -> Executor:
         ray.init(**{"log_to_driver": False, "logging_level": "warning", **options})
     except (TypeError, ConnectionError, RuntimeError) as error:
         raise ValueError(f"--options do not fit Ray: {error}") from None
-    task = ray.remote(num_cpus=threads, max_retries=0)(work)
-    return lambda training: _RayJob(ray, task.remote(training.plan, training.folder.absolute()))
+    remote = ray.remote(num_cpus=threads, max_retries=0)(work)
+
+    def start(training: Training) -> Job:
+        task = remote.remote(training.plan, training.folder.absolute())
+        done, result = lambda: ray.wait([task], timeout=0)[0], partial(ray.get, task)
+        return _RemoteJob(done, result, partial(ray.cancel, task))  # KeyboardInterrupt in work
+
+    return start
 
 
-class _RayJob:
-    def __init__(self, ray: Any, task: Any) -> None:
-        self._ray, self._task = ray, task
-
-    def ended(self) -> Ended | None:
-        ready, _ = self._ray.wait([self._task], timeout=0)
-        if not ready:
-            return None
-        try:
-            return Ended(*self._ray.get(self._task))
-        except self._ray.exceptions.RayError as error:  # worker or node lost
-            return Ended("died", _first_line(error))
-
-    def stop(self) -> None:
-        self._ray.cancel(self._task)  # KeyboardInterrupt in its process
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _optional(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ImportError(
+            f'this executor needs {package}: pip install "quad-gym[sweep]" ({error})'
+        ) from None

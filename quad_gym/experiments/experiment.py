@@ -54,16 +54,22 @@ class Training:
 
     def curve(self, score: str) -> tuple[Floats, Floats]:
         """Steps and scores of the evaluations so far, (k,) each."""
-        file, rows = self.folder / EVALUATIONS, []
-        if file.exists():
-            with file.open(encoding="utf-8", newline="") as stream:
-                rows = [(float(row["steps"]), float(row[score])) for row in csv.DictReader(stream)]
+        rows = [(row["steps"], row[score]) for row in read_evaluations(self.folder)]
         steps, scores = np.array(rows).reshape(-1, 2).T
         return steps, scores
 
     def steps_done(self) -> int:
         """Number of steps at the last evaluation."""
         return int(max(self.curve("steps")[0], default=0))
+
+
+def read_evaluations(folder: Path) -> list[dict[str, float]]:
+    """Evaluations of the training in a folder so far."""
+    file = folder / EVALUATIONS
+    if not file.exists():
+        return []
+    with file.open(encoding="utf-8", newline="") as stream:
+        return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(stream)]
 
 
 def trainings_of(cases: Mapping[str, Plan], seeds: Sequence[int], folder: Path) -> list[Training]:

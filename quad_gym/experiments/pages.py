@@ -1,9 +1,12 @@
-"""Pages of reports: one HTML file with tables and figures, which needs no network."""
+"""Reports: files of numbers and figures, and one HTML page that shows them without a network."""
 
 import base64
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
+
+from quad_gym.analysis.plots import save_figure
 
 _PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 64rem; margin: 2rem auto;
@@ -18,39 +21,59 @@ figure {{ margin: 1.5rem 0; }} img, video {{ max-width: 100%; }} figcaption {{ c
 """
 
 
-def write_page(file: Path, title: str, *parts: str) -> Path:
-    """Write a page of HTML elements below a title.
+class Report:
+    """Report in a folder: its page grows by one element with each call.
 
-    Returns:
-        Path of the file.
+    Args:
+        folder: Folder of the report.
+        title: Title of the page.
     """
-    body = "\n".join([element("h1", title), *parts])
-    file.write_text(_PAGE.format(title=escape(title), body=body), encoding="utf-8")
-    return file
+
+    def __init__(self, folder: Path, title: str) -> None:
+        self.folder, self._title = folder, title
+        self.files: list[Path] = []
+        """Files of the report"""
+        self._parts: list[str] = []
+        self.add("h1", title)
+
+    def add(self, tag: str, text: str) -> None:
+        """Add an element that contains only text, such as a paragraph."""
+        self._parts.append(_element(tag, text))
+
+    def add_bullets(self, sentences: Sequence[str]) -> None:
+        """Add a list of sentences."""
+        items = "".join(_element("li", sentence) for sentence in sentences)
+        self._parts.append(f"<ul>{items}</ul>")
+
+    def add_table(self, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Add a table of texts."""
+        cells = [[_element("th", text) for text in headings]]
+        cells += [[_element("td", text) for text in row] for row in rows]
+        rows_text = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
+        self._parts.append(f"<table>{rows_text}</table>")
+
+    def add_figure(self, name: str, figure: Any, caption: str) -> None:
+        """Save a matplotlib figure under a name, and add it."""
+        picture, *others = save_figure(figure, self.folder / name)
+        self.add_picture(picture, caption)
+        self.files += others
+
+    def add_picture(self, file: Path, caption: str) -> None:
+        """Add a picture or film of the folder, contained in the page, with a caption."""
+        self.files.append(file)
+        kind, data = file.suffix[1:], base64.b64encode(file.read_bytes()).decode()
+        shown = f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
+        if kind == "mp4":
+            shown = f'<video controls loop src="data:video/mp4;base64,{data}"></video>'
+        self._parts.append(f"<figure>{shown}{_element('figcaption', caption)}</figure>")
+
+    def write(self) -> list[Path]:
+        """Write the page, report.html; return all files, the page last."""
+        page = self.folder / "report.html"
+        body = "\n".join(self._parts)
+        page.write_text(_PAGE.format(title=escape(self._title), body=body), encoding="utf-8")
+        return [*self.files, page]
 
 
-def element(tag: str, text: str) -> str:
-    """Element that contains only text, such as a paragraph."""
+def _element(tag: str, text: str) -> str:
     return f"<{tag}>{escape(text)}</{tag}>"
-
-
-def bullets(sentences: Sequence[str]) -> str:
-    """List of sentences."""
-    return f"<ul>{''.join(element('li', sentence) for sentence in sentences)}</ul>"
-
-
-def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Table of texts."""
-    cells = [[element("th", text) for text in headings]]
-    cells += [[element("td", text) for text in row] for row in rows]
-    rows_text = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
-    return f"<table>{rows_text}</table>"
-
-
-def figure(file: Path, caption: str) -> str:
-    """Picture or film, contained in the page, with a caption."""
-    kind, data = file.suffix[1:], base64.b64encode(file.read_bytes()).decode()
-    shown = f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
-    if kind == "mp4":
-        shown = f'<video controls loop src="data:video/mp4;base64,{data}"></video>'
-    return f"<figure>{shown}{element('figcaption', caption)}</figure>"

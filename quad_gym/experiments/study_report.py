@@ -1,16 +1,15 @@
 """Report of a study: tables, figures, numbers, and a page."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from quad_gym import IDS, sensor_suite
-from quad_gym.analysis import plots
 from quad_gym.analysis.comparison_plots import learning_figure
-from quad_gym.analysis.reports import text_table, versions, write_csv, write_json
+from quad_gym.analysis.reports import stacked, text_table, versions, write_csv, write_json
 from quad_gym.analysis.study_plots import (
     Glance,
     Pace,
@@ -18,21 +17,10 @@ from quad_gym.analysis.study_plots import (
     pace_figure,
 )
 from quad_gym.envs.benchmarks import BENCHMARKS
-from quad_gym.experiments import pages
+from quad_gym.experiments.pages import Report
 from quad_gym.experiments.study import Results
 from quad_gym.experiments.study_films import CHOICES, label_of, pair_of
 from quad_gym.experiments.study_words import conclusions, number, share
-
-CAPTIONS = {
-    "learning": "Return of the evaluations during training, each arm on its own observations; "
-    "thin lines are single seeds, bold ones their median.",
-    "glance": "The same episode, flown on the estimate. Above, where the vehicle looks; below, "
-    f"standard deviation of the filter, and errors. {CHOICES['glance']}",
-    "pace": "The same episode, flown on the estimate. Above, the speed of the vehicle; below, "
-    f"standard deviation of the filter, and errors. {CHOICES['pace']}",
-    "film": "The policies and the episode of the figure: the truth, and the estimate on which both "
-    "fly.",
-}
 
 
 def _table(results: Results) -> tuple[tuple[str, ...], list[list[str]]]:
@@ -85,49 +73,47 @@ def _trainings(results: Results) -> str:
 def write_report(results: Results, film: Path | None = None) -> list[Path]:
     """Write figures, numbers and pages; the last file is the page, which also shows the film."""
     study, folder = results.study, results.study.folder
+    table = folder / "table.md"
+    table.write_text(page_text(results), encoding="utf-8")
     summary = {
         **results.description(),
         "conclusions": conclusions(results),
         "versions": versions("numpy", "numba", "scipy"),
     }
-    (folder / "table.md").write_text(page_text(results), encoding="utf-8")
-    figures = {name: plots.save_figure(f, folder / name) for name, f in _figures(results).items()}
-    shown = {CAPTIONS[name]: files[0] for name, files in figures.items()}
+    report = Report(folder, study.env_id)
+    report.files += [
+        write_csv(folder / "episodes.csv", stacked(_episodes(results))),
+        write_json(folder / "summary.json", summary),
+        table,
+    ]
+    report.add(
+        "p",
+        f"{_trainings(results)}{study.episodes:,} episodes with each policy, flown on the "
+        "estimate unless the arm says otherwise. Means over seeds; in brackets 95 % "
+        "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
+        f"{study.about.meaning}.",
+    )
+    report.add_table(*_table(results))
+    report.add_bullets(conclusions(results))
+    _add_figures(report, results)
     if film is not None:
         speed = study.about.film_speed
-        shown[CAPTIONS["film"] + ("" if speed == 1.0 else f" At {speed:g} times the speed.")] = film
-    page = pages.write_page(
-        folder / "report.html",
-        study.env_id,
-        pages.element(
-            "p",
-            f"{_trainings(results)}{study.episodes:,} episodes with each policy, flown on the "
-            "estimate unless the arm says otherwise. Means over seeds; in brackets 95 % "
-            "intervals over seeds and episodes (quad_gym.analysis.intervals). Success: "
-            f"{study.about.meaning}.",
-        ),
-        pages.table(*_table(results)),
-        pages.bullets(conclusions(results)),
-        *(pages.figure(file, caption) for caption, file in shown.items()),
-    )
-    return [
-        write_csv(folder / "episodes.csv", _episodes(results)),
-        write_json(folder / "summary.json", summary),
-        folder / "table.md",
-        *(file for files in figures.values() for file in files),
-        *([] if film is None else [film]),
-        page,
-    ]
+        report.add_picture(
+            film,
+            "The policies and the episode of the figure: the truth, and the estimate on which both "
+            f"fly.{'' if speed == 1.0 else f' At {speed:g} times the speed.'}",
+        )
+    return report.write()
 
 
-def _episodes(results: Results) -> dict[str, list[Any]]:
-    """Columns of numbers of all episodes."""
-    study, columns = results.study, dict[str, list[Any]]()
+def _episodes(results: Results) -> Iterator[dict[str, Any]]:
+    """Numbers of all episodes, policy by policy."""
+    study = results.study
     for arm in study.arms:
         seeds = (None,) if arm.policy is not None else study.seeds
         for seed, flown in zip(seeds, results.flown[arm.name], strict=True):
             episodes = flown.episodes
-            block: dict[str, Any] = {
+            yield {
                 "arm": [arm.name] * study.episodes,
                 "training_seed": [seed] * study.episodes,
                 "episode": study.first_episode + np.arange(study.episodes),
@@ -140,29 +126,36 @@ def _episodes(results: Results) -> dict[str, list[Any]]:
                 "speed": flown.recorded["mean_speed"],
                 "success": study.about.success(flown),
             }
-            for name, values in block.items():
-                columns.setdefault(name, []).extend(values)
-    return columns
 
 
-def _figures(results: Results) -> dict[str, Any]:
-    study, found = results.study, {}
+def _add_figures(report: Report, results: Results) -> None:
+    """Draw the learning curves, and one episode of two policies."""
+    study = results.study
     curves = {results.arm(name).label: results.curves[name] for name in results.trained()}
     levels = {results.arm(n).label: results.rows[n]["return"].value for n in results.fixed()}
     if curves:
-        found["learning"] = learning_figure(
-            curves, levels, score="return of an episode", logarithmic=False
+        report.add_figure(
+            "learning",
+            learning_figure(curves, levels, score="return of an episode", logarithmic=False),
+            "Return of the evaluations during training, each arm on its own observations; "
+            "thin lines are single seeds, bold ones their median.",
         )
-    pair = pair_of(results)
-    if pair is not None:
-        episodes = {}
-        for name, k in pair.trainings.items():
-            recorded = results.flown[name][k].recorded
-            traces = {trace: recorded[trace][:, pair.episode] for trace in study.about.traced}
-            label = label_of(results, name).replace(", ", ",\n")
-            episodes[label] = {"time": recorded["time"], **traces}
-        found[study.about.figure] = _FIGURES[study.about.figure](study.env_id, episodes)
-    return found
+    pair, kind = pair_of(results), study.about.figure
+    if pair is None:
+        return
+    episodes = {}
+    for name, k in pair.trainings.items():
+        recorded = results.flown[name][k].recorded
+        traces = {trace: recorded[trace][:, pair.episode] for trace in study.about.traced}
+        label = label_of(results, name).replace(", ", ",\n")
+        episodes[label] = {"time": recorded["time"], **traces}
+    above = "where the vehicle looks" if kind == "glance" else "the speed of the vehicle"
+    report.add_figure(
+        kind,
+        _glances(study.env_id, episodes) if kind == "glance" else _paces(episodes),
+        f"The same episode, flown on the estimate. Above, {above}; below, "
+        f"standard deviation of the filter, and errors. {CHOICES[kind]}",
+    )
 
 
 def _glances(env_id: str, episodes: Mapping[str, Mapping[str, Any]]) -> Any:
@@ -172,8 +165,5 @@ def _glances(env_id: str, episodes: Mapping[str, Mapping[str, Any]]) -> Any:
     return glance_figure({label: Glance(**each) for label, each in episodes.items()}, half_view)
 
 
-def _paces(env_id: str, episodes: Mapping[str, Mapping[str, Any]]) -> Any:
+def _paces(episodes: Mapping[str, Mapping[str, Any]]) -> Any:
     return pace_figure({label: Pace(**each) for label, each in episodes.items()})
-
-
-_FIGURES = {"glance": _glances, "pace": _paces}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from quad_gym.analysis.intervals import mean_interval, rate_over_trainings
-from quad_gym.analysis.reports import text_table, write_csv
+from quad_gym.analysis.reports import columns_of, text_table, write_csv
 from quad_gym.experiments.experiment import Training
 
 SCORES = ("mean_error", "late_error", "crash_rate", "return", "gates_passed")
@@ -108,7 +108,7 @@ def write_tables(rows: Sequence[dict[str, Any]], folder: Path) -> None:
     """
     parts = [folder / f"{name}.{os.getpid()}.part" for name in FILES]  # of this sweep alone
     for part, table in zip(parts, (rows, groups_of(rows)), strict=False):
-        write_csv(part, {name: [row[name] for row in table] for name in table[0]})
+        write_csv(part, columns_of(table))
     parts[-1].write_text(table_text(rows), encoding="utf-8")
     for part, name in zip(parts, FILES, strict=True):
         part.replace(folder / name)

@@ -1,9 +1,7 @@
 """The benchmark's script runs and writes what it says; no test asserts on a clock."""
 
-import functools
 import json
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ import quad_gym
 from quad_gym.commands import benchmark as script
 from quad_gym.commands.options import parse
 from quad_gym.envs.configuration import TASK_DEFAULTS
-from quad_gym.experiments.benchmark import interfaces, learning, rendering, stages
+from quad_gym.experiments.benchmark import interfaces, learning, stages
 from quad_gym.experiments.benchmark.filter import repeated
 from quad_gym.experiments.benchmark.stages import Staged, hovering
 from quad_gym.experiments.benchmark.timing import Effort, Timing, by_turns
@@ -90,16 +88,6 @@ def test_what_takes_turns_is_timed_by_turns():
     assert timings == [Timing(2.0, 0.5), Timing(1.0, 0.0)]
 
 
-def test_the_rendering_section_has_every_task_and_view(tmp_path, capsys, monkeypatch):
-    pytest.importorskip("pygame")
-    monkeypatch.setattr(rendering, "INSTANTS", 2)
-    short = functools.partial(gymnasium.make_vec, max_episode_steps=50)
-    monkeypatch.setattr(rendering.gymnasium, "make_vec", short)
-    rows = run(tmp_path, "--only", "rendering")["sections"]["rendering"]
-    assert len({(row["task"], row["view"]) for row in rows}) == len(rows) == 2 * len(quad_gym.IDS)
-    assert "frames/s" in capsys.readouterr().out
-
-
 def test_the_options_section_compares_each_with_everything_off(tmp_path):
     found = run(tmp_path, "--only", "options", "--batch", "16")
     rows = {row["name"]: row for row in found["sections"]["options"]}
@@ -143,15 +131,12 @@ def test_the_learning_section_says_when_the_policy_was_better_than_pd(tmp_path, 
     found = learning.summary([dict(zip(names, row, strict=True)) for row in flown], pd=0.07)
     assert (found["steps_to_pd"], found["seconds_to_pd"], found["error"]) == (20, 2.0, 0.05)
     better = {**rows[0], **found}
-    assert "1 of 2 below tuned PD, the last after 2.0 s" in learning.learning_table([*rows, better])
+    assert "1 of 2 below tuned PD, the last after 2.0 s" in learning.SECTION.table([*rows, better])
 
 
 def test_all_sections_are_those_that_take_no_minutes():
     chosen = script.chosen_sections(parse(script.Args, []))
-    assert chosen == [
-        *("filter", "tick", "options", "interfaces"),
-        *("tasks", "memory", "rendering"),
-    ]
+    assert chosen == ["filter", "tick", "options", "interfaces", "tasks"]
 
 
 @pytest.mark.parametrize(

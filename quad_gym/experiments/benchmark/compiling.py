@@ -70,13 +70,12 @@ def empty_cache(package: Path) -> None:
         file.unlink()
 
 
-def time_compile(quick: bool) -> list[timing.Row]:
+def time_compile(scope: timing.Scope) -> list[timing.Row]:
     """Time the first reset with an empty and a full cache, and a step after an edit.
 
-    Args:
-        quick: True for the fastest configuration only.
+    With `scope.quick`, only the fastest configuration and one edit are measured.
     """
-    rows: list[timing.Row] = []
+    quick, rows = scope.quick, list[timing.Row]()
 
     def add(name: str, cache: str, suite: str | None, seconds: float) -> None:
         print(f"  {name}, {cache}: {seconds:.1f} s", file=sys.stderr, flush=True)
@@ -97,22 +96,19 @@ def time_compile(quick: bool) -> list[timing.Row]:
         for source in EDITED[: 1 if quick else None]:
             with (package / source).open("a", encoding="utf-8") as file:
                 file.write("\n_EDITED = 1.0\n")
-            step = "env.step(env.action_space.sample())"
-            add(
-                f"first step after an edit of {source}",
-                "edit",
-                suite,
-                seconds_of(folder, before, options, step),
-            )
+            step = seconds_of(folder, before, options, "env.step(env.action_space.sample())")
+            add(f"first step after an edit of {source}", "edit", suite, step)
     return rows
 
 
-def compile_table(rows: list[timing.Row]) -> str:
-    """Format the section."""
-    columns = {
-        "up to the first reset": timing.NAME,
-        "suite": lambda row: row["suite"] or "-",
-        "cache": timing.column("cache"),
-        "s": timing.column("seconds", ".1f"),
-    }
-    return timing.table(f"A new process with {ENVS:,} flights of the circle", rows, columns)
+SECTION = timing.Section(
+    time_compile,
+    {
+        f"A new process with {ENVS:,} flights of the circle": {
+            "up to the first reset": timing.NAME,
+            "suite": lambda row: row["suite"] or "-",
+            "cache": timing.column("cache"),
+            "s": timing.column("seconds", ".1f"),
+        }
+    },
+)

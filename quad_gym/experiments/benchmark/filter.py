@@ -35,15 +35,10 @@ def repeated(batch: FlightBatch, flights: NDArray[np.intp], count: int) -> NDArr
     return blocks
 
 
-def time_filter(count: int, effort: timing.Effort, recorded_ticks: int) -> list[timing.Row]:
-    """Time cycles of update and prediction on one core.
-
-    Args:
-        count: Number of flights in a batch.
-        effort: Number and length of the repeats.
-        recorded_ticks: Length of the flight of the filters for one vehicle.
-    """
+def time_filter(scope: timing.Scope) -> list[timing.Row]:
+    """Time cycles of update and prediction on one core."""
     rows: list[timing.Row] = []
+    count, effort, recorded_ticks = scope.batch, scope.effort, 5 if scope.quick else 40
     with_camera = quad_gym.sensor_suite("lab")
     for measurements, sensors in ((6, with_camera.replace(camera=None)), (12, with_camera)):
         features = (measurements - 6) // 3
@@ -77,8 +72,14 @@ def time_filter(count: int, effort: timing.Effort, recorded_ticks: int) -> list[
     return rows
 
 
-def filter_table(rows: list[timing.Row]) -> str:
-    """Format the section."""
-    times, ratio = timing.column("seconds", ",.2f", 1e6), timing.column("times_lanes", ",.1f")
-    columns = {"filter": timing.NAME, "us": times, "spread": timing.SPREAD, "x lanes": ratio}
-    return timing.table("UKF cycle, one core", rows, columns)
+SECTION = timing.Section(
+    time_filter,
+    {
+        "UKF cycle, one core": {
+            "filter": timing.NAME,
+            "us": timing.column("seconds", ",.2f", 1e6),
+            "spread": timing.SPREAD,
+            "x lanes": timing.column("times_lanes", ",.1f"),
+        }
+    },
+)

@@ -125,14 +125,9 @@ def time_others(envs: int, effort: timing.Effort) -> list[timing.Row]:
     return rows
 
 
-def time_interfaces(envs: int, cores: int, effort: timing.Effort) -> list[timing.Row]:
-    """Time steps of all interfaces with random actions.
-
-    Args:
-        envs: Number of environments in a batch.
-        cores: Largest number of threads.
-        effort: Number and length of the repeats.
-    """
+def time_interfaces(scope: timing.Scope) -> list[timing.Row]:
+    """Time steps of all interfaces with random actions."""
+    envs, cores, effort = scope.envs, scope.threads, scope.effort
     rows: list[timing.Row] = []
     for rate in (200, 50):
         for observation in ("estimate", "truth", "noisy", "measurements"):
@@ -153,14 +148,16 @@ def time_interfaces(envs: int, cores: int, effort: timing.Effort) -> list[timing
     return rows + time_others(envs, effort)
 
 
-def interfaces_table(rows: list[timing.Row]) -> str:
-    """Format the section."""
-    columns = {
-        "interface, observation, control, suite": timing.NAME,
-        "envs": timing.column("envs", ","),
-        "threads": timing.column("threads"),
-        "steps/s": timing.per_second,
-        "spread": timing.SPREAD,
-        "resets": timing.percent("reset_share"),
-    }
-    return timing.table("Random actions around hover", rows, columns)
+SECTION = timing.Section(
+    time_interfaces,
+    {
+        "Random actions around hover": {
+            "interface, observation, control, suite": timing.NAME,
+            "envs": timing.column("envs", ","),
+            "threads": timing.column("threads"),
+            "steps/s": timing.per_second,
+            "spread": timing.SPREAD,
+            "resets": timing.percent("reset_share"),
+        }
+    },
+)

@@ -4,67 +4,60 @@ Each training equals `quad-gym train circle --engine compiled`. The time exclude
 evaluations.
 """
 
-import csv
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
-from quad_gym.analysis.reports import text_table
+from baselines.pd import PDPolicy
+from baselines.plans import Plan
+from baselines.recipes import recipe
+from baselines.seeds import first_seed
+from baselines.training import train
+from quad_gym.evaluation import roll_out
 from quad_gym.experiments.benchmark import timing
+from quad_gym.experiments.experiment import read_evaluations
 
 ENV_ID = "QuadGym/Circle-v0"
 
 
-def time_learning(seeds: int, steps: int | None, threads: int, quick: bool) -> list[timing.Row]:
-    """Train with each seed.
-
-    Args:
-        seeds: Number of training seeds, from 0 on.
-        steps: Environment steps of a training; None: as in the recipe.
-        threads: Threads of each training.
-        quick: True for one short training.
-    """
-    from baselines.plans import Plan
-    from baselines.recipes import recipe
-    from baselines.training import train
-
+def time_learning(scope: timing.Scope) -> list[timing.Row]:
+    """Train with each seed; with `scope.quick`, one short training."""
+    quick, rows = scope.quick, list[timing.Row]()
     chosen = recipe(ENV_ID)
-    chosen = chosen.replace(steps=(2 * 8_192 if quick else steps) or chosen.steps)
-    rows: list[timing.Row] = []
-    for seed in range(1 if quick else seeds):
+    chosen = chosen.replace(steps=(2 * 8_192 if quick else scope.steps) or chosen.steps)
+    for seed in range(1 if quick else scope.seeds):
         plan = Plan(
             env_id=ENV_ID,
             recipe=chosen,
             seed=seed,
-            threads=threads,
+            threads=scope.threads,
             engine="compiled",
             evaluations=2 if quick else 40,
             episodes=8 if quick else 100,
         )
         with tempfile.TemporaryDirectory() as name:
             done = train(plan, Path(name), tensorboard=False, quiet=True)
-            text = (Path(name) / "evaluations.csv").read_text(encoding="utf-8")
-        evaluations = [{k: float(v) for k, v in r.items()} for r in csv.DictReader(text.split())]
-        row = {"seed": seed, "threads": threads, **summary(evaluations, pd_error(plan))}
-        rows.append(row | {"steps": done.steps, "seconds": done.seconds})
+            found = summary(read_evaluations(Path(name)), pd_error(plan))
+        rows.append(
+            {
+                "seed": seed,
+                "threads": scope.threads,
+                **found,
+                "steps": done.steps,
+                "seconds": done.seconds,
+            }
+        )
         print(f"  seed {seed}: {done.seconds:.1f} s", file=sys.stderr, flush=True)
     return rows
 
 
-def pd_error(plan: Any) -> float:
+def pd_error(plan: Plan) -> float:
     """Mean error of tuned PD control in the episodes of the training's evaluations [m]."""
-    from baselines.pd import PDPolicy
-    from baselines.seeds import first_seed
-    from quad_gym.evaluation import roll_out
-
     judge = plan.make_judge()
     first = first_seed("validation", plan.seed, plan.episodes)
-    error: float = roll_out(PDPolicy(judge, gains="tuned"), judge, seed=first).summary()[
-        "mean_error"
-    ]
+    episodes = roll_out(PDPolicy(judge, gains="tuned"), judge, seed=first)
     judge.close()
-    return error
+    return episodes.summary()["mean_error"]
 
 
 def summary(evaluations: list[dict[str, float]], pd: float) -> timing.Row:
@@ -80,29 +73,28 @@ def summary(evaluations: list[dict[str, float]], pd: float) -> timing.Row:
     }
 
 
-def learning_table(rows: list[timing.Row]) -> str:
-    """Format the section: a line per seed, and the latest of all."""
-
-    def format_or_dash(value: float | None, form: str) -> str:
-        return "-" if value is None else format(value, form)
-
-    cells = [
-        (
-            f"{row['seed']}",
-            format_or_dash(row["steps_to_pd"], ",.0f"),
-            format_or_dash(row["seconds_to_pd"], ".1f"),
-            f"{1e3 * row['pd_error']:.1f}",
-            *(f"{row['steps']:,}", f"{row['seconds']:.1f}", f"{1e3 * row['error']:.1f}"),
-            f"{row['crash_rate']:.1%}",
-        )
-        for row in rows
-    ]
-    groups = {
-        "": ["seed"],
-        "below tuned PD after": ["steps", "s", "PD [mm]"],
-        "at the end": ["steps", "s", "error [mm]", "crashed"],
-    }
-    table = text_table(groups, cells)
+def _in_words(rows: list[timing.Row]) -> str:
+    """Number of trainings that became better than PD, and the latest of them."""
     times = [row["seconds_to_pd"] for row in rows if row["seconds_to_pd"] is not None]
     latest = f", the last after {max(times):.1f} s" if times else ""
-    return f"{table}\n{len(times)} of {len(rows)} below tuned PD{latest} of training."
+    return f"\n{len(times)} of {len(rows)} below tuned PD{latest} of training."
+
+
+SECTION = timing.Section(
+    time_learning,
+    {
+        "": {"seed": timing.column("seed", "d")},
+        "below tuned PD after": {
+            "steps": timing.column("steps_to_pd", ",.0f"),
+            "s": timing.column("seconds_to_pd", ".1f"),
+            "PD [mm]": timing.column("pd_error", ".1f", 1e3),
+        },
+        "at the end": {
+            "steps": timing.column("steps", ","),
+            "s": timing.column("seconds", ".1f"),
+            "error [mm]": timing.column("error", ".1f", 1e3),
+            "crashed": timing.column("crash_rate", ".1%"),
+        },
+    },
+    _in_words,
+)

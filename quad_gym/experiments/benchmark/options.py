@@ -90,8 +90,9 @@ TICKS = 10
 that some turns are undisturbed."""
 
 
-def time_options(count: int, effort: timing.Effort) -> list[timing.Row]:
+def time_options(scope: timing.Scope) -> list[timing.Row]:
     """Time a tick of a flight with each option, and a reset with each start, on one core."""
+    count, effort = scope.batch, scope.effort
     task = TASK_DEFAULTS["hover"].replace(duration=0.0)
     turns: dict[str, Callable[[], float]] = {}
     for name, options in {**OPTIONS, **STARTS}.items():
@@ -132,13 +133,15 @@ def _turn_of(batch: FlightBatch, job: Callable[[], Any]) -> Callable[[], float]:
     return turn
 
 
-def options_table(rows: list[timing.Row]) -> str:
-    """Format the section."""
-    columns = {
-        "option": timing.NAME,
-        "suite": timing.column("suite"),
-        "us": timing.column("seconds", ".3f", 1e6),
-        "spread": timing.SPREAD,
-        "x off": timing.column("times_off", ".2f"),
-    }
-    return timing.table("One flight's tick with one option on, one core", rows, columns)
+SECTION = timing.Section(
+    time_options,
+    {
+        "One flight's tick with one option on, one core": {
+            "option": timing.NAME,
+            "suite": timing.column("suite"),
+            "us": timing.column("seconds", ".3f", 1e6),
+            "spread": timing.SPREAD,
+            "x off": timing.column("times_off", ".2f"),
+        }
+    },
+)

@@ -54,25 +54,20 @@ class OwnCircle(Task):
         }
 
 
-def time_own_task(effort: timing.Effort, threads: int) -> list[timing.Row]:
+def time_own_task(scope: timing.Scope) -> list[timing.Row]:
     """Time steps of both tasks in alternation, at 50 Hz on the estimate."""
-    rows: list[timing.Row] = []
+    rows, effort = list[timing.Row](), scope.effort
+    options: dict[str, Any] = {"control_rate": 50.0, "threads": scope.threads}
+    kinds = (options, {**options, "task": OwnCircle()})
     for count in COUNTS:
-        envs, steps = [], []
-        options: dict[str, Any] = {"control_rate": 50.0, "threads": threads}
-        for task in (None, OwnCircle()):
-            own: dict[str, Any] = {} if task is None else {"task": task}
-            env = gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **options, **own)
+        envs = [gymnasium.make_vec("QuadGym/Circle-v0", num_envs=count, **kind) for kind in kinds]
+        steps = [partial(_step, env, random_actions(count)) for env in envs]
+        for env in envs:
             env.reset(seed=0)
-            envs.append(env)
-            steps.append(partial(_step, env, random_actions(count)))
-        first = timing.by_turns(
-            [partial(timing.lasting, step, 1) for step in steps], 3
-        )  # also warms up
+        first = timing.by_turns([partial(timing.lasting, step, 1) for step in steps], 3)  # warms up
         calls = max(1, round(effort.seconds / 4.0 / first[0].best))
-        found = timing.by_turns(
-            [partial(timing.lasting, step, calls) for step in steps], 4 * effort.repeats
-        )
+        jobs = [partial(timing.lasting, step, calls) for step in steps]
+        found = timing.by_turns(jobs, 4 * effort.repeats)
         for env in envs:
             env.close()
         for name, timed in zip(("shipped", "own, in NumPy"), found, strict=True):
@@ -86,15 +81,14 @@ def _step(env: Any, actions: Any) -> None:
     env.step(next(actions))
 
 
-def own_task_table(rows: list[timing.Row]) -> str:
-    """Format the section."""
-    ratio = timing.column("share", ".2f")
-    columns = {
-        "task": timing.NAME,
-        "steps/s": timing.per_second,
-        "spread": timing.SPREAD,
-        "of shipped": ratio,
-    }
-    return timing.table(
-        "The circle, shipped and as a task of one's own, 50 Hz, estimate", rows, columns
-    )
+SECTION = timing.Section(
+    time_own_task,
+    {
+        "The circle, shipped and as a task of one's own, 50 Hz, estimate": {
+            "task": timing.NAME,
+            "steps/s": timing.per_second,
+            "spread": timing.SPREAD,
+            "of shipped": timing.column("share", ".2f"),
+        }
+    },
+)

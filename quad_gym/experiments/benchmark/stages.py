@@ -65,15 +65,8 @@ class Staged:
         """Run the stage once for every block."""
         begin = blocks.ctypes.data - self._skipped
         self._others[-1]["mask"] = 1.0
-        run_stage(
-            begin,
-            blocks.strides[0],
-            len(blocks),
-            self._stage,
-            *self._others,
-            self._table,
-            self._flag,
-        )
+        size = (blocks.strides[0], len(blocks))
+        run_stage(begin, *size, self._stage, *self._others, self._table, self._flag)
 
 
 def over_a_period(batch: FlightBatch) -> NDArray[Any]:
@@ -90,9 +83,9 @@ def over_a_period(batch: FlightBatch) -> NDArray[Any]:
     return blocks
 
 
-def time_tick(count: int, effort: timing.Effort) -> list[timing.Row]:
+def time_tick(scope: timing.Scope) -> list[timing.Row]:
     """Time a whole tick on one core, and its stages, per flight, with the suites of `SUITES`."""
-    return [row for suite in SUITES for row in _time_suite(suite, count, effort)]
+    return [row for suite in SUITES for row in _time_suite(suite, scope.batch, scope.effort)]
 
 
 def _time_suite(suite: str, count: int, effort: timing.Effort) -> list[timing.Row]:
@@ -126,13 +119,17 @@ def _time_suite(suite: str, count: int, effort: timing.Effort) -> list[timing.Ro
     return rows
 
 
-def tick_table(rows: list[timing.Row]) -> str:
-    """Format the section."""
-    columns = {
-        "suite": timing.column("suite"),
-        "stage": lambda row: row["part"] + (" (at the start)" if row["kind"] == "start" else ""),
-        "us": timing.column("seconds", ".3f", 1e6),
-        "spread": timing.SPREAD,
-        "of the whole": timing.percent("share"),
-    }
-    return timing.table("One flight's tick, one core", rows, columns)
+SECTION = timing.Section(
+    time_tick,
+    {
+        "One flight's tick, one core": {
+            "suite": timing.column("suite"),
+            "stage": lambda row: (
+                row["part"] + (" (at the start)" if row["kind"] == "start" else "")
+            ),
+            "us": timing.column("seconds", ".3f", 1e6),
+            "spread": timing.SPREAD,
+            "of the whole": timing.percent("share"),
+        }
+    },
+)

@@ -1,9 +1,10 @@
-"""Timing by the best of several repeats, and tables of the results."""
+"""Sections of the benchmark: timing by the best of several repeats, and tables of the results."""
 
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from quad_gym.analysis.reports import text_table
@@ -15,6 +16,25 @@ class Effort(NamedTuple):
     repeats: int
     seconds: float
     """length of a repeat [s]"""
+
+
+@dataclass(frozen=True)
+class Scope:
+    """Extent of the measurements."""
+
+    batch: int
+    """Number of flights in the batches of filter, tick and options"""
+    envs: int
+    """Number of environments in the batches of interfaces"""
+    threads: int
+    """Largest number of threads"""
+    seeds: int
+    """Number of training seeds"""
+    steps: int | None
+    """Environment steps of a training; None: as in the recipe"""
+    effort: Effort
+    quick: bool
+    """True for a check that the sections run"""
 
 
 class Timing(NamedTuple):
@@ -56,10 +76,7 @@ def measure(
     return _timing(times)
 
 
-def by_turns(
-    jobs: Iterable[Callable[[], float]],
-    turns: int,
-) -> list[Timing]:
+def by_turns(jobs: Iterable[Callable[[], float]], turns: int) -> list[Timing]:
     """Time several jobs in alternation, so that other load on the machine affects all of them.
 
     Args:
@@ -90,15 +107,21 @@ def report(name: str, timing: Timing, **more: Any) -> Row:
     return {"name": name, "seconds": timing.best, "spread": timing.spread, **more}
 
 
-Column = Callable[[Row], str]
+Cell = Callable[[Row], str]
+"""Function that formats the cell of a row in one column."""
 
 
-def column(key: str, form: str = "", scale: float = 1) -> Column:
-    """Column of a table: a text, or a number multiplied by a scale."""
-    return lambda row: format(scale * row[key] if form else row[key], form)
+def column(key: str, form: str = "", scale: float = 1) -> Cell:
+    """Column of texts, or of numbers multiplied by a scale; a dash for None."""
+
+    def cell(row: Row) -> str:
+        value = row[key]
+        return "-" if value is None else format(scale * value if form else value, form)
+
+    return cell
 
 
-def percent(key: str) -> Column:
+def percent(key: str) -> Cell:
     """Column of shares, in percent; a dash for None."""
     return lambda row: "-" if row[key] is None else f"{100.0 * row[key]:.1f} %"
 
@@ -111,7 +134,19 @@ def per_second(row: Row) -> str:
 NAME, SPREAD = column("name"), percent("spread")
 
 
-def table(heading: str, rows: Sequence[Row], columns: Mapping[str, Column]) -> str:
-    """Format rows for the screen."""
-    cells = [[text(row) for text in columns.values()] for row in rows]
-    return text_table({heading: list(columns)}, cells)
+@dataclass(frozen=True)
+class Section:
+    """Section of the benchmark."""
+
+    measure: Callable[[Scope], list[Row]]
+    groups: Mapping[str, Mapping[str, Cell]]
+    """Columns of the table by heading, in groups by heading"""
+    summary: Callable[[list[Row]], str] = lambda rows: ""
+    """Function that returns the text below the table"""
+
+    def table(self, rows: list[Row]) -> str:
+        """Format rows for the screen."""
+        columns = [cell for group in self.groups.values() for cell in group.values()]
+        headings = {heading: list(group) for heading, group in self.groups.items()}
+        cells = [[cell(row) for cell in columns] for row in rows]
+        return text_table(headings, cells) + self.summary(rows)
